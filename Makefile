@@ -1,0 +1,50 @@
+# Each target sets up what it needs (dev/setup.sh, once) and then runs one thing.
+
+VENV := $(if $(ROS_DISTRO),.venv-ros,.venv)
+PYTEST_ARGS ?=
+
+# make variable -> option of `pose-graph demo`; only those that are given
+option = $(if $($(1)),--$(2) '$($(1))')
+DEMO_ARGS = $(call option,BAG,bag) $(call option,ODOM,odom) $(call option,FIX,fix) \
+	$(call option,GLOBAL_POSE,global-pose) $(call option,LOOP_CLOSURE,loop-closure) \
+	$(call option,TRUTH,truth) $(call option,HOLD_OUT,hold-out) $(call option,RATE,rate) \
+	$(call option,OUT,out)
+
+.PHONY: help setup demo test lint types fmt lock clean
+
+help:
+	@echo 'make demo    set up, then simulate a drive, replay it through the node and judge the result'
+	@echo '             own bag: BAG=folder|file.mcap|file.db3 ODOM=/topic FIX=/topic [GLOBAL_POSE=/topic]'
+	@echo '             [LOOP_CLOSURE=/topic] [TRUTH=/topic] [HOLD_OUT=5] [RATE=factor] [OUT=demo]'
+	@echo 'make test    set up, then run the checks (ruff, mypy) and all tests; PYTEST_ARGS="-k word"'
+	@echo 'make lint    ruff alone;  make types: mypy alone;  make fmt: let ruff mend what it can'
+	@echo 'make setup   set up alone: $(VENV), from wheels, or on top of ROS where one is sourced'
+	@echo 'make lock    resolve dev/requirements.in again into requirements.lock'
+	@echo 'make clean   remove the set-up and what builds leave behind'
+	@echo 'PYTHON=python3.12 chooses the Python of the set-up.'
+
+setup:
+	@dev/setup.sh
+
+demo: setup
+	@$(VENV)/bin/pose-graph demo $(DEMO_ARGS)
+
+test: setup
+	@dev/test.sh $(VENV) $(PYTEST_ARGS)
+
+lint: setup
+	$(VENV)/bin/ruff check
+
+types: setup
+	$(VENV)/bin/mypy
+
+fmt: setup
+	$(VENV)/bin/ruff check --fix
+
+lock: setup
+	$(VENV)/bin/python dev/lock.py
+
+clean:
+	rm -rf .venv .venv-ros build install log *.egg-info .coverage htmlcov
+	rm -rf .hypothesis .mypy_cache .pytest_cache .ruff_cache
+	find pose_graph_ros test dev launch -name __pycache__ -prune -exec rm -rf {} +

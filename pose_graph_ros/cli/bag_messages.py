@@ -1,0 +1,96 @@
+# Copyright 2026 The pose_graph_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""Messages for a bag from arrays: what drivers of wheels, receivers and matchers would publish."""
+
+from collections.abc import Iterable, Iterator, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from pose_graph_ros.core import se2
+from pose_graph_ros.core.se2 import FloatArray, IntArray
+from pose_graph_ros.core.trajectory import Trajectory
+from pose_graph_ros.ros.bag_writer import BagWriter, message_types
+
+Message = tuple[str, str, int, Any]
+"""Topic, type, stamp [ns] and message."""
+_TYPES = message_types()
+_ODOMETRY = 'nav_msgs/msg/Odometry'
+_FIX = 'sensor_msgs/msg/NavSatFix'
+_POSE = 'geometry_msgs/msg/PoseWithCovarianceStamped'
+_PLANAR = np.ix_([0, 1, 5], [0, 1, 5])
+
+
+def write_bag(
+    folder: str | Path, messages: Iterable[Message], *, overwrite: bool = False,
+) -> None:
+    """
+    Write messages as a rosbag2, in the order of their stamps.
+
+    Raises
+    ------
+    BagError
+        If the folder exists and is not to be overwritten, or is no bag.
+
+    """
+    with BagWriter(folder, overwrite=overwrite) as bag:
+        for topic, type_name, stamp, message in sorted(messages, key=lambda item: item[2]):
+            bag.write(topic, type_name, stamp, message)
+
+
+def odometry_messages(
+    topic: str, frame: str, path: Trajectory, variances: Sequence[float], latency_ns: int = 0,
+) -> Iterator[Message]:
+    """Return nav_msgs/Odometry with the twists that lead from each pose to the next."""
+    pose_with_covariance, twist_with_covariance, make_twist, vector = (
+        _TYPES[f'geometry_msgs/msg/{key}']
+        for key in ('PoseWithCovariance', 'TwistWithCovariance', 'Twist', 'Vector3'))
+    covariance = np.diag(variances).ravel()
+    stamps, poses = path.stamps_ns, path.poses
+    steps = se2.between(poses[:-1], poses[1:]) / (np.diff(stamps) * 1e-9)[:, None]
+    rates = np.concatenate((steps[:1], steps)).tolist()
+    for stamp, pose, (vx, _, yaw_rate) in zip(stamps.tolist(), poses.tolist(), rates, strict=True):
+        twist = make_twist(vector(vx, 0.0, 0.0), vector(0.0, 0.0, yaw_rate))
+        yield topic, _ODOMETRY, stamp + latency_ns, _TYPES[_ODOMETRY](
+            _header(stamp, frame), 'base_link', pose_with_covariance(_pose(pose), covariance),
+            twist_with_covariance(twist, covariance))
+
+
+def fix_messages(
+    topic: str, stamps_ns: IntArray, geodetic: FloatArray, sigma: float, latency_ns: int = 0,
+) -> Iterator[Message]:
+    """Return sensor_msgs/NavSatFix from latitude, longitude and height, (M, 3) [deg, deg, m]."""
+    status = _TYPES['sensor_msgs/msg/NavSatStatus']
+    covariance = sigma**2 * np.diag([1.0, 1.0, 4.0]).ravel()
+    for stamp, fix in zip(stamps_ns.tolist(), geodetic.tolist(), strict=True):
+        yield topic, _FIX, stamp + latency_ns, _TYPES[_FIX](
+            _header(stamp, 'gps'), status(status.STATUS_FIX, status.SERVICE_GPS), *fix,
+            covariance, _TYPES[_FIX].COVARIANCE_TYPE_DIAGONAL_KNOWN)
+
+
+def loop_closure_messages(
+    topic: str, stamps_ns: IntArray, poses: FloatArray, covariance: FloatArray,
+    latency_ns: int = 0,
+) -> Iterator[Message]:
+    """Return the poses (L, 3) of the robot at the later of two stamps (L, 2), in the earlier."""
+    pose_with_covariance = _TYPES['geometry_msgs/msg/PoseWithCovariance']
+    full = np.diag([0.0, 0.0, 0.01, 3e-4, 3e-4, 0.0])
+    full[_PLANAR] = covariance
+    for (old, new), pose in zip(stamps_ns.tolist(), poses.tolist(), strict=True):
+        yield topic, _POSE, new + latency_ns, _TYPES[_POSE](
+            _header(new, f'@{old // 10**9}.{old % 10**9:09d}'),
+            pose_with_covariance(_pose(pose), full.ravel()))
+
+
+def _header(stamp_ns: int, frame: str) -> Any:
+    time = _TYPES['builtin_interfaces/msg/Time'](*divmod(stamp_ns, 10**9))
+    return _TYPES['std_msgs/msg/Header'](time, frame)
+
+
+def _pose(pose: list[float]) -> Any:
+    x, y, theta = pose
+    return _TYPES['geometry_msgs/msg/Pose'](
+        _TYPES['geometry_msgs/msg/Point'](x, y, 0.0),
+        _TYPES['geometry_msgs/msg/Quaternion'](
+            0.0, 0.0, float(np.sin(0.5 * theta)), float(np.cos(0.5 * theta))))

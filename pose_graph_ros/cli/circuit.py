@@ -1,0 +1,144 @@
+# Copyright 2026 The pose_graph_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""
+A car that drives round and round some city blocks: the motion behind the simulated drive.
+
+The circuit is a list of intersections. The car keeps to the right lane of the streets, which are
+gently bent; a turn has a curvature that begins and ends at zero; the speed obeys limits of speed,
+lateral and longitudinal acceleration, and falls to zero at lights.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.ndimage import gaussian_filter1d
+from scipy.signal import lfilter
+
+from pose_graph_ros.core import se2
+from pose_graph_ros.core.se2 import FloatArray, IntArray
+
+CORNERS = ((310, 0), (310, 180), (105, 180), (105, 0), (200, 0), (200, 260), (0, 260), (0, 0))
+"""Intersections at which the circuit turns by 90 degrees, in driving order [m]."""
+STOP_CORNERS = (1, 4, 6)
+"""Indices of the corners with a light before them."""
+LANE_OFFSET = 1.8
+"""To the right of the middle of the street [m]."""
+STREET_BEARING = 0.35
+"""Of the first street, from east to north [rad]."""
+TURN_LENGTH = 18.0
+"""Arc length of a turn [m]; the smallest radius is this over pi."""
+PATH_STEP = 0.1
+MAX_SPEED = 7.2
+MAX_ACCELERATION = 1.4
+MAX_LATERAL_ACCELERATION = 2.0
+PERIOD_S = 0.01
+
+
+@dataclass(frozen=True, slots=True)
+class Motion:
+    """Where the car is, every 10 ms."""
+
+    time: FloatArray
+    """Since the begin, shape (N,) [s]."""
+    distance: FloatArray
+    """Driven so far, shape (N,) [m]."""
+    poses: FloatArray
+    """In the frame of the city, shape (N, 3) [m, m, rad]; headings are not wrapped."""
+    lap_time: float
+    """When the second lap begins [s]; beyond the end, or infinite, if it does not."""
+
+
+def drive_circuit(generator: np.random.Generator, duration_s: float) -> Motion:
+    """Drive along the circuit; the way within the lane and the waits at lights are random."""
+    heading, stops, lap_length = _circuit(duration_s)
+    path = _streets(generator, heading)
+    length = np.concatenate(([0.0], np.cumsum(np.hypot(*np.diff(path[:, :2], axis=0).T))))
+    curvature = np.gradient(path[:, 2], length)
+
+    speed_limit = np.minimum(
+        MAX_SPEED, np.sqrt(MAX_LATERAL_ACCELERATION / np.maximum(np.abs(curvature), 1e-6)))
+    speed_limit[[0, *stops]] = 0.0
+    # v^2 grows and shrinks by at most 2 a per metre: the lower envelope of cones over the limits
+    slope = 2.0 * MAX_ACCELERATION * length
+    forward = slope + np.minimum.accumulate(speed_limit**2 - slope)
+    backward = np.minimum.accumulate((speed_limit**2 + slope)[::-1])[::-1] - slope
+    speed = np.sqrt(np.maximum(np.minimum(forward, backward), 0.0))
+
+    wait = np.zeros(len(length))
+    wait[0] = 3.0
+    wait[stops] = generator.uniform(8.0, 20.0, len(stops))
+    travel = 2.0 * np.diff(length) / (speed[1:] + speed[:-1])
+    arrival = np.concatenate(([0.0], np.cumsum(travel + wait[:-1])))
+    knots = np.column_stack((arrival, arrival + wait)).ravel()
+    time = np.arange(0.0, duration_s + 5.0, PERIOD_S)
+    # smoothing over half a second takes away the jumps of the acceleration, and spoils the end
+    distance = gaussian_filter1d(np.interp(time, knots, np.repeat(length, 2)), 0.25 / PERIOD_S)
+    time, distance = time[time <= duration_s], distance[time <= duration_s]
+    poses = np.column_stack([np.interp(distance, length, column) for column in path.T])
+    lap = round(lap_length / PATH_STEP)
+    lap_time = float(arrival[lap]) if lap < len(arrival) else np.inf
+    return Motion(time, distance, poses, lap_time)
+
+
+def gauss_markov(
+    generator: np.random.Generator, count: int, sigma: float, step: float,
+) -> FloatArray:
+    """Return a stationary first-order process; `step` is the sample period over the time const."""
+    keep = np.exp(-step)
+    noise = generator.normal(0.0, sigma * np.sqrt(1.0 - keep**2), count)
+    noise[0] = generator.normal(0.0, sigma)
+    return np.asarray(lfilter([1.0], [1.0, -keep], noise))
+
+
+def _circuit(duration_s: float) -> tuple[FloatArray, IntArray, float]:
+    """Return heading every `PATH_STEP` [rad], indices of the stops and the length of a lap [m]."""
+    corners = np.array(CORNERS, dtype=np.float64)
+    incoming = corners - np.roll(corners, 1, axis=0)
+    incoming /= np.linalg.norm(incoming, axis=1, keepdims=True)
+    outgoing = np.roll(incoming, -1, axis=0)
+    right = np.array([[0.0, -1.0], [1.0, 0.0]])
+    lane = corners + LANE_OFFSET * (incoming + outgoing) @ right
+    turns = np.arctan2(
+        incoming[:, 0] * outgoing[:, 1] - incoming[:, 1] * outgoing[:, 0],
+        np.sum(incoming * outgoing, axis=1))
+
+    # how far from its corner a turn begins and ends: the integral of the cosine of its heading
+    turn = (np.arange(1000) + 0.5) / 1000
+    reach = TURN_LENGTH * np.mean(np.cos(0.5 * np.pi * _ramp(turn)))
+    straights = np.linalg.norm(lane - np.roll(lane, 1, axis=0), axis=1) - 2.0 * reach
+    begins = np.cumsum(straights + TURN_LENGTH) - TURN_LENGTH
+    lap_length = float(begins[-1] + TURN_LENGTH)
+
+    laps = 1 + int((duration_s + 5.0) * MAX_SPEED / lap_length)
+    begins = np.concatenate([begins + k * lap_length for k in range(laps)])
+    along = np.arange(0.0, laps * lap_length, PATH_STEP)
+    heading = np.zeros(len(along))
+    for begin, angle in zip(begins, np.tile(turns, laps), strict=True):
+        heading += angle * _ramp((along - begin) / TURN_LENGTH)
+    stops = begins.reshape(laps, -1)[:, STOP_CORNERS].ravel() - 4.0
+    return heading, np.round(stops / PATH_STEP).astype(np.int64), lap_length
+
+
+def _ramp(u: FloatArray) -> FloatArray:
+    """Rise from 0 to 1 on [0, 1] with a derivative that begins and ends at 0."""
+    u = np.clip(u, 0.0, 1.0)
+    return u - np.sin(2.0 * np.pi * u) / (2.0 * np.pi)
+
+
+def _streets(generator: np.random.Generator, heading: FloatArray) -> FloatArray:
+    """Return the path driven, shape (N, 3): streets are bent a little, nobody drives straight."""
+    middle = 0.5 * (heading[1:] + heading[:-1])
+    steps = PATH_STEP * np.column_stack((np.cos(middle), np.sin(middle)))
+    grid = np.concatenate(([[0.0, 0.0]], np.cumsum(steps, axis=0)))
+    bent = grid + np.column_stack((
+        7.0 * np.sin(2.0 * np.pi * grid[:, 1] / 310.0),
+        9.0 * np.sin(2.0 * np.pi * grid[:, 0] / 360.0 + 0.6)))
+    city = bent @ se2.rotation(STREET_BEARING).T
+
+    direction = np.gradient(city, axis=0) / PATH_STEP
+    normal = np.column_stack((-direction[:, 1], direction[:, 0]))
+    wander = gaussian_filter1d(
+        gauss_markov(generator, len(city), 0.35, PATH_STEP / 60.0), 8.0 / PATH_STEP)
+    path = city + wander[:, None] * normal
+    direction = np.gradient(path, axis=0)
+    return np.column_stack((path, np.unwrap(np.arctan2(direction[:, 1], direction[:, 0]))))

@@ -1,0 +1,175 @@
+# Copyright 2026 The pose_graph_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""
+Run the real node on a bag, over DDS, and leave the corrected path and a picture.
+
+The node and the player are processes of their own, on this machine alone and in a domain of their
+own. Without a bag a simulated drive is made first, with a known truth.
+"""
+
+import argparse
+from collections.abc import Mapping
+import os
+from pathlib import Path
+import random
+import signal
+import subprocess
+import sys
+import tempfile
+import time
+from typing import Any
+
+import numpy as np
+
+from pose_graph_ros.cli import options as shared
+from pose_graph_ros.cli.results import collect_drive, write_results
+from pose_graph_ros.cli.simulate import simulate_drive, write_drive
+from pose_graph_ros.core.exceptions import PoseGraphError
+from pose_graph_ros.core.trajectory import Trajectory
+from pose_graph_ros.ros.bags import BagError, open_bag
+from pose_graph_ros.ros.conversions import planar_pose, stamp_ns
+from pose_graph_ros.ros.inputs import choose_inputs, Inputs
+
+SIMULATED_TOPICS = {'odom': '/odom', 'fix': '/gps/fix', 'loop_closure': '/loop_closure'}
+SIMULATED_TRUTH = '/ground_truth'
+# Often enough for the player to know what is under way, and for a path soon after the end.
+DEMO_PARAMETERS = ('diagnostics_period:=0.05', 'path_period:=0.5')
+STOP_TIMEOUT = 15.0
+POLL_PERIOD = 0.1
+# As the player says it; its module cannot be imported without ROS.
+NOT_CONVERGED = 3
+
+
+class DemoError(PoseGraphError):
+    """A process of the demo failed; the message says which."""
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Add the arguments of this tool."""
+    parser.add_argument('--bag', type=Path,
+                        help='rosbag2 folder, .mcap or .db3 (default: a simulated drive)')
+    parser.add_argument('-o', '--out', metavar='DIR', type=Path, default=Path('demo'),
+                        help='folder for the results (default: %(default)s)')
+    parser.add_argument('--rate', type=float, default=20.0,
+                        help='times the recorded speed, 0 for as fast as the node takes it '
+                             '(default: %(default)s)')
+    parser.add_argument('--seed', type=int, default=1, help='of the simulated drive')
+    shared.add_inputs(parser)
+    shared.add_parameters(parser)
+
+
+def execute(options: argparse.Namespace) -> int:
+    """Run the tool; return the exit code."""
+    values = shared.parameter_values(options)
+    options.out.mkdir(parents=True, exist_ok=True)
+    bag_path, wanted, truth, title = _bag(options)
+    with open_bag(bag_path) as bag:
+        inputs = choose_inputs(bag, wanted, options.hold_out)
+    if bag_path.suffix == '.bag':
+        raise BagError(f'{bag_path}: a ROS 1 bag cannot be played to a ROS 2 node; '
+                       'pose-graph replay reads it')
+    print(f'bag: {bag_path}')
+    for source, topic in inputs.topics.items():
+        print(f'  {source:<13} {topic}')
+
+    start = time.monotonic()
+    signal.signal(signal.SIGTERM, signal.default_int_handler)  # so that no process is left behind
+    converged = _run(bag_path, inputs, options, shared.ros_arguments(options))
+    seconds = time.monotonic() - start
+    corrected = _read_path(options.out / 'corrected')
+    with open_bag(bag_path) as bag:
+        drive = collect_drive(bag, inputs, values, corrected, truth)
+    table = write_results(drive, options.out, title, {
+        'bag': bag_path.name, 'topics': dict(inputs.topics), 'rate': options.rate,
+        'seconds': seconds, 'node': _read_diagnostics(options.out / 'corrected')})
+    print(f'\n{table}\n')
+    print(f'written to {options.out}/: path.tum, corrected/ (rosbag2), drive.png, summary.json')
+    return 0 if converged else 1
+
+
+def _bag(
+    options: argparse.Namespace,
+) -> tuple[Path, Mapping[str, str | None], str | None, str]:
+    """Return the bag to play, its topics, that of the truth, and a title for the picture."""
+    if options.bag is not None:
+        return options.bag, shared.wanted_topics(options), options.truth, options.bag.stem
+    path = options.out / 'simulated_drive'
+    print(f'simulating a drive (seed {options.seed})')
+    write_drive(simulate_drive(options.seed), path, overwrite=True)
+    wanted = {source: topic or SIMULATED_TOPICS.get(source)
+              for source, topic in shared.wanted_topics(options).items()}
+    return path, wanted, options.truth or SIMULATED_TRUTH, 'Simulated drive'
+
+
+def _run(bag: Path, inputs: Inputs, options: argparse.Namespace, ros_args: list[str]) -> bool:
+    """Start the node, play the bag to it, stop it; tell whether the optimisation converged."""
+    with tempfile.TemporaryDirectory(prefix='pose_graph_') as log:
+        env = isolated_environment(Path(log))
+        for parameter in DEMO_PARAMETERS:
+            ros_args += ['-p', parameter]
+        processes = [node := subprocess.Popen(
+            [sys.executable, '-m', 'pose_graph_ros.ros.main', *ros_args], env=env)]
+        try:
+            player = [sys.executable, '-m', 'pose_graph_ros.ros.player', str(bag.resolve()),
+                      str((options.out / 'corrected').resolve()), '--rate', str(options.rate),
+                      '--hold-out', str(inputs.hold_out)]
+            for source, topic in inputs.topics.items():
+                player += [f'--{source}', topic]
+            processes.append(subprocess.Popen(player, env=env))
+            while processes[1].poll() is None:
+                if node.poll() is not None:
+                    raise DemoError(f'the node ended early, with code {node.returncode}')
+                time.sleep(POLL_PERIOD)
+        finally:
+            codes = [_stop(process) for process in reversed(processes)]
+        if codes[-1] != 0:
+            raise DemoError(f'the node ended with code {codes[-1]}')
+        print('the node stopped cleanly')
+        if codes[0] not in (0, NOT_CONVERGED):
+            raise DemoError(f'the player ended with code {codes[0]}')
+        return codes[0] == 0
+
+
+def isolated_environment(log: Path) -> dict[str, str]:
+    """Return an environment for ROS processes that talk to each other alone."""
+    env = dict(os.environ)
+    # the wheels from PyPI do not set it; a sourced ROS does
+    env.setdefault('AMENT_PREFIX_PATH', sys.prefix)
+    env['ROS_AUTOMATIC_DISCOVERY_RANGE'] = 'LOCALHOST'
+    env['ROS_DOMAIN_ID'] = str(random.SystemRandom().randint(1, 100))
+    env['ROS_LOG_DIR'] = str(log)
+    env.pop('ROS_LOCALHOST_ONLY', None)
+    return env
+
+
+def _stop(node: 'subprocess.Popen[bytes]') -> int:
+    """End a process by SIGINT, as Ctrl-C does; return its exit code."""
+    if node.poll() is None:
+        node.send_signal(signal.SIGINT)
+    try:
+        return node.wait(STOP_TIMEOUT)
+    except subprocess.TimeoutExpired:
+        node.kill()
+        return node.wait()
+
+
+def _read_path(folder: Path) -> Trajectory:
+    """Return the last path in the bag that the player wrote."""
+    with open_bag(folder) as bag:
+        path = None
+        for message in bag.messages(['/path']) if '/path' in bag.topics else ():
+            path = message.decode()
+    if path is None:
+        raise BagError(f'{folder}: the node published no path')
+    poses = {stamp_ns(item): planar_pose(item.pose) for item in path.poses}
+    return Trajectory(np.array(list(poses), dtype=np.int64),
+                      np.array([pose for pose in poses.values() if pose is not None]))
+
+
+def _read_diagnostics(folder: Path) -> dict[str, Any]:
+    """Return the node's last diagnostics in the bag that the player wrote."""
+    with open_bag(folder) as bag:
+        last = None
+        for message in bag.messages(['/diagnostics']) if '/diagnostics' in bag.topics else ():
+            last = message.decode()
+    return {} if last is None else {item.key: item.value for item in last.status[0].values}

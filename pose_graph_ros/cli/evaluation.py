@@ -1,0 +1,228 @@
+# Copyright 2026 The pose_graph_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""
+Measure how far the corrected path is from the truth and from the fixes, and odometry alone.
+
+Distances are taken at the stamps of the truth or of the fixes, with the paths interpolated at
+them; what lies outside the time of a path is left out. Odometry has a frame of its own, so it is
+first laid over the truth (or the fixes) as well as a rigid motion can: the kindest view of it.
+"""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from pose_graph_ros.core import alignment, se2
+from pose_graph_ros.core.se2 import FloatArray, IntArray
+from pose_graph_ros.core.trajectory import Trajectory
+
+
+@dataclass(frozen=True, slots=True)
+class Drive:
+    """
+    What went into the pose graph, what came out, and the truth if it is known.
+
+    Raises
+    ------
+    ValueError
+        If the shapes do not fit or a position is not finite.
+
+    """
+
+    odometry: Trajectory
+    """Raw odometry, `T_odom_base`."""
+    fix_stamps_ns: IntArray
+    """Shape (M,) [ns]."""
+    fix_positions: FloatArray
+    """Positions of the fixes in the map, shape (M, 2) [m]."""
+    fix_held_out: npt.NDArray[np.bool_]
+    """Fixes that the pose graph did not get, shape (M,)."""
+    corrected: Trajectory
+    """The result, `T_map_base`."""
+    truth: Trajectory | None
+    """`T_map_base`."""
+    loop_stamps_ns: IntArray
+    """Stamps of both ends of the loop closures, shape (L, 2) [ns]."""
+    map_axes: tuple[str, str] = ('x', 'y')
+    """What the axes of the map are called."""
+
+    def __post_init__(self) -> None:
+        count = len(self.fix_stamps_ns)
+        if self.fix_positions.shape != (count, 2) or self.fix_held_out.shape != (count,):
+            raise ValueError(
+                f'expected {count} positions (M, 2) and flags (M,) of fixes, got '
+                f'{self.fix_positions.shape} and {self.fix_held_out.shape}')
+        if self.loop_stamps_ns.ndim != 2 or self.loop_stamps_ns.shape[1] != 2:
+            raise ValueError(
+                f'expected stamps of loop closures (L, 2), got {self.loop_stamps_ns.shape}')
+        paths = (self.odometry, self.corrected, *([] if self.truth is None else [self.truth]))
+        values = (self.fix_positions, *(path.poses for path in paths))
+        if not all(np.all(np.isfinite(array)) for array in values):
+            raise ValueError('expected finite positions, got NaN or infinity')
+
+
+@dataclass(frozen=True, slots=True)
+class ErrorRow:
+    """Statistics of one kind of error; it stands for at least one value."""
+
+    name: str
+    count: int
+    median: float
+    rms: float
+    p95: float
+    maximum: float
+    unit: str = 'm'
+
+
+def fit_rigid(source: FloatArray, target: FloatArray) -> FloatArray:
+    """
+    Return the rigid motion that lays points over others with the least sum of squares.
+
+    All points count alike. If they say nothing about the angle it is 0.
+
+    Parameters
+    ----------
+    source, target : ndarray, shape (N, 2)
+        Corresponding points [m].
+
+    Returns
+    -------
+    ndarray, shape (3,)
+        `T_target_source`: `se2.transform(it, source)` is next to `target`.
+
+    Raises
+    ------
+    ValueError
+        If there is no point or the shapes differ.
+
+    """
+    if source.shape != target.shape or source.ndim != 2 or len(source) == 0:
+        raise ValueError(
+            f'expected equally many points (N, 2), N > 0, got {source.shape} and {target.shape}')
+    return se2.wrapped(alignment.align(source, target, np.ones(len(source))).T_map_odom)
+
+
+def place_odometry(drive: Drive) -> Trajectory:
+    """
+    Return the odometry laid over the truth if known, else over the fixes, else the result.
+
+    Where even the result shares no time with the odometry, the odometry stays where it is.
+    """
+    anchors = [(drive.fix_stamps_ns, drive.fix_positions),
+               (drive.corrected.stamps_ns, drive.corrected.poses[:, :2])]
+    if drive.truth is not None:
+        anchors.insert(0, (drive.truth.stamps_ns, drive.truth.poses[:, :2]))
+    for stamps, positions in anchors:
+        inside = drive.odometry.covers(stamps)
+        if np.any(inside):
+            odometry = drive.odometry.at(stamps[inside])[:, :2]
+            pose = fit_rigid(odometry, positions[inside])
+            return Trajectory(drive.odometry.stamps_ns, se2.compose(pose, drive.odometry.poses))
+    return drive.odometry
+
+
+def distances(
+    path: Trajectory, stamps_ns: IntArray, positions: FloatArray,
+) -> tuple[IntArray, FloatArray]:
+    """
+    Return the distances of a path from stamped positions where the path covers their stamps.
+
+    Parameters
+    ----------
+    path : Trajectory
+    stamps_ns : ndarray, shape (N,)
+    positions : ndarray, shape (N, 2)
+        In the frame of the path [m].
+
+    Returns
+    -------
+    stamps_ns : ndarray, shape (K,)
+        Those of the stamps that the path covers [ns].
+    distances : ndarray, shape (K,)
+        At these stamps [m].
+
+    """
+    inside = path.covers(stamps_ns)
+    offsets = path.at(stamps_ns[inside])[:, :2] - positions[inside]
+    return stamps_ns[inside], np.hypot(offsets[:, 0], offsets[:, 1])
+
+
+def error_rows(name: str, errors: FloatArray, unit: str = 'm') -> list[ErrorRow]:
+    """Return the row of statistics of non-negative errors, shape (N,); no row without errors."""
+    if len(errors) == 0:
+        return []
+    return [ErrorRow(
+        name, len(errors), float(np.median(errors)), float(np.sqrt(np.mean(np.square(errors)))),
+        float(np.percentile(errors, 95.0)), float(np.max(errors)), unit)]
+
+
+def evaluate(drive: Drive) -> list[ErrorRow]:
+    """
+    Compare odometry alone, the fixes and the corrected path with the truth and with the fixes.
+
+    Rows for which there is nothing to compare are left out.
+    """
+    rows: list[ErrorRow] = []
+    paths = {'odometry alone': place_odometry(drive), 'corrected path': drive.corrected}
+    truth = drive.truth
+    if truth is not None:
+        for name, path in paths.items():
+            _, errors = distances(path, truth.stamps_ns, truth.poses[:, :2])
+            rows += error_rows(f'{name} to truth', errors)
+        _, errors = distances(truth, drive.fix_stamps_ns, drive.fix_positions)
+        rows[1:1] = error_rows('fixes to truth', errors)
+        inside = drive.corrected.covers(truth.stamps_ns)
+        turns = se2.wrap(
+            drive.corrected.at(truth.stamps_ns[inside])[:, 2] - truth.poses[inside, 2])
+        rows += error_rows('corrected heading to truth', np.rad2deg(np.abs(turns)), 'deg')
+    for kind, chosen in (('used', ~drive.fix_held_out), ('held out', drive.fix_held_out)):
+        for name, path in paths.items():
+            _, errors = distances(path, drive.fix_stamps_ns[chosen], drive.fix_positions[chosen])
+            rows += error_rows(f'{name} to fixes {kind}', errors)
+    return rows
+
+
+def format_table(rows: Sequence[ErrorRow]) -> str:
+    """Return the rows as a plain text table of less than 80 columns."""
+    if len(rows) == 0:
+        return 'nothing to compare: neither truth nor fixes share time with the paths'
+    width = max(len(row.name) for row in rows)
+    lines = [f'{"":{width}}  {"median":>7} {"rms":>7} {"95 %":>7} {"max":>7}      {"count":>7}']
+    for row in rows:
+        values = ' '.join(f'{v:7.2f}' for v in (row.median, row.rms, row.p95, row.maximum))
+        lines.append(f'{row.name:{width}}  {values} {row.unit:<4} {row.count:7}')
+    return '\n'.join(lines)
+
+
+def summary(
+    drive: Drive, rows: Sequence[ErrorRow], extra: Mapping[str, Any],
+) -> dict[str, Any]:
+    """
+    Return the figures of a drive as plain Python values, ready for JSON.
+
+    Parameters
+    ----------
+    drive : Drive
+    rows : sequence of ErrorRow
+        What `evaluate` said.
+    extra : mapping
+        Further figures; they win over those of this function.
+
+    """
+    stamps, positions = drive.corrected.stamps_ns, drive.corrected.poses[:, :2]
+    steps = np.diff(positions, axis=0)
+    return {
+        'duration_s': float(stamps[-1] - stamps[0]) * 1e-9 if len(stamps) else 0.0,
+        'distance_m': float(np.sum(np.hypot(steps[:, 0], steps[:, 1]))),
+        'odometry': len(drive.odometry),
+        'poses': len(drive.corrected),
+        'fixes_used': int(np.sum(~drive.fix_held_out)),
+        'fixes_held_out': int(np.sum(drive.fix_held_out)),
+        'loop_closures': len(drive.loop_stamps_ns),
+        'truth': drive.truth is not None,
+        'errors': [asdict(row) for row in rows],
+        **extra,
+    }

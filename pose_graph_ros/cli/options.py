@@ -1,0 +1,100 @@
+# Copyright 2026 The pose_graph_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""Command-line options that several tools share."""
+
+import argparse
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import yaml
+
+from pose_graph_ros.core.exceptions import ConfigError
+from pose_graph_ros.ros.parameters import checked
+
+
+def add_inputs(parser: argparse.ArgumentParser) -> None:
+    """Add the options that choose topics, and what is held out."""
+    group = parser.add_argument_group(
+        'topics in the bag', 'where an option is not given, the only topic of its type is taken')
+    group.add_argument('--odom', metavar='TOPIC', help='nav_msgs/Odometry')
+    group.add_argument('--fix', metavar='TOPIC', help='sensor_msgs/NavSatFix')
+    group.add_argument('--global-pose', metavar='TOPIC',
+                       help='geometry_msgs/PoseWithCovarianceStamped in the map')
+    group.add_argument('--loop-closure', metavar='TOPIC',
+                       help='geometry_msgs/PoseWithCovarianceStamped seen from an earlier pose')
+    group.add_argument('--truth', metavar='TOPIC',
+                       help='Odometry or PoseStamped in the map, for comparison alone')
+    parser.add_argument('--hold-out', metavar='N', type=int, default=0,
+                        help='keep every N-th fix out of the graph and measure against it')
+
+
+def add_parameters(parser: argparse.ArgumentParser) -> None:
+    """Add the options that set parameters of the node."""
+    parser.add_argument('--params-file', metavar='FILE', type=Path,
+                        help='ROS 2 parameter file of the node')
+    parser.add_argument('-p', '--param', metavar='NAME:=VALUE', action='append', default=[],
+                        help='a parameter of the node, as after --ros-args')
+
+
+def wanted_topics(options: argparse.Namespace) -> dict[str, str | None]:
+    """Return the topics that the options name, by input."""
+    return {'odom': options.odom, 'fix': options.fix, 'global_pose': options.global_pose,
+            'loop_closure': options.loop_closure}
+
+
+def parameter_values(options: argparse.Namespace) -> dict[str, Any]:
+    """
+    Return all parameters as the node would have them.
+
+    Raises
+    ------
+    ConfigError
+        If a file or a value is not what the node takes.
+
+    """
+    given: dict[str, Any] = {}
+    if options.params_file is not None:
+        given |= _read_file(options.params_file)
+    for text in options.param:
+        name, separator, value = text.partition(':=')
+        if separator == '':
+            raise ConfigError(f'--param: expected NAME:=VALUE, got {text!r}')
+        given[name] = yaml.safe_load(value)
+    return checked(given)
+
+
+def ros_arguments(options: argparse.Namespace) -> list[str]:
+    """Return the same parameters as arguments for the node."""
+    arguments = ['--ros-args']
+    if options.params_file is not None:
+        arguments += ['--params-file', str(options.params_file.resolve())]
+    for text in options.param:
+        arguments += ['-p', text]
+    return arguments
+
+
+def _read_file(path: Path) -> dict[str, Any]:
+    """Read the parameters that a ROS 2 parameter file has for the node."""
+    try:
+        content = yaml.safe_load(path.read_text(encoding='utf-8'))
+    except (OSError, UnicodeDecodeError, yaml.YAMLError) as error:
+        raise ConfigError(f'{path}: cannot be read as yaml: {error}') from error
+    given: dict[str, Any] = {}
+    for name, section in (content if isinstance(content, Mapping) else {}).items():
+        if str(name).rpartition('/')[2] not in ('**', '*', 'pose_graph'):
+            continue
+        parameters = section.get('ros__parameters') if isinstance(section, Mapping) else None
+        if not isinstance(parameters, Mapping):
+            raise ConfigError(f'{path}: {name}: expected ros__parameters')
+        _flatten(parameters, '', given)
+    given.pop('use_sim_time', None)
+    return {name: value for name, value in given.items() if not name.startswith('qos_overrides')}
+
+
+def _flatten(tree: Mapping[str, Any], prefix: str, flat: dict[str, Any]) -> None:
+    for name, value in tree.items():
+        if isinstance(value, Mapping):
+            _flatten(value, f'{prefix}{name}.', flat)
+        else:
+            flat[prefix + name] = value

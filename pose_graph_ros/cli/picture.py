@@ -1,0 +1,259 @@
+# Copyright 2026 The pose_graph_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""
+Draw a drive: a map of all paths, and below it how far off they are over time.
+
+The colours are after Okabe and Ito: people with any kind of colour vision tell them apart.
+"""
+
+from pathlib import Path
+from typing import Any
+
+from matplotlib.axes import Axes
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.collections import LineCollection
+from matplotlib.figure import Figure
+from matplotlib.patheffects import withStroke
+from matplotlib.ticker import FuncFormatter, MultipleLocator
+import numpy as np
+
+from pose_graph_ros.cli.evaluation import distances, Drive, evaluate, place_odometry
+from pose_graph_ros.core.se2 import FloatArray, IntArray
+from pose_graph_ros.core.trajectory import Trajectory
+
+BLUE, ORANGE, VERMILION, GREEN, PURPLE = '#0072B2', '#E69F00', '#D55E00', '#009E73', '#B583A4'
+INK, GREY, GRID, SHADE = '#222222', '#666666', '#E2E2E2', '#F0F0F0'
+WIDTH, DPI = 16.0, 100
+"""Width of the picture [inch] and dots per inch."""
+LEFT, RIGHT, TOP, BETWEEN, BOTTOM = 0.8, 0.3, 0.95, 1.05, 0.6
+"""Margins of the panels [inch]."""
+LEGEND_WIDTH, ERROR_HEIGHT = 2.9, 2.5
+MAP_HEIGHTS = (4.5, 9.0)
+"""Least and greatest height of the map [inch]; between them it has the shape of the drive."""
+TALL, TALL_HEIGHT, TALL_WIDTHS = 1.15, 8.4, (4.5, 7.5)
+"""A drive this much taller than wide has its map beside the errors: height and widths [inch]."""
+OUTAGE_S = 5.0
+"""A pause of the fixes longer than this and than ten usual periods is an outage [s]."""
+MIN_FIXES = 3
+"""With fewer fixes there is no usual period."""
+SECOND = 10**9
+TICK_SPACING = 1.6
+"""Of the grid of the map, at most [inch]."""
+TWO_DIGITS = 10.0
+"""Errors below are given in centimetres [m]."""
+LOG_RATIO = 4.0
+"""The error axis is logarithmic if odometry alone is this many times worse than the rest."""
+LOG_FLOOR = 0.05
+"""What lies below cannot be told apart on a logarithmic axis [m]."""
+
+
+def draw_drive(drive: Drive, file: Path, title: str) -> None:
+    """
+    Draw a drive into a picture, 1600 pixels wide.
+
+    Parameters
+    ----------
+    drive : Drive
+    file : Path
+        What is written; the suffix (`.png`, `.svg`, `.pdf`) chooses the format.
+    title : str
+
+    """
+    odometry = place_odometry(drive)
+    low, high = _limits(drive, odometry)
+    ratio = float((high - low)[1] / (high - low)[0])
+    wide = WIDTH - LEFT - RIGHT
+    if ratio > TALL:
+        size = np.array([np.clip(TALL_HEIGHT / ratio, *TALL_WIDTHS), TALL_HEIGHT])
+        height = TOP + TALL_HEIGHT + BOTTOM
+        left = LEFT + size[0] + BETWEEN
+        error_box = (left, BOTTOM, WIDTH - RIGHT - left, 0.6 * TALL_HEIGHT)
+    else:
+        width = wide - LEGEND_WIDTH
+        size = np.array([width, np.clip(width * ratio, *MAP_HEIGHTS)])
+        height = TOP + size[1] + BETWEEN + ERROR_HEIGHT + BOTTOM
+        error_box = (LEFT, BOTTOM, wide, ERROR_HEIGHT)
+    figure = Figure(figsize=(WIDTH, height), dpi=DPI, facecolor='white')
+    FigureCanvasAgg(figure)
+    plan = _add_axes(figure, (LEFT, height - TOP - size[1], *size))
+    errors = _add_axes(figure, error_box)
+
+    _draw_map(plan, drive, odometry)
+    metres_per_inch = float(np.max((high - low) / size))
+    middle, half = 0.5 * (low + high), 0.5 * metres_per_inch * size
+    plan.set(xlim=(middle[0] - half[0], middle[0] + half[0]),
+             ylim=(middle[1] - half[1], middle[1] + half[1]))
+    for axis in (plan.xaxis, plan.yaxis):
+        axis.set_major_locator(MultipleLocator(_nice_step(TICK_SPACING * metres_per_inch)))
+    _draw_errors(errors, drive, odometry)
+    figure.text(LEFT / WIDTH, 1.0 - 0.2 / height, title, fontsize=18, fontweight='bold',
+                color=INK, va='top', parse_math=False)
+    figure.text(LEFT / WIDTH, 1.0 - 0.57 / height, _facts(drive), fontsize=12, color=GREY,
+                va='top')
+    figure.savefig(file)
+
+
+def _add_axes(figure: Figure, box: tuple[float, float, float, float]) -> Axes:
+    """Add a panel; left, bottom, width, height are in inches."""
+    width, height = figure.get_size_inches()
+    left, bottom, box_width, box_height = box
+    axes = figure.add_axes(
+        (left / width, bottom / height, box_width / width, box_height / height))
+    axes.spines[['top', 'right']].set_visible(False)
+    axes.spines[['left', 'bottom']].set_color(GREY)
+    axes.tick_params(which='both', colors=GREY, labelsize=11)
+    axes.grid(color=GRID, linewidth=0.8)
+    axes.set_axisbelow(True)
+    return axes
+
+
+def _limits(drive: Drive, odometry: Trajectory) -> tuple[FloatArray, FloatArray]:
+    """Return two corners of the map: it shows the paths, but of odometry what stays near them."""
+    paths = [drive.corrected, *([] if drive.truth is None else [drive.truth])]
+    near = np.concatenate([path.poses[:, :2] for path in paths])
+    stray = np.concatenate((odometry.poses[:, :2], drive.fix_positions))
+    if len(near) == 0:
+        near = stray if len(stray) else np.zeros((1, 2))
+    low, high = near.min(axis=0), near.max(axis=0)
+    margin = max(0.2 * float(np.max(high - low)), 5.0)
+    shown = np.concatenate((near, np.clip(stray, low - margin, high + margin)))
+    low, high = shown.min(axis=0), shown.max(axis=0)
+    pad = max(0.03 * float(np.max(high - low)), 1.0)
+    return low - pad, high + pad
+
+
+def _nice_step(step: float) -> float:
+    """Return the largest of 1, 2, 5, 10, 20, 50, ... that is at most the step, but 1 at least."""
+    power = 10.0 ** np.floor(np.log10(max(step, 1.0)))
+    return float(max(factor * power for factor in (1, 2, 5) if factor * power <= max(step, 1.0)))
+
+
+def _facts(drive: Drive) -> str:
+    """Return the line below the title."""
+    path = max(drive.corrected, drive.odometry, key=len)
+    parts = []
+    if len(path) > 1:
+        steps = np.diff(path.poses[:, :2], axis=0)
+        parts = [f'{(path.stamps_ns[-1] - path.stamps_ns[0]) / SECOND:.0f} s',
+                 f'{np.sum(np.hypot(steps[:, 0], steps[:, 1])):.0f} m']
+    used, held_out = int(np.sum(~drive.fix_held_out)), int(np.sum(drive.fix_held_out))
+    parts.append(f'{used} fixes used' + (f', {held_out} held out' if held_out else ''))
+    parts.append(f'{len(drive.loop_stamps_ns)} loop closures')
+    return '   ·   '.join(parts)
+
+
+def _draw_map(axes: Axes, drive: Drive, odometry: Trajectory) -> None:
+    rows = {row.name: row for row in evaluate(drive)}
+    reference = next(
+        (name for name in ('truth', 'fixes held out', 'fixes used')
+         if f'corrected path to {name}' in rows), '')
+
+    def label(name: str) -> str:
+        row = rows.get(f'{name} to {reference}')
+        if row is None:
+            return name
+        digits = 2 if row.rms < TWO_DIGITS else 1
+        return f'{name}\nmedian {row.median:.{digits}f} m, rms {row.rms:.{digits}f} m'
+
+    path = drive.corrected
+    axes.plot(*path.poses[:, :2].T, color=BLUE, linewidth=3.4, solid_capstyle='round', zorder=3,
+              label=label('corrected path'))
+    if drive.truth is not None:
+        axes.plot(*drive.truth.poses[:, :2].T, color=INK, linewidth=0.8, linestyle=(0, (6, 4)),
+                  zorder=4, label='truth')
+    axes.plot(*odometry.poses[:, :2].T, color=PURPLE, linewidth=1.3, zorder=1,
+              label=label('odometry alone'))
+    used = drive.fix_positions[~drive.fix_held_out]
+    held_out = drive.fix_positions[drive.fix_held_out]
+    if len(used):
+        axes.plot(*used.T, 'o', color=ORANGE, markersize=4.5, markeredgewidth=0, alpha=0.55,
+                  zorder=2, label=label('fixes'))
+    if len(held_out):
+        axes.plot(*held_out.T, 'D', color='none', markeredgecolor=VERMILION, markersize=4.5,
+                  markeredgewidth=0.9, zorder=2, label='fixes held out')
+    inside = np.all(path.covers(drive.loop_stamps_ns), axis=1)
+    if np.any(inside):
+        ends = path.at(drive.loop_stamps_ns[inside])[..., :2]
+        axes.add_collection(LineCollection(list(ends), colors=GREEN, linewidths=1.2, zorder=5))
+        axes.plot(*ends.reshape(-1, 2).T, 'o', color='none', markeredgecolor=GREEN, markersize=7,
+                  markeredgewidth=1.3, zorder=5, label='loop closures')
+    if len(path):
+        for name, pose, marker in (('start', path.poses[0], 'o'), ('end', path.poses[-1], 's')):
+            axes.plot(*pose[:2], marker, color='white', markeredgecolor=INK, markersize=10,
+                      markeredgewidth=2.0, zorder=6)
+            axes.annotate(
+                name, pose[:2], (0, 12 if name == 'start' else -12), textcoords='offset points',
+                ha='center', va='bottom' if name == 'start' else 'top', fontsize=13,
+                fontweight='bold', color=INK, zorder=7,
+                path_effects=[withStroke(linewidth=3.5, foreground='white')])
+    axes.set_xlabel(f'{drive.map_axes[0]} [m]', fontsize=12, color=INK)
+    axes.set_ylabel(f'{drive.map_axes[1]} [m]', fontsize=12, color=INK)
+    legend = axes.legend(
+        loc='upper left', bbox_to_anchor=(1.01, 1.0), frameon=False, fontsize=12,
+        labelspacing=0.9, borderaxespad=0.0, labelcolor=INK, alignment='left',
+        title=f'distance to {reference}' if reference else None, title_fontsize=12)
+    legend.get_title().set_color(GREY)
+
+
+def _draw_errors(axes: Axes, drive: Drive, odometry: Trajectory) -> None:
+    """Draw distances over time: to the truth, else to the fixes, else to the corrected path."""
+    paths = [path for path in (odometry, drive.corrected) if len(path)]
+    begin = min((int(path.stamps_ns[0]) for path in paths), default=0)
+    end = max((int(path.stamps_ns[-1]) for path in paths), default=SECOND)
+    lines: list[tuple[Trajectory, IntArray, FloatArray, dict[str, Any]]]
+    look_odometry = {'color': PURPLE, 'linewidth': 1.2, 'zorder': 2}
+    look_fixes = {'color': ORANGE, 'marker': 'o', 'markersize': 3, 'markeredgewidth': 0,
+                  'linestyle': 'none', 'alpha': 0.6, 'zorder': 1}
+    look_corrected = {'color': BLUE, 'linewidth': 2.2, 'zorder': 3}
+    stamps, positions = drive.fix_stamps_ns, drive.fix_positions
+    if drive.truth is not None:
+        target = 'the truth'
+        true_stamps, true_positions = drive.truth.stamps_ns, drive.truth.poses[:, :2]
+        lines = [(odometry, true_stamps, true_positions, look_odometry),
+                 (drive.truth, stamps, positions, look_fixes),
+                 (drive.corrected, true_stamps, true_positions, look_corrected)]
+    elif len(stamps) == 0:
+        target = 'the corrected path'
+        lines = [(odometry, drive.corrected.stamps_ns, drive.corrected.poses[:, :2],
+                  look_odometry)]
+    else:
+        target = 'the fixes'
+        held_out = drive.fix_held_out
+        look_held_out = {'color': 'none', 'marker': 'D', 'markeredgecolor': VERMILION,
+                         'markersize': 4, 'linestyle': 'none', 'zorder': 4}
+        lines = [(odometry, stamps, positions, look_odometry),
+                 (drive.corrected, stamps, positions, look_corrected),
+                 (drive.corrected, stamps[held_out], positions[held_out], look_held_out)]
+
+    highest = []
+    for path, line_stamps, line_positions, look in lines:
+        covered, errors = distances(path, line_stamps, line_positions)
+        axes.plot((covered - begin) * 1e-9, errors, **look)
+        highest.append(float(np.percentile(errors, 99.0)) if len(errors) else 0.0)
+    axes.set_xlim(0.0, max((end - begin) * 1e-9, 1.0))
+    if highest[0] > LOG_RATIO * max(highest[1:], default=0.0) > 0.0:
+        axes.set_yscale('log')
+        axes.set_ylim(LOG_FLOOR, 1.5 * highest[0])
+        axes.yaxis.set_major_formatter(FuncFormatter(lambda value, _: f'{value:g}'))
+    else:
+        axes.set_ylim(0.0, max(1.15 * max(highest), 0.1))
+    axes.set_xlabel('time [s]', fontsize=12, color=INK)
+    axes.set_ylabel('distance [m]', fontsize=12, color=INK)
+    axes.set_title(f'distance to {target}', loc='left', fontsize=13, fontweight='bold', color=INK)
+    outages = _outages(drive, begin, end)
+    for outage in outages:
+        axes.axvspan(*outage, color=SHADE, zorder=0)
+    if outages:
+        axes.set_title('shaded: no fixes used', loc='right', fontsize=12, color=GREY)
+
+
+def _outages(drive: Drive, begin: int, end: int) -> list[tuple[float, float]]:
+    """Return begin and end [s] of the times without a fix that the pose graph got."""
+    used = np.sort(drive.fix_stamps_ns[~drive.fix_held_out])
+    used = used[(used > begin) & (used < end)]
+    if len(used) < MIN_FIXES:
+        return []
+    edges = (np.concatenate(([begin], used, [end])) - begin) * 1e-9
+    pauses = np.diff(edges)
+    long = pauses > max(OUTAGE_S, 10.0 * float(np.median(pauses)))
+    return list(zip(edges[:-1][long].tolist(), edges[1:][long].tolist(), strict=True))

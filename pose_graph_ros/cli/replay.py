@@ -1,0 +1,141 @@
+# Copyright 2026 The pose_graph_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""
+Run a bag through the same engine as the node, without ROS and as fast as it goes.
+
+The messages are read and added as in the node, without threads, and the same full optimisation
+ends the stream, so the path is that of a node which got the same messages.
+"""
+
+import argparse
+from collections import Counter
+from collections.abc import Mapping
+from dataclasses import dataclass
+import os
+from pathlib import Path
+import sys
+import time
+from typing import Any
+
+from pose_graph_ros.cli import options as shared
+from pose_graph_ros.cli.results import collect_drive, write_results
+from pose_graph_ros.core.backend import PoseGraphBackend
+from pose_graph_ros.core.batch import Status
+from pose_graph_ros.core.estimate import UpdateReport
+from pose_graph_ros.core.exceptions import PoseGraphError
+from pose_graph_ros.core.io.g2o import write_g2o
+from pose_graph_ros.core.measurements import Answer, OdometrySample
+from pose_graph_ros.ros.bags import BagError, BagReader, MessageError, open_bag
+from pose_graph_ros.ros.conversions import FixReader, MessageReader
+from pose_graph_ros.ros.inputs import choose_inputs, Inputs, read_inputs
+from pose_graph_ros.ros.parameters import backend_config
+
+# An update each time the graph has grown by this share (and this many nodes) keeps the estimate
+# near the optimum at a cost in all that is proportional to the last solve.
+GROWTH = 0.02
+LEAST_GROWTH = 10
+
+
+@dataclass(frozen=True, slots=True)
+class Replayed:
+    """A bag's run through the engine."""
+
+    backend: PoseGraphBackend
+    report: UpdateReport
+    """Of the closing optimisation."""
+    refused: Counter[tuple[str, str]]
+    """Messages that could not be turned into measurements, by input and reason."""
+
+
+def run(bag: BagReader, inputs: Inputs, values: Mapping[str, Any]) -> Replayed:
+    """Feed a bag's messages to a new engine and optimise fully at the end."""
+    backend = PoseGraphBackend(backend_config(values))
+    reader = MessageReader(
+        values['map_frame'], FixReader(values['datum'], values['fix.lever_arm']))
+    refused: Counter[tuple[str, str]] = Counter()
+    next_update = LEAST_GROWTH
+    for source, message, held_out in read_inputs(bag, inputs):
+        if held_out:
+            continue
+        try:
+            measurement = reader.read(source, message.decode())
+        except MessageError:
+            refused[source, 'malformed'] += 1
+            continue
+        if isinstance(measurement, Answer):
+            refused[source, measurement.reason] += 1
+        elif isinstance(measurement, OdometrySample):
+            backend.add_odometry(measurement, source)
+        else:
+            backend.add_measurement(measurement, source)
+        if backend.graph.n_nodes >= next_update:
+            backend.update()
+            next_update = backend.graph.n_nodes + max(
+                LEAST_GROWTH, int(GROWTH * backend.graph.n_nodes))
+    return Replayed(backend, backend.optimize(), refused)
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Add the arguments of this tool."""
+    parser.add_argument('bag', type=Path, help='rosbag2 folder, .mcap or .db3')
+    parser.add_argument('-o', '--out', metavar='DIR', type=Path, default=Path('replay'),
+                        help='folder for the results (default: %(default)s)')
+    shared.add_inputs(parser)
+    shared.add_parameters(parser)
+
+
+def execute(options: argparse.Namespace) -> int:
+    """Run the tool; return the exit code."""
+    values = shared.parameter_values(options)
+    with open_bag(options.bag) as bag:
+        inputs = choose_inputs(bag, shared.wanted_topics(options), options.hold_out)
+        for source, topic in inputs.topics.items():
+            print(f'{source}: {topic}')
+        start = time.monotonic()
+        replayed = run(bag, inputs, values)
+        seconds = time.monotonic() - start
+        backend, report = replayed.backend, replayed.report
+        estimate = backend.estimate()
+        if estimate is None:
+            raise BagError(f'{options.bag}: no usable odometry on {inputs.topics["odom"]}')
+        drive = collect_drive(bag, inputs, values, estimate.path, options.truth)
+    counts = {f'{source}.{answer}': count for (source, answer), count
+              in sorted((backend.counts + replayed.refused).items())}
+    table = write_results(drive, options.out, options.bag.stem, {
+        'seconds': seconds, 'alignment': estimate.alignment.value,
+        'hidden_nodes': estimate.n_hidden, 'edges': estimate.n_edges,
+        'observed_nodes': estimate.n_observed, 'chi2': estimate.chi2,
+        'status': report.status.value, 'counts': counts})
+    write_g2o(backend.graph, options.out / 'graph.g2o')
+    print(f'{estimate.n_hidden} hidden nodes, {estimate.n_edges} edges, {estimate.n_observed} '
+          f'observed nodes in {seconds:.2f} s; {report.status.value}, chi2 {report.chi2:.6g}; '
+          f'{estimate.alignment.value}')
+    print('counts: ' + ', '.join(f'{name} {count}' for name, count in counts.items()))
+    print(f'\n{table}\n\nwritten: {options.out}/path.tum, drive.png, summary.json, graph.g2o')
+    return 0 if report.status is Status.CONVERGED else 1
+
+
+def main(args: list[str] | None = None) -> int:
+    """Run `replay` as a program of its own."""
+    parser = argparse.ArgumentParser(
+        prog='replay', description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    add_arguments(parser)
+    return guarded(execute, parser.parse_args(args))
+
+
+def guarded(execute: Any, options: argparse.Namespace) -> int:
+    """Run a tool; what the user can mend is one line on stderr and exit code 2."""
+    try:
+        return int(execute(options))
+    except BrokenPipeError:  # who reads the output has seen enough
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        return 1
+    except (PoseGraphError, OSError) as error:
+        print(f'error: {error}', file=sys.stderr)
+        return 2
+    except KeyboardInterrupt:
+        return 130
+
+
+if __name__ == '__main__':
+    sys.exit(main())

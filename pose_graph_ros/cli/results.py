@@ -1,0 +1,137 @@
+# Copyright 2026 The pose_graph_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""What a run leaves behind: the corrected path, a picture, a summary and a table of errors."""
+
+from collections.abc import Mapping
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from pose_graph_ros.cli.evaluation import Drive, evaluate, format_table, summary
+from pose_graph_ros.cli.picture import draw_drive
+from pose_graph_ros.core import se2
+from pose_graph_ros.core.io.tum import write_tum
+from pose_graph_ros.core.measurements import Answer, GlobalPose, LoopClosure, Position
+from pose_graph_ros.core.trajectory import Trajectory
+from pose_graph_ros.ros.bags import BagError, BagReader, MessageError
+from pose_graph_ros.ros.conversions import FixReader, MessageReader, planar_pose, stamp_ns
+from pose_graph_ros.ros.inputs import Inputs, read_inputs
+
+TRUTH_TYPES = ('nav_msgs/msg/Odometry', 'geometry_msgs/msg/PoseStamped',
+               'geometry_msgs/msg/PoseWithCovarianceStamped')
+
+
+def collect_drive(
+    bag: BagReader, inputs: Inputs, values: Mapping[str, Any], corrected: Trajectory,
+    truth_topic: str | None,
+) -> Drive:
+    """
+    Read what went into the graph once more, for comparing it with the corrected path.
+
+    Parameters
+    ----------
+    bag : BagReader
+    inputs : Inputs
+    values : mapping
+        The node's parameters: the frame of the map, datum and lever arm.
+    corrected : Trajectory
+        The result, `T_map_base`.
+    truth_topic : str, optional
+        Poses in the map that are taken for the truth.
+
+    """
+    fixes = FixReader(values['datum'], values['fix.lever_arm'])
+    reader = MessageReader(values['map_frame'], fixes)
+    odometry: dict[int, np.ndarray] = {}
+    observed: list[tuple[int, np.ndarray, np.ndarray, bool]] = []
+    loops: list[tuple[int, int]] = []
+    for source, message, held_out in read_inputs(bag, inputs):
+        try:
+            measurement = reader.read(source, message.decode())
+        except MessageError:
+            continue
+        match measurement:
+            case Answer():
+                continue
+            case Position(stamp, position, _, lever_arm):
+                observed.append((stamp, position, lever_arm, held_out))
+            case GlobalPose(stamp, pose, _):
+                observed.append((stamp, pose[:2], np.zeros(2), held_out))
+            case LoopClosure(stamp, _, _, int(reference)):
+                loops.append((reference, stamp))
+            case LoopClosure():
+                continue
+            case sample:
+                odometry.setdefault(sample.stamp_ns, sample.pose)
+    stamps = np.array([row[0] for row in observed], dtype=np.int64)
+    positions = np.array([row[1] for row in observed]).reshape(-1, 2)
+    arms = np.array([row[2] for row in observed]).reshape(-1, 2)
+    inside = corrected.covers(stamps)
+    if np.any(arms):  # from the antenna to the robot, as the corrected path has it turned
+        turn = corrected.at(stamps[inside]) * (0.0, 0.0, 1.0)
+        positions[inside] -= se2.transform(turn, arms[inside])
+    return Drive(
+        odometry=_trajectory(odometry), fix_stamps_ns=stamps, fix_positions=positions,
+        fix_held_out=np.array([row[3] for row in observed], dtype=bool), corrected=corrected,
+        truth=None if truth_topic is None else read_truth(bag, truth_topic),
+        loop_stamps_ns=np.array(loops, dtype=np.int64).reshape(-1, 2),
+        map_axes=('east', 'north') if 'fix' in inputs.topics and not any(values['datum'][2:])
+        else ('x', 'y'))
+
+
+def read_truth(bag: BagReader, topic: str) -> Trajectory:
+    """
+    Read poses that are taken for the truth.
+
+    Raises
+    ------
+    BagError
+        If there is no such topic, or its type holds no pose.
+
+    """
+    info = bag.topics.get(topic)
+    if info is None or info.type not in TRUTH_TYPES:
+        what = 'no topic' if info is None else f'type {info.type} of'
+        raise BagError(f'{bag.path}: {what} {topic} (--truth); expected one of '
+                       f'{", ".join(TRUTH_TYPES)}; the bag has {bag.describe()}')
+    poses: dict[int, np.ndarray] = {}
+    for bag_message in bag.messages([topic]):
+        try:
+            message = bag_message.decode()
+        except MessageError:
+            continue
+        pose = planar_pose(message.pose if info.type == TRUTH_TYPES[1] else message.pose.pose)
+        if pose is not None:
+            poses.setdefault(stamp_ns(message), pose)
+    return _trajectory(poses)
+
+
+def _trajectory(poses: Mapping[int, np.ndarray]) -> Trajectory:
+    stamps = np.array(sorted(poses), dtype=np.int64)
+    return Trajectory(stamps, np.array([poses[stamp] for stamp in stamps.tolist()]).reshape(-1, 3))
+
+
+def write_results(drive: Drive, folder: Path, title: str, facts: Mapping[str, Any]) -> str:
+    """
+    Write `path.tum`, `drive.png` and `summary.json` into a folder; return the table of errors.
+
+    Parameters
+    ----------
+    drive : Drive
+    folder : Path
+        Made if it is not there.
+    title : str
+        Of the picture.
+    facts : mapping
+        What else belongs into the summary.
+
+    """
+    folder.mkdir(parents=True, exist_ok=True)
+    rows = evaluate(drive)
+    write_tum(drive.corrected, folder / 'path.tum')
+    draw_drive(drive, folder / 'drive.png', title)
+    content = summary(drive, rows, dict(facts))
+    (folder / 'summary.json').write_text(json.dumps(content, indent=2) + '\n', encoding='utf-8')
+    return format_table(rows)

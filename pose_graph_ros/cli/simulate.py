@@ -1,0 +1,235 @@
+# Copyright 2026 The pose_graph_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""
+Simulate a drive through some city blocks, whose truth is known, and write it as a rosbag2.
+
+The car keeps to the right lane of gently bent streets, slows down for corners, stops at lights
+and drives some streets again, on the second lap all of them. It has
+
+- wheel odometry: two wheels with wrong radii, a wrong track width, slip in turns and in a few
+  events, and a heading that wanders; the odometry's frame is turned by about 2 rad to the map;
+- fixes: a slow (Gauss-Markov) and a white error, none for 70 s around the begin of lap two;
+- loop closures, wherever it comes to a place for the second time in the same direction.
+
+The frame `map` is east and north on the plane that touches the ellipsoid at the position that the
+*first fix of the bag* reports, error included, because a localisation that starts from fixes has
+no better origin. The antenna sits over base_link.
+"""
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from scipy.ndimage import gaussian_filter1d
+from scipy.spatial import KDTree
+
+from pose_graph_ros.cli.bag_messages import (
+    fix_messages,
+    loop_closure_messages,
+    odometry_messages,
+    write_bag,
+)
+from pose_graph_ros.cli.circuit import drive_circuit, gauss_markov, PERIOD_S
+from pose_graph_ros.core import se2
+from pose_graph_ros.core.se2 import FloatArray, IntArray
+from pose_graph_ros.core.tangent_plane import TangentPlane
+from pose_graph_ros.core.trajectory import Trajectory
+
+MIN_DURATION_S = 10.0
+START_NS = 1_746_518_400_250_000_000
+CITY = TangentPlane(50.7271, 7.0866, 61.0)
+"""The plane in which the circuit lies; it begins where the plane touches the ellipsoid."""
+ODOMETRY_PERIOD_S = 0.05
+TRACK_WIDTH = 1.5
+WHEEL_SCALE = (1.0068, 1.0070)
+"""Measured over true distance of the left and the right wheel."""
+TRACK_SCALE = 1.012
+SLIP_EVENTS_PER_S = 1.0 / 60.0
+SLIP_S = 0.012
+"""Excess of a wheel's speed in a slip event, integrated over the event [s]."""
+HEADING_WANDER = 1.2e-3
+"""Standard deviation of the wandering error of the yaw rate [rad/s]."""
+WANDER_TIME_S = 40.0
+ODOMETRY_VARIANCES = (1e-3, 1e-3, 1e6, 1e6, 1e6, 3e-2)
+"""Constant diagonal that common drivers give to the pose and to the twist."""
+FIX_PERIOD_S = 0.5
+FIX_SIGMA_SLOW = 1.2
+FIX_SIGMA_WHITE = 0.4
+FIX_CORRELATION_S = 60.0
+OUTAGE_S = (-40.0, 30.0)
+"""Begin and end of the outage of the fixes relative to the begin of the second lap [s]."""
+ODOMETRY_LATENCY_NS, FIX_LATENCY_NS, LOOP_LATENCY_NS = 4_000_000, 130_000_000, 800_000_000
+"""From the stamp of a measurement to its recording [ns]."""
+LOOP_SIGMAS = (0.1, 0.1, np.deg2rad(1.0))
+LOOP_SPACING = 25.0
+LOOP_RADIUS = 2.0
+LOOP_ANGLE = np.deg2rad(20.0)
+LOOP_MIN_TIME_S = 15.0
+LOOP_MIN_DISTANCE = 50.0
+
+
+@dataclass(frozen=True, slots=True)
+class SimulatedDrive:
+    """What the sensors of a simulated drive said, and the truth."""
+
+    truth: Trajectory
+    """`T_map_base`."""
+    odometry: Trajectory
+    """`T_odom_base`."""
+    fix_stamps_ns: IntArray
+    """Shape (M,) [ns]."""
+    fixes: FloatArray
+    """Latitude, longitude, ellipsoidal height, shape (M, 3) [deg, deg, m]."""
+    fix_sigma: float
+    """Standard deviation of a fix along each of east and north [m]."""
+    loop_stamps_ns: IntArray
+    """Stamps of the earlier and of the later pose of the loop closures, shape (L, 2) [ns]."""
+    loop_poses: FloatArray
+    """Measured pose of the later in the frame of the earlier, shape (L, 3) [m, m, rad]."""
+    loop_covariance: FloatArray
+    """Covariance of each of the measured poses, shape (3, 3)."""
+
+
+def simulate_drive(seed: int = 1, duration_s: float = 440.0) -> SimulatedDrive:
+    """
+    Simulate a drive; equal arguments give equal drives.
+
+    Parameters
+    ----------
+    seed : int
+        Seed of all that is random: the sensors' errors, the way within the lane, waits at lights.
+    duration_s : float
+        Length of the recording [s]; the second lap begins after about 310 s.
+
+    Raises
+    ------
+    ValueError
+        If the duration is below 10 s.
+
+    """
+    if not duration_s >= MIN_DURATION_S:
+        raise ValueError(f'expected a duration of {MIN_DURATION_S} s or more, got {duration_s} s')
+    generator = np.random.default_rng(seed)
+    motion = drive_circuit(generator, duration_s)
+    truth = Trajectory(START_NS + np.round(motion.time * 1e9).astype(np.int64), motion.poses)
+
+    odometry = _odometry(generator, truth)
+    fix_stamps, fix_positions = _fixes(generator, truth, motion.lap_time)
+    loop_stamps, loop_poses = _loop_closures(generator, truth, motion.distance)
+
+    fixes = CITY.to_geodetic(fix_positions)
+    truth_stamps = _jittered_stamps(generator, truth, ODOMETRY_PERIOD_S)
+    poses = truth.at(truth_stamps)
+    plane = TangentPlane(*fixes[0].tolist())
+    poses[:, :2] = plane.to_map(*CITY.to_geodetic(poses[:, :2]).T)
+    return SimulatedDrive(
+        truth=Trajectory(truth_stamps, poses), odometry=odometry,
+        fix_stamps_ns=fix_stamps, fixes=fixes,
+        fix_sigma=float(np.hypot(FIX_SIGMA_SLOW, FIX_SIGMA_WHITE)),
+        loop_stamps_ns=loop_stamps, loop_poses=loop_poses,
+        loop_covariance=np.diag(np.square(LOOP_SIGMAS)))
+
+
+def write_drive(drive: SimulatedDrive, folder: str | Path, *, overwrite: bool = False) -> None:
+    """
+    Write a drive as a rosbag2 with `/odom`, `/gps/fix`, `/loop_closure` and `/ground_truth`.
+
+    Raises
+    ------
+    BagError
+        If the folder exists and is not to be overwritten, or is no bag.
+
+    """
+    write_bag(folder, (
+        *odometry_messages(
+            '/odom', 'odom', drive.odometry, ODOMETRY_VARIANCES, ODOMETRY_LATENCY_NS),
+        *odometry_messages(
+            '/ground_truth', 'map', drive.truth, (0.0,) * 6, ODOMETRY_LATENCY_NS),
+        *fix_messages(
+            '/gps/fix', drive.fix_stamps_ns, drive.fixes, drive.fix_sigma, FIX_LATENCY_NS),
+        *loop_closure_messages(
+            '/loop_closure', drive.loop_stamps_ns, drive.loop_poses, drive.loop_covariance,
+            LOOP_LATENCY_NS)), overwrite=overwrite)
+
+
+def _jittered_stamps(
+    generator: np.random.Generator, truth: Trajectory, period_s: float,
+) -> IntArray:
+    """Return stamps [ns] of a sensor within the time of the truth: own phase, own jitter."""
+    span = truth.stamps_ns[-1] - truth.stamps_ns[0]
+    ticks = np.arange(generator.uniform(0.2, 0.8), span * 1e-9 / period_s - 0.2)
+    ticks += np.clip(generator.normal(0.0, 0.01, len(ticks)), -0.1, 0.1)
+    stamps: IntArray = truth.stamps_ns[0] + np.round(ticks * period_s * 1e9).astype(np.int64)
+    return stamps
+
+
+def _odometry(generator: np.random.Generator, truth: Trajectory) -> Trajectory:
+    """Integrate what the wheels measure; return `T_odom_base`."""
+    steps = se2.between(truth.poses[:-1], truth.poses[1:])
+    forward, turn = np.hypot(steps[:, 0], steps[:, 1]), steps[:, 2]
+    left = WHEEL_SCALE[0] * (forward - 0.5 * TRACK_WIDTH * turn)
+    right = WHEEL_SCALE[1] * (forward + 0.5 * TRACK_WIDTH * turn)
+
+    # in a turn the inner wheel skids a little, and now and then a wheel spins for half a second
+    turning = np.abs(turn) / PERIOD_S
+    left *= 1.0 + np.where(turn > 0.0, 0.02, 0.005) * turning
+    right *= 1.0 + np.where(turn < 0.0, 0.02, 0.005) * turning
+    impulses = generator.random((2, len(steps))) < SLIP_EVENTS_PER_S * PERIOD_S
+    spin = gaussian_filter1d(impulses / PERIOD_S, 0.2 / PERIOD_S)
+    left *= 1.0 + SLIP_S * spin[0]
+    right *= 1.0 + SLIP_S * spin[1]
+
+    wander = gauss_markov(
+        generator, len(steps), HEADING_WANDER, PERIOD_S / WANDER_TIME_S)
+    forward = 0.5 * (left + right) + generator.normal(0.0, 3e-4, len(steps)) * (forward > 1e-4)
+    turn = (right - left) / (TRACK_SCALE * TRACK_WIDTH) + np.where(
+        forward > 1e-4, wander * PERIOD_S, 0.0)
+
+    start = se2.wrap(truth.poses[0, 2] - 2.0)
+    heading = start + np.concatenate(([0.0], np.cumsum(turn)))
+    middle = 0.5 * (heading[1:] + heading[:-1])
+    moves = forward[:, None] * np.column_stack((np.cos(middle), np.sin(middle)))
+    positions = np.array([3.2, -1.4]) + np.concatenate(([[0.0, 0.0]], np.cumsum(moves, axis=0)))
+    dense = Trajectory(truth.stamps_ns, np.column_stack((positions, se2.wrap(heading))))
+    stamps = _jittered_stamps(generator, truth, ODOMETRY_PERIOD_S)
+    return Trajectory(stamps, dense.at(stamps))
+
+
+def _fixes(
+    generator: np.random.Generator, truth: Trajectory, lap_time: float,
+) -> tuple[IntArray, FloatArray]:
+    """Return stamps and positions (M, 2) of the fixes in the frame of the city [m]."""
+    stamps = _jittered_stamps(generator, truth, FIX_PERIOD_S)
+    errors = np.column_stack([
+        gauss_markov(generator, len(stamps), FIX_SIGMA_SLOW, FIX_PERIOD_S / FIX_CORRELATION_S)
+        + generator.normal(0.0, FIX_SIGMA_WHITE, len(stamps)) for _ in range(2)])
+    time = (stamps - truth.stamps_ns[0]) * 1e-9 - lap_time
+    received = (time < OUTAGE_S[0]) | (time > OUTAGE_S[1])
+    return stamps[received], (truth.at(stamps)[:, :2] + errors)[received]
+
+
+def _loop_closures(
+    generator: np.random.Generator, truth: Trajectory, distance: FloatArray,
+) -> tuple[IntArray, FloatArray]:
+    """Return stamps (L, 2) and measured poses (L, 3) where the car comes along again."""
+    # a place every half metre of the way, so that a standing car is at one place only
+    places = np.unique(np.searchsorted(distance, np.arange(0.0, distance[-1], 0.5)))
+    poses, stamps = truth.poses[places], truth.stamps_ns[places]
+    pairs = KDTree(poses[:, :2]).query_pairs(LOOP_RADIUS, output_type='ndarray')
+    old, new = np.sort(pairs, axis=1).T
+    good = (
+        (stamps[new] - stamps[old] > LOOP_MIN_TIME_S * 1e9)
+        & (distance[places[new]] - distance[places[old]] > LOOP_MIN_DISTANCE)
+        & (np.abs(se2.wrap(poses[new, 2] - poses[old, 2])) < LOOP_ANGLE))
+    old, new = old[good], new[good]
+    # one pair, drawn by lot, of each stretch of the way
+    lot = generator.permutation(len(new))
+    _, first = np.unique(distance[places[new[lot]]] // LOOP_SPACING, return_index=True)
+    old, new = old[lot[first]], new[lot[first]]
+    # a camera knows nothing of the other sensors' stamps
+    pairs_ns = np.column_stack((stamps[old], stamps[new]))
+    pairs_ns += generator.integers(1, round(PERIOD_S * 1e9), pairs_ns.shape)
+    pairs_ns = np.minimum(pairs_ns, truth.stamps_ns[-1])
+    ends = truth.at(pairs_ns)
+    noise = generator.normal(0.0, LOOP_SIGMAS, (len(new), 3))
+    return pairs_ns, se2.compose(se2.between(ends[:, 0], ends[:, 1]), noise)

@@ -1,0 +1,150 @@
+# Copyright 2026 The pose_graph_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""
+All settings of the engine and their defaults, in one place.
+
+The ROS parameters, the yaml file and the README's table take their defaults from here.
+"""
+
+from dataclasses import dataclass, field
+import math
+
+from pose_graph_ros.core.exceptions import ConfigError
+
+
+def _require(settings: object, *names: str, positive: bool = False) -> None:
+    """Raise ConfigError unless the named settings are finite and not negative (or positive)."""
+    for name in names:
+        value = getattr(settings, name)
+        if not math.isfinite(value) or value < 0.0 or (positive and value == 0.0):
+            expected = 'a positive number' if positive else 'a number that is not negative'
+            raise ConfigError(
+                f'{type(settings).__name__}.{name}: expected {expected}, got {value!r}')
+
+
+# Motion since the last hidden node below these is standing still: odometry jitters [m, rad].
+REST_DISTANCE = 0.05
+REST_HEADING = 0.05
+
+
+@dataclass(frozen=True, slots=True)
+class NodePolicy:
+    """When odometry makes a new hidden node: after enough motion, or as a slow heartbeat."""
+
+    minimum_travel_distance: float = 1.0
+    """Distance from the last hidden node that makes the next one [m]."""
+    minimum_travel_heading: float = 0.3
+    """Turn since the last hidden node that makes the next one [rad]."""
+    minimum_interval: float = 0.2
+    """Never more hidden nodes than one in this time [s]; bounds the graph at high speed."""
+    moving_interval: float = 1.0
+    """A hidden node at the latest after this time, unless the robot stands still [s]."""
+    heartbeat: float = 10.0
+    """A hidden node at the latest after this time, even when standing still [s]."""
+
+    def __post_init__(self) -> None:
+        _require(self, 'minimum_travel_distance', 'minimum_travel_heading', 'minimum_interval')
+        _require(self, 'moving_interval', 'heartbeat', positive=True)
+
+    def due(self, distance: float, turned: float, elapsed: float) -> bool:
+        """
+        Tell whether a node is due.
+
+        Parameters
+        ----------
+        distance, turned, elapsed : float
+            From the last hidden node: straight distance [m], angle [rad] and time [s].
+
+        """
+        far = distance >= self.minimum_travel_distance or turned >= self.minimum_travel_heading
+        moved = distance >= REST_DISTANCE or turned >= REST_HEADING
+        return ((far and elapsed >= self.minimum_interval)
+                or (moved and elapsed >= self.moving_interval) or elapsed >= self.heartbeat)
+
+
+@dataclass(frozen=True, slots=True)
+class OdometryNoise:
+    """
+    Random-walk noise of odometry: variances grow with the path length and the turn.
+
+    Composable by construction: the noise of a long increment is that of its parts added up, so
+    that, but for the small floors, the spacing of the hidden nodes does not change the estimate's
+    uncertainty.
+    """
+
+    sigma_distance: float = 0.05
+    """Along the direction of travel [m per sqrt(m) travelled]."""
+    sigma_lateral: float = 0.03
+    """Across the direction of travel [m per sqrt(m) travelled]."""
+    sigma_heading_distance: float = 0.01
+    """Heading [rad per sqrt(m) travelled]."""
+    sigma_heading_turn: float = 0.05
+    """Heading [rad per sqrt(rad) turned]."""
+    sigma_floor_position: float = 0.002
+    """Position, once per increment [m]; keeps the information finite when standing still."""
+    sigma_floor_heading: float = 0.0005
+    """Heading, once per increment [rad]."""
+
+    def __post_init__(self) -> None:
+        _require(self, 'sigma_distance', 'sigma_lateral', 'sigma_heading_distance',
+                 'sigma_heading_turn')
+        _require(self, 'sigma_floor_position', 'sigma_floor_heading', positive=True)
+
+
+@dataclass(frozen=True, slots=True)
+class AlignmentPolicy:
+    """When the angle between odometry and map counts as known from positions alone."""
+
+    sigma_heading: float = 0.15
+    """The closed-form angle must be at least this certain [rad]."""
+    minimum_baseline: float = 1.0
+    """The positions must span at least this length [m] ..."""
+    baseline_in_sigmas: float = 5.0
+    """... and at least this many sigmas of a position."""
+
+    def __post_init__(self) -> None:
+        _require(self, 'sigma_heading', 'minimum_baseline', 'baseline_in_sigmas', positive=True)
+
+
+@dataclass(frozen=True, slots=True)
+class SolverConfig:
+    """Gauss-Newton with Levenberg-Marquardt damping where a step would raise chi2."""
+
+    max_iterations: int = 50
+    """Iterations at the most."""
+    step_tolerance: float = 1e-8
+    """Converged when no coordinate would move by more than this any more [m, rad]."""
+    initial_damping: float = 0.0
+    """Factor on the diagonal of H in the first iteration; 0 is Gauss-Newton."""
+
+    def __post_init__(self) -> None:
+        if self.max_iterations < 1:
+            raise ConfigError(f'SolverConfig.max_iterations: expected >= 1, '
+                              f'got {self.max_iterations!r}')
+        _require(self, 'step_tolerance', positive=True)
+        _require(self, 'initial_damping')
+
+
+@dataclass(frozen=True, slots=True)
+class BackendConfig:
+    """Settings of `PoseGraphBackend`."""
+
+    nodes: NodePolicy = field(default_factory=NodePolicy)
+    odometry_noise: OdometryNoise = field(default_factory=OdometryNoise)
+    alignment: AlignmentPolicy = field(default_factory=AlignmentPolicy)
+    online: SolverConfig = field(
+        default_factory=lambda: SolverConfig(max_iterations=10, step_tolerance=1e-4))
+    """For the timer: what is left over is done at the next update."""
+    closing: SolverConfig = field(
+        default_factory=lambda: SolverConfig(max_iterations=100, step_tolerance=1e-10))
+    """For the full optimisation at the end of a stream."""
+    position_sigma_floor: float = 0.01
+    """No position or pose is believed to be better than this [m]."""
+    heading_sigma_floor: float = 0.001
+    """No heading is believed to be better than this [rad]."""
+    default_position_sigma: float = 5.0
+    """Taken for a position whose sender says that its covariance is unknown [m]."""
+
+    def __post_init__(self) -> None:
+        _require(self, 'position_sigma_floor', 'heading_sigma_floor', 'default_position_sigma',
+                 positive=True)

@@ -1,0 +1,197 @@
+# Copyright 2026 The pose_graph_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""
+The two kinds of constraints, as struct of arrays: edges and observed nodes.
+
+An *edge* is directed from hidden node i to hidden node j and carries the measured pose of j in i.
+An *observed node* is a pose measured from outside; its constraint ties it to one hidden node. A
+position is an observed node whose information on the heading is zero, and whose mean heading is
+zero, so that its error lies in the axes of the map.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, fields
+from enum import IntEnum
+from typing import Any, Self
+
+import numpy as np
+import numpy.typing as npt
+
+from pose_graph_ros.core.exceptions import GraphUpdateError
+from pose_graph_ros.core.se2 import FloatArray, IntArray
+
+KindArray = npt.NDArray[np.uint8]
+
+# With its diagonal scaled to 1, the smallest eigenvalue of an information matrix may be this much
+# below zero and its triangles may differ by this much: files print few digits.
+SEMIDEFINITE_TOLERANCE = 1e-5
+
+
+class EdgeKind(IntEnum):
+    """Where an edge comes from."""
+
+    ODOMETRY = 0
+    LOOP_CLOSURE = 1
+
+
+class ObservedKind(IntEnum):
+    """What an observed node tells."""
+
+    GLOBAL_POSE = 0
+    POSITION = 1
+
+
+@dataclass(frozen=True, slots=True)
+class _Table:
+    """Columns of equal length; `joined` and `rows` work on all of them."""
+
+    def __len__(self) -> int:
+        return len(getattr(self, fields(self)[0].name))
+
+    @classmethod
+    def joined(cls, tables: Sequence[Self]) -> Self:
+        """Return the rows of all tables, in order."""
+        if len(tables) == 0:
+            return cls()
+        return cls(*(np.concatenate([getattr(table, item.name) for table in tables])
+                     for item in fields(cls)))
+
+    def rows(self, index: IntArray | npt.NDArray[np.bool_] | slice) -> Self:
+        """Return the chosen rows."""
+        return type(self)(*(getattr(self, item.name)[index] for item in fields(self)))
+
+
+def _empty(*shape: int) -> FloatArray:
+    return np.empty((0, *shape))
+
+
+def _integers(values: npt.ArrayLike, dtype: type[np.generic]) -> npt.NDArray[Any]:
+    """Return an array of integers; nothing is rounded to one."""
+    array = np.asarray(values)
+    if array.size > 0 and array.dtype.kind not in 'iu':
+        raise GraphUpdateError(f'expected integers, got {array.dtype} {array.tolist()}')
+    return array.astype(dtype, copy=False)
+
+
+@dataclass(frozen=True, slots=True)
+class Edges(_Table):
+    """M directed edges."""
+
+    i: IntArray
+    """Node that the edge starts from, shape (M,)."""
+    j: IntArray
+    """Node that it leads to, shape (M,)."""
+    mean: FloatArray
+    """Measured pose of j in i, shape (M, 3) [m, m, rad]."""
+    information: FloatArray
+    """Inverse covariance of the error (3.48), in the frame of the measured pose, (M, 3, 3)."""
+    kind: KindArray
+    """`EdgeKind`, shape (M,)."""
+
+    def __init__(
+        self, i: npt.ArrayLike = (), j: npt.ArrayLike = (),
+        mean: npt.ArrayLike | None = None, information: npt.ArrayLike | None = None,
+        kind: npt.ArrayLike = (),
+    ) -> None:
+        set_columns(self, {
+            'i': _integers(i, np.int64), 'j': _integers(j, np.int64),
+            'mean': np.asarray(_empty(3) if mean is None else mean, dtype=np.float64),
+            'information': np.asarray(
+                _empty(3, 3) if information is None else information, dtype=np.float64),
+            'kind': _integers(kind, np.uint8)})
+
+
+@dataclass(frozen=True, slots=True)
+class ObservedNodes(_Table):
+    """K observed nodes, each with its one constraint."""
+
+    node: IntArray
+    """Hidden node that is observed, shape (K,)."""
+    offset: FloatArray
+    """
+    Pose of the observed frame in the hidden node, shape (K, 3) [m, m, rad]: motion by odometry
+    since the hidden node, then the lever arm. The identity makes the error that of (3.52).
+    """
+    mean: FloatArray
+    """Observed pose in the map, shape (K, 3) [m, m, rad]."""
+    information: FloatArray
+    """Inverse covariance of the error (3.52), in the frame of the observed pose, (K, 3, 3)."""
+    kind: KindArray
+    """`ObservedKind`, shape (K,)."""
+
+    def __init__(
+        self, node: npt.ArrayLike = (), offset: npt.ArrayLike | None = None,
+        mean: npt.ArrayLike | None = None, information: npt.ArrayLike | None = None,
+        kind: npt.ArrayLike = (),
+    ) -> None:
+        node = _integers(node, np.int64)
+        set_columns(self, {
+            'node': node,
+            'offset': np.asarray(
+                np.zeros((len(node), 3)) if offset is None else offset, dtype=np.float64),
+            'mean': np.asarray(_empty(3) if mean is None else mean, dtype=np.float64),
+            'information': np.asarray(
+                _empty(3, 3) if information is None else information, dtype=np.float64),
+            'kind': _integers(kind, np.uint8)})
+
+
+def set_columns(table: _Table, columns: dict[str, npt.NDArray[np.generic]]) -> None:
+    """Fill a frozen table once, in its constructor."""
+    for name, column in columns.items():
+        object.__setattr__(table, name, column)
+
+
+def check(table: Edges | ObservedNodes, n_nodes: int) -> None:
+    """
+    Raise unless the rows are sound constraints between hidden nodes 0 to n_nodes - 1.
+
+    Raises
+    ------
+    GraphUpdateError
+        Says which row, what was expected and what came: shapes, node indices, an edge from a
+        node to itself, numbers that are not finite, an information matrix that is not symmetric
+        or not positive semidefinite.
+
+    """
+    name, size = type(table).__name__, len(table)
+    for item in fields(table):
+        column = getattr(table, item.name)
+        tail = {'mean': (3,), 'offset': (3,), 'information': (3, 3)}.get(item.name, ())
+        if column.shape != (size, *tail):
+            raise GraphUpdateError(
+                f'{name}.{item.name}: expected shape {(size, *tail)}, got {column.shape}')
+        _refuse_rows(~np.isfinite(column), f'{name}.{item.name} is not finite', column)
+    ends = (table.i, table.j) if isinstance(table, Edges) else (table.node,)
+    for end in ends:
+        _refuse_rows((end < 0) | (end >= n_nodes),
+                     f'{name}: expected a hidden node in 0..{n_nodes - 1}', end)
+    kinds = EdgeKind if isinstance(table, Edges) else ObservedKind
+    _refuse_rows(table.kind >= len(kinds), f'{name}.kind is no {kinds.__name__}', table.kind)
+    if isinstance(table, Edges):
+        _refuse_rows(table.i == table.j, f'{name}: an edge leads from a node to itself', table.i)
+    _check_information(f'{name}.information', table.information)
+
+
+def _check_information(name: str, matrix: FloatArray) -> None:
+    """Refuse what is not symmetric and positive semidefinite, whatever units its rows have."""
+    diagonal = np.diagonal(matrix, axis1=1, axis2=2)
+    root = np.sqrt(np.where(diagonal > 0.0, diagonal, 1.0))
+    with np.errstate(over='ignore'):
+        scaled = matrix / root[:, :, None] / root[:, None, :]
+    # a correlation beyond 1 is none; how far beyond does not matter, and might overflow
+    scaled = np.clip(scaled, -2.0, 2.0)
+    skew = np.max(np.abs(scaled - np.swapaxes(scaled, 1, 2)), axis=(1, 2), initial=0.0)
+    _refuse_rows(skew > SEMIDEFINITE_TOLERANCE, f'{name} is not symmetric', matrix)
+    smallest = np.min(np.linalg.eigvalsh(scaled), axis=-1, initial=np.inf)
+    negative = np.any(diagonal < 0.0, axis=-1) | (smallest < -SEMIDEFINITE_TOLERANCE)
+    _refuse_rows(negative | ~np.any(matrix, axis=(1, 2)),
+                 f'{name} is not positive semidefinite, or zero', matrix)
+
+
+def _refuse_rows(
+    bad: npt.NDArray[np.bool_], reason: str, values: npt.NDArray[np.generic],
+) -> None:
+    """Raise GraphUpdateError naming the first bad row, if there is one."""
+    if np.any(bad):
+        row = int(np.flatnonzero(bad.reshape(len(bad), -1).any(axis=1))[0])
+        raise GraphUpdateError(f'{reason}; row {row}: {values[row].tolist()}')

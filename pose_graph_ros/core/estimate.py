@@ -1,0 +1,60 @@
+# Copyright 2026 The pose_graph_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""What the engine hands out: snapshots that do not change later."""
+
+from dataclasses import dataclass
+from enum import Enum
+
+from pose_graph_ros.core.batch import Status
+from pose_graph_ros.core.se2 import FloatArray
+from pose_graph_ros.core.trajectory import Trajectory
+
+
+class AlignmentState(Enum):
+    """What is known of the odometry frame in the map."""
+
+    LOCAL = 'local'
+    """Nothing was measured in the map: the map is the odometry frame of the start."""
+    UNALIGNED = 'unaligned'
+    """Positions are known, the angle between odometry and map is not yet."""
+    ALIGNED = 'aligned'
+
+
+@dataclass(frozen=True, slots=True)
+class UpdateReport:
+    """What an update did."""
+
+    status: Status
+    reason: str
+    """Why it failed, else empty."""
+    new_constraints: int
+    """Loop closures and observed nodes that joined the graph."""
+    iterations: int
+    chi2: float
+
+
+@dataclass(frozen=True, slots=True)
+class Estimate:
+    """A snapshot for publishing; nothing in it changes later."""
+
+    path: Trajectory
+    """`T_map_base` at the hidden nodes, and last at the newest odometry."""
+    T_odom_base: FloatArray
+    """Newest odometry, shape (3,)."""
+    T_map_base: FloatArray
+    """Estimate at the newest odometry, shape (3,)."""
+    T_map_odom: FloatArray
+    """Pose of the odometry frame in the map, shape (3,): corrects any later odometry."""
+    covariance: FloatArray
+    """Of `T_map_base`, in map axes, shape (3, 3)."""
+    alignment: AlignmentState
+    alignment_sigma: float
+    """Of the heading between odometry and map when it was found [rad]; infinite before."""
+    chi2: float
+    n_hidden: int
+    n_edges: int
+    n_observed: int
+
+    def __post_init__(self) -> None:
+        for array in (self.T_odom_base, self.T_map_base, self.T_map_odom, self.covariance):
+            array.flags.writeable = False

@@ -1,0 +1,68 @@
+# Copyright 2026 The pose_graph_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""
+Latitude and longitude to the map and back: the plane that touches the ellipsoid at the datum.
+
+The map's x axis points east and its y axis north at the datum (turned by the datum's yaw, if it
+has one). PROJ's geocentric and topocentric conversions do the work on WGS 84: exact at any
+latitude, without zones and without convergence of a grid.
+"""
+
+import numpy as np
+import numpy.typing as npt
+import pyproj
+
+from pose_graph_ros.core import se2
+from pose_graph_ros.core.se2 import FloatArray
+
+
+class TangentPlane:
+    """
+    Local tangent plane at a datum.
+
+    Parameters
+    ----------
+    latitude, longitude : float
+        Of the datum, WGS 84 [degrees].
+    altitude : float
+        Of the datum above the ellipsoid [m].
+    yaw : float
+        Angle of the map's x axis from east, counter-clockwise [rad].
+
+    Raises
+    ------
+    ValueError
+        If the datum is no point on the Earth.
+
+    """
+
+    def __init__(
+        self, latitude: float, longitude: float, altitude: float = 0.0, yaw: float = 0.0,
+    ) -> None:
+        if not (abs(latitude) <= 90.0 and abs(longitude) <= 360.0
+                and np.isfinite(altitude) and np.isfinite(yaw)):
+            raise ValueError(
+                'datum: expected latitude in [-90, 90], longitude in [-360, 360] and finite '
+                f'altitude and yaw, got {latitude}, {longitude}, {altitude}, {yaw}')
+        self.latitude, self.longitude = float(latitude), float(longitude)
+        self.altitude, self.yaw = float(altitude), float(yaw)
+        self._projection = pyproj.Transformer.from_pipeline(
+            '+proj=pipeline +step +proj=unitconvert +xy_in=deg +xy_out=rad '
+            '+step +proj=cart +ellps=WGS84 +step +proj=topocentric +ellps=WGS84 '
+            f'+lat_0={self.latitude!r} +lon_0={self.longitude!r} +h_0={self.altitude!r}')
+        self._map = np.array([0.0, 0.0, yaw])
+
+    def to_map(
+        self, latitude: npt.ArrayLike, longitude: npt.ArrayLike, altitude: npt.ArrayLike,
+    ) -> FloatArray:
+        """Return map coordinates, shape (..., 2) [m], of points on WGS 84 [degrees, m]."""
+        east, north, _ = self._projection.transform(longitude, latitude, altitude)
+        return se2.transform(se2.inverse(self._map), np.stack((east, north), axis=-1))
+
+    def to_geodetic(self, position: FloatArray) -> FloatArray:
+        """Return latitude, longitude [degrees] and altitude [m], shape (..., 3), of points."""
+        east_north = se2.transform(self._map, position)
+        east, north = east_north[..., 0], east_north[..., 1]
+        longitude, latitude, altitude = self._projection.transform(
+            east, north, np.zeros_like(east), direction='INVERSE')
+        return np.stack((latitude, longitude, altitude), axis=-1)

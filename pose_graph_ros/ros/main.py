@@ -1,0 +1,66 @@
+# Copyright 2026 The pose_graph_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""
+The process of the node: from the command line to a clean end.
+
+SIGINT and SIGTERM set a flag that the loop looks at, so a second one, or one that comes while the
+node starts or ends, changes nothing.
+"""
+
+import logging
+import signal
+import sys
+import traceback
+from types import FrameType
+
+
+class StopSignals:
+    """Takes SIGINT and SIGTERM from its construction on."""
+
+    def __init__(self) -> None:
+        self.received = False
+        for number in (signal.SIGINT, signal.SIGTERM):
+            signal.signal(number, self._on_signal)
+
+    def _on_signal(self, _signal: int, _frame: FrameType | None) -> None:
+        self.received = True
+
+
+def main(args: list[str] | None = None) -> int:
+    """Run the node until SIGINT or SIGTERM; return the exit code."""
+    stop = StopSignals()
+    # ruff: noqa: PLC0415  the imports take most of the start, and signals must be taken by then
+    import rclpy
+    from rclpy.exceptions import InvalidParameterTypeException, InvalidParameterValueException
+    from rclpy.executors import SingleThreadedExecutor
+    from rclpy.signals import SignalHandlerOptions
+
+    from pose_graph_ros.core.exceptions import ConfigError
+    from pose_graph_ros.ros.node import PoseGraphNode
+
+    logging.basicConfig(level=logging.WARNING, format='[%(levelname)s] [%(name)s] %(message)s')
+    try:
+        rclpy.init(args=args, signal_handler_options=SignalHandlerOptions.NO)
+        node = PoseGraphNode()
+    except (ConfigError, InvalidParameterTypeException, InvalidParameterValueException,
+            RuntimeError) as error:  # the errors of rcl, such as for bad arguments
+        print(f'pose_graph_node: {error}', file=sys.stderr)
+        rclpy.try_shutdown()
+        return 2
+    executor = SingleThreadedExecutor()
+    executor.add_node(node)
+    while not stop.received and rclpy.ok():
+        try:
+            executor.spin_once(timeout_sec=0.1)
+        except Exception:
+            # whatever a message or the middleware does, the node goes on
+            node.get_logger().error(f'a callback failed:\n{traceback.format_exc()}')
+    node.stop()
+    executor.shutdown()
+    node.destroy_node()
+    rclpy.try_shutdown()
+    return 0
+
+
+if __name__ == '__main__':
+    sys.exit(main())

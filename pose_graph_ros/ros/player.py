@@ -1,0 +1,271 @@
+# Copyright 2026 The pose_graph_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""
+Plays a bag to the node over DDS, as a process of its own, and records what the node answers.
+
+Nothing is lost on the way: the writers are reliable, and no more messages are under way than the
+node's queue holds, by the node's own count of processed messages in its diagnostics. At the end
+the node is asked for the full optimisation, and its last path is recorded.
+"""
+
+import argparse
+from collections import Counter
+from collections.abc import Callable
+from functools import partial
+from pathlib import Path
+import sys
+import time
+from typing import Any
+
+from diagnostic_msgs.msg import DiagnosticArray
+from geometry_msgs.msg import PoseWithCovarianceStamped
+from nav_msgs.msg import Odometry, Path as PathMessage
+import rclpy
+from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
+from rclpy.node import Node
+from rclpy.qos import QoSDurabilityPolicy, QoSProfile, QoSReliabilityPolicy
+from rclpy.serialization import deserialize_message
+from sensor_msgs.msg import NavSatFix
+from std_srvs.srv import Trigger
+
+from pose_graph_ros.ros.bag_writer import BagWriter
+from pose_graph_ros.ros.bags import BagError, MessageError, open_bag
+from pose_graph_ros.ros.inputs import Inputs, read_inputs, TOPICS, TYPES
+
+try:
+    from tf2_msgs.msg import TFMessage
+except ImportError:  # ROS 2 from PyPI lacks tf2_msgs until it is built
+    TFMessage = None
+
+CLASSES = {TYPES['odom']: Odometry, TYPES['fix']: NavSatFix,
+           TYPES['global_pose']: PoseWithCovarianceStamped}
+RELIABLE = QoSProfile(depth=1000, reliability=QoSReliabilityPolicy.RELIABLE)
+LATCHED = QoSProfile(depth=1, reliability=QoSReliabilityPolicy.RELIABLE,
+                     durability=QoSDurabilityPolicy.TRANSIENT_LOCAL)
+# Messages under way, well below the depth of the node's queues.
+WINDOW = 400
+# Patience with the node: to appear, to process another message, to answer [s].
+APPEAR_TIMEOUT = 30.0
+STALL_TIMEOUT = 20.0
+ANSWER_TIMEOUT = 90.0
+# Exit code where all was played and recorded, but the optimisation did not get to its end.
+NOT_CONVERGED = 3
+# No path for so long means that the last one has come; the node's `path_period` is below [s].
+PATH_SILENCE = 1.0
+
+
+class PlayError(Exception):
+    """The node did not do its part; the message says which."""
+
+
+class Player(Node):
+    """
+    Publishes a bag and records the node's outputs.
+
+    Parameters
+    ----------
+    inputs : Inputs
+    node_name : str
+        Name of the node that is played to, for its service and its diagnostics.
+
+    """
+
+    def __init__(self, inputs: Inputs, node_name: str = 'pose_graph') -> None:
+        super().__init__('pose_graph_player')
+        self._inputs = inputs
+        self._node_name = node_name
+        self._executor = SingleThreadedExecutor()
+        self._executor.add_node(self)
+        self._writers = {
+            source: self.create_publisher(CLASSES[TYPES[source]], TOPICS[source], RELIABLE)
+            for source in inputs.topics}
+        self.recorded: list[tuple[str, str, int, bytes]] = []
+        """Topic, type, time of arrival [ns] and bytes of what the node published."""
+        self.path: bytes | None = None
+        """The newest path."""
+        self._path_at = -float('inf')
+        self.diagnostics: dict[str, str] = {}
+        """The newest values of the node's diagnostics."""
+        self._diagnostics_raw = b''
+        self._record('pose', PoseWithCovarianceStamped, TYPES['global_pose'])
+        self._record('odometry/filtered', Odometry, TYPES['odom'])
+        if TFMessage is not None:
+            self._record('/tf', TFMessage, 'tf2_msgs/msg/TFMessage')
+        self.create_subscription(PathMessage, 'path', self._on_path, LATCHED, raw=True)
+        self.create_subscription(
+            DiagnosticArray, '/diagnostics', self._on_diagnostics, RELIABLE, raw=True)
+        self._optimize = self.create_client(Trigger, f'{node_name}/optimize')
+
+    def _record(self, topic: str, message_type: type, type_name: str) -> None:
+        name = self.resolve_topic_name(topic)
+
+        def take(raw: bytes) -> None:
+            self.recorded.append((name, type_name, time.time_ns(), raw))
+
+        self.create_subscription(message_type, topic, take, RELIABLE, raw=True)
+
+    def _on_path(self, raw: bytes) -> None:
+        self.path, self._path_at = raw, time.monotonic()
+
+    def _on_diagnostics(self, raw: bytes) -> None:
+        for status in deserialize_message(raw, DiagnosticArray).status:
+            if status.name.partition(':')[0].rpartition('/')[2] == self._node_name:
+                self.diagnostics = {value.key: value.value for value in status.values}
+                self._diagnostics_raw = raw
+
+    @property
+    def processed(self) -> int:
+        """Messages that the node says it has processed."""
+        return int(self.diagnostics.get('processed', 0))
+
+    def spin_until(self, done: Callable[[], bool], timeout: float, failure: str) -> None:
+        """Take messages until something holds."""
+        end = time.monotonic() + timeout
+        while not done():
+            if time.monotonic() > end:
+                raise PlayError(f'{failure} (waited {timeout:g} s)')
+            self._executor.spin_once(timeout_sec=0.05)
+
+    def play(self, bag: Path, rate: float) -> Counter[str]:
+        """
+        Publish the inputs at `rate` times the recorded speed, 0 for as fast as the node takes.
+
+        Returns
+        -------
+        Counter
+            Messages published by input, and held out under `held_out`.
+
+        """
+        self.spin_until(
+            lambda: all(writer.get_subscription_count() > 0 for writer in self._writers.values())
+            and len(self.diagnostics) > 0 and self._optimize.service_is_ready(), APPEAR_TIMEOUT,
+            'the node does not listen')
+        # matching is not simultaneous on both sides
+        settled = time.monotonic() + 0.5
+        self.spin_until(lambda: time.monotonic() > settled, 2.0, '')
+        already = self.processed
+        published: Counter[str] = Counter()
+        with open_bag(bag) as reader:
+            total = sum(reader.topics[topic].count for topic in self._inputs.topics.values())
+            start = first_ns = None
+            shown = 0.0
+            for source, message, held_out in read_inputs(reader, self._inputs):
+                if held_out:
+                    published['held_out'] += 1
+                    continue
+                try:
+                    message.decode()
+                except MessageError:
+                    # the node would never see it, and the replay leaves it out as well
+                    published['malformed'] += 1
+                    continue
+                if start is None or first_ns is None:
+                    start, first_ns = time.monotonic(), message.recorded_ns
+                if rate > 0.0:
+                    self._sleep_until(start + (message.recorded_ns - first_ns) * 1e-9 / rate)
+                self._writers[source].publish(message.raw)
+                published[source] += 1
+                sent = already + _sent(published)
+                if sent - self.processed > WINDOW:
+                    self._wait_for(sent - WINDOW // 2)
+                self._executor.spin_once(timeout_sec=0.0)
+                if time.monotonic() - shown > 1.0:
+                    shown = time.monotonic()
+                    _progress(published.total(), total)
+        _progress(published.total(), total)
+        print(file=sys.stderr)
+        self._wait_for(already + _sent(published))
+        return published
+
+    def _sleep_until(self, instant: float) -> None:
+        while (left := instant - time.monotonic()) > 0.0:
+            self._executor.spin_once(timeout_sec=min(left, 0.05))
+
+    def _wait_for(self, count: int) -> None:
+        """Wait until the node has processed so many; patient as long as it gets on."""
+        while (before := self.processed) < count:
+            self.spin_until(
+                partial(self._more_than, before), STALL_TIMEOUT,
+                f'the node has processed {before} messages of {count} and does not get on')
+
+    def _more_than(self, count: int) -> bool:
+        return self.processed > count
+
+    def close(self) -> tuple[bool, str]:
+        """Ask the node for the full optimisation, wait for its path; return its answer."""
+        answer = self._optimize.call_async(Trigger.Request())
+        asked_at = time.monotonic()
+        self.spin_until(answer.done, ANSWER_TIMEOUT, 'no answer from ~/optimize')
+        answered_at = time.monotonic()
+        response = answer.result()
+        # one that was under way may come first: the last one is taken, after a silence
+        self.spin_until(
+            lambda: asked_at < self._path_at
+            and max(answered_at, self._path_at) < time.monotonic() - PATH_SILENCE,
+            ANSWER_TIMEOUT, 'no path came after the optimisation')
+        return bool(response.success), str(response.message)
+
+    def write(self, folder: Path) -> None:
+        """Write what was recorded as a rosbag2; of path and diagnostics the last message."""
+        path_topic = self.resolve_topic_name('path')
+        with BagWriter(folder, overwrite=True, latched=[path_topic]) as writer:
+            for topic, type_name, arrived_ns, raw in self.recorded:
+                writer.write(topic, type_name, arrived_ns, raw)
+            if self.path is not None:
+                writer.write(path_topic, 'nav_msgs/msg/Path', time.time_ns(), self.path)
+            writer.write('/diagnostics', 'diagnostic_msgs/msg/DiagnosticArray', time.time_ns(),
+                         self._diagnostics_raw)
+
+    def n_path_poses(self) -> int:
+        """Return how many poses the newest path has."""
+        return 0 if self.path is None else len(deserialize_message(self.path, PathMessage).poses)
+
+
+def _sent(published: Counter[str]) -> int:
+    return published.total() - published['held_out'] - published['malformed']
+
+
+def _progress(done: int, total: int) -> None:
+    """Show progress on one line of a terminal, on few lines elsewhere."""
+    end = '\r' if sys.stderr.isatty() else '\n'
+    print(f'  played {done} of {total} messages ({100.0 * done / max(total, 1):.0f} %)',
+          end=end, file=sys.stderr, flush=True)
+
+
+def main(args: list[str] | None = None) -> int:
+    """Play a bag; the arguments come from `pose-graph demo`."""
+    parser = argparse.ArgumentParser(prog='player', description=__doc__)
+    parser.add_argument('bag', type=Path)
+    parser.add_argument('out', type=Path, help='folder of the rosbag2 to write')
+    for source in TYPES:
+        parser.add_argument(f'--{source}', metavar='TOPIC', help='topic in the bag')
+    parser.add_argument('--hold-out', type=int, default=0)
+    parser.add_argument('--rate', type=float, default=20.0)
+    options = parser.parse_args(args)
+    topics: dict[str, Any] = {source: getattr(options, source) for source in TYPES}
+    inputs = Inputs({source: topic for source, topic in topics.items() if topic is not None},
+                    options.hold_out)
+    rclpy.init()
+    try:
+        player = Player(inputs)
+        published = player.play(options.bag, options.rate)
+        success, answer = player.close()
+        player.write(options.out)
+        print('published: ' + ', '.join(f'{key} {count}' for key, count in published.items()))
+        print(f'the node: processed {player.processed}; optimisation {answer}; '
+              f'path of {player.n_path_poses()} poses')
+        if not success:
+            print(f'player: ~/optimize: {answer}', file=sys.stderr)
+            return NOT_CONVERGED
+    except (PlayError, BagError) as error:
+        print(f'player: {error}', file=sys.stderr)
+        return 1
+    except (KeyboardInterrupt, ExternalShutdownException):
+        return 130
+    finally:
+        rclpy.try_shutdown()
+    return 0
+
+
+if __name__ == '__main__':
+    sys.exit(main())

@@ -1,0 +1,193 @@
+# Copyright 2026 The pose_graph_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""
+The thread that owns the engine: the single writer of the graph.
+
+Callbacks post measurements and ask for updates; they never wait for a solver. What they read is a
+frozen estimate that the thread swaps in. Imports no ROS.
+"""
+
+from collections import Counter, deque
+from collections.abc import Callable
+from concurrent.futures import Future
+from dataclasses import dataclass, field
+import logging
+import threading
+import time
+
+from pose_graph_ros.core.backend import PoseGraphBackend
+from pose_graph_ros.core.estimate import Estimate, UpdateReport
+from pose_graph_ros.core.measurements import Measurement, OdometrySample, Verdict
+
+logger = logging.getLogger(__name__)
+
+# More than this waiting means that the worker has lost touch; what comes then is counted as lost.
+INBOX_LIMIT = 100_000
+
+
+@dataclass(frozen=True, slots=True)
+class WorkerStatus:
+    """A snapshot for the diagnostics."""
+
+    processed: int = 0
+    """Measurements that the engine has taken or refused."""
+    counts: Counter[tuple[str, str]] = field(default_factory=Counter)
+    """(source, 'accepted' or reason) to how often."""
+    pending: int = 0
+    quarantined: int = 0
+    updates: int = 0
+    """Updates that solved something."""
+    solve_mean: float = 0.0
+    """Duration of such an update [s]."""
+    solve_max: float = 0.0
+    report: UpdateReport | None = None
+    """Of the newest update."""
+
+
+class Worker:
+    """
+    Runs a backend in a thread of its own.
+
+    Parameters
+    ----------
+    backend : PoseGraphBackend
+    on_estimate : callable
+        Called in the worker's thread after each new estimate.
+
+    """
+
+    def __init__(
+        self, backend: PoseGraphBackend, on_estimate: Callable[[Estimate], None],
+    ) -> None:
+        self._backend = backend
+        self._on_estimate = on_estimate
+        self._inbox: deque[tuple[str, OdometrySample | Measurement]] = deque()
+        self._update_wanted = False
+        self._closings: list[Future[UpdateReport]] = []
+        self._stopping = False
+        self._condition = threading.Condition()
+        self._solves, self._solve_total, self._solve_max = 0, 0.0, 0.0
+        self._said: set[tuple[str, str]] = set()
+        self._rest_until = -float('inf')
+        self.estimate: Estimate | None = None
+        """The newest estimate; replaced as a whole."""
+        self.status = WorkerStatus()
+        """The newest status; replaced as a whole."""
+        self._thread = threading.Thread(target=self._run, name='pose graph', daemon=True)
+
+    def start(self) -> None:
+        """Start the thread."""
+        self._thread.start()
+
+    @property
+    def alive(self) -> bool:
+        """Whether the thread runs."""
+        return self._thread.is_alive()
+
+    def stop(self, timeout: float) -> bool:
+        """End the thread, waiting so long [s] for a solve; tell whether it has ended."""
+        with self._condition:
+            self._stopping = True
+            self._condition.notify()
+        self._thread.join(timeout)
+        return not self._thread.is_alive()
+
+    def post(self, source: str, measurement: OdometrySample | Measurement) -> bool:
+        """Hand a measurement over; False if the inbox is full and it was dropped."""
+        with self._condition:
+            if len(self._inbox) >= INBOX_LIMIT:
+                return False
+            self._inbox.append((source, measurement))
+            self._condition.notify()
+        return True
+
+    def request_update(self) -> None:
+        """Ask for an update of the graph with all that has been posted."""
+        with self._condition:
+            self._update_wanted = True
+            self._condition.notify()
+
+    def request_closing(self) -> 'Future[UpdateReport]':
+        """Ask for a full optimisation of all that has been posted."""
+        future: Future[UpdateReport] = Future()
+        with self._condition:
+            self._closings.append(future)
+            self._condition.notify()
+        return future
+
+    def _run(self) -> None:
+        while True:
+            with self._condition:
+                self._condition.wait_for(lambda: (
+                    self._stopping or self._update_wanted
+                    or len(self._inbox) + len(self._closings) > 0))
+                batch, self._inbox = self._inbox, deque()
+                wanted = self._update_wanted and time.monotonic() >= self._rest_until
+                self._update_wanted = False
+                closings, self._closings = self._closings, []
+                if self._stopping:
+                    for future in closings:
+                        future.cancel()
+                    return
+            report: UpdateReport | None = None
+            try:
+                for source, measurement in batch:
+                    self._add(source, measurement)
+                if wanted or len(closings) > 0:
+                    report = self._update(closing=len(closings) > 0)
+                if report is not None or self.estimate is None:
+                    self._publish()
+                self._report(report, len(batch))
+                if report is not None:
+                    for future in closings:
+                        future.set_result(report)
+            except Exception as error:
+                # the thread must outlive whatever comes: it is the only one that writes
+                logger.exception('the worker failed')
+                self._backend.counts['worker', 'internal_error'] += 1
+                for future in closings:
+                    if not future.done():
+                        future.set_exception(error)
+
+    def _add(self, source: str, measurement: OdometrySample | Measurement) -> None:
+        try:
+            if isinstance(measurement, OdometrySample):
+                answer = self._backend.add_odometry(measurement, source)
+            else:
+                answer = self._backend.add_measurement(measurement, source)
+            key = (source, answer.reason)
+            if answer.verdict is Verdict.REJECTED and key not in self._said:
+                self._said.add(key)
+                logger.warning('%s: %s: %s (said once, counted in diagnostics)', source,
+                               answer.reason, answer.detail)
+        except Exception:
+            self._backend.counts[source, 'internal_error'] += 1
+            logger.exception('a measurement of %s could not be added', source)
+
+    def _update(self, *, closing: bool) -> UpdateReport:
+        start = time.monotonic()
+        report = self._backend.optimize() if closing else self._backend.update()
+        if report.iterations > 0:
+            seconds = time.monotonic() - start
+            self._solves += 1
+            self._solve_total += seconds
+            self._solve_max = max(self._solve_max, seconds)
+            # where a solve takes longer than the timer's period, half of the time stays free
+            self._rest_until = time.monotonic() + seconds
+        if report.reason != '':
+            logger.warning('the solver failed, the last good estimate stays: %s', report.reason)
+        return report
+
+    def _publish(self) -> None:
+        self.estimate = self._backend.estimate()
+        if self.estimate is not None:
+            self._on_estimate(self.estimate)
+
+    def _report(self, report: UpdateReport | None, processed: int) -> None:
+        """Swap in a new status, whole; the report of the last update stays if there is none."""
+        status, backend = self.status, self._backend
+        self.status = WorkerStatus(
+            processed=status.processed + processed, counts=Counter(backend.counts),
+            pending=backend.n_pending, quarantined=backend.n_quarantined, updates=self._solves,
+            solve_mean=self._solve_total / max(self._solves, 1), solve_max=self._solve_max,
+            report=status.report if report is None else report)

@@ -1,0 +1,85 @@
+# Copyright 2026 The pose_graph_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""
+Installation by `pip install .`, `pip install -e .` and `colcon build`.
+
+colcon obeys setup.cfg, which sends the executables to lib/pose_graph_ros, where `ros2 run` looks
+for them. pip does not and puts them into bin; there the two classes below add launchers to
+lib/pose_graph_ros, so that the package works alike after each of the three.
+"""
+
+from glob import glob
+from pathlib import Path
+
+from setuptools import Distribution, find_packages, setup
+
+from distutils.command.install_data import install_data  # isort: skip  (setuptools provides it)
+
+PACKAGE = 'pose_graph_ros'
+EXECUTABLES = ('pose_graph_node', 'replay')     # those for `ros2 run`
+LIBEXEC = Path('lib', PACKAGE)
+HERE = Path(__file__).resolve().parent
+
+
+class DataDistribution(Distribution):
+    """A distribution whose data files (share/) are installed by `pip install -e .`, too."""
+
+    def has_data(self) -> bool:
+        """Answer what setuptools' editable_wheel asks before it runs install_data."""
+        return self.has_data_files()
+
+
+class InstallData(install_data):
+    """Install the data files and, where scripts do not go to lib/pose_graph_ros, launchers."""
+
+    def run(self) -> None:
+        super().run()
+        if Path(self.get_finalized_command('install').install_scripts).parts[-2:] == LIBEXEC.parts:
+            return
+        folder = Path(self.install_dir) / LIBEXEC
+        folder.mkdir(parents=True, exist_ok=True)
+        for name in EXECUTABLES:
+            self.copy_file(str(HERE / 'dev' / 'launcher.sh'), str(folder / name))
+            (folder / name).chmod(0o755)
+            self.outfiles.append(str(folder / name))
+
+
+setup(
+    name=PACKAGE,
+    version='0.1.0',
+    description='Online back end of pose-graph SLAM: fuses odometry, global poses and GNSS.',
+    license='Apache-2.0',
+    maintainer='pose_graph_ros maintainers',
+    maintainer_email='maintainers@example.com',
+    packages=find_packages(include=[PACKAGE, f'{PACKAGE}.*']),
+    data_files=[
+        ('share/ament_index/resource_index/packages', [f'resource/{PACKAGE}']),
+        (f'share/{PACKAGE}', ['package.xml']),
+        (f'share/{PACKAGE}/config', sorted(glob('config/*.yaml'))),
+        (f'share/{PACKAGE}/launch', sorted(glob('launch/*.launch.py'))),
+    ],
+    entry_points={
+        'console_scripts': [
+            'pose_graph_node = pose_graph_ros.ros.main:main',
+            'replay = pose_graph_ros.cli.replay:main',
+            'pose-graph = pose_graph_ros.cli.main:main',
+        ],
+    },
+    cmdclass={'install_data': InstallData},
+    distclass=DataDistribution,
+    zip_safe=True,
+    python_requires='>=3.11',
+    # The lower bounds are what Ubuntu 24.04 has. rclpy and the messages come with ROS.
+    install_requires=[
+        'numpy>=1.26',
+        'scipy>=1.11',
+        'pyproj>=3.6',
+        'matplotlib>=3.6',
+        'rosbags>=0.11',
+        'PyYAML>=6.0',
+    ],
+    extras_require={
+        'test': ['pytest>=7.4', 'pytest-timeout>=2.2', 'hypothesis>=6.98'],
+        'dev': ['ruff', 'mypy', 'scipy-stubs'],
+    },
+)

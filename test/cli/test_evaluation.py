@@ -1,0 +1,238 @@
+# Copyright 2026 The pose_graph_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""Errors of hand-made drives are the ones that can be told by hand; the picture is a picture."""
+
+from collections.abc import Callable
+from dataclasses import replace
+import json
+from pathlib import Path
+
+from hypothesis import given, settings, strategies as st
+from hypothesis.extra.numpy import arrays
+from matplotlib.image import imread
+import numpy as np
+import pytest
+
+from pose_graph_ros.cli.evaluation import (
+    distances,
+    Drive,
+    error_rows,
+    evaluate,
+    fit_rigid,
+    format_table,
+    place_odometry,
+    summary,
+)
+from pose_graph_ros.cli.picture import BLUE, draw_drive, GREEN, VERMILION
+from pose_graph_ros.core import se2
+from pose_graph_ros.core.trajectory import Trajectory
+
+NOTHING = Trajectory(np.zeros(0, dtype=np.int64), np.zeros((0, 3)))
+NO_LOOPS = np.zeros((0, 2), dtype=np.int64)
+SECOND = 10**9
+
+
+def straight(offset: float = 0.0) -> Trajectory:
+    """Drive 10 m east in 10 s, some metres to the left."""
+    poses = np.column_stack((np.arange(11.0), np.full(11, offset), np.zeros(11)))
+    return Trajectory(np.arange(11) * SECOND, poses)
+
+
+def hand_made_drive() -> Drive:
+    """Truth on the x axis, the result 0.5 m to its left, fixes 1 m (used) and 2 m (held out)."""
+    odometry = straight()
+    start = np.array([5.0, -3.0, 2.0])
+    return Drive(
+        odometry=Trajectory(odometry.stamps_ns, se2.compose(start, odometry.poses)),
+        fix_stamps_ns=np.array([0, 15, 30, 90, 200]) * SECOND // 10,
+        fix_positions=np.array([[0.0, 1.0], [1.5, 1.0], [3.0, -2.0], [9.0, 2.0], [20.0, 0.0]]),
+        fix_held_out=np.array([False, False, True, True, False]),
+        corrected=straight(0.5), truth=straight(), loop_stamps_ns=np.array([[1, 8]]) * SECOND)
+
+
+def without_truth(drive: Drive) -> Drive:
+    return replace(drive, truth=None)
+
+
+def without_fixes(drive: Drive) -> Drive:
+    return replace(
+        drive, fix_stamps_ns=np.zeros(0, dtype=np.int64), fix_positions=np.zeros((0, 2)),
+        fix_held_out=np.zeros(0, dtype=bool))
+
+
+coordinates = st.floats(-1e3, 1e3)
+
+
+@settings(max_examples=50)
+@given(
+    source=st.integers(2, 20).flatmap(
+        lambda n: arrays(np.float64, (n, 2), elements=coordinates)),
+    pose=arrays(np.float64, 3, elements=coordinates))
+def test_fit_rigid_recovers_any_rigid_motion(source: np.ndarray, pose: np.ndarray) -> None:
+    target = se2.transform(pose, source)
+    fitted = fit_rigid(source, target)
+    np.testing.assert_allclose(se2.transform(fitted, source), target, atol=1e-6)
+    if np.ptp(source, axis=0).max() > 1.0:
+        np.testing.assert_allclose(
+            se2.between(fitted, se2.wrapped(pose)), 0.0, atol=1e-6)
+
+
+@settings(max_examples=30)
+@given(
+    source=arrays(np.float64, (6, 2), elements=coordinates),
+    target=arrays(np.float64, (6, 2), elements=coordinates),
+    other=arrays(np.float64, 3, elements=st.floats(-1.0, 1.0)))
+def test_no_other_rigid_motion_fits_better(
+    source: np.ndarray, target: np.ndarray, other: np.ndarray,
+) -> None:
+    fitted = fit_rigid(source, target)
+    best = np.sum((se2.transform(fitted, source) - target) ** 2)
+    moved = np.sum((se2.transform(fitted + other, source) - target) ** 2)
+    assert best <= moved * (1.0 + 1e-9) + 1e-6
+
+
+def test_fit_rigid_needs_points_and_turns_nothing_by_a_single_one() -> None:
+    np.testing.assert_allclose(
+        fit_rigid(np.array([[1.0, 2.0]]), np.array([[4.0, 6.0]])), [3.0, 4.0, 0.0])
+    for source, target in ((np.zeros((0, 2)), np.zeros((0, 2))), (np.zeros((2, 2)), np.zeros(2))):
+        with pytest.raises(ValueError, match='equally many points'):
+            fit_rigid(source, target)
+
+
+def test_distances_interpolate_inside_the_time_of_the_path_only() -> None:
+    stamps = np.array([-SECOND, 2 * SECOND, 2 * SECOND + SECOND // 4, 11 * SECOND])
+    positions = np.array([[0.0, 0.0], [2.0, 3.0], [2.25, 4.0], [0.0, 0.0]])
+    covered, errors = distances(straight(), stamps, positions)
+    np.testing.assert_array_equal(covered, stamps[1:3])
+    np.testing.assert_allclose(errors, [3.0, 4.0])
+
+
+def test_statistics_of_known_errors() -> None:
+    assert error_rows('x', np.zeros(0)) == []
+    (row,) = error_rows('x', np.array([3.0, 0.0, 4.0, 1.0, 2.0]), 'deg')
+    assert (row.name, row.count, row.median, row.maximum, row.unit) == ('x', 5, 2.0, 4.0, 'deg')
+    assert row.rms == pytest.approx(np.sqrt(6.0))
+    assert row.p95 == pytest.approx(3.8)
+
+
+def test_odometry_is_laid_over_the_truth_or_else_the_fixes_or_else_the_result() -> None:
+    drive = hand_made_drive()
+    np.testing.assert_allclose(place_odometry(drive).poses, straight().poses, atol=1e-9)
+    fixes = place_odometry(without_truth(drive))
+    inside = drive.fix_stamps_ns <= 10 * SECOND
+    np.testing.assert_allclose(
+        fixes.at(drive.fix_stamps_ns[inside])[:, :2].mean(axis=0),
+        drive.fix_positions[inside].mean(axis=0))
+    result = place_odometry(without_fixes(without_truth(drive)))
+    np.testing.assert_allclose(result.poses, straight(0.5).poses, atol=1e-9)
+    nothing = replace(
+        without_fixes(without_truth(drive)), corrected=NOTHING)
+    assert place_odometry(nothing) is drive.odometry
+
+
+def test_rows_of_a_hand_made_drive() -> None:
+    rows = {row.name: row for row in evaluate(hand_made_drive())}
+    assert list(rows) == [
+        'odometry alone to truth', 'fixes to truth', 'corrected path to truth',
+        'corrected heading to truth',
+        'odometry alone to fixes used', 'corrected path to fixes used',
+        'odometry alone to fixes held out', 'corrected path to fixes held out',
+    ]
+    assert rows['odometry alone to truth'].maximum == pytest.approx(0.0, abs=1e-9)
+    assert rows['fixes to truth'].count == 4  # the fifth is after the end
+    assert rows['fixes to truth'].median == pytest.approx(1.5)
+    assert rows['corrected path to truth'].rms == pytest.approx(0.5)
+    assert rows['corrected heading to truth'].unit == 'deg'
+    assert rows['corrected path to fixes used'].median == pytest.approx(0.5)
+    assert rows['corrected path to fixes held out'].median == pytest.approx(2.0)
+    assert rows['corrected path to fixes held out'].maximum == pytest.approx(2.5)
+
+
+def test_headings_are_compared_around_the_circle() -> None:
+    drive = hand_made_drive()
+    stamps, poses = drive.corrected.stamps_ns, drive.corrected.poses
+    turn = np.array([0.0, 0.0, np.pi - 0.01])
+    turned = replace(drive, truth=Trajectory(stamps, poses + turn),
+                     corrected=Trajectory(stamps, poses - turn))
+    row = next(row for row in evaluate(turned) if row.unit == 'deg')
+    assert row.maximum == pytest.approx(np.rad2deg(0.02))
+
+
+def test_rows_without_data_are_left_out() -> None:
+    drive = hand_made_drive()
+    assert {row.name for row in evaluate(without_fixes(drive))} == {
+        'odometry alone to truth', 'corrected path to truth', 'corrected heading to truth'}
+    assert len(evaluate(without_truth(drive))) == 4
+    assert evaluate(without_truth(without_fixes(drive))) == []
+    elsewhere = Trajectory(drive.corrected.stamps_ns + 10**15, drive.corrected.poses)
+    rows = evaluate(replace(drive, truth=elsewhere))
+    assert all(row.name.partition(' to ')[2] != 'truth' for row in rows)
+    empty = replace(drive, corrected=NOTHING)
+    for row in evaluate(empty):
+        assert np.all(np.isfinite([row.median, row.rms, row.p95, row.maximum]))
+    assert summary(empty, [], {})['duration_s'] == 0.0
+
+
+def test_a_drive_that_does_not_fit_together_is_refused() -> None:
+    drive = hand_made_drive()
+    for wrong, words in (
+        ({'fix_positions': np.zeros((3, 2))}, 'of fixes'),
+        ({'fix_held_out': np.zeros(3, dtype=bool)}, 'of fixes'),
+        ({'loop_stamps_ns': np.zeros(4, dtype=np.int64)}, 'loop closures'),
+        ({'fix_positions': np.full((5, 2), np.nan)}, 'finite'),
+    ):
+        with pytest.raises(ValueError, match=words):
+            replace(drive, **wrong)
+
+
+def test_the_table_is_aligned_and_fits_a_terminal() -> None:
+    lines = format_table(evaluate(hand_made_drive())).splitlines()
+    assert len(lines) == 9
+    assert len({len(line) for line in lines}) == 1
+    assert len(lines[0]) < 80
+    assert 'corrected path to truth' in lines[3]
+    assert '0.50' in lines[3]
+    assert 'nothing to compare' in format_table([])
+
+
+def test_the_summary_survives_json() -> None:
+    drive = hand_made_drive()
+    result = summary(drive, evaluate(drive), {'solve_ms': 1.5})
+    assert json.loads(json.dumps(result, allow_nan=False)) == result
+    assert result['duration_s'] == pytest.approx(10.0)
+    assert result['distance_m'] == pytest.approx(10.0)
+    assert (result['fixes_used'], result['fixes_held_out'], result['loop_closures']) == (3, 2, 1)
+    assert result['solve_ms'] == 1.5
+
+
+@pytest.mark.parametrize('strip', [
+    lambda drive: drive, without_truth, without_fixes,
+    lambda drive: without_truth(without_fixes(drive)),
+    lambda drive: replace(drive, loop_stamps_ns=NO_LOOPS),
+    lambda drive: replace(drive, corrected=NOTHING),
+    lambda drive: replace(
+        without_truth(without_fixes(drive)), corrected=NOTHING, odometry=NOTHING),
+], ids=['whole', 'no truth', 'no fixes', 'neither', 'no loops', 'no result', 'nothing'])
+def test_the_picture_is_a_picture(strip: Callable[[Drive], Drive], tmp_path: Path) -> None:
+    file = tmp_path / 'drive.png'
+    draw_drive(strip(hand_made_drive()), file, 'A drive by hand')
+    pixels = imread(file)
+    assert pixels.shape[1] == 1600
+    assert pixels.shape[0] >= 700
+    assert len(np.unique(pixels[..., 0])) > 50
+    assert 0.005 < np.mean(pixels[..., 0] < 0.9) < 0.5
+
+
+@pytest.mark.parametrize(('turn', 'shape'), [(0.0, 'wide'), (np.pi / 2.0, 'tall')])
+def test_the_paths_are_drawn_in_their_colours(turn: float, shape: str, tmp_path: Path) -> None:
+    drive = hand_made_drive()
+    pose = np.array([100.0, 50.0, turn])
+    truth = Trajectory(straight().stamps_ns, se2.compose(pose, straight().poses))
+    result = Trajectory(truth.stamps_ns, se2.compose(pose, straight(0.5).poses))
+    turned = replace(drive, truth=truth, corrected=result,
+                     fix_positions=se2.transform(pose, drive.fix_positions))
+    draw_drive(turned, tmp_path / f'{shape}.png', shape)
+    pixels = np.round(imread(tmp_path / f'{shape}.png')[..., :3] * 255.0)
+    for colour in (BLUE, GREEN, VERMILION):
+        rgb = [int(colour[k:k + 2], 16) for k in (1, 3, 5)]
+        assert np.sum(np.all(np.abs(pixels - rgb) < 3.0, axis=-1)) > 20, colour

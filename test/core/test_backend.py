@@ -1,0 +1,746 @@
+# Copyright 2026 The pose_graph_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""The facade: the order of arrival changes nothing, nothing is half done or believed blindly."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+from hypothesis import given, settings, strategies as st
+import numpy as np
+import pytest
+from random_graphs import dense_system, free_part, snapshot
+
+from pose_graph_ros.core import batch, se2
+from pose_graph_ros.core.backend import PoseGraphBackend
+from pose_graph_ros.core.batch import BatchResult, Status
+from pose_graph_ros.core.config import BackendConfig, NodePolicy, OdometryNoise, SolverConfig
+from pose_graph_ros.core.covariance import UNKNOWN_HEADING_VARIANCE
+from pose_graph_ros.core.estimate import AlignmentState
+from pose_graph_ros.core.graph import Graph
+from pose_graph_ros.core.measurements import (
+    Answer,
+    GlobalPose,
+    LoopClosure,
+    Measurement,
+    OdometrySample,
+    Position,
+    Verdict,
+)
+from pose_graph_ros.core.se2 import FloatArray
+
+SECOND = 1_000_000_000
+# The promise: the same measurements give the same path, whatever their order [m, rad].
+SAME_PATH = 1e-9
+# Odometry and map differ by a shift and by this angle.
+T_MAP_ODOM = np.array([40.0, -25.0, np.deg2rad(122.0)])
+
+Event = OdometrySample | Measurement
+
+
+@dataclass(frozen=True)
+class Drive:
+    """A loop of some 60 m, driven once and a bit, with noisy sensors, in order of the stamps."""
+
+    odometry: list[OdometrySample]
+    global_poses: list[GlobalPose]
+    positions: list[Position]
+    closures: list[LoopClosure]
+    truth: FloatArray
+    """`T_map_base` at the odometry samples."""
+
+
+def drive(seed: int = 0, *, noise: float = 1.0, n: int = 141) -> Drive:
+    """Simulate: 5 Hz odometry at 2.5 m/s; the other sensors between its samples."""
+    rng = np.random.default_rng(seed)
+    stamps = 10 * SECOND + np.arange(n) * SECOND // 5
+    step = np.array([0.5, 0.0, 2.0 * np.pi / 120.0])
+    local, odometry = np.zeros((n, 3)), np.zeros((n, 3))
+    odometry[0] = [3.0, 1.0, 0.4]
+    for k in range(1, n):
+        local[k] = se2.compose(local[k - 1], step)
+        slip = noise * rng.standard_normal(3) * [0.02, 0.01, 0.005]
+        odometry[k] = se2.compose(odometry[k - 1], step + slip)
+    truth = se2.compose(T_MAP_ODOM, se2.compose(odometry[0], local))
+
+    def between_samples(k: int) -> tuple[int, FloatArray]:
+        fraction = int(rng.integers(1, 100))
+        return (int(stamps[k]) + fraction * SECOND // 500,
+                se2.interpolate(truth[k], truth[k + 1], fraction / 100.0))
+
+    global_poses, positions, closures = [], [], []
+    lever_arm = np.array([0.4, 0.1])
+    for k in range(5, n - 1, 30):
+        stamp, pose = between_samples(k)
+        sigma = np.array([0.2, 0.3, 0.05])
+        global_poses.append(GlobalPose(
+            stamp, pose + noise * sigma * rng.standard_normal(3), np.diag(sigma**2)))
+    for k in range(2, n - 1, 7):
+        stamp, pose = between_samples(k)
+        where = se2.transform(pose, lever_arm) + noise * 0.5 * rng.standard_normal(2)
+        positions.append(Position(stamp, where, 0.25 * np.eye(2), lever_arm))
+    for k in range(122, n - 1, 6):
+        stamp, pose = between_samples(k)
+        reference_ns, reference = between_samples(k - 120)
+        closures.append(LoopClosure(
+            stamp, se2.between(reference, pose) + noise * 0.05 * rng.standard_normal(3),
+            0.0025 * np.eye(3), reference_ns=reference_ns))
+    return Drive([OdometrySample(int(s), p) for s, p in zip(stamps, odometry, strict=True)],
+                 global_poses, positions, closures, truth)
+
+
+DRIVE = drive()
+
+
+def feed(backend: PoseGraphBackend, event: Event) -> Answer:
+    if isinstance(event, OdometrySample):
+        return backend.add_odometry(event)
+    return backend.add_measurement(event, type(event).__name__)
+
+
+def in_order(*sources: Sequence[Event]) -> list[Event]:
+    return sorted((event for source in sources for event in source),
+                  key=lambda event: event.stamp_ns)
+
+
+def run(
+    events: Sequence[Event], update_every: int = 0, **arguments: object,
+) -> PoseGraphBackend:
+    backend = PoseGraphBackend(**arguments)
+    for k, event in enumerate(events, 1):
+        feed(backend, event)
+        if update_every > 0 and k % update_every == 0:
+            assert backend.update().status is not Status.FAILED
+    backend.optimize()
+    return backend
+
+
+def path(backend: PoseGraphBackend) -> FloatArray:
+    estimate = backend.estimate()
+    assert estimate is not None
+    return estimate.path.poses
+
+
+def assert_same_path(backend: PoseGraphBackend, expected: FloatArray) -> None:
+    poses = path(backend)
+    np.testing.assert_allclose(poses[:, :2], expected[:, :2], atol=SAME_PATH)
+    np.testing.assert_allclose(se2.wrap(poses[:, 2] - expected[:, 2]), 0.0, atol=SAME_PATH)
+
+
+ALL = in_order(DRIVE.odometry, DRIVE.global_poses, DRIVE.positions, DRIVE.closures)
+REFERENCE = run(ALL)
+REFERENCE_PATH = path(REFERENCE)
+
+
+# --- Hidden nodes ----------------------------------------------------------------------------
+
+def test_hidden_nodes_come_from_odometry_alone() -> None:
+    odometry_alone = run(DRIVE.odometry)
+    assert odometry_alone.graph.n_nodes == REFERENCE.graph.n_nodes
+    np.testing.assert_array_equal(odometry_alone.node_stamps_ns, REFERENCE.node_stamps_ns)
+    # 70 m with a node a metre (two samples; with 5 cm of noise now and then three)
+    assert 50 <= REFERENCE.graph.n_nodes <= 71
+
+
+def test_a_robot_that_stands_still_makes_nodes_by_the_heartbeat_alone() -> None:
+    config = BackendConfig(nodes=NodePolicy(heartbeat=10.0))
+    backend = PoseGraphBackend(config)
+    for k in range(501):     # 100 s
+        backend.add_odometry(OdometrySample(SECOND + k * SECOND // 5, np.zeros(3)))
+    assert backend.graph.n_nodes == 11
+
+
+def test_a_quick_robot_makes_no_more_nodes_than_the_interval_allows() -> None:
+    backend = PoseGraphBackend(BackendConfig(nodes=NodePolicy(minimum_interval=1.0)))
+    for k in range(101):     # 10 s at 20 m/s
+        backend.add_odometry(OdometrySample(SECOND + k * SECOND // 10, np.array([2.0 * k, 0, 0])))
+    assert backend.graph.n_nodes == 11
+
+
+# --- Order of arrival ------------------------------------------------------------------------
+
+@settings(max_examples=15)
+@given(st.data())
+def test_any_interleaving_of_the_topics_gives_the_same_path(data: st.DataObject) -> None:
+    sources: list[list[Event]] = [
+        list(DRIVE.odometry), list(DRIVE.global_poses), list(DRIVE.positions),
+        list(DRIVE.closures)]
+    whose = [k for k, source in enumerate(sources) for _ in source]
+    order = data.draw(st.permutations(whose))
+    iterators = [iter(source) for source in sources]
+    events = [next(iterators[k]) for k in order]
+    assert_same_path(run(events, data.draw(st.sampled_from((0, 11, 40)))), REFERENCE_PATH)
+
+
+@settings(max_examples=15)
+@given(st.randoms(use_true_random=False), st.integers(0, 141), st.sampled_from((0, 7, 50)))
+def test_shuffled_measurements_give_the_same_path(
+    random: object, known: int, update_every: int,
+) -> None:
+    measurements = [*DRIVE.global_poses, *DRIVE.positions, *DRIVE.closures]
+    random.shuffle(measurements)
+    half = len(measurements) // 2
+    events = [*measurements[:half], *DRIVE.odometry[:known], *measurements[half:],
+              *DRIVE.odometry[known:]]
+    assert_same_path(run(events, update_every), REFERENCE_PATH)
+
+
+@settings(max_examples=10)
+@given(st.randoms(use_true_random=False), st.sampled_from((0, 1, 9)))
+def test_with_positions_alone_any_order_gives_the_same_path(
+    random: object, update_every: int,
+) -> None:
+    expected = path(run(in_order(DRIVE.odometry, DRIVE.positions, DRIVE.closures)))
+    measurements = [*DRIVE.positions, *DRIVE.closures]
+    random.shuffle(measurements)
+    events: list[Event] = list(DRIVE.odometry)
+    for measurement in measurements:
+        events.insert(random.randrange(len(events) + 1), measurement)
+    odometry = iter(DRIVE.odometry)     # in its own order again
+    events = [next(odometry) if isinstance(event, OdometrySample) else event for event in events]
+    assert_same_path(run(events, update_every), expected)
+
+
+def test_updates_on_the_way_do_not_change_the_result() -> None:
+    for update_every in (1, 13):
+        assert_same_path(run(ALL, update_every), REFERENCE_PATH)
+
+
+def test_late_measurements_change_the_past() -> None:
+    backend = run(DRIVE.odometry)
+    drifted = path(backend).copy()
+    for measurement in reversed(in_order(DRIVE.positions, DRIVE.global_poses, DRIVE.closures)):
+        assert feed(backend, measurement).verdict is Verdict.ACCEPTED
+    backend.optimize()
+    assert not np.allclose(path(backend)[:10], drifted[:10], atol=1.0)
+    assert_same_path(backend, REFERENCE_PATH)
+
+
+def test_the_path_is_near_the_truth_and_exact_without_noise() -> None:
+    stamps = [sample.stamp_ns for sample in DRIVE.odometry]
+    at = np.searchsorted(stamps, REFERENCE.estimate().path.stamps_ns)
+    error = REFERENCE_PATH - DRIVE.truth[at]
+    assert np.sqrt(np.mean(np.sum(error[:, :2]**2, axis=1))) < 0.5     # [m], a fix has 0.7
+    exact = drive(noise=0.0)
+    backend = run(in_order(exact.odometry, exact.global_poses, exact.positions, exact.closures))
+    at = np.searchsorted(stamps, backend.estimate().path.stamps_ns)
+    # interpolating straight between samples of a curve costs 0.4 mm
+    np.testing.assert_allclose(path(backend), exact.truth[at], atol=2e-3)
+    assert backend.estimate().chi2 < 1e-3
+
+
+# --- Answers ---------------------------------------------------------------------------------
+
+def test_a_measurement_is_pending_until_odometry_reaches_its_stamp() -> None:
+    backend = PoseGraphBackend()
+    for sample in DRIVE.odometry[:50]:
+        backend.add_odometry(sample)
+    late = next(p for p in DRIVE.positions if p.stamp_ns > DRIVE.odometry[50].stamp_ns)
+    answer = feed(backend, late)
+    assert answer.verdict is Verdict.PENDING
+    assert backend.n_pending == 1
+    assert backend.counts['Position', 'accepted'] == 0
+    assert backend.update().new_constraints == 0
+    for sample in DRIVE.odometry[50:]:
+        before = backend.n_pending
+        backend.add_odometry(sample)
+        if before == 1 and backend.n_pending == 0:
+            assert sample.stamp_ns >= late.stamp_ns
+    assert backend.n_pending == 0
+    assert backend.counts['Position', 'accepted'] == 1
+
+
+def test_a_loop_closure_waits_for_the_later_of_its_two_stamps() -> None:
+    backend = PoseGraphBackend()
+    for sample in DRIVE.odometry[:50]:
+        backend.add_odometry(sample)
+    early, late = DRIVE.odometry[10].stamp_ns, DRIVE.odometry[60].stamp_ns
+    assert backend.add_measurement(
+        LoopClosure(early, np.zeros(3), np.eye(3), reference_ns=late), 'scan',
+    ).verdict is Verdict.PENDING
+    for sample in DRIVE.odometry[50:61]:
+        backend.add_odometry(sample)
+    assert backend.counts['scan', 'accepted'] == 1
+
+
+def test_measurements_before_any_odometry_wait() -> None:
+    backend = PoseGraphBackend()
+    assert backend.estimate() is None
+    assert backend.update().status is Status.CONVERGED
+    assert backend.optimize().status is Status.CONVERGED
+    for measurement in (*DRIVE.positions, *DRIVE.closures):
+        assert feed(backend, measurement).verdict is Verdict.PENDING
+
+
+@pytest.mark.parametrize(('sample', 'reason'), [
+    (OdometrySample(0, np.zeros(3)), 'zero_stamp'),
+    (OdometrySample(DRIVE.odometry[-1].stamp_ns, np.zeros(3)), 'duplicate_stamp'),
+    (OdometrySample(DRIVE.odometry[3].stamp_ns, np.zeros(3)), 'out_of_order'),
+    (OdometrySample(100 * SECOND, np.array([0.0, np.nan, 0.0])), 'not_finite'),
+    (OdometrySample(100 * SECOND, np.array([0.0, 0.0, np.inf])), 'not_finite'),
+    (OdometrySample(100 * SECOND, np.array([1e200, 0.0, 0.0])), 'too_large'),
+])
+def test_bad_odometry_is_rejected_and_counted(sample: OdometrySample, reason: str) -> None:
+    backend = run(DRIVE.odometry)
+    before = snapshot(backend.graph)
+    answer = backend.add_odometry(sample)
+    assert answer.verdict is Verdict.REJECTED
+    assert answer.reason == reason
+    assert answer.detail != ''
+    assert backend.counts['odom', reason] == 1
+    assert backend.counts['odom', 'accepted'] == len(DRIVE.odometry)
+    assert snapshot(backend.graph) == before
+
+
+GOOD = 20 * SECOND
+BAD_MEASUREMENTS = [
+    (GlobalPose(0, np.zeros(3), np.eye(3)), 'zero_stamp'),
+    (GlobalPose(-5, np.zeros(3), np.eye(3)), 'zero_stamp'),
+    (GlobalPose(GOOD, np.array([np.nan, 0.0, 0.0]), np.eye(3)), 'not_finite'),
+    (GlobalPose(GOOD, np.zeros(3), np.diag([-1.0, 1.0, 1.0])), 'covariance_not_positive'),
+    (GlobalPose(SECOND, np.zeros(3), np.eye(3)), 'before_odometry'),
+    (Position(GOOD, np.array([0.0, np.inf]), np.eye(2), np.zeros(2)), 'not_finite'),
+    (Position(GOOD, np.array([1e200, 0.0]), np.eye(2), np.zeros(2)), 'too_large'),
+    (LoopClosure(GOOD, np.array([0.0, -1e200, 0.0]), np.eye(3), reference_node=0), 'too_large'),
+    (Position(GOOD, np.zeros(2), np.full((2, 2), np.nan), np.zeros(2)), 'covariance_not_finite'),
+    (Position(GOOD, np.zeros(2), np.diag([1e-300, 1e-300]), np.zeros(2)), None),
+    (LoopClosure(GOOD, np.zeros(3), np.zeros((3, 3)), reference_node=0),
+     'covariance_not_positive'),
+    (LoopClosure(GOOD, np.zeros(3), np.eye(3), reference_ns=GOOD + 1), 'same_node'),
+    (LoopClosure(GOOD, np.zeros(3), np.eye(3), reference_ns=GOOD), 'same_node'),
+    (LoopClosure(GOOD, np.zeros(3), np.eye(3), reference_ns=SECOND), 'before_odometry'),
+    (LoopClosure(SECOND, np.zeros(3), np.eye(3), reference_ns=GOOD), 'before_odometry'),
+    (LoopClosure(GOOD, np.zeros(3), np.eye(3), reference_node=10_000), 'unknown_node'),
+    (LoopClosure(GOOD, np.zeros(3), np.eye(3), reference_node=-2), 'unknown_node'),
+    (LoopClosure(GOOD, np.zeros(3), np.eye(3)), 'unknown_node'),
+]
+
+
+@pytest.mark.parametrize(('measurement', 'reason'), BAD_MEASUREMENTS)
+def test_bad_measurements_are_rejected_and_counted(
+    measurement: Measurement, reason: str | None,
+) -> None:
+    backend = run(DRIVE.odometry)
+    before = snapshot(backend.graph)
+    answer = backend.add_measurement(measurement, 'source')
+    if reason is None:
+        assert answer.verdict is Verdict.ACCEPTED
+        return
+    assert answer.verdict is Verdict.REJECTED
+    assert answer.reason == reason
+    assert answer.detail != ''
+    assert backend.counts['source', reason] == 1
+    assert backend.update().new_constraints == 0
+    assert snapshot(backend.graph) == before
+
+
+def test_duplicates_are_counted_once_for_each_source() -> None:
+    backend = run(ALL)
+    n_observed = len(backend.graph.observed)
+    for measurement in (*DRIVE.positions, *DRIVE.global_poses, *DRIVE.closures):
+        assert feed(backend, measurement).reason == 'duplicate_stamp'
+    assert backend.counts['Position', 'duplicate_stamp'] == len(DRIVE.positions)
+    assert backend.add_measurement(DRIVE.positions[0], 'other').verdict is Verdict.ACCEPTED
+    backend.optimize()
+    assert len(backend.graph.observed) == n_observed + 1
+
+
+def test_two_loop_closures_at_one_stamp_with_different_references_are_both_taken() -> None:
+    backend = run(DRIVE.odometry)
+    for node in (0, 3):
+        assert backend.add_measurement(
+            LoopClosure(GOOD, np.zeros(3), np.eye(3), reference_node=node), 'scan',
+        ).verdict is Verdict.ACCEPTED
+
+
+@pytest.mark.parametrize('measurement', [
+    GlobalPose(GOOD, np.array([5.0, 6.0, 1.0]), np.zeros((3, 3))),
+    Position(GOOD, np.array([5.0, 6.0]), np.zeros((2, 2)), np.zeros(2))])
+def test_a_covariance_of_zeros_means_unknown(measurement: Measurement) -> None:
+    backend = run(DRIVE.odometry)
+    assert backend.add_measurement(measurement, 'fix').verdict is Verdict.ACCEPTED
+    assert backend.counts['fix', 'default_covariance'] == 1
+    backend.update()
+    # a position, 5 m uncertain: not a word about the heading
+    assert backend.estimate().alignment is AlignmentState.UNALIGNED
+    assert backend.estimate().covariance[0, 0] >= 25.0
+
+
+# --- Alignment -------------------------------------------------------------------------------
+
+def test_without_anything_in_the_map_the_map_is_the_odometry_frame() -> None:
+    estimate = run(DRIVE.odometry).estimate()
+    assert estimate.alignment is AlignmentState.LOCAL
+    assert np.isinf(estimate.alignment_sigma)
+    np.testing.assert_allclose(estimate.T_map_odom, 0.0, atol=1e-12)
+    np.testing.assert_allclose(estimate.T_map_base, DRIVE.odometry[-1].pose, atol=1e-12)
+
+
+def test_positions_align_once_they_tell_the_angle_and_the_estimate_says_so() -> None:
+    backend, states = PoseGraphBackend(), []
+    positions_sigma = np.sqrt(DRIVE.positions[0].covariance[0, 0])
+    for event in in_order(DRIVE.odometry, DRIVE.positions):
+        feed(backend, event)
+        assert backend.update().status is not Status.FAILED
+        estimate = backend.estimate()
+        states.append(estimate.alignment)
+        if estimate.alignment is AlignmentState.UNALIGNED:
+            assert estimate.covariance[2, 2] == UNKNOWN_HEADING_VARIANCE
+            # it holds on to one position: no better than that is, nor than the way from there
+            assert estimate.covariance[0, 0] >= positions_sigma**2
+            nearest = min(np.hypot(*(estimate.T_map_base[:2] - item.position))
+                          for item in DRIVE.positions)
+            assert estimate.covariance[0, 0] >= 0.9 * nearest**2
+            assert estimate.n_observed == 0
+        if estimate.alignment is AlignmentState.ALIGNED:
+            assert estimate.covariance[2, 2] < 0.1
+            assert estimate.alignment_sigma <= BackendConfig().alignment.sigma_heading
+    kinds = list(AlignmentState)
+    order = [kinds.index(state) for state in states]
+    assert order == sorted(order)
+    assert {*states} == {*kinds}
+    backend.optimize()
+    # the angle of 122 degrees is found
+    at_start = se2.compose(path(backend)[0], se2.inverse(DRIVE.odometry[0].pose))
+    assert se2.wrap(at_start[2] - T_MAP_ODOM[2]) == pytest.approx(0.0, abs=0.1)
+    assert not np.any(backend.graph.fixed)
+
+
+def test_the_unaligned_estimate_passes_through_the_first_position() -> None:
+    backend = PoseGraphBackend()
+    for sample in DRIVE.odometry[:9]:
+        backend.add_odometry(sample)
+    first = DRIVE.positions[0]
+    assert first.stamp_ns < DRIVE.odometry[3].stamp_ns
+    feed(backend, first)
+    backend.update()
+    estimate = backend.estimate()
+    assert estimate.alignment is AlignmentState.UNALIGNED
+    there = se2.transform(estimate.path.at(first.stamp_ns), first.lever_arm)
+    # the path is straight from node to node, a metre apart, odometry is not
+    np.testing.assert_allclose(there, first.position, atol=0.05)
+    np.testing.assert_allclose(
+        se2.compose(estimate.T_map_odom, estimate.T_odom_base), estimate.T_map_base, atol=1e-12)
+
+
+def test_a_global_pose_aligns_at_once() -> None:
+    backend = PoseGraphBackend()
+    for event in in_order(DRIVE.odometry[:10], DRIVE.global_poses[:1]):
+        feed(backend, event)
+    report = backend.update()
+    assert report.status is Status.CONVERGED
+    assert report.new_constraints == 1
+    estimate = backend.estimate()
+    assert estimate.alignment is AlignmentState.ALIGNED
+    # one pose and odometry: they agree exactly
+    assert estimate.chi2 == pytest.approx(0.0, abs=1e-12)
+    np.testing.assert_allclose(estimate.T_map_base[:2], DRIVE.truth[9][:2], atol=2.0)
+
+
+def test_a_global_pose_without_a_heading_is_a_position() -> None:
+    backend = run(DRIVE.odometry)
+    pose = DRIVE.global_poses[0]
+    backend.add_measurement(
+        replace(pose, covariance=np.diag([0.1, 0.1, np.inf])), 'fix')
+    backend.update()
+    assert backend.estimate().alignment is AlignmentState.UNALIGNED
+
+
+# --- Failing solvers -------------------------------------------------------------------------
+
+class Flaky:
+    """A solver that spoils the poses and fails while `broken`."""
+
+    def __init__(self) -> None:
+        self.broken = False
+        self.calls = 0
+
+    def __call__(self, graph: Graph, config: SolverConfig) -> BatchResult:
+        self.calls += 1
+        if not self.broken:
+            return batch.optimize(graph, config)
+        graph.set_poses(graph.poses + 17.0)
+        return BatchResult(Status.FAILED, 'broken on purpose', 0, 1.0, 1.0, None,
+                           np.empty(0, dtype=np.int64))
+
+
+@pytest.mark.parametrize('known', [20, 100])
+def test_a_failing_solver_leaves_the_graph_bit_equal_and_recovers(known: int) -> None:
+    solve = Flaky()
+    backend = PoseGraphBackend(solve=solve)
+    for event in ALL[:known]:
+        feed(backend, event)
+    backend.update()
+    for event in ALL[known:known + 30]:
+        feed(backend, event)
+    before, estimate = snapshot(backend.graph), backend.estimate()
+    solve.broken = True
+    report = backend.update()
+    assert report.status is Status.FAILED
+    assert report.reason == 'broken on purpose'
+    assert report.new_constraints == 0
+    assert snapshot(backend.graph) == before
+    assert backend.n_quarantined > 0
+    assert backend.counts['solver', 'failed'] == 1
+    after = backend.estimate()
+    np.testing.assert_array_equal(after.path.poses, estimate.path.poses)
+    np.testing.assert_array_equal(after.covariance, estimate.covariance)
+    assert after.alignment is estimate.alignment
+    assert after.chi2 == estimate.chi2
+
+    solve.broken = False
+    for event in ALL[known + 30:]:
+        feed(backend, event)
+    assert backend.update().status is not Status.FAILED
+    assert backend.n_quarantined > 0     # not tried again by the timer ...
+    assert backend.optimize().status is Status.CONVERGED
+    assert backend.n_quarantined == 0    # ... but at the end
+    assert_same_path(backend, REFERENCE_PATH)
+
+
+def test_an_alignment_whose_solve_fails_is_undone() -> None:
+    solve = Flaky()
+    backend = PoseGraphBackend(solve=solve)
+    events = in_order(DRIVE.odometry, DRIVE.positions)
+    for event in events[:6]:
+        feed(backend, event)
+    backend.update()
+    assert backend.estimate().alignment is AlignmentState.UNALIGNED
+    for event in events[6:]:
+        feed(backend, event)
+    before, estimate = snapshot(backend.graph), backend.estimate()
+    solve.broken = True
+    assert backend.update().status is Status.FAILED
+    assert snapshot(backend.graph) == before
+    # still where the first position says, and no more certain than before
+    np.testing.assert_array_equal(backend.estimate().path.poses, estimate.path.poses)
+    np.testing.assert_array_equal(backend.estimate().covariance, estimate.covariance)
+    solve.broken = False
+    assert backend.optimize().status is Status.CONVERGED
+    assert backend.estimate().alignment is AlignmentState.ALIGNED
+    assert_same_path(backend, path(run(events)))
+
+
+# --- The estimate ----------------------------------------------------------------------------
+
+def test_snapshots_do_not_change_afterwards() -> None:
+    backend = PoseGraphBackend()
+    for event in ALL[:80]:
+        feed(backend, event)
+    backend.update()
+    estimate = backend.estimate()
+    arrays = (estimate.path.poses, estimate.path.stamps_ns, estimate.T_odom_base,
+              estimate.T_map_base, estimate.T_map_odom, estimate.covariance)
+    before = [array.tobytes() for array in arrays]
+    for event in ALL[80:]:
+        feed(backend, event)
+    backend.optimize()
+    assert [array.tobytes() for array in arrays] == before
+    assert not np.array_equal(backend.estimate().path.poses[:20], estimate.path.poses[:20])
+
+
+def test_the_estimate_reaches_to_the_newest_odometry() -> None:
+    estimate = REFERENCE.estimate()
+    assert estimate.path.stamps_ns[-1] == DRIVE.odometry[-1].stamp_ns
+    np.testing.assert_array_equal(estimate.T_odom_base, DRIVE.odometry[-1].pose)
+    np.testing.assert_array_equal(estimate.path.poses[-1], estimate.T_map_base)
+    np.testing.assert_allclose(se2.compose(estimate.T_map_odom, estimate.T_odom_base),
+                               estimate.T_map_base, atol=1e-12)
+    assert estimate.n_hidden == REFERENCE.graph.n_nodes
+    assert estimate.n_edges == len(REFERENCE.graph.edges)
+    assert estimate.n_observed == len(DRIVE.positions) + len(DRIVE.global_poses)
+    assert estimate.chi2 == pytest.approx(REFERENCE.energies().chi2, rel=1e-9)
+
+
+def test_the_covariance_of_the_newest_node_is_the_block_of_the_dense_inverse() -> None:
+    # as many samples as end in a hidden node
+    backend = run(ALL)
+    last = int(np.searchsorted(
+        [sample.stamp_ns for sample in DRIVE.odometry], backend.node_stamps_ns[-1]))
+    events = [event for event in ALL if event.stamp_ns <= DRIVE.odometry[last].stamp_ns]
+    backend = run(events)
+    assert backend.estimate().path.stamps_ns[-1] == backend.node_stamps_ns[-1]
+    H, _ = free_part(backend.graph, *dense_system(backend.graph))
+    np.testing.assert_allclose(
+        backend.estimate().covariance, np.linalg.inv(H)[-3:, -3:], rtol=1e-6, atol=1e-12)
+
+
+def test_the_covariance_is_that_of_the_solved_system_where_steps_were_damped() -> None:
+    damped = SolverConfig(max_iterations=2, initial_damping=1.0)
+    backend = PoseGraphBackend(BackendConfig(online=damped))
+    for event in in_order(DRIVE.odometry[:10], DRIVE.global_poses[:1]):
+        feed(backend, event)
+    backend.update()
+    estimate = backend.estimate()
+    assert estimate.alignment is AlignmentState.ALIGNED
+    # no more certain than the one pose that holds everything
+    assert np.trace(estimate.covariance[:2, :2]) > 0.9 * np.trace(
+        DRIVE.global_poses[0].covariance[:2, :2])
+
+
+def test_too_many_waiting_measurements_are_rejected(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr('pose_graph_ros.core.backend.MAX_PENDING', 3)
+    backend = PoseGraphBackend()
+    answers = [feed(backend, position) for position in DRIVE.positions[:5]]
+    assert [answer.verdict for answer in answers] == [Verdict.PENDING] * 3 + [Verdict.REJECTED] * 2
+    assert backend.counts['Position', 'too_many_pending'] == 2
+    # what was turned away may come again when there is room
+    for sample in DRIVE.odometry:
+        backend.add_odometry(sample)
+    assert feed(backend, DRIVE.positions[4]).verdict is Verdict.ACCEPTED
+    np.testing.assert_array_equal(backend.odometry.poses, [s.pose for s in DRIVE.odometry])
+
+
+def test_the_covariance_grows_along_odometry_and_shrinks_with_a_measurement() -> None:
+    backend, traces = PoseGraphBackend(), []
+    for sample in DRIVE.odometry[:60]:
+        backend.add_odometry(sample)
+        traces.append(np.trace(backend.estimate().covariance[:2, :2]))
+    assert np.all(np.diff(traces) >= 0.0)
+    # the chain's own H gives the same: odometry that is propagated is odometry that is solved
+    backend.optimize()
+    H, _ = free_part(backend.graph, *dense_system(backend.graph))
+    noise = OdometryNoise()
+    assert traces[-1] == pytest.approx(
+        np.trace(np.linalg.inv(H)[-3:-1, -3:-1]), rel=0.1, abs=2.0 * noise.sigma_distance**2)
+    backend.add_measurement(LoopClosure(
+        DRIVE.odometry[59].stamp_ns, np.zeros(3), 1e-4 * np.eye(3), reference_node=0), 'scan')
+    backend.optimize()
+    assert np.trace(backend.estimate().covariance[:2, :2]) < 0.1 * traces[-1]
+
+
+# --- Any numbers at all ----------------------------------------------------------------------
+
+numbers = st.one_of(
+    st.floats(), st.sampled_from((0.0, 1e-300, 1e-160, 1e-9, 1.0, 1e9, 1e15, 1e160, 1e308)))
+triples = st.lists(numbers, min_size=3, max_size=3).map(np.array)
+signs = st.sampled_from((-1.0, 0.0, 0.5, 0.999999, 1.0))
+
+
+@st.composite
+def covariances(draw: st.DrawFn) -> FloatArray:
+    """Return matrices of which many are covariances, some of them extreme."""
+    deviation = np.abs(draw(triples))
+    correlation = np.eye(3)
+    for i, j in ((0, 1), (0, 2), (1, 2)):
+        correlation[i, j] = correlation[j, i] = draw(signs)
+    with np.errstate(all='ignore'):
+        return correlation * deviation * deviation[:, None]
+
+
+@settings(max_examples=300)
+@given(st.lists(st.tuples(triples, covariances(), st.integers(0, 3), st.integers(0, 40)),
+                min_size=1, max_size=4))
+def test_no_numbers_bring_the_backend_down(
+    events: list[tuple[FloatArray, FloatArray, int, int]],
+) -> None:
+    backend = PoseGraphBackend()
+    for sample in DRIVE.odometry[:20]:
+        backend.add_odometry(sample)
+    with np.errstate(all='ignore'):
+        for k, (value, covariance, kind, late) in enumerate(events):
+            stamp = DRIVE.odometry[10].stamp_ns + late * SECOND // 10
+            if kind == 0:
+                backend.add_odometry(OdometrySample(stamp, value))
+            elif kind == 1:
+                backend.add_measurement(GlobalPose(stamp, value, covariance), f'{k}')
+            elif kind == 2:
+                backend.add_measurement(
+                    Position(stamp, value[:2], covariance[:2, :2], np.zeros(2)), f'{k}')
+            else:
+                backend.add_measurement(
+                    LoopClosure(stamp, value, covariance, reference_node=0), f'{k}')
+            backend.update()
+        report = backend.optimize()
+    estimate = backend.estimate()
+    assert isinstance(report.status, Status)
+    assert np.all(np.isfinite(estimate.path.poses))
+    assert np.all(np.isfinite(estimate.covariance))
+
+
+# --- What users ran into ---------------------------------------------------------------------
+
+@pytest.mark.parametrize('drift', [-2.0, -1.0, 0.5, 1.0, 2.0])
+def test_a_heading_that_drifts_far_in_a_long_outage_is_wound_the_right_way(drift: float) -> None:
+    rng = np.random.default_rng(5)
+    period, n = 0.5, 900
+    turn = 0.05 * np.sin(np.arange(n) * period / 15.0) * period
+    truth = [np.zeros(3)]
+    odometry = [np.array([7.0, -2.0, 2.1])]
+    outage = range(200, 700)
+    for k in range(1, n):
+        step = np.array([5.0 * period, 0.0, turn[k]])
+        truth.append(se2.compose(truth[-1], step))
+        wrong = step + rng.normal(0.0, [0.05, 0.03, 0.01]) * np.sqrt(5.0 * period)
+        wrong[2] += drift / len(outage) if k in outage else 0.0
+        odometry.append(se2.compose(odometry[-1], wrong))
+
+    backend = PoseGraphBackend()
+    for k in range(n):
+        stamp = round((1.0 + k * period) * 1e9)
+        backend.add_odometry(OdometrySample(stamp, odometry[k]))
+        if k not in outage and k % 2 == 0:
+            backend.add_measurement(Position(
+                stamp, truth[k][:2] + rng.normal(0.0, 1.5, 2), 2.25 * np.eye(2), np.zeros(2)),
+                'fix')
+        backend.update()
+    assert backend.optimize().status is Status.CONVERGED
+    found = backend.energies().chi2
+
+    graph = backend.graph
+    stamps = backend.node_stamps_ns
+    graph.set_poses(np.array([truth[round((s * 1e-9 - 1.0) / period)] for s in stamps.tolist()]))
+    from_truth = batch.optimize(graph, BackendConfig().closing)
+    assert found <= from_truth.chi2 * (1.0 + 1e-9)
+
+
+def test_a_solve_that_raises_is_undone_and_set_aside() -> None:
+    calls = []
+
+    def solve(*arguments: object) -> object:
+        calls.append(1)
+        if len(calls) == 1:
+            raise ValueError('out of order')
+        return batch.optimize(*arguments)
+
+    backend = PoseGraphBackend(solve=solve)
+    for event in in_order(DRIVE.odometry, DRIVE.global_poses):
+        feed(backend, event)
+    before = backend.graph.poses.copy()
+    report = backend.update()
+    assert (report.status, report.reason) == (Status.FAILED, 'ValueError: out of order')
+    assert np.array_equal(backend.graph.poses, before)
+    assert len(backend.graph.observed) == 0
+    assert backend.estimate().alignment is not AlignmentState.ALIGNED
+    assert backend.n_quarantined == len(DRIVE.global_poses)
+    assert backend.optimize().status is Status.CONVERGED
+    assert len(backend.graph.observed) == len(DRIVE.global_poses)
+
+
+def test_a_loop_closure_that_came_too_early_can_be_sent_again() -> None:
+    backend = run(DRIVE.odometry[:60])
+    node = backend.graph.n_nodes + 5
+    closure = LoopClosure(DRIVE.odometry[30].stamp_ns, np.zeros(3), np.eye(3),
+                          reference_node=node)
+    assert backend.add_measurement(closure, 'loop').reason == 'unknown_node'
+    for sample in DRIVE.odometry[60:]:
+        backend.add_odometry(sample)
+    assert backend.graph.n_nodes > node
+    assert backend.add_measurement(closure, 'loop').verdict is Verdict.ACCEPTED
+    assert backend.add_measurement(closure, 'loop').reason == 'duplicate_stamp'
+
+
+def test_one_poor_position_does_not_delay_the_alignment() -> None:
+    def updates(poor: bool) -> int:
+        backend = PoseGraphBackend()
+        for k, event in enumerate(in_order(DRIVE.odometry, DRIVE.positions)):
+            if poor and isinstance(event, Position):
+                poor = False
+                feed(backend, replace(event, covariance=1e4 * np.eye(2)))
+            else:
+                feed(backend, event)
+            backend.update()
+            if backend.estimate().alignment is AlignmentState.ALIGNED:
+                return k
+        raise AssertionError('never aligned')
+
+    assert updates(poor=True) <= updates(poor=False) + 20

@@ -1,0 +1,325 @@
+# Copyright 2026 The pose_graph_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""The batch optimisation against other solvers, stored optima and the meaning of its result."""
+
+import hashlib
+import json
+import os
+from pathlib import Path
+
+import numpy as np
+import pytest
+from random_graphs import (
+    consistent_graph,
+    dense_system,
+    free_part,
+    random_edges,
+    random_graph,
+    random_observed,
+    random_poses,
+    slow_edge,
+    slow_observed,
+    snapshot,
+)
+from scipy.optimize import least_squares
+
+from pose_graph_ros.core import batch, initialization, se2
+from pose_graph_ros.core.batch import Status
+from pose_graph_ros.core.config import SolverConfig
+from pose_graph_ros.core.constraints import EdgeKind, Edges, ObservedKind, ObservedNodes
+from pose_graph_ros.core.graph import Graph, GraphUpdate
+from pose_graph_ros.core.io.g2o import read_g2o
+from pose_graph_ros.core.se2 import FloatArray
+
+# chi2 is flat at its minimum: steps of 1e-8 leave a relative error of some 1e-15.
+SAME_CHI2 = 1e-9
+# A numeric Jacobian stops the other solver some 1e-8 before the minimum.
+SAME_POSES = 1e-6
+# What steps below the tolerance leave of a gradient of some 1e4.
+STATIONARY = 1e-6
+
+DATA = Path(__file__).parents[1] / 'data'
+GOLDEN = {name: entry for name, entry in
+          json.loads((DATA / 'golden.json').read_text(encoding='ascii')).items()
+          if name != 'about'}
+
+PUBLIC = Path(os.environ.get(
+    'POSE_GRAPH_DATA', Path(__file__).parents[3] / 'shared' / 'data' / 'graphs'))
+# Optima of public graphs, as the literature and other solvers have them; relative error 1e-5.
+PUBLIC_OPTIMA = {
+    'ring.g2o': (11.163, None),
+    'input_M3500_g2o.g2o': (137.912951, None),
+    'intel_vertigo.g2o': (546.461112, None),
+    'CSAIL_P_toro.graph': (38.956286, 'toro'),
+    'M3500a.g2o': (912.115, 'toro'),
+    'city10000.g2o': (511.985164, None),
+}
+NEEDS_CHORDAL_START = {'M3500a.g2o'}
+
+THOROUGH = SolverConfig(max_iterations=200, step_tolerance=1e-10)
+
+
+def gradient(graph: Graph) -> FloatArray:
+    return free_part(graph, *dense_system(graph))[1]
+
+
+def other_solver(graph: Graph) -> tuple[float, FloatArray]:
+    """Return chi2 and the poses of scipy's optimum, from the graph's own start."""
+    edges, observed, free = graph.edges, graph.observed, ~graph.fixed
+    roots = [np.linalg.cholesky(w).T for w in edges.information]
+    values, vectors = np.linalg.eigh(observed.information)
+    unary_roots = np.sqrt(np.maximum(values, 0.0))[:, :, None] * np.swapaxes(vectors, 1, 2)
+
+    def moved(x: FloatArray) -> FloatArray:
+        poses = graph.poses.copy()
+        poses[free] = x.reshape(-1, 3)
+        return poses
+
+    def errors(x: FloatArray) -> FloatArray:
+        poses = moved(x)
+        whitened = [
+            root @ slow_edge(poses[i], poses[j], z)[0]
+            for root, i, j, z in zip(roots, edges.i, edges.j, edges.mean, strict=True)]
+        whitened += [
+            root @ slow_observed(poses[i], offset, z)[0]
+            for root, i, offset, z in zip(
+                unary_roots, observed.node, observed.offset, observed.mean, strict=True)]
+        return np.concatenate(whitened)
+
+    result = least_squares(errors, graph.poses[free].ravel(), xtol=1e-15, ftol=1e-15, gtol=1e-15)
+    return float(2.0 * result.cost), se2.wrapped(moved(result.x))
+
+
+@pytest.mark.parametrize('seed', range(6))
+def test_the_optimum_is_that_of_scipy(seed: int) -> None:
+    graph = consistent_graph(seed, noise=0.05)
+    rng = np.random.default_rng(seed)
+    at = [1, 4, 6]
+    observed = random_observed(rng, at)
+    mean = se2.compose(graph.poses[at], observed.offset) + 0.1 * rng.standard_normal((3, 3))
+    mean[0, 2] = 0.0     # a position
+    graph.apply(GraphUpdate(observed=ObservedNodes(
+        observed.node, observed.offset, mean, observed.information, observed.kind)))
+    chi2, poses = other_solver(graph)
+    result = batch.optimize(graph, SolverConfig())
+    assert result.status is Status.CONVERGED
+    assert result.chi2 == pytest.approx(chi2, rel=SAME_CHI2)
+    difference = graph.poses - poses
+    np.testing.assert_allclose(difference[:, :2], 0.0, atol=SAME_POSES)
+    np.testing.assert_allclose(se2.wrap(difference[:, 2]), 0.0, atol=SAME_POSES)
+
+
+@pytest.mark.parametrize('seed', range(20))
+def test_a_converged_result_is_stationary_and_says_what_was_done(seed: int) -> None:
+    graph = consistent_graph(seed, noise=0.2)
+    chi2_before = graph.energies().chi2
+    result = batch.optimize(graph, THOROUGH)
+    assert result.status is Status.CONVERGED
+    assert result.reason == ''
+    assert result.iterations > 1
+    assert result.chi2_before == chi2_before
+    assert result.chi2 == pytest.approx(graph.energies().chi2, rel=SAME_CHI2)
+    np.testing.assert_allclose(gradient(graph), 0.0, atol=STATIONARY)
+    np.testing.assert_array_equal(result.free_nodes, np.arange(1, graph.n_nodes))
+    assert result.factorization is not None
+    H, _ = free_part(graph, *dense_system(graph))
+    np.testing.assert_allclose(
+        result.factorization.covariance(2), np.linalg.inv(H)[6:9, 6:9], rtol=1e-5, atol=1e-9)
+
+
+def test_damped_steps_leave_the_factorization_of_the_undamped_system() -> None:
+    graph = consistent_graph(seed=1, noise=0.2)
+    result = batch.optimize(graph, SolverConfig(max_iterations=2, initial_damping=1.0))
+    assert result.status is Status.MAX_ITERATIONS
+    H, _ = free_part(graph, *dense_system(graph))
+    np.testing.assert_allclose(
+        result.factorization.covariance(2), np.linalg.inv(H)[6:9, 6:9], rtol=1e-9, atol=1e-12)
+
+
+@pytest.mark.parametrize('seed', range(10))
+def test_no_step_raises_chi2(seed: int) -> None:
+    graph = random_graph(seed, fix=(0,))
+    one_step = SolverConfig(max_iterations=1, step_tolerance=1e-10)
+    chi2 = graph.energies().chi2
+    for _ in range(30):
+        result = batch.optimize(graph, one_step)
+        assert result.status is not Status.FAILED
+        assert result.iterations <= 1
+        assert graph.energies().chi2 <= chi2 * (1.0 + batch.ROUNDING) + batch.ROUNDING
+        chi2 = graph.energies().chi2
+
+
+def test_it_gets_through_where_plain_gauss_newton_jumps_about() -> None:
+    graph = consistent_graph(seed=111, noise=0.8, n_nodes=12)
+    start = graph.checkpoint()
+    chi2_of_steps = []
+    for _ in range(50):     # plain Gauss-Newton with dense matrices
+        H, b = free_part(graph, *dense_system(graph))
+        step = -np.linalg.solve(H, b)
+        graph.set_poses(np.vstack((graph.poses[:1], graph.poses[1:] + step.reshape(-1, 3))))
+        chi2_of_steps.append(graph.energies().chi2)
+    assert np.max(np.abs(step)) > 1.0
+    graph.restore(start)
+    result = batch.optimize(graph, THOROUGH)
+    assert result.status is Status.CONVERGED
+    assert result.chi2 < min(chi2_of_steps[-10:])
+    np.testing.assert_allclose(gradient(graph), 0.0, atol=STATIONARY)
+
+
+def test_gauss_newton_converges_quadratically_at_zero_error() -> None:
+    graph = consistent_graph(seed=3)
+    truth = graph.poses.copy()
+    disturbed = truth + 0.05 * np.random.default_rng(3).standard_normal(truth.shape)
+    disturbed[0] = truth[0]
+    graph.set_poses(disturbed)
+    result = batch.optimize(graph, SolverConfig())
+    assert result.status is Status.CONVERGED
+    assert result.iterations <= 6
+    assert result.chi2 < 1e-20
+    np.testing.assert_allclose(graph.poses, truth, atol=1e-12)
+
+
+def chain_with_positions(rng: np.random.Generator) -> Graph:
+    truth = np.zeros((15, 3))
+    steps = np.column_stack((np.ones(14), np.zeros(14), rng.uniform(-0.3, 0.3, 14)))
+    for k, step in enumerate(steps):
+        truth[k + 1] = se2.compose(truth[k], step)
+    noisy = steps + 0.02 * rng.standard_normal(steps.shape)
+    at = np.arange(0, 15, 2)
+    mean = truth[at] + 0.1 * rng.standard_normal((len(at), 3))
+    mean[:, 2] = 0.0
+    graph = Graph()
+    graph.apply(GraphUpdate(
+        hidden=truth, edges=Edges(np.arange(14), np.arange(1, 15), noisy,
+                                  np.tile(np.diag([400.0, 900.0, 2500.0]), (14, 1, 1)),
+                                  [EdgeKind.ODOMETRY] * 14),
+        observed=ObservedNodes(at, None, mean, np.tile(np.diag([100.0, 80.0, 0.0]),
+                                                       (len(at), 1, 1)),
+                               [ObservedKind.POSITION] * len(at))))
+    return graph
+
+
+def test_the_result_does_not_depend_on_the_start() -> None:
+    rng = np.random.default_rng(5)
+    graph = chain_with_positions(rng)
+    truth, results = graph.poses.copy(), []
+    for _ in range(10):
+        graph.set_poses(truth + rng.uniform(-0.4, 0.4, truth.shape))
+        assert batch.optimize(graph, THOROUGH).status is Status.CONVERGED
+        results.append(graph.poses.copy())
+    for poses in results[1:]:
+        np.testing.assert_allclose(poses, results[0], atol=1e-9)
+
+
+def test_a_map_far_from_its_origin_converges_to_the_same_shape() -> None:
+    near = chain_with_positions(np.random.default_rng(6))
+    shift = np.array([691_000.0, 5_334_000.0, 0.0])     # as UTM has it
+    unary = near.observed
+    far = Graph()
+    far.apply(GraphUpdate(hidden=near.poses + shift, edges=near.edges, observed=ObservedNodes(
+        unary.node, unary.offset, unary.mean + shift, unary.information, unary.kind)))
+    for graph in (near, far):
+        assert batch.optimize(graph, SolverConfig()).status is Status.CONVERGED
+    # a double has steps of 1e-9 m there
+    np.testing.assert_allclose(far.poses - shift, near.poses, atol=1e-7)
+
+
+def test_fixed_nodes_keep_their_poses_bit_for_bit() -> None:
+    graph = random_graph(seed=7, fix=(0, 3))
+    before = graph.poses[[0, 3]].copy()
+    result = batch.optimize(graph, SolverConfig())
+    np.testing.assert_array_equal(graph.poses[[0, 3]], before)
+    np.testing.assert_array_equal(result.free_nodes, [1, 2, 4, 5, 6])
+
+
+def test_headings_leave_wrapped() -> None:
+    for seed in range(5):
+        graph = random_graph(seed, fix=(0,))
+        batch.optimize(graph, SolverConfig())
+        assert np.all((graph.poses[:, 2] >= -np.pi) & (graph.poses[:, 2] < np.pi))
+
+
+@pytest.mark.parametrize('n_nodes', [0, 1])
+def test_a_graph_without_unknowns_has_converged(n_nodes: int) -> None:
+    graph = Graph()
+    graph.apply(GraphUpdate(hidden=np.zeros((n_nodes, 3)), fix=range(n_nodes)))
+    result = batch.optimize(graph, SolverConfig())
+    assert result.status is Status.CONVERGED
+    assert result.iterations == 0
+    assert result.factorization is None
+
+
+def floating(rng: np.random.Generator) -> Graph:
+    return random_graph(int(rng.integers(100)), n_observed=0)
+
+
+def with_a_loose_part(rng: np.random.Generator) -> Graph:
+    graph = random_graph(1, fix=(0,))
+    graph.apply(GraphUpdate(hidden=random_poses(rng, 2), edges=random_edges(rng, [7], [8])))
+    return graph
+
+
+def without_any_heading(_: np.random.Generator) -> Graph:
+    graph = Graph()
+    graph.apply(GraphUpdate(hidden=np.zeros((1, 3)), observed=ObservedNodes(
+        [0], None, [[1.0, 2.0, 0.0]], [np.diag([1.0, 1.0, 0.0])], [ObservedKind.POSITION])))
+    return graph
+
+
+def beyond_all_numbers(_: np.random.Generator) -> Graph:
+    graph = random_graph(2, fix=(0,))
+    graph.apply(GraphUpdate(observed=ObservedNodes(
+        [3], None, [[1e200, 0.0, 0.0]], [np.eye(3)], [ObservedKind.GLOBAL_POSE])))
+    return graph
+
+
+@pytest.mark.parametrize(
+    'make', [floating, with_a_loose_part, without_any_heading, beyond_all_numbers])
+@pytest.mark.parametrize('damping', [0.0, 1.0])
+def test_a_failure_is_a_result_and_leaves_everything_as_it_was(make, damping: float) -> None:
+    graph = make(np.random.default_rng(8))
+    before = snapshot(graph)
+    with np.errstate(over='ignore', invalid='ignore'):
+        result = batch.optimize(graph, SolverConfig(initial_damping=damping))
+    assert result.status is Status.FAILED
+    assert result.reason != ''
+    assert result.iterations == 0
+    assert result.factorization is None
+    assert snapshot(graph) == before
+
+
+def test_being_stuck_where_an_angle_jumps_does_not_count_as_converged() -> None:
+    graph = consistent_graph(seed=8, noise=0.8, n_nodes=12)
+    result = batch.optimize(graph, THOROUGH)
+    assert np.max(np.abs(gradient(graph))) > 100.0     # one error is at pi
+    assert result.status is Status.STALLED
+
+
+# --- Stored optima ---------------------------------------------------------------------------
+
+@pytest.mark.parametrize('name', GOLDEN)
+@pytest.mark.parametrize('chordal', [False, True])
+def test_small_graphs_reach_their_stored_optima(name: str, *, chordal: bool) -> None:
+    path = DATA / name
+    assert hashlib.sha256(path.read_bytes()).hexdigest() == GOLDEN[name]['sha256']
+    graph = read_g2o(path).graph
+    if chordal:
+        graph.set_poses(initialization.chordal(graph))
+    result = batch.optimize(graph, SolverConfig())
+    assert result.status is Status.CONVERGED
+    assert result.chi2 == pytest.approx(GOLDEN[name]['chi2'], rel=SAME_CHI2)
+    np.testing.assert_allclose(gradient(graph), 0.0, atol=STATIONARY)
+
+
+@pytest.mark.parametrize('name', PUBLIC_OPTIMA)
+def test_public_graphs_reach_their_known_optima(name: str) -> None:
+    path = PUBLIC / name
+    if not path.is_file():
+        pytest.skip(f'{path} is not there; POSE_GRAPH_DATA may name the folder of {name}')
+    chi2, edge2_order = PUBLIC_OPTIMA[name]
+    graph = read_g2o(path, edge2_order).graph
+    if name in NEEDS_CHORDAL_START:
+        graph.set_poses(initialization.chordal(graph))
+    result = batch.optimize(graph, SolverConfig())
+    assert result.status is Status.CONVERGED
+    assert result.chi2 == pytest.approx(chi2, rel=1e-5)

@@ -1,0 +1,285 @@
+# Copyright 2026 The pose_graph_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""Measurements at their own stamps, bound to hidden nodes before: no bias, the right noise."""
+
+from hypothesis import given, strategies as st
+import numpy as np
+import pytest
+
+from pose_graph_ros.core import binding, linearize, se2
+from pose_graph_ros.core.binding import Anchor
+from pose_graph_ros.core.config import BackendConfig, OdometryNoise
+from pose_graph_ros.core.constraints import EdgeKind, Edges, ObservedKind, ObservedNodes
+from pose_graph_ros.core.measurements import (
+    Answer,
+    GlobalPose,
+    LoopClosure,
+    Measurement,
+    Position,
+    Verdict,
+)
+from pose_graph_ros.core.se2 import FloatArray
+from pose_graph_ros.core.timeline import OdometryTimeline
+
+SECOND = 1_000_000_000
+# Compositions of poses of some 50 m.
+ROUNDING = 1e-12
+# Sample covariances of 2e5 draws: 0.3 % one sigma; second-order terms of the noise: 1 %.
+N_SAMPLES = 200_000
+SAMPLING = 0.03
+
+CONFIG = BackendConfig()
+T_MAP_ODOM = np.array([30.0, -12.0, 2.1])
+# A curved drive, a hidden node every fourth sample.
+ODOMETRY = np.zeros((21, 3))
+for _k in range(20):
+    ODOMETRY[_k + 1] = se2.compose(ODOMETRY[_k], np.array([0.4, 0.02, 0.15]))
+STAMPS = SECOND + np.arange(21) * SECOND // 10
+NODE_STAMPS = STAMPS[::4]
+NODES = se2.compose(T_MAP_ODOM, ODOMETRY[::4])
+
+covered = st.integers(int(STAMPS[0]), int(STAMPS[-1]))
+
+
+def timeline() -> OdometryTimeline:
+    filled = OdometryTimeline()
+    for stamp, pose in zip(STAMPS.tolist(), ODOMETRY, strict=True):
+        filled.append(stamp, pose)
+    return filled
+
+
+TIMELINE = timeline()
+
+
+def anchored(stamp: int, config: BackendConfig = CONFIG) -> Anchor:
+    return binding.anchored(stamp, NODE_STAMPS, TIMELINE, config)
+
+
+def truth(stamp: int) -> FloatArray:
+    return se2.compose(T_MAP_ODOM, TIMELINE.pose(stamp))
+
+
+def covariance_of(constraint: Edges | ObservedNodes) -> FloatArray:
+    return np.linalg.inv(constraint.information[0])
+
+
+def assert_agree(sampled: FloatArray, expected: FloatArray) -> None:
+    scale = np.sqrt(np.outer(np.diagonal(expected), np.diagonal(expected)))
+    np.testing.assert_allclose(sampled / scale, expected / scale, atol=SAMPLING)
+
+
+# --- anchors ---------------------------------------------------------------------------------
+
+@given(covered)
+def test_a_stamp_is_seen_from_the_last_hidden_node_before_it(stamp: int) -> None:
+    anchor = anchored(stamp)
+    assert NODE_STAMPS[anchor.node] <= stamp
+    assert anchor.node == len(NODE_STAMPS) - 1 or stamp < NODE_STAMPS[anchor.node + 1]
+    np.testing.assert_allclose(
+        se2.compose(NODES[anchor.node], anchor.motion)[:2], truth(stamp)[:2], atol=ROUNDING)
+    assert np.min(np.linalg.eigvalsh(anchor.noise)) > -ROUNDING
+
+
+def test_at_a_hidden_node_there_is_no_motion_and_no_noise() -> None:
+    for node, stamp in enumerate(NODE_STAMPS.tolist()):
+        anchor = anchored(stamp)
+        assert anchor.node == node
+        np.testing.assert_array_equal(anchor.motion, 0.0)
+        np.testing.assert_array_equal(anchor.noise, 0.0)
+
+
+# --- no bias ---------------------------------------------------------------------------------
+
+@given(covered)
+def test_a_true_global_pose_has_no_error_at_the_true_nodes(stamp: int) -> None:
+    constraint = binding.global_pose_constraint(
+        GlobalPose(stamp, truth(stamp), np.eye(3)), anchored(stamp))
+    assert constraint.kind[0] == ObservedKind.GLOBAL_POSE
+    np.testing.assert_allclose(linearize.observed_errors(NODES, constraint), 0.0, atol=ROUNDING)
+
+
+@given(covered, st.floats(-2.0, 2.0), st.floats(-2.0, 2.0))
+def test_a_true_position_has_no_error_at_the_true_nodes(stamp: int, x: float, y: float) -> None:
+    lever_arm = np.array([x, y])
+    constraint = binding.position_constraint(
+        Position(stamp, se2.transform(truth(stamp), lever_arm), np.eye(2), lever_arm),
+        anchored(stamp))
+    assert constraint.kind[0] == ObservedKind.POSITION
+    error = linearize.observed_errors(NODES, constraint)
+    np.testing.assert_allclose(error[:, :2], 0.0, atol=ROUNDING)
+    np.testing.assert_allclose(
+        linearize.energies(error, constraint.information), 0.0, atol=ROUNDING)
+    np.testing.assert_array_equal(constraint.information[0, 2], 0.0)
+
+
+@given(covered, covered)
+def test_a_true_loop_closure_has_no_error_at_the_true_nodes(stamp: int, other: int) -> None:
+    z = se2.between(truth(other), truth(stamp))
+    constraint = binding.loop_closure_constraint(
+        LoopClosure(stamp, z, np.eye(3), reference_ns=other), anchored(other), anchored(stamp))
+    assert constraint.kind[0] == EdgeKind.LOOP_CLOSURE
+    np.testing.assert_allclose(linearize.edge_errors(NODES, constraint), 0.0, atol=ROUNDING)
+
+
+# --- the right noise -------------------------------------------------------------------------
+#
+# The nodes are at their true poses, odometry since then and the measurement are drawn, and the
+# errors of the constraints that they would make are compared with the covariance of the one
+# constraint that is made of the means.
+
+# Large enough to matter beside the measurement's, small enough for first order.
+NOISY = BackendConfig(odometry_noise=OdometryNoise(
+    sigma_distance=0.02, sigma_lateral=0.01, sigma_heading_distance=0.02,
+    sigma_heading_turn=0.02))
+STAMP, OTHER = int(STAMPS[7]) + SECOND // 40, int(STAMPS[14]) + SECOND // 30
+MAP_COVARIANCE = 1e-4 * np.array([[6.0, 1.5, 0.5], [1.5, 2.0, -0.3], [0.5, -0.3, 1.0]])
+
+
+def draws(covariance: FloatArray, rng: np.random.Generator) -> FloatArray:
+    return rng.multivariate_normal(np.zeros(len(covariance)), covariance, N_SAMPLES)
+
+
+def noisy_motions(anchor: Anchor, rng: np.random.Generator) -> FloatArray:
+    return se2.compose(np.tile(anchor.motion, (N_SAMPLES, 1)), draws(anchor.noise, rng))
+
+
+def tiled(array: FloatArray) -> FloatArray:
+    return np.tile(array, (N_SAMPLES, 1))
+
+
+def test_the_noise_of_a_global_pose_is_that_of_samples() -> None:
+    rng = np.random.default_rng(1)
+    anchor, pose = anchored(STAMP, NOISY), truth(STAMP)
+    measured = pose + draws(MAP_COVARIANCE, rng)
+    moved = se2.compose(tiled(NODES[anchor.node]), noisy_motions(anchor, rng))
+    errors = se2.between(measured, moved)     # (3.52) through the offset
+    constraint = binding.global_pose_constraint(
+        GlobalPose(STAMP, pose, MAP_COVARIANCE), anchor)
+    assert_agree(np.cov(errors.T), covariance_of(constraint))
+
+
+def test_the_noise_of_a_position_is_at_least_that_of_samples() -> None:
+    rng = np.random.default_rng(2)
+    lever_arm = np.array([1.5, -0.7])
+    anchor, where = anchored(STAMP, NOISY), se2.transform(truth(STAMP), lever_arm)
+    covariance = 0.2 * MAP_COVARIANCE[:2, :2]
+    measured = where + draws(covariance, rng)
+    moved = se2.compose(tiled(NODES[anchor.node]), noisy_motions(anchor, rng))
+    errors = se2.transform(moved, lever_arm) - measured     # in map axes
+    constraint = binding.position_constraint(
+        Position(STAMP, where, covariance, lever_arm), anchor)
+    claimed = np.linalg.inv(constraint.information[0, :2, :2])
+    sampled = np.cov(errors.T)
+    # no direction is claimed to be better than it is, and the worst is not overdone
+    ratios = np.linalg.eigvals(np.linalg.solve(claimed, sampled)).real
+    assert np.max(ratios) == pytest.approx(1.0, abs=SAMPLING)
+
+
+def test_the_noise_of_a_position_at_a_node_is_its_own() -> None:
+    constraint = binding.position_constraint(
+        Position(int(NODE_STAMPS[2]), np.zeros(2), MAP_COVARIANCE[:2, :2], np.zeros(2)),
+        anchored(int(NODE_STAMPS[2])))
+    np.testing.assert_allclose(
+        np.linalg.inv(constraint.information[0, :2, :2]), MAP_COVARIANCE[:2, :2], rtol=1e-9)
+
+
+@pytest.mark.parametrize(('stamp', 'other'), [(OTHER, STAMP), (STAMP, OTHER)])
+def test_the_noise_of_a_loop_closure_is_that_of_samples(stamp: int, other: int) -> None:
+    rng = np.random.default_rng(3)
+    anchor, reference = anchored(stamp, NOISY), anchored(other, NOISY)
+    z = se2.between(truth(other), truth(stamp))
+    measured = z + draws(MAP_COVARIANCE, rng)     # in the axes of the reference pose
+    mean = se2.compose(se2.compose(noisy_motions(reference, rng), measured),
+                       se2.inverse(noisy_motions(anchor, rng)))
+    between = se2.between(NODES[reference.node], NODES[anchor.node])
+    errors = se2.between(mean, tiled(between))     # (3.48)
+    constraint = binding.loop_closure_constraint(
+        LoopClosure(stamp, z, MAP_COVARIANCE, reference_ns=other), reference, anchor)
+    assert (constraint.i[0], constraint.j[0]) == (reference.node, anchor.node)
+    assert_agree(np.cov(errors.T), covariance_of(constraint))
+
+
+# --- bad covariances -------------------------------------------------------------------------
+
+NAN, INF, LARGEST = np.nan, np.inf, np.finfo(float).max     # 1.8e308 itself reads as inf
+GOOD = np.diag([0.04, 0.09, 0.01])
+UPPER = np.triu(np.full((3, 3), 0.01), 1)
+# Covariance, then what is said of a global pose, a position and a loop closure with it: the
+# reason of the rejection, None if it is taken, 'position' if that is what is left of it.
+VERDICTS = {
+    'good': (GOOD, None, None, None),
+    'zeros': (np.zeros((3, 3)), *3 * ('covariance_not_positive',)),
+    'nan': (np.full((3, 3), NAN), *3 * ('covariance_not_finite',)),
+    'inf': (np.diag([INF] * 3), *3 * ('covariance_not_finite',)),
+    'largest': (np.diag([LARGEST] * 3), *3 * ('covariance_too_large',)),
+    'minus_one': (np.diag([-1.0, 0.09, 0.01]), *3 * ('covariance_not_positive',)),
+    'asymmetric': (GOOD + UPPER, *3 * ('covariance_not_symmetric',)),
+    'not_definite': (GOOD + 0.1 * (UPPER + UPPER.T) / 0.01,
+                     *3 * ('covariance_not_positive_definite',)),
+    'heading_nan': (np.diag([0.04, 0.09, NAN]), 'position', None, 'covariance_not_finite'),
+    'heading_inf': (np.diag([0.04, 0.09, INF]), 'position', None, 'covariance_not_finite'),
+    'heading_largest': (np.diag([0.04, 0.09, LARGEST]), 'position', None, 'covariance_too_large'),
+    'heading_zero': (np.diag([0.04, 0.09, 0.0]), 'position', None, 'covariance_not_positive'),
+    'heading_minus_one': (
+        np.diag([0.04, 0.09, -1.0]), 'position', None, 'covariance_not_positive'),
+    'heading_flat': (np.diag([0.04, 0.09, np.pi**2 / 3.0]), 'position', None, None),
+    'tiny': (np.diag([1e-300, 1e-300, 1e-300]), None, None, None),
+}
+
+
+def measurements(covariance: FloatArray) -> tuple[Measurement, ...]:
+    return (GlobalPose(SECOND, np.array([1.0, 2.0, 3.0]), covariance),
+            Position(SECOND, np.array([1.0, 2.0]), covariance[:2, :2], np.zeros(2)),
+            LoopClosure(SECOND, np.array([1.0, 2.0, 3.0]), covariance, reference_node=0))
+
+
+@pytest.mark.parametrize('name', VERDICTS)
+def test_every_bad_covariance_gets_its_verdict(name: str) -> None:
+    covariance, *verdicts = VERDICTS[name]
+    with np.errstate(all='raise', under='ignore'):
+        answers = [binding.repaired(one, CONFIG) for one in measurements(covariance)]
+    for given_, answer, verdict in zip(measurements(covariance), answers, verdicts, strict=True):
+        if verdict is None:
+            assert type(answer) is type(given_)
+            assert np.min(np.diagonal(answer.covariance)[:2]) >= 0.99e-4     # 1 cm squared
+            assert np.all(np.linalg.eigvalsh(answer.covariance) > 0.0)
+        elif verdict == 'position':
+            assert isinstance(answer, Position)
+            np.testing.assert_array_equal(answer.position, [1.0, 2.0])
+            np.testing.assert_array_equal(answer.lever_arm, 0.0)
+            np.testing.assert_array_equal(answer.covariance, covariance[:2, :2])
+        else:
+            assert isinstance(answer, Answer)
+            assert answer.verdict is Verdict.REJECTED
+            assert answer.reason == verdict
+
+
+def test_values_and_stamps_are_looked_at_too() -> None:
+    bad = [GlobalPose(SECOND, np.array([0.0, 0.0, NAN]), GOOD),
+           Position(SECOND, np.array([INF, 0.0]), GOOD[:2, :2], np.zeros(2)),
+           LoopClosure(SECOND, np.array([0.0, -INF, 0.0]), GOOD, reference_node=0)]
+    assert [binding.repaired(one, CONFIG).reason for one in bad] == 3 * ['not_finite']
+    late = Position(0, np.zeros(2), GOOD[:2, :2], np.zeros(2))
+    assert binding.repaired(late, CONFIG).reason == 'zero_stamp'
+
+
+def test_a_lever_arm_that_is_no_number_is_refused() -> None:
+    bad = Position(SECOND, np.zeros(2), GOOD[:2, :2], np.array([NAN, 0.0]))
+    assert isinstance(binding.repaired(bad, CONFIG), Answer)
+
+
+def test_no_measurement_is_changed_in_place() -> None:
+    covariance = np.diag([1e-9, 1e-9, 1e-9])
+    before = covariance.copy()
+    for one in measurements(covariance):
+        binding.repaired(one, CONFIG)
+    np.testing.assert_array_equal(covariance, before)
+
+
+def test_an_unknown_covariance_leaves_a_position_with_the_default() -> None:
+    pose, position, _ = measurements(np.zeros((3, 3)))
+    for one in (pose, position):
+        left = binding.with_default_covariance(one, CONFIG)
+        np.testing.assert_array_equal(left.covariance, 25.0 * np.eye(2))
+        np.testing.assert_array_equal(left.position, [1.0, 2.0])
+        assert left.stamp_ns == SECOND

@@ -1,0 +1,72 @@
+# Copyright 2026 The pose_graph_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""Settings: defaults that pass, values that cannot be, and when a node is due."""
+
+from dataclasses import fields, FrozenInstanceError, replace
+
+import numpy as np
+import pytest
+
+from pose_graph_ros.core.config import (
+    AlignmentPolicy,
+    BackendConfig,
+    NodePolicy,
+    OdometryNoise,
+    SolverConfig,
+)
+from pose_graph_ros.core.exceptions import ConfigError
+
+NUMBERS = [(kind, item.name)
+           for kind in (NodePolicy, OdometryNoise, AlignmentPolicy, SolverConfig, BackendConfig)
+           for item in fields(kind) if isinstance(getattr(kind(), item.name), float)]
+MAY_BE_ZERO = {
+    'minimum_travel_distance', 'minimum_travel_heading', 'minimum_interval', 'sigma_distance',
+    'sigma_lateral', 'sigma_heading_distance', 'sigma_heading_turn', 'initial_damping',
+}
+
+
+@pytest.mark.parametrize(('kind', 'name'), NUMBERS)
+@pytest.mark.parametrize('value', [-1.0, np.nan, np.inf, -np.inf])
+def test_no_setting_is_negative_or_not_finite(kind: type, name: str, value: float) -> None:
+    with pytest.raises(ConfigError, match=f'{kind.__name__}.{name}: expected .* got {value}'):
+        replace(kind(), **{name: value})
+
+
+@pytest.mark.parametrize(('kind', 'name'), NUMBERS)
+def test_zero_is_taken_where_it_means_something(kind: type, name: str) -> None:
+    if name in MAY_BE_ZERO:
+        assert getattr(replace(kind(), **{name: 0.0}), name) == 0.0
+    else:
+        with pytest.raises(ConfigError, match=f'{name}: expected a positive number, got 0.0'):
+            replace(kind(), **{name: 0.0})
+
+
+@pytest.mark.parametrize('iterations', [0, -3])
+def test_there_is_at_least_one_iteration(iterations: int) -> None:
+    with pytest.raises(ConfigError, match=f'max_iterations: expected >= 1, got {iterations}'):
+        SolverConfig(max_iterations=iterations)
+
+
+def test_a_config_error_is_a_value_error_and_settings_are_frozen() -> None:
+    assert issubclass(ConfigError, ValueError)
+    with pytest.raises(FrozenInstanceError):
+        BackendConfig().default_position_sigma = 3.0
+
+
+@pytest.mark.parametrize(('distance', 'turned', 'elapsed', 'due'), [
+    (0.0, 0.0, 0.0, False),
+    (1.0, 0.0, 0.2, True),
+    (1.0, 0.0, 0.1, False),      # too soon
+    (0.9, 0.29, 1.9, False),     # too little
+    (0.0, 0.3, 0.2, True),
+    (0.1, 0.0, 2.0, True),       # slow, but moving
+    (0.0, 0.1, 2.0, True),
+    (0.04, 0.04, 9.9, False),    # odometry that jitters at rest
+    (0.0, 0.0, 10.0, True),      # the heartbeat
+])
+def test_a_node_is_due_after_enough_motion_or_time(
+    distance: float, turned: float, elapsed: float, *, due: bool,
+) -> None:
+    policy = NodePolicy(minimum_travel_distance=1.0, minimum_travel_heading=0.3,
+                        minimum_interval=0.2, moving_interval=2.0, heartbeat=10.0)
+    assert policy.due(distance, turned, elapsed) == due

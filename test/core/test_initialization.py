@@ -1,0 +1,143 @@
+# Copyright 2026 The pose_graph_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""The chordal start: exact without noise, in any gauge, whatever the poses were before."""
+
+from hypothesis import given, strategies as st
+import numpy as np
+import pytest
+from random_graphs import consistent_graph, random_observed, random_poses
+
+from pose_graph_ros.core import batch, initialization, se2
+from pose_graph_ros.core.config import SolverConfig
+from pose_graph_ros.core.constraints import ObservedKind, ObservedNodes
+from pose_graph_ros.core.exceptions import LinearSolveError
+from pose_graph_ros.core.graph import Graph, GraphUpdate
+from pose_graph_ros.core.se2 import FloatArray
+
+# Two linear problems with condition numbers of some 1e3.
+EXACT = 1e-11
+
+seeds = st.integers(0, 2**32 - 1)
+
+
+def assert_poses_equal(poses: FloatArray, expected: FloatArray) -> None:
+    np.testing.assert_allclose(poses[:, :2], expected[:, :2], atol=EXACT)
+    np.testing.assert_allclose(se2.wrap(poses[:, 2] - expected[:, 2]), 0.0, atol=EXACT)
+
+
+def scattered(graph: Graph, rng: np.random.Generator) -> None:
+    """Forget all poses but those of the fixed nodes."""
+    poses = random_poses(rng, graph.n_nodes, 100.0)
+    graph.set_poses(np.where(graph.fixed[:, None], graph.poses, poses))
+
+
+def observe_exactly(graph: Graph, nodes: list[int], rng: np.random.Generator) -> None:
+    """Add observed nodes with offsets that agree with the poses; the first is a position."""
+    observed = random_observed(rng, nodes)
+    mean = se2.compose(graph.poses[nodes], observed.offset)
+    mean[::3, 2] = 0.0
+    graph.apply(GraphUpdate(observed=ObservedNodes(
+        observed.node, observed.offset, mean, observed.information, observed.kind)))
+
+
+@given(seeds, st.integers(0, 7))
+def test_without_noise_it_is_exact_whichever_node_is_fixed(seed: int, fixed: int) -> None:
+    graph = consistent_graph(seed)
+    truth = graph.poses.copy()
+    graph.apply(GraphUpdate(free=(0,)))
+    graph.apply(GraphUpdate(fix=(fixed,)))
+    scattered(graph, np.random.default_rng(seed))
+    start = initialization.chordal(graph)
+    assert_poses_equal(start, truth)
+    assert np.all((start[:, 2] >= -np.pi) & (start[:, 2] < np.pi))
+
+
+@given(seeds)
+def test_without_noise_it_is_exact_with_several_fixed_nodes(seed: int) -> None:
+    graph = consistent_graph(seed)
+    truth = graph.poses.copy()
+    graph.apply(GraphUpdate(fix=(0, 3, 6)))
+    scattered(graph, np.random.default_rng(seed))
+    assert_poses_equal(initialization.chordal(graph), truth)
+
+
+@given(seeds)
+def test_without_noise_it_is_exact_with_observed_nodes_and_offsets_alone(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    graph = consistent_graph(seed)
+    truth = graph.poses.copy()
+    graph.apply(GraphUpdate(free=(0,)))
+    observe_exactly(graph, [5, 2, 7, 2], rng)
+    scattered(graph, rng)
+    assert_poses_equal(initialization.chordal(graph), truth)
+
+
+@given(seeds)
+def test_it_reads_no_pose_that_is_not_fixed(seed: int) -> None:
+    graph = consistent_graph(seed, noise=0.3)
+    first = initialization.chordal(graph)
+    scattered(graph, np.random.default_rng(seed))
+    before = graph.poses.copy()
+    np.testing.assert_array_equal(initialization.chordal(graph), first)
+    np.testing.assert_array_equal(graph.poses, before)     # nor does it write any
+    np.testing.assert_array_equal(first[0], graph.poses[0])
+
+
+@pytest.mark.parametrize('seed', range(10))
+def test_with_noise_it_is_near_the_optimum(seed: int) -> None:
+    graph = consistent_graph(seed, noise=0.01)
+    start = initialization.chordal(graph)
+    graph.set_poses(start)
+    assert batch.optimize(graph, SolverConfig()).iterations <= 6
+    np.testing.assert_allclose(start[:, :2], graph.poses[:, :2], atol=0.2)     # 20 sigma
+    np.testing.assert_allclose(se2.wrap(start[:, 2] - graph.poses[:, 2]), 0.0, atol=0.2)
+
+
+def test_positions_alone_do_not_determine_it() -> None:
+    graph = Graph()
+    graph.apply(GraphUpdate(hidden=np.zeros((2, 3)), observed=ObservedNodes(
+        [0, 1], None, [[0.0, 0.0, 0.0], [1.0, 0.0, 0.0]], [np.diag([1.0, 1.0, 0.0])] * 2,
+        [ObservedKind.POSITION] * 2)))
+    with pytest.raises(LinearSolveError):
+        initialization.chordal(graph)
+
+
+def test_headings_that_cancel_are_an_error() -> None:
+    graph = Graph()
+    graph.apply(GraphUpdate(hidden=np.zeros((1, 3)), observed=ObservedNodes(
+        [0, 0], None, [[0.0, 0.0, 0.0], [0.0, 0.0, np.pi]], [np.eye(3)] * 2,
+        [ObservedKind.GLOBAL_POSE] * 2)))
+    with pytest.raises(LinearSolveError, match='cancel'):
+        initialization.chordal(graph)
+
+
+# --- Headings and translations together ------------------------------------------------------
+
+@given(st.integers(0, 10_000))
+def test_joint_is_exact_without_noise_from_positions_alone(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    graph = consistent_graph(seed, noise=0.0)
+    expected = graph.poses.copy()
+    information = np.zeros((graph.n_nodes, 3, 3))
+    information[:, 0, 0] = information[:, 1, 1] = rng.uniform(0.1, 10.0, graph.n_nodes)
+    offset = np.column_stack((rng.uniform(-1.0, 1.0, (graph.n_nodes, 2)), np.zeros(graph.n_nodes)))
+    mean = np.zeros((graph.n_nodes, 3))
+    mean[:, :2] = se2.transform(expected, offset[:, :2])
+    graph.apply(GraphUpdate(
+        observed=ObservedNodes(np.arange(graph.n_nodes), offset, mean, information,
+                               np.full(graph.n_nodes, ObservedKind.POSITION)),
+        free=np.flatnonzero(graph.fixed).tolist()))
+    graph.set_poses(random_poses(rng, graph.n_nodes))
+    assert_poses_equal(initialization.joint(graph), expected)
+
+
+def test_joint_says_so_where_nothing_holds_the_graph() -> None:
+    graph = consistent_graph(3, noise=0.0)
+    graph.apply(GraphUpdate(free=np.flatnonzero(graph.fixed).tolist()))
+    graph.set_poses(np.ones((graph.n_nodes, 3)))
+    try:
+        poses = initialization.joint(graph)
+    except LinearSolveError:
+        return
+    # or rounding made up a solution: then it is none that the engine would take for better
+    assert np.all(np.isfinite(poses))

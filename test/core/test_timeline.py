@@ -1,0 +1,148 @@
+# Copyright 2026 The pose_graph_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""Odometry by stamp against a slow walk from sample to sample."""
+
+from fractions import Fraction
+from itertools import pairwise
+
+from hypothesis import given, strategies as st
+import numpy as np
+import pytest
+from random_graphs import matrix, random_poses, vector
+
+from pose_graph_ros.core import se2
+from pose_graph_ros.core.se2 import FloatArray
+from pose_graph_ros.core.timeline import OdometryTimeline
+
+# Sums of tens of lengths of some 10 m.
+ROUNDING = 1e-11
+# The Unix time of 2026 in nanoseconds: a double does not hold it.
+EPOCH = 1_767_225_600_000_000_001
+
+stamp_lists = st.lists(st.integers(0, 3_000_000_000), min_size=1, max_size=12, unique=True).map(
+    lambda stamps: [EPOCH + stamp for stamp in sorted(stamps)])
+
+
+def filled(stamps: list[int], poses: FloatArray) -> OdometryTimeline:
+    timeline = OdometryTimeline()
+    for stamp, pose in zip(stamps, poses, strict=True):
+        timeline.append(stamp, pose)
+    return timeline
+
+
+def slow_pose(stamps: list[int], poses: FloatArray, at: int) -> FloatArray:
+    for k, stamp in enumerate(stamps):
+        if stamp == at:
+            return poses[k]
+        if stamp > at:
+            fraction = float(Fraction(at - stamps[k - 1], stamp - stamps[k - 1]))
+            turn = np.angle(np.exp(1j * (poses[k, 2] - poses[k - 1, 2])))
+            pose = poses[k - 1] + fraction * (poses[k] - poses[k - 1])
+            pose[2] = poses[k - 1, 2] + fraction * turn
+            return pose
+    raise AssertionError
+
+
+def slow_travel(stamps: list[int], poses: FloatArray, start: int, end: int) -> tuple:
+    """Walk through all samples in between."""
+    at = [start, *(s for s in stamps if start < s < end), end]
+    walk = [slow_pose(stamps, poses, stamp) for stamp in at]
+    distance = turn = 0.0
+    for a, b in pairwise(walk):
+        distance += np.hypot(*(b - a)[:2])
+        turn += abs(np.angle(np.exp(1j * (b[2] - a[2]))))
+    return distance, turn
+
+
+@given(st.data())
+def test_motion_is_that_of_a_slow_walk(data: st.DataObject) -> None:
+    stamps = data.draw(stamp_lists)
+    poses = random_poses(np.random.default_rng(data.draw(st.integers(0, 999))), len(stamps))
+    timeline = filled(stamps, poses)
+    start, end = sorted(data.draw(st.tuples(*2 * (st.integers(stamps[0], stamps[-1]),))))
+    motion = timeline.motion(start, end)
+    a, b = (slow_pose(stamps, poses, stamp) for stamp in (start, end))
+    expected = vector(np.linalg.inv(matrix(a)) @ matrix(b))
+    np.testing.assert_allclose(motion.increment[:2], expected[:2], atol=ROUNDING)
+    assert abs(se2.wrap(motion.increment[2] - expected[2])) < ROUNDING
+    distance, turn = slow_travel(stamps, poses, start, end)
+    assert motion.distance == pytest.approx(distance, abs=ROUNDING)
+    assert motion.turn == pytest.approx(turn, abs=ROUNDING)
+    np.testing.assert_allclose(timeline.pose(end)[:2], b[:2], atol=ROUNDING)
+
+
+@given(st.data())
+def test_motions_compose_and_travel_adds_up(data: st.DataObject) -> None:
+    stamps = data.draw(stamp_lists)
+    timeline = filled(stamps, random_poses(np.random.default_rng(3), len(stamps)))
+    a, b, c = sorted(data.draw(st.tuples(*3 * (st.integers(stamps[0], stamps[-1]),))))
+    first, second, whole = timeline.motion(a, b), timeline.motion(b, c), timeline.motion(a, c)
+    np.testing.assert_allclose(
+        se2.compose(first.increment, second.increment)[:2], whole.increment[:2], atol=ROUNDING)
+    assert first.distance + second.distance == pytest.approx(whole.distance, abs=ROUNDING)
+    assert first.turn + second.turn == pytest.approx(whole.turn, abs=ROUNDING)
+
+
+def test_a_sample_is_given_back_bit_for_bit() -> None:
+    stamps = [EPOCH + 10 * k for k in range(40)]
+    poses = random_poses(np.random.default_rng(4), 40)
+    timeline = filled(stamps, poses)
+    for stamp, pose in zip(stamps, poses, strict=True):
+        np.testing.assert_array_equal(timeline.pose(stamp), pose)
+    np.testing.assert_array_equal(timeline.stamps_ns, stamps)
+    np.testing.assert_array_equal(timeline.poses, poses)
+    motion = timeline.motion(stamps[3], stamps[3])
+    np.testing.assert_array_equal(motion.increment, 0.0)
+    assert motion.distance == motion.turn == 0.0
+
+
+def test_single_nanoseconds_count() -> None:
+    timeline = filled([EPOCH, EPOCH + 4], np.array([[0.0, 0.0, 0.0], [4.0, 0.0, 0.0]]))
+    for k in range(5):
+        assert timeline.pose(EPOCH + k)[0] == k
+
+
+def test_headings_are_interpolated_across_half_a_turn() -> None:
+    timeline = filled([0, 10], np.array([[0.0, 0.0, np.pi - 0.1], [0.0, 0.0, -np.pi + 0.1]]))
+    assert abs(timeline.pose(5)[2]) == pytest.approx(np.pi)
+    assert timeline.motion(0, 10).turn == pytest.approx(0.2)
+
+
+def test_what_is_not_covered_is_refused() -> None:
+    timeline = OdometryTimeline()
+    assert len(timeline) == 0
+    assert not timeline.covers(5)
+    timeline = filled([10, 20], np.zeros((2, 3)))
+    assert [timeline.covers(stamp) for stamp in (9, 10, 15, 20, 21)] == [
+        False, True, True, True, False]
+    for stamp in (9, 21):
+        with pytest.raises(ValueError, match=str(stamp)):
+            timeline.pose(stamp)
+    with pytest.raises(ValueError, match='start <= end, got 20 and 10'):
+        timeline.motion(20, 10)
+
+
+@pytest.mark.parametrize('stamp', [20, 15])
+def test_a_stamp_that_is_not_newer_is_refused_and_nothing_changes(stamp: int) -> None:
+    timeline = filled([10, 20], np.zeros((2, 3)))
+    with pytest.raises(ValueError, match=f'after 20, got {stamp}'):
+        timeline.append(stamp, np.ones(3))
+    assert len(timeline) == 2
+    assert timeline.motion(10, 20).distance == 0.0
+
+
+def test_jitter_at_rest_is_no_path() -> None:
+    rng = np.random.default_rng(1)
+    n = 30_000     # ten minutes at 50 Hz, 2 mm and 2 mrad
+    poses = np.clip(rng.normal(0.0, 0.002, (n, 3)), -0.004, 0.004)
+    timeline = filled([20_000_000 * (k + 1) for k in range(n)], poses)
+    motion = timeline.motion(20_000_000, 20_000_000 * n)
+    assert motion.distance < 0.02
+    assert motion.turn < 0.02
+
+
+def test_slow_motion_is_counted_whole() -> None:
+    n = 1001     # a millimetre a sample
+    poses = np.column_stack((np.arange(n) * 0.001, np.zeros(n), np.zeros(n)))
+    timeline = filled([k + 1 for k in range(n)], poses)
+    assert timeline.motion(1, n).distance == pytest.approx(1.0, abs=0.011)

@@ -1,0 +1,183 @@
+# Copyright 2026 The pose_graph_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""A real node in a process of its own, and an independent client that talks to it over DDS."""
+
+from collections.abc import Callable, Sequence
+import math
+from pathlib import Path
+import signal
+import subprocess
+import sys
+import time
+
+import pytest
+
+pytest.importorskip('rclpy', reason='ROS 2 is not there: no rclpy')
+
+from diagnostic_msgs.msg import DiagnosticArray
+from geometry_msgs.msg import PoseWithCovarianceStamped
+from nav_msgs.msg import Odometry, Path as PathMessage
+import rclpy
+from rclpy.context import Context
+from rclpy.executors import SingleThreadedExecutor
+from rclpy.qos import QoSDurabilityPolicy, QoSProfile, QoSReliabilityPolicy
+from sensor_msgs.msg import NavSatFix
+from std_srvs.srv import Trigger
+
+from pose_graph_ros.cli.demo import isolated_environment
+
+try:
+    from tf2_msgs.msg import TFMessage
+except ImportError:
+    TFMessage = None
+
+RELIABLE = QoSProfile(depth=1000, reliability=QoSReliabilityPolicy.RELIABLE)
+LATCHED = QoSProfile(depth=1, reliability=QoSReliabilityPolicy.RELIABLE,
+                     durability=QoSDurabilityPolicy.TRANSIENT_LOCAL)
+NANOSECONDS = 1_000_000_000
+PATIENCE = 20.0
+"""How long a test waits for something that should come at once [s]."""
+
+
+class NodeProcess:
+    """The node as a user starts it."""
+
+    def __init__(self, log: Path, arguments: Sequence[str] = ()) -> None:
+        self.env = isolated_environment(log)
+        self._stderr = (log / 'stderr').open('w+')
+        self.process = subprocess.Popen(
+            [sys.executable, '-m', 'pose_graph_ros.ros.main', '--ros-args',
+             '-p', 'diagnostics_period:=0.1', '-p', 'frequency:=10.0', '-p', 'path_period:=0.1',
+             *arguments],
+            env=self.env, stderr=self._stderr)
+
+    def stderr(self) -> str:
+        self._stderr.seek(0)
+        return self._stderr.read()
+
+    def signal_and_wait(self, *signals: signal.Signals) -> int:
+        for number in signals:
+            self.process.send_signal(number)
+        return self.process.wait(PATIENCE)
+
+    def __enter__(self) -> 'NodeProcess':
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        if self.process.poll() is None:
+            self.process.kill()
+            self.process.wait()
+        self._stderr.close()
+
+
+class Client:
+    """Publishes what sensors would, and keeps everything that the node publishes."""
+
+    def __init__(self, domain: int, namespace: str = '', odom: str = 'odom') -> None:
+        self._context = Context()
+        rclpy.init(context=self._context, domain_id=domain)
+        self.node = rclpy.create_node('client', context=self._context, namespace=namespace)
+        self._executor = SingleThreadedExecutor(context=self._context)
+        self._executor.add_node(self.node)
+        create = self.node.create_publisher
+        self.odom = create(Odometry, odom, RELIABLE)
+        self.global_pose = create(PoseWithCovarianceStamped, 'global_pose', RELIABLE)
+        self.fix = create(NavSatFix, 'gps/fix', RELIABLE)
+        self.loop_closure = create(PoseWithCovarianceStamped, 'loop_closure', RELIABLE)
+        self.poses: list[PoseWithCovarianceStamped] = []
+        self.filtered: list[Odometry] = []
+        self.paths: list[PathMessage] = []
+        self.transforms: list[object] = []
+        self.diagnostics: list[DiagnosticArray] = []
+        subscribe = self.node.create_subscription
+        subscribe(PoseWithCovarianceStamped, 'pose', self.poses.append, RELIABLE)
+        subscribe(Odometry, 'odometry/filtered', self.filtered.append, RELIABLE)
+        subscribe(PathMessage, 'path', self.paths.append, LATCHED)
+        subscribe(DiagnosticArray, '/diagnostics', self.diagnostics.append, RELIABLE)
+        if TFMessage is not None:
+            subscribe(TFMessage, '/tf', lambda message: self.transforms.extend(message.transforms),
+                      RELIABLE)
+        self._optimize = self.node.create_client(Trigger, 'pose_graph/optimize')
+
+    def __enter__(self) -> 'Client':
+        inputs = (self.odom, self.global_pose, self.fix, self.loop_closure)
+        self.spin_until(lambda: all(p.get_subscription_count() > 0 for p in inputs)
+                        and len(self.diagnostics) > 0 and self._optimize.service_is_ready(),
+                        'the node listens')
+        # the other side may know of the match a little later
+        self.spin_for(0.3)
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._executor.shutdown()
+        self.node.destroy_node()
+        rclpy.shutdown(context=self._context)
+
+    def spin_until(self, done: Callable[[], bool], what: str) -> None:
+        end = time.monotonic() + PATIENCE
+        while not done():
+            assert time.monotonic() < end, f'waited {PATIENCE} s until {what}'
+            self._executor.spin_once(timeout_sec=0.05)
+
+    def spin_for(self, seconds: float) -> None:
+        end = time.monotonic() + seconds
+        while (left := end - time.monotonic()) > 0.0:
+            self._executor.spin_once(timeout_sec=left)
+
+    @property
+    def values(self) -> dict[str, str]:
+        return {item.key: item.value for item in self.diagnostics[-1].status[0].values}
+
+    def wait_processed(self, count: int) -> None:
+        self.spin_until(lambda: int(self.values['processed']) >= count,
+                        f'{count} messages are processed')
+
+    def optimize(self) -> Trigger.Response:
+        future = self._optimize.call_async(Trigger.Request())
+        self.spin_until(future.done, 'the optimisation is answered')
+        return future.result()
+
+
+def stamp_ns(message: object) -> int:
+    stamp = message.header.stamp
+    return stamp.sec * NANOSECONDS + stamp.nanosec
+
+
+def yaw(quaternion: object) -> float:
+    return 2.0 * math.atan2(quaternion.z, quaternion.w)
+
+
+def odometry(seconds: float, x: float, y: float, theta: float, speed: float = 1.0) -> Odometry:
+    message = Odometry()
+    message.header.stamp.sec, nanosec = divmod(round(seconds * NANOSECONDS), NANOSECONDS)
+    message.header.stamp.nanosec = nanosec
+    message.header.frame_id, message.child_frame_id = 'odom', 'base_link'
+    message.pose.pose.position.x, message.pose.pose.position.y = x, y
+    message.pose.pose.orientation.z = math.sin(theta / 2.0)
+    message.pose.pose.orientation.w = math.cos(theta / 2.0)
+    message.twist.twist.linear.x = speed
+    return message
+
+
+def pose(
+    seconds: float, x: float, y: float, theta: float, frame: str = 'map', *,
+    variances: Sequence[float] = (0.01, 0.01, 0.001),
+) -> PoseWithCovarianceStamped:
+    message = PoseWithCovarianceStamped()
+    message.header = odometry(seconds, 0.0, 0.0, 0.0).header
+    message.header.frame_id = frame
+    message.pose.pose = odometry(seconds, x, y, theta).pose.pose
+    for index, variance in zip((0, 7, 35), variances, strict=True):
+        message.pose.covariance[index] = variance
+    return message
+
+
+def fix(seconds: float, latitude: float, longitude: float, sigma: float = 0.5) -> NavSatFix:
+    message = NavSatFix()
+    message.header = odometry(seconds, 0.0, 0.0, 0.0).header
+    message.header.frame_id = 'gps'
+    message.status.status = 0
+    message.latitude, message.longitude, message.altitude = latitude, longitude, 100.0
+    message.position_covariance_type = 2
+    message.position_covariance = [sigma * sigma, 0.0, 0.0, 0.0, sigma * sigma, 0.0, 0.0, 0.0, 4.0]
+    return message

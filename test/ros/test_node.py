@@ -1,0 +1,326 @@
+# Copyright 2026 The pose_graph_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""The real node, driven over DDS by an independent process: this one."""
+
+from collections.abc import Iterator
+import math
+from pathlib import Path
+import random
+import signal
+import time
+
+from harness import Client, fix, NodeProcess, odometry, pose, RELIABLE, stamp_ns, TFMessage, yaw
+import numpy as np
+import pytest
+from rclpy.serialization import serialize_message
+
+from pose_graph_ros.core import se2
+from pose_graph_ros.core.tangent_plane import TangentPlane
+
+ANGLE = math.radians(122.0)
+"""Between the odometry frame and the map in these drives."""
+START = 1_700_000_000.0
+PLANE = TangentPlane(48.1, 11.6, 100.0)
+
+
+@pytest.fixture
+def node(tmp_path: Path, request: pytest.FixtureRequest) -> Iterator[NodeProcess]:
+    with NodeProcess(tmp_path, getattr(request, 'param', ())) as process:
+        yield process
+
+
+@pytest.fixture
+def client(node: NodeProcess) -> Iterator[Client]:
+    with Client(int(node.env['ROS_DOMAIN_ID'])) as connected:
+        yield connected
+
+
+def true_pose(seconds: float) -> np.ndarray:
+    """A circle of 20 m radius, at 2 m/s, in the map; it begins at the origin."""
+    angle = seconds / 10.0
+    return np.array([20.0 * math.sin(angle), 20.0 * (1.0 - math.cos(angle)), angle])
+
+
+def odometry_pose(seconds: float) -> np.ndarray:
+    """The same drive without noise, in the odometry frame."""
+    return se2.compose(np.array([5.0, -3.0, -ANGLE]), true_pose(seconds))
+
+
+def drive(client: Client, begin: float, end: float, *, fixes: bool = True) -> int:
+    """Publish a drive: odometry at 10 Hz, exact fixes at 2 Hz; return the number of messages."""
+    count = 0
+    for step in range(round(begin * 10), round(end * 10)):
+        seconds = step / 10.0
+        client.odom.publish(odometry(START + seconds, *odometry_pose(seconds).tolist(), speed=2.0))
+        count += 1
+        if fixes and step % 5 == 0:
+            latitude, longitude, _ = PLANE.to_geodetic(true_pose(seconds)[:2])
+            client.fix.publish(fix(START + seconds, latitude, longitude))
+            count += 1
+        client.spin_for(0.002)
+    client.wait_processed(count)
+    return count
+
+
+def test_every_message_of_a_drive_is_sound(node: NodeProcess, client: Client) -> None:
+    drive(client, 0.0, 30.0)
+    answer = client.optimize()
+    assert answer.success, answer.message
+    final = len(client.paths)
+    client.spin_until(lambda: len(client.paths) > final, 'the path of the optimisation comes')
+
+    assert client.values['alignment'] == 'aligned'
+    assert client.values['odom.accepted'] == '300'
+    # the last fix is as new as odometry that had not come: all but it can be used
+    assert client.values['fix.accepted'] == '60'
+    for messages in (client.poses, client.filtered, client.paths, client.transforms):
+        stamps = [stamp_ns(message) for message in messages]
+        assert all(np.diff(stamps) > 0), 'stamps do not increase'
+    assert len(client.poses) == len(client.filtered) > 250
+    for message in client.filtered:
+        assert (message.header.frame_id, message.child_frame_id) == ('map', 'base_link')
+        assert message.twist.twist.linear.x == 2.0
+        check_pose(message.pose)
+    for message in client.poses:
+        assert message.header.frame_id == 'map'
+        check_pose(message.pose)
+    assert client.values['hidden_nodes'] == str(len(client.paths[-1].poses) - 1)
+
+    path = client.paths[-1]
+    assert path.header.frame_id == 'map'
+    stamps = np.array([stamp_ns(item) for item in path.poses])
+    assert all(np.diff(stamps) > 0)
+    assert {item.header.frame_id for item in path.poses} == {'map'}
+    poses = np.array([(item.pose.position.x, item.pose.position.y, yaw(item.pose.orientation))
+                      for item in path.poses])
+    # exact measurements: what is left is the rounding of latitude and longitude
+    truth = np.array([true_pose(stamp * 1e-9 - START) for stamp in stamps])
+    error = poses - truth
+    error[:, 2] = se2.wrap(error[:, 2])
+    assert np.max(np.abs(error)) < 1e-3
+    newest = client.poses[-1]
+    at = true_pose(stamp_ns(newest) * 1e-9 - START)
+    position = newest.pose.pose.position
+    assert math.hypot(position.x - at[0], position.y - at[1]) < 0.1
+    assert newest.pose.covariance[0] < 1.0
+
+
+def check_pose(message: object) -> None:
+    position, q = message.pose.position, message.pose.orientation
+    assert np.all(np.isfinite((position.x, position.y, position.z)))
+    assert math.hypot(q.x, q.y, q.z, q.w) == pytest.approx(1.0, abs=1e-9)
+    covariance = np.asarray(message.covariance).reshape(6, 6)
+    assert np.all(np.isfinite(covariance))
+    assert np.array_equal(covariance, covariance.T)
+    assert np.min(np.linalg.eigvalsh(covariance)) >= 0.0
+
+
+@pytest.mark.skipif(TFMessage is None, reason='tf2_msgs is not built: no /tf')
+def test_the_transform_times_odometry_is_the_pose(node: NodeProcess, client: Client) -> None:
+    drive(client, 0.0, 15.0)
+    poses = {stamp_ns(message): message.pose.pose for message in client.poses}
+    compared = 0
+    for transform in client.transforms:
+        assert transform.header.frame_id == 'map'
+        assert transform.child_frame_id == 'odom'
+        stamp = stamp_ns(transform)
+        if stamp not in poses:
+            continue
+        translation = transform.transform.translation
+        T_map_odom = np.array(
+            [translation.x, translation.y, yaw(transform.transform.rotation)])
+        expected = se2.compose(T_map_odom, odometry_pose(stamp * 1e-9 - START))
+        assert poses[stamp].position.x == pytest.approx(expected[0], abs=1e-5)
+        assert poses[stamp].position.y == pytest.approx(expected[1], abs=1e-5)
+        compared += 1
+    assert compared > 100
+
+
+def test_the_output_says_that_it_is_unaligned_until_the_angle_is_known(
+    node: NodeProcess, client: Client,
+) -> None:
+    drive(client, 0.0, 2.0)
+    client.spin_until(lambda: client.values.get('alignment') == 'unaligned', 'it is unaligned')
+    assert client.diagnostics[-1].status[0].level == b'\x01'
+    client.spin_for(0.3)
+    client.odom.publish(odometry(START + 2.0, *odometry_pose(2.0).tolist()))
+    last = len(client.poses)
+    client.spin_until(lambda: len(client.poses) > last, 'a pose comes')
+    assert client.poses[-1].pose.covariance[35] > 3.0
+    drive_on = [(step / 10.0) for step in range(21, 150)]
+    for seconds in drive_on:
+        client.odom.publish(odometry(START + seconds, *odometry_pose(seconds).tolist()))
+        latitude, longitude, _ = PLANE.to_geodetic(true_pose(seconds)[:2])
+        client.fix.publish(fix(START + seconds, latitude, longitude))
+        client.spin_for(0.002)
+    client.spin_until(lambda: client.values['alignment'] == 'aligned', 'it is aligned')
+    assert client.diagnostics[-1].status[0].level == b'\x00'
+
+
+def test_a_global_pose_and_a_loop_closure_are_heard(node: NodeProcess, client: Client) -> None:
+    client.global_pose.publish(pose(START + 1.0, *true_pose(1.0).tolist()))
+    client.global_pose.publish(pose(START + 1.5, 0.0, 0.0, 0.0, frame='elsewhere'))
+    drive(client, 0.0, 10.0, fixes=False)
+    seen = se2.between(true_pose(0.5), true_pose(9.0))
+    client.loop_closure.publish(
+        pose(START + 9.0, *seen.tolist(), frame=f'@{START + 0.5:.9f}'))
+    client.loop_closure.publish(pose(START + 9.0, 0.0, 0.0, 0.0, frame='x9999'))
+    client.loop_closure.publish(pose(START + 9.0, 0.0, 0.0, 0.0, frame='base_link'))
+    client.wait_processed(105)
+    answer = client.optimize()
+    assert answer.success, answer.message
+    client.spin_until(lambda: client.values.get('loop_closure.unknown_node') == '1',
+                      'the unknown node is counted')
+    values = client.values
+    assert values['alignment'] == 'aligned'
+    assert values['global_pose.accepted'] == '1'
+    assert values['global_pose.wrong_frame'] == '1'
+    assert values['loop_closure.accepted'] == '1'
+    assert values['loop_closure.wrong_frame'] == '1'
+    assert float(values['chi2']) < 1e-6
+
+
+def test_a_silence_ends_with_the_full_optimisation(tmp_path: Path) -> None:
+    with NodeProcess(tmp_path, ('-p', 'closing_silence:=0.5')) as node, \
+            Client(int(node.env['ROS_DOMAIN_ID'])) as client:
+        drive(client, 0.0, 20.0)
+        client.spin_for(1.5)
+        poses = client.paths[-1].poses
+        error = [math.hypot(item.pose.position.x - x, item.pose.position.y - y)
+                 for item in poses for x, y, _ in [true_pose(stamp_ns(item) * 1e-9 - START)]]
+        assert max(error) < 1e-3
+
+
+def test_malformed_messages_are_counted_and_the_node_goes_on(
+    node: NodeProcess, client: Client,
+) -> None:
+    nan, infinite, huge = math.nan, math.inf, 1e200
+    sent = 0
+    for number in (nan, infinite, -infinite, huge):
+        client.odom.publish(odometry(START, number, 0.0, 0.0))
+        client.global_pose.publish(pose(START + 0.5, number, 0.0, 0.0))
+        client.global_pose.publish(
+            pose(START + 0.5, 0.0, 0.0, 0.0, variances=(number, number, 1.0)))
+        client.fix.publish(fix(START + 0.5, number, 11.6))
+        client.fix.publish(fix(START + 0.5, 48.1, 11.6, sigma=number))
+        client.loop_closure.publish(pose(START + 0.5, number, 0.0, 0.0, frame='x0'))
+        sent += 6
+    empty = odometry(START, 0.0, 0.0, 0.0)
+    empty.pose.pose.orientation.w = 0.0
+    client.odom.publish(empty)
+    client.odom.publish(odometry(0.0, 0.0, 0.0, 0.0))
+    no_fix = fix(START + 0.5, 48.1, 11.6)
+    no_fix.status.status = -1
+    client.fix.publish(no_fix)
+    client.fix.publish(fix(0.0, 48.1, 11.6))
+    sent += 4
+    client.wait_processed(sent)
+    generator = random.Random(1)
+    whole = serialize_message(odometry(START, 1.0, 2.0, 3.0))
+    for _ in range(50):
+        cut = whole[:generator.randrange(4, len(whole))]
+        client.odom.publish(cut + generator.randbytes(generator.randrange(40)))
+    client.spin_for(0.3)
+    # stamps before the good ones: what of the noise could be read as odometry does not matter
+    seen = int(client.values['received'])
+    assert seen >= sent
+    before = int(client.values.get('odom.accepted', '0'))
+    for step in range(20):
+        client.odom.publish(odometry(4e9 / 2 + step, float(step), 0.0, 0.0))
+    client.spin_until(lambda: int(client.values.get('odom.accepted', '0')) >= before + 20,
+                      'good odometry is accepted')
+    values = client.values
+    assert values['odom.zero_stamp'] == '1'
+    assert values['fix.no_fix'] == '1'
+    assert values['fix.zero_stamp'] == '1'
+    assert int(values['odom.not_finite']) >= 3
+    assert int(values['odom.too_large']) >= 1
+    for message in client.filtered:
+        check_pose(message.pose)
+    assert values['fix.not_finite'] in ('3', '4')
+    assert values['loop_closure.not_finite'] == '3'
+    assert values['loop_closure.too_large'] == '1'
+    assert node.process.poll() is None
+    assert 'Traceback' not in node.stderr()
+
+
+@pytest.mark.parametrize('signals', [
+    (signal.SIGINT,), (signal.SIGTERM,), (signal.SIGINT, signal.SIGINT),
+    (signal.SIGTERM, signal.SIGTERM), (signal.SIGINT, signal.SIGTERM)])
+def test_signals_end_the_node_without_a_traceback(
+    node: NodeProcess, client: Client, signals: tuple[signal.Signals, ...],
+) -> None:
+    drive(client, 0.0, 3.0)
+    assert node.signal_and_wait(*signals) == 0
+    assert 'Traceback' not in node.stderr()
+
+
+@pytest.mark.parametrize(('parameter', 'expected'), [
+    ('frequency:=1000.0', 'frequency'), ('datum:=[95.0, 10.0]', 'latitude'),
+    ('map_frame:=3', 'map_frame'), ('odom_frame:=map', 'different'),
+    ('fix.lever_arm:=[1.0]', 'lever arm')])
+def test_a_bad_parameter_is_one_line_and_no_traceback(
+    tmp_path: Path, parameter: str, expected: str,
+) -> None:
+    with NodeProcess(tmp_path, ('-p', parameter)) as node:
+        assert node.process.wait(20.0) == 2
+        lines = node.stderr().splitlines()
+        assert len(lines) == 1, lines
+        assert expected in lines[0]
+
+
+def test_whole_numbers_are_numbers_and_optimizing_nothing_says_so(tmp_path: Path) -> None:
+    arguments = ('-p', 'frequency:=5', '-p', 'datum:=[48, 11]', '-p', 'fix.lever_arm:=[1, 0]')
+    with NodeProcess(tmp_path, arguments) as node, \
+            Client(int(node.env['ROS_DOMAIN_ID'])) as client:
+        answer = client.optimize()
+        assert not answer.success
+        assert 'no odometry' in answer.message
+
+
+def test_arguments_that_ros_cannot_read_end_the_node_without_a_traceback(tmp_path: Path) -> None:
+    for arguments in (('-p', 'frequency'), ('--params-file', '/no/such.yaml'), ('--no-such',)):
+        with NodeProcess(tmp_path, arguments) as node:
+            assert node.process.wait(20.0) == 2
+            assert 'pose_graph_node: ' in node.stderr()
+            assert 'Traceback' not in node.stderr()
+
+
+def test_a_signal_during_the_start_ends_the_node_as_quietly(tmp_path: Path) -> None:
+    for delay in (0.2, 0.4, 0.6, 0.8, 1.0):
+        with NodeProcess(tmp_path) as node:
+            time.sleep(delay)
+            node.process.send_signal(signal.SIGINT)
+            node.process.wait(20.0)
+            stderr = node.stderr()
+            # before its first line runs, Python itself takes the signal
+            assert 'Traceback' not in stderr or 'pose_graph_ros' not in stderr, stderr
+
+
+@pytest.mark.parametrize(
+    'node', [('-r', '__ns:=/robot1', '-r', 'odom:=wheels', '-p', 'map_frame:=world')],
+    indirect=True)
+def test_a_namespace_a_remap_and_a_frame(node: NodeProcess) -> None:
+    with Client(int(node.env['ROS_DOMAIN_ID']), namespace='robot1', odom='wheels') as client:
+        drive(client, 0.0, 5.0)
+        client.spin_until(lambda: len(client.paths) > 0, 'a path comes')
+        assert client.paths[-1].header.frame_id == 'world'
+        assert client.filtered[-1].header.frame_id == 'world'
+        names = {name for name, _ in client.node.get_topic_names_and_types()}
+        assert {'/robot1/path', '/robot1/pose', '/robot1/odometry/filtered', '/tf',
+                '/diagnostics'} - ({'/tf'} if TFMessage is None else set()) <= names
+
+
+def test_best_effort_senders_are_heard_and_a_late_subscriber_gets_the_path(
+    node: NodeProcess, client: Client,
+) -> None:
+    drive(client, 0.0, 8.0)
+    client.optimize()
+    client.spin_for(0.5)
+    domain = int(node.env['ROS_DOMAIN_ID'])
+    with Client(domain) as late:
+        late.spin_until(lambda: len(late.paths) > 0, 'the latched path comes')
+        assert len(late.paths[-1].poses) == len(client.paths[-1].poses)
+    info = client.node.get_subscriptions_info_by_topic('/odom')
+    assert [item.qos_profile.reliability.name for item in info] == ['BEST_EFFORT']
+    assert RELIABLE.depth >= 200

@@ -1,0 +1,123 @@
+# Copyright 2026 The pose_graph_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""The worker's thread: everything posted is processed, whatever the engine does."""
+
+from collections.abc import Callable
+import threading
+import time
+
+import numpy as np
+
+from pose_graph_ros.core import batch
+from pose_graph_ros.core.backend import PoseGraphBackend
+from pose_graph_ros.core.batch import Status
+from pose_graph_ros.core.estimate import Estimate
+from pose_graph_ros.core.measurements import GlobalPose, OdometrySample
+from pose_graph_ros.ros.worker import Worker
+
+PATIENCE = 10.0
+
+
+def wait_until(done: Callable[[], bool]) -> None:
+    end = time.monotonic() + PATIENCE
+    while not done():
+        assert time.monotonic() < end, f'waited {PATIENCE} s'
+        time.sleep(0.002)
+
+
+def sample(step: int) -> OdometrySample:
+    return OdometrySample(step * 100_000_000, np.array([0.3 * step, 0.0, 0.0]))
+
+
+def test_all_that_is_posted_is_processed_and_one_estimate_follows_the_other() -> None:
+    estimates: list[Estimate] = []
+    worker = Worker(PoseGraphBackend(), estimates.append)
+    worker.start()
+    for step in range(1, 101):
+        assert worker.post('odom', sample(step))
+        worker.post('pose', GlobalPose(step * 100_000_000, np.array([0.3 * step, 0.0, 0.0]),
+                                       0.01 * np.eye(3)))
+        worker.request_update()
+    report = worker.request_closing().result(PATIENCE)
+    assert report.status is Status.CONVERGED
+    wait_until(lambda: worker.status.processed == 200)
+    assert worker.status.counts['pose', 'accepted'] == 100
+    assert worker.estimate is estimates[-1]
+    assert worker.estimate.n_observed == 100
+    assert worker.stop(PATIENCE)
+
+
+def test_an_engine_that_raises_is_counted_and_the_thread_goes_on() -> None:
+    class Broken(PoseGraphBackend):
+        def add_measurement(self, *_: object) -> None:
+            raise ZeroDivisionError('broken')
+
+    worker = Worker(Broken(), lambda _: None)
+    worker.start()
+    worker.post('odom', sample(1))
+    worker.post('pose', GlobalPose(1, np.zeros(3), np.eye(3)))
+    worker.post('odom', sample(2))
+    wait_until(lambda: worker.status.processed == 3)
+    assert worker.status.counts['pose', 'internal_error'] == 1
+    assert worker.status.counts['odom', 'accepted'] == 2
+    assert worker.stop(PATIENCE)
+
+
+def test_a_solver_that_raises_is_answered_as_a_failure_and_the_thread_goes_on() -> None:
+    calls = []
+
+    def solve(*arguments: object) -> object:
+        calls.append(1)
+        if len(calls) == 1:
+            raise MemoryError('no memory')
+        return batch.optimize(*arguments)
+
+    worker = Worker(PoseGraphBackend(solve=solve), lambda _: None)
+    worker.start()
+    for step in range(1, 50):
+        worker.post('odom', sample(step))
+    failed = worker.request_closing().result(PATIENCE)
+    assert (failed.status, failed.reason) == (Status.FAILED, 'MemoryError: no memory')
+    assert worker.request_closing().result(PATIENCE).status is Status.CONVERGED
+    assert worker.stop(PATIENCE)
+
+
+def test_posting_never_waits_for_the_solver() -> None:
+    solving, release = threading.Event(), threading.Event()
+
+    def solve(*arguments: object) -> object:
+        solving.set()
+        assert release.wait(PATIENCE)
+        return batch.optimize(*arguments)
+
+    worker = Worker(PoseGraphBackend(solve=solve), lambda _: None)
+    worker.start()
+    for step in range(1, 20):
+        worker.post('odom', sample(step))
+    closing = worker.request_closing()
+    assert solving.wait(PATIENCE)
+    for step in range(20, 40):
+        worker.post('odom', sample(step))
+    assert not closing.done()
+    release.set()
+    assert closing.result(PATIENCE).status is Status.CONVERGED
+    wait_until(lambda: worker.status.processed == 39)
+    assert worker.stop(PATIENCE)
+
+
+def test_stopping_does_not_wait_for_ever() -> None:
+    release = threading.Event()
+
+    def solve(*arguments: object) -> object:
+        release.wait(PATIENCE)
+        return batch.optimize(*arguments)
+
+    worker = Worker(PoseGraphBackend(solve=solve), lambda _: None)
+    worker.start()
+    worker.post('odom', sample(1))
+    worker.request_closing()
+    wait_until(lambda: worker.status is not None)
+    time.sleep(0.05)
+    assert not worker.stop(0.1)
+    release.set()
+    assert worker.stop(PATIENCE)
