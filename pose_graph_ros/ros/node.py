@@ -186,9 +186,12 @@ class PoseGraphNode(Node):
             response.message = (
                 'the node stops' if closing.cancelled() else f'failed: {closing.exception()}')
             return response
-        if self._worker.estimate is None:
+        estimate = self._worker.estimate
+        if estimate is None:
             response.message = 'there is no odometry yet'
             return response
+        # who has the answer must not have to guess which path is the optimised one
+        self._out.publish_path(estimate, at_once=True)
         report = closing.result()
         response.success = report.status is Status.CONVERGED
         response.message = (

@@ -108,10 +108,15 @@ class Publishers:
             self._pose.publish(
                 messages.stamped_pose_message(stamp, message.pose, self.map_frame))
 
-    def publish_path(self, estimate: Estimate) -> None:
-        """Publish the path of an estimate that was not shown yet, at most once in the period."""
+    def publish_path(self, estimate: Estimate, *, at_once: bool = False) -> None:
+        """
+        Publish the path of an estimate that was not shown yet.
+
+        That is done at most once in the period, except `at_once`.
+        """
         now = time.monotonic()
-        if (estimate is self._path_shown or now - self._path_at < self._path_period
+        early = now - self._path_at < self._path_period and not at_once
+        if (estimate is self._path_shown or early
                 or self._path.get_subscription_count() == 0):
             return
         self._path_shown, self._path_at = estimate, now

@@ -133,8 +133,15 @@ class Client:
                         f'{count} messages are processed')
 
     def optimize(self) -> Trigger.Response:
+        """Have the node optimise; return when its outputs after that have come."""
         future = self._optimize.call_async(Trigger.Request())
         self.spin_until(future.done, 'the optimisation is answered')
+        answered_ns = time.time_ns()
+        self.spin_until(lambda: stamp_ns(self.diagnostics[-1]) > answered_ns,
+                        'diagnostics come that were made after the answer')
+        if future.result().success:
+            self.spin_until(lambda: len(self.paths) > 0 and len(self.paths[-1].poses)
+                            == int(self.values['hidden_nodes']) + 1, 'the whole path comes')
         return future.result()
 
 
