@@ -2,6 +2,7 @@
 
 VENV := $(if $(ROS_DISTRO),.venv-ros,.venv)
 PYTEST_ARGS ?=
+BENCH_ARGS ?=
 
 # make variable -> option of `pose-graph demo`; only those that are given
 option = $(if $($(1)),--$(2) '$($(1))')
@@ -10,13 +11,14 @@ DEMO_ARGS = $(call option,BAG,bag) $(call option,ODOM,odom) $(call option,FIX,fi
 	$(call option,TRUTH,truth) $(call option,HOLD_OUT,hold-out) $(call option,RATE,rate) \
 	$(call option,OUT,out)
 
-.PHONY: help setup demo test lint types fmt lock clean
+.PHONY: help setup demo test bench lint types fmt lock clean
 
 help:
 	@echo 'make demo    set up, then simulate a drive, replay it through the node and judge the result'
 	@echo '             own bag: BAG=folder|file.mcap|file.db3 ODOM=/topic FIX=/topic [GLOBAL_POSE=/topic]'
 	@echo '             [LOOP_CLOSURE=/topic] [TRUTH=/topic] [HOLD_OUT=5] [RATE=factor] [OUT=demo]'
 	@echo 'make test    set up, then run the checks (ruff, mypy) and all tests; PYTEST_ARGS="-k word"'
+	@echo 'make bench   measure the engine against GTSAM; BENCH_ARGS="--quick --gate", or --help'
 	@echo 'make lint    ruff alone;  make types: mypy alone;  make fmt: let ruff mend what it can'
 	@echo 'make setup   set up alone: $(VENV), from wheels, or on top of ROS where one is sourced'
 	@echo 'make lock    resolve dev/requirements.in again into requirements.lock'
@@ -31,6 +33,11 @@ demo: setup
 
 test: setup
 	@dev/test.sh $(VENV) $(PYTEST_ARGS)
+
+bench: setup
+	@$(VENV)/bin/python -m pip install --quiet --disable-pip-version-check --no-deps \
+		-r benchmark/requirements.txt
+	@$(VENV)/bin/python -m benchmark $(BENCH_ARGS)
 
 lint: setup
 	$(VENV)/bin/ruff check

@@ -70,9 +70,12 @@ setup(
     zip_safe=True,
     python_requires='>=3.11',
     # The lower bounds are what Ubuntu 24.04 has. rclpy and the messages come with ROS.
+    # Of Numba it has none; 0.60 is the first with math.log2, and takes its Python and NumPy.
+    # Tested with 0.60.0 and 0.68.1 on NumPy 1.26, 0.61.2 on NumPy 2.2, 0.68.1 on NumPy 2.4.
     install_requires=[
         'numpy>=1.26',
         'scipy>=1.11',
+        'numba>=0.60',
         'pyproj>=3.6',
         'matplotlib>=3.6',
         'rosbags>=0.11',

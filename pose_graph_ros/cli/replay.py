@@ -30,10 +30,8 @@ from pose_graph_ros.ros.conversions import FixReader, MessageReader
 from pose_graph_ros.ros.inputs import choose_inputs, Inputs, read_inputs
 from pose_graph_ros.ros.parameters import backend_config
 
-# An update each time the graph has grown by this share (and this many nodes) keeps the estimate
-# near the optimum at a cost in all that is proportional to the last solve.
-GROWTH = 0.02
-LEAST_GROWTH = 10
+# An update each time that so many hidden nodes have come keeps the estimate near the optimum.
+UPDATE_EVERY = 10
 
 
 @dataclass(frozen=True, slots=True)
@@ -53,7 +51,7 @@ def run(bag: BagReader, inputs: Inputs, values: Mapping[str, Any]) -> Replayed:
     reader = MessageReader(
         values['map_frame'], FixReader(values['datum'], values['fix.lever_arm']))
     refused: Counter[tuple[str, str]] = Counter()
-    next_update = LEAST_GROWTH
+    next_update = UPDATE_EVERY
     for source, message, held_out in read_inputs(bag, inputs):
         if held_out:
             continue
@@ -70,8 +68,7 @@ def run(bag: BagReader, inputs: Inputs, values: Mapping[str, Any]) -> Replayed:
             backend.add_measurement(measurement, source)
         if backend.graph.n_nodes >= next_update:
             backend.update()
-            next_update = backend.graph.n_nodes + max(
-                LEAST_GROWTH, int(GROWTH * backend.graph.n_nodes))
+            next_update = backend.graph.n_nodes + UPDATE_EVERY
     return Replayed(backend, backend.optimize(), refused)
 
 

@@ -3,15 +3,16 @@
 """
 The facade that the node, the replay tool and the tests all drive.
 
-Odometry makes the hidden nodes and the edges between them. A measurement waits until odometry has
-reached its stamp, is bound to the hidden nodes before it, and joins the graph at the next update.
-An update aligns the odometry frame with the map if that is still to do, applies what has come in
-and optimises. If that fails, the graph goes back to where it was and what had come in is set aside
-until the next full optimisation. Stamps are integer nanoseconds; there is no clock in here.
+Odometry makes the hidden nodes and the edges between them, each of them solved for at once. A
+measurement waits until odometry has reached its stamp, is bound to the hidden nodes before it, and
+joins the graph at the next update. An update aligns the odometry frame with the map if that is
+still to do and hands all that has come in to the smoother, whose work does not grow with the
+graph. If that fails, everything is as before, and what had come in is set aside until the next
+full optimisation. Stamps are integer nanoseconds; there is no clock in here.
 """
 
 from collections import Counter
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 import heapq
 import itertools
 import math
@@ -19,14 +20,14 @@ from typing import cast
 
 import numpy as np
 
-from pose_graph_ros.core import alignment, batch, binding, covariance, se2
+from pose_graph_ros.core import alignment, batch, binding, covariance, se2, tables as tb
 from pose_graph_ros.core.arrays import GrowingArray
 from pose_graph_ros.core.batch import Status
-from pose_graph_ros.core.config import BackendConfig, SolverConfig
-from pose_graph_ros.core.constraints import EdgeKind, Edges, ObservedKind, ObservedNodes
+from pose_graph_ros.core.config import BackendConfig
+from pose_graph_ros.core.constraints import Edges, ObservedNodes
 from pose_graph_ros.core.estimate import AlignmentState, Estimate, UpdateReport
 from pose_graph_ros.core.graph import Energies, Graph, GraphUpdate
-from pose_graph_ros.core.linearize import observed_errors
+from pose_graph_ros.core.incremental import IncrementalSmoother, UpdateResult
 from pose_graph_ros.core.measurements import (
     ACCEPTED,
     Answer,
@@ -45,9 +46,6 @@ from pose_graph_ros.core.trajectory import Trajectory
 
 # Measurements that wait for odometry; a sender whose clock is ahead must not fill the memory.
 MAX_PENDING = 10_000
-# A global pose tells the alignment at once if its heading is at least this certain [rad].
-ALIGNING_SIGMA = 0.5
-
 
 
 @dataclass(slots=True)
@@ -69,22 +67,26 @@ class PoseGraphBackend:
     ----------
     config : BackendConfig
     solve : callable
-        Optimises a graph in place; `batch.optimize` unless a test passes another.
+        Optimises a whole graph in place; `batch.optimize` unless a test passes another.
+    smoother : IncrementalSmoother
+        With an empty graph; one as configured unless a test passes another.
 
     """
 
     def __init__(
         self, config: BackendConfig | None = None, solve: Solve = batch.optimize,
+        smoother: IncrementalSmoother | None = None,
     ) -> None:
         self._config = BackendConfig() if config is None else config
         self._solve = solve
-        self._graph = Graph()
+        self._smoother = (
+            IncrementalSmoother(self._config.smoother) if smoother is None else smoother)
         self._timeline = OdometryTimeline()
         self._node_stamps = GrowingArray((), np.int64)
         self._node_odometry = np.zeros(3)
         """Odometry at the newest hidden node."""
         self._newest_node_covariance = np.zeros((3, 3))
-        """In map axes, propagated by odometry since the last solve."""
+        """In map axes."""
         self._pending: list[tuple[int, int, str, Measurement]] = []
         self._arrival = itertools.count()
         self._queue = _Queue()
@@ -100,7 +102,7 @@ class PoseGraphBackend:
     @property
     def graph(self) -> Graph:
         """The pose graph; its owner is this object."""
-        return self._graph
+        return self._smoother.graph
 
     @property
     def node_stamps_ns(self) -> IntArray:
@@ -124,7 +126,7 @@ class PoseGraphBackend:
 
     def energies(self) -> Energies:
         """Return the energy of every constraint in the graph."""
-        return self._graph.energies()
+        return self.graph.energies()
 
     def add_odometry(self, sample: OdometrySample, source: str = 'odom') -> Answer:
         """Take an odometry sample; make a hidden node and its edge if the policy says so."""
@@ -143,8 +145,8 @@ class PoseGraphBackend:
                 f'odometry at {sample.stamp_ns} after {newest}')
         pose = se2.wrapped(sample.pose)
         self._timeline.append(sample.stamp_ns, pose)
-        if self._graph.n_nodes == 0:
-            self._graph.apply(GraphUpdate(hidden=pose[None], fix=(0,)))
+        if self.graph.n_nodes == 0:
+            self._smoother.update(GraphUpdate(hidden=pose[None], fix=(0,)))
             self._node_stamps.append_one(sample.stamp_ns)
             self._node_odometry = pose
         else:
@@ -162,18 +164,17 @@ class PoseGraphBackend:
                 math.hypot(difference[0], difference[1]), abs(float(se2.wrap(difference[2]))),
                 (stamp_ns - last_ns) * 1e-9):
             return
-        self._node_odometry = pose
         motion = self._timeline.motion(last_ns, stamp_ns)
-        node = self._graph.n_nodes
-        start = self._graph.poses[-1]
         noise = covariance.odometry_covariance(self._config.odometry_noise, *motion)
-        self._newest_node_covariance = covariance.propagated(
-            start, self._newest_node_covariance, motion.increment, noise)
-        self._graph.apply(GraphUpdate(
-            hidden=se2.compose(start, motion.increment)[None],
-            edges=Edges([node - 1], [node], [motion.increment], [covariance.information(noise)],
-                        [EdgeKind.ODOMETRY])))
+        result = self._smoother.extend(motion.increment, covariance.information(noise))
+        if result.status is Status.FAILED:
+            # the next sample makes the node, at the end of a longer motion
+            self.counts['solver', 'failed'] += 1
+            return
+        self._settled = self._settled and result.status is Status.CONVERGED
+        self._newest_node_covariance = self._smoother.newest_covariance()
         self._node_stamps.append_one(stamp_ns)
+        self._node_odometry = pose
 
     def add_measurement(self, measurement: Measurement, source: str) -> Answer:
         """
@@ -241,54 +242,53 @@ class PoseGraphBackend:
                 return rejected('before_odometry', f'reference stamp {closure.reference_ns}')
             return self._anchor(closure.reference_ns)
         node = closure.reference_node
-        if node is None or not 0 <= node < self._graph.n_nodes:
+        if node is None or not 0 <= node < self.graph.n_nodes:
             return rejected('unknown_node', f'there is no hidden node {node}')
         return binding.Anchor(node, np.zeros(3), np.zeros((3, 3)))
 
     def update(self) -> UpdateReport:
         """Add what has come in to the graph and improve the estimate; for a timer."""
-        return self._optimize(self._config.online, closing=False)
-
-    def optimize(self) -> UpdateReport:
-        """Optimise fully, once more with what had been set aside: the end of a stream."""
-        self._queue.edges += self._quarantine.edges
-        self._queue.observed += self._quarantine.observed
-        self._quarantine = _Queue()
-        self._settled = False
-        return self._optimize(self._config.closing, closing=True)
-
-    def _optimize(self, config: SolverConfig, *, closing: bool) -> UpdateReport:
-        if self._graph.n_nodes == 0:
+        if self.graph.n_nodes == 0:
             return UpdateReport(Status.CONVERGED, '', 0, 0, 0.0)
-        checkpoint = self._graph.checkpoint()
-        alignment_before = self._alignment, self._alignment_sigma
-        if self._alignment is not AlignmentState.ALIGNED:
-            self._align()
+        state = self._alignment, self._alignment_sigma
+        T_map_graph = self._align()
         joining = self._joining()
         if len(joining) == 0 and self._settled:
             return UpdateReport(Status.CONVERGED, '', 0, 0, self._chi2)
-        self._graph.apply(GraphUpdate(
-            edges=Edges.joined(joining.edges), observed=ObservedNodes.joined(joining.observed)))
-        try:
-            result = solve_from_two_starts(self._graph, config, self._solve, closing=closing)
-            reason = result.reason
-        except Exception as error:
-            # whatever it is: what came in must not stay half applied
-            result, reason = None, f'{type(error).__name__}: {error}'
-        if result is None or result.status is Status.FAILED:
-            self._graph.restore(checkpoint)
-            self._alignment, self._alignment_sigma = alignment_before
+        before: FloatArray | None = None
+        if T_map_graph is not None:
+            before = self.graph.poses.copy()
+            self.graph.set_poses(se2.compose(T_map_graph, before))
+        result = self._step(GraphUpdate(
+            edges=Edges.joined(joining.edges), observed=ObservedNodes.joined(joining.observed),
+            # from here on the map holds the graph, not its first node
+            free=() if T_map_graph is None else (0,)))
+        if result.status is Status.FAILED:
+            if before is not None:
+                self.graph.set_poses(before)
+                self._settled = False
+            self._alignment, self._alignment_sigma = state
             self._quarantine.edges += joining.edges
             self._quarantine.observed += joining.observed
             self.counts['solver', 'failed'] += 1
-            return UpdateReport(Status.FAILED, reason, 0, 0, self._chi2)
-        self._settled = result.status is not Status.MAX_ITERATIONS
-        self._chi2 = result.chi2
-        if result.factorization is not None and result.free_nodes[-1] == self._graph.n_nodes - 1:
-            self._newest_node_covariance = result.factorization.covariance(
-                len(result.free_nodes) - 1)
+            return UpdateReport(Status.FAILED, result.reason, 0, 0, self._chi2)
+        self._settled = result.status is Status.CONVERGED
+        # kept up by the smoother, at the cost of a sum; exact after a full optimisation
+        self._chi2 = max(float(self.graph.memory['scalars'][tb.CHI2]), 0.0)
+        self._newest_node_covariance = self._smoother.newest_covariance()
         return UpdateReport(
-            result.status, '', len(joining), result.iterations, result.chi2)
+            result.status, '', len(joining), result.iterations, self._chi2, result.relinearized,
+            result.eliminated, result.visited)
+
+    def _step(self, update: GraphUpdate) -> UpdateResult:
+        """Have the smoother make an update, whole or, whatever happens, not at all."""
+        checkpoint = self.graph.begin()
+        try:
+            return self._smoother.update(update)
+        except Exception as error:
+            self.graph.undo(checkpoint)
+            reason = f'{type(error).__name__}: {error}'
+            return UpdateResult(Status.FAILED, reason, 0, 0, 0, 0, math.nan)
 
     def _joining(self) -> _Queue:
         """Take what can join the graph out of the queue; observed nodes wait for alignment."""
@@ -298,38 +298,59 @@ class PoseGraphBackend:
             joining.observed, self._queue.observed = self._queue.observed, []
         return joining
 
-    def _align(self) -> None:
-        """Turn the whole graph into the map if the observed nodes in the queue tell the angle."""
-        if len(self._queue.observed) == 0:
-            return
-        self._alignment = AlignmentState.UNALIGNED
-        observed = ObservedNodes.joined(self._queue.observed)
-        predicted = se2.compose(self._graph.poses[observed.node], observed.offset)
-        sigma = np.full(len(observed), np.inf)
-        full = observed.kind == ObservedKind.GLOBAL_POSE
-        sigma[full] = np.sqrt(np.linalg.inv(observed.information[full])[:, 2, 2])
-        if np.min(sigma) <= ALIGNING_SIGMA:
-            best = int(np.argmin(sigma))
-            self._turn(se2.compose(observed.mean[best], se2.inverse(predicted[best])),
-                       float(sigma[best]))
-            return
-        variance = 1.0 / (0.5 * np.trace(observed.information[:, :2, :2], axis1=1, axis2=2))
-        found = alignment.align(predicted[:, :2], observed.mean[:, :2], variance)
-        self._alignment_sigma = found.sigma_heading
-        if found.certain(self._config.alignment):
-            self._turn(found.T_map_odom, found.sigma_heading)
+    def _align(self) -> FloatArray | None:
+        """Return the motion of the graph into the map, once the observed nodes tell it."""
+        if self._alignment is AlignmentState.ALIGNED or len(self._queue.observed) == 0:
+            return None
+        turn = alignment.find_turn(
+            self.graph.poses, ObservedNodes.joined(self._queue.observed), self._config.alignment)
+        self._alignment = (AlignmentState.UNALIGNED if turn.T_map_graph is None
+                           else AlignmentState.ALIGNED)
+        self._alignment_sigma = turn.sigma
+        return turn.T_map_graph
 
-    def _turn(self, T_map_graph: FloatArray, sigma: float) -> None:
-        """Move the whole graph rigidly; from here on the map holds it, not its first node."""
-        self._graph.set_poses(se2.compose(T_map_graph, self._graph.poses))
-        self._graph.apply(GraphUpdate(free=(0,)))
-        self._alignment, self._alignment_sigma = AlignmentState.ALIGNED, sigma
+    def optimize(self) -> UpdateReport:
+        """Optimise fully, once more with what had been set aside: the end of a stream."""
+        report = self.update()
+        if len(self._quarantine) > 0:
+            self._queue.edges += self._quarantine.edges
+            self._queue.observed += self._quarantine.observed
+            self._quarantine = _Queue()
+            again = self.update()
+            report = replace(again, new_constraints=report.new_constraints + again.new_constraints)
+        if self.graph.n_nodes == 0:
+            return report
+        return report.after(self._solve_whole())
+
+    def _solve_whole(self) -> UpdateReport:
+        """Optimise the whole graph from two starts; if that fails all poses are as before."""
+        before = self.graph.poses.copy()
+        try:
+            result = solve_from_two_starts(
+                self.graph, self._config.closing, self._solve, closing=True)
+            status, reason = result.status, result.reason
+        except Exception as error:
+            # whatever it is: no pose must stay on its way
+            status, reason = Status.FAILED, f'{type(error).__name__}: {error}'
+        if status is Status.FAILED:
+            self.graph.set_poses(before)
+            self._settled = False
+            self.counts['solver', 'failed'] += 1
+            return UpdateReport(Status.FAILED, reason, 0, 0, self._chi2)
+        if self.graph.memory.head[tb.N_SEEDS] > 0:
+            # the solver has left the elimination to the smoother
+            self._smoother.update(GraphUpdate())
+        self._settled = status is not Status.MAX_ITERATIONS
+        self._chi2 = result.chi2
+        self._newest_node_covariance = self._smoother.newest_covariance()
+        return UpdateReport(status, '', 0, result.iterations, result.chi2)
 
     def estimate(self) -> Estimate | None:
         """Return the present estimate; None before the first odometry."""
-        if self._graph.n_nodes == 0:
+        graph = self.graph
+        if graph.n_nodes == 0:
             return None
-        poses, stamps = self._graph.poses, self.node_stamps_ns
+        poses, stamps = graph.poses, self.node_stamps_ns
         newest_ns = int(self._timeline.stamps_ns[-1])
         motion = self._timeline.motion(int(stamps[-1]), newest_ns)
         newest = se2.compose(poses[-1], motion.increment)
@@ -338,7 +359,9 @@ class PoseGraphBackend:
         cov = covariance.propagated(
             poses[-1], self._newest_node_covariance, motion.increment, noise)
         if self._alignment is AlignmentState.UNALIGNED:
-            shift, cov = self._unaligned(newest)
+            # those that turned the graph in an update that failed are set aside
+            shift, cov = alignment.guess(poses, newest, ObservedNodes.joined(
+                self._queue.observed + self._quarantine.observed))
             poses, newest = poses + shift, newest + shift
         if newest_ns > stamps[-1]:
             stamps, poses = np.append(stamps, newest_ns), np.vstack((poses, newest))
@@ -347,29 +370,7 @@ class PoseGraphBackend:
             path=Trajectory(stamps, poses), T_odom_base=odometry, T_map_base=newest,
             T_map_odom=se2.compose(newest, se2.inverse(odometry)), covariance=cov,
             alignment=self._alignment, alignment_sigma=self._alignment_sigma, chi2=self._chi2,
-            n_hidden=self._graph.n_nodes, n_edges=len(self._graph.edges),
-            n_observed=len(self._graph.observed))
-
-    def _unaligned(self, newest: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """
-        Say where the robot is while the angle to the map is unknown, and how little that is.
-
-        The graph is shifted onto the most certain position. With d the distance from there and
-        an angle that is uniform on the circle, the mean square error of each coordinate is d^2,
-        that of the heading pi^2 / 3.
-        """
-        # those that turned the graph in an update that failed are set aside
-        waiting = self._queue.observed + self._quarantine.observed
-        first = max(waiting, key=lambda item: float(np.trace(item.information[0, :2, :2])))
-        error = observed_errors(self._graph.poses, first)[0]
-        turn = np.eye(3)
-        turn[:2, :2] = se2.rotation(first.mean[0, 2])
-        shift = -(turn @ error)
-        shift[2] = 0.0
-        where = se2.compose(self._graph.poses[first.node], first.offset)[0]
-        variance = float(np.sum((newest[:2] - where[:2])**2)
-                         + 2.0 / np.trace(first.information[0, :2, :2]))
-        return shift, np.diag((variance, variance, covariance.UNKNOWN_HEADING_VARIANCE))
+            n_hidden=graph.n_nodes, n_edges=graph.n_edges, n_observed=graph.n_observed)
 
     def _count(self, source: str, answer: Answer) -> Answer:
         if answer.verdict is Verdict.ACCEPTED:

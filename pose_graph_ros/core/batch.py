@@ -1,43 +1,31 @@
 # Copyright 2026 The pose_graph_ros authors
 # SPDX-License-Identifier: Apache-2.0
 """
-Batch optimisation of a whole graph: Gauss-Newton and Levenberg-Marquardt in one loop.
+Batch optimisation of a whole graph, in its tables.
 
-Every iteration linearizes at the present poses and solves `(H + lambda diag(H)) dx = -b`. With
-lambda = 0 that is Gauss-Newton. A step that would raise chi2 is not taken: lambda grows until one
-lowers it. Every step that is taken lets lambda shrink, and below a bound it becomes 0 again, so
-that the last iterations converge as fast as Gauss-Newton does.
-
-The scaling by diag(H) makes the damping independent of units (Marquardt 1963).
+The order of elimination and the cliques are worked out once (`symbolic`), the iterations run over
+them without Python (`descent`). Afterwards the tree of cliques is that of the last linearization,
+and the incremental smoother goes on from there.
 """
 
 import contextlib
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from enum import Enum
-from typing import NamedTuple
 
 import numpy as np
-import scipy.sparse
 
+from pose_graph_ros.core import (
+    editing,
+    gauss_newton,
+    initialization,
+    symbolic,
+    tables as tb,
+)
 from pose_graph_ros.core.config import SolverConfig
+from pose_graph_ros.core.descent import descend, End
 from pose_graph_ros.core.exceptions import LinearSolveError
 from pose_graph_ros.core.graph import Graph
-from pose_graph_ros.core.linear_system import Factorization, LinearSystem
-from pose_graph_ros.core.se2 import FloatArray, IntArray
-
-# Damping that the first refused step brings, its growth and its decay, and where it is dropped.
-FIRST_DAMPING = 1e-5
-DAMPING_GROWTH = 10.0
-DAMPING_DECAY = 0.1
-LEAST_DAMPING = 1e-9
-LARGEST_DAMPING = 1e12
-# chi2 is a sum of many rounded numbers: an increase by this fraction (of at least 1) is none.
-ROUNDING = 1e-12
-# Where no step lowers chi2 by this fraction of it (of at least 1) although one should, there is no
-# minimum.
-STALL = 1e-6
-# Steps below this that no longer shrink are rounding noise [m, rad].
-NOISE_STEP = 1e-7
+from pose_graph_ros.core.se2 import FloatArray
 
 
 class Status(Enum):
@@ -61,121 +49,104 @@ class BatchResult:
     """Steps that were taken."""
     chi2_before: float
     chi2: float
-    factorization: Factorization | None
-    """
-    Of H without damping: at the poses before the last step, or after it if that was damped.
-    None if there are no unknowns, or H is singular.
-    """
-    free_nodes: IntArray
-    """Hidden nodes with unknowns, in the order of the blocks of H."""
 
 
-class _Trial(NamedTuple):
-    """What `_downhill` found."""
-
-    step: FloatArray | None
-    """None if no step lowers chi2."""
-    factorization: Factorization | None
-    """Of H without damping; None if damping was needed."""
-    damping: float
-    """For the next iteration."""
-    chi2: float
-    """After the step; without one, before it."""
-    stalled: bool = False
-    """Whether there is no step although this is no minimum."""
+_STATUS = {End.CONVERGED: Status.CONVERGED, End.STALLED: Status.STALLED,
+           End.OUT_OF_ITERATIONS: Status.MAX_ITERATIONS, End.UNDETERMINED: Status.FAILED}
 
 
 def optimize(graph: Graph, config: SolverConfig) -> BatchResult:
     """
     Move the hidden nodes to the minimum of chi2 that lies downhill.
 
-    A numerical failure is a result, not an exception; the poses are then as before the call.
+    A numerical failure is a result, not an exception; the poses are then as before the call, and
+    the smoother eliminates everything anew at its next step. Not for use between `Graph.begin`
+    and `Graph.undo`: the tree of cliques is a new one.
     """
+    chi2, answer = _look_before(graph)
+    if answer is not None:
+        return answer
     poses = graph.poses.copy()
-    chi2 = chi2_before = graph.energies(poses).chi2
+    return _finished(graph, poses, chi2, _descend(graph, config, _analysed(graph), chi2))
+
+
+def optimize_from_nothing(graph: Graph, config: SolverConfig) -> BatchResult:
+    """
+    Move the hidden nodes to a minimum of chi2 without the present poses for a guess.
+
+    The start is the chordal one where the constraints determine headings, else that of headings
+    and positions solved for together. If it leads to something worse than the present poses are,
+    they are the start after all. Else as `optimize`.
+    """
+    chi2, answer = _look_before(graph)
+    if answer is not None:
+        return answer
+    poses, cliques = graph.poses.copy(), _analysed(graph)
+    head = graph.memory.head
+    result = None
+    with contextlib.suppress(LinearSolveError):
+        try:
+            start = initialization.chordal_poses(head, cliques)
+        except LinearSolveError:
+            start = initialization.joint(graph)
+        gauss_newton.put_poses(head, start)
+        result = _descend(graph, config, cliques, _chi2(graph))
+    if result is None or result.status is Status.FAILED or not result.chi2 <= chi2:
+        gauss_newton.put_poses(head, poses)
+        result = _descend(graph, config, cliques, chi2)
+    return _finished(graph, poses, chi2, result)
+
+
+def _look_before(graph: Graph) -> tuple[float, BatchResult | None]:
+    """Return chi2, and the result if there is nothing to optimise or no way to."""
+    head = graph.memory.head
+    chi2 = _chi2(graph)
     if not np.isfinite(chi2):
-        return _failed('chi2 is not finite', chi2)
-    damping, previous_length = config.initial_damping, np.inf
-    factorization: Factorization | None = None
-    status, iterations = Status.MAX_ITERATIONS, 0
-    try:
-        system = LinearSystem(graph)
-        if system.size == 0:
-            status = Status.CONVERGED
-        while status is Status.MAX_ITERATIONS and iterations < config.max_iterations:
-            step, factorization, damping, chi2, stalled = _downhill(
-                graph, system, poses, chi2, damping)
-            if step is None:
-                status = Status.STALLED if stalled else Status.CONVERGED
-                break
-            poses = system.moved(poses, step)
-            iterations += 1
-            length = float(np.max(np.abs(step)))
-            if damping == 0.0 and _converged(length, previous_length, config.step_tolerance):
-                status = Status.CONVERGED
-            previous_length = length
-    except LinearSolveError as error:
-        return _failed(str(error), chi2_before)
-    if factorization is None and system.size > 0:
-        with contextlib.suppress(LinearSolveError):
-            factorization = Factorization(system.assemble(poses)[0])
-    graph.set_poses(poses)
-    return BatchResult(
-        status, '', iterations, chi2_before, chi2, factorization, system.free_nodes)
+        return chi2, _failed('chi2 is not finite', chi2)
+    if np.all(graph.fixed):
+        return chi2, BatchResult(Status.CONVERGED, '', 0, chi2, chi2)
+    node, count = symbolic.loose_part(head)
+    if node >= 0:
+        return chi2, _failed(
+            f'hidden node {node} and {count - 1} others are tied to no fixed and no observed '
+            f'node: their poses are not determined', chi2)
+    return chi2, None
+
+
+def _chi2(graph: Graph) -> float:
+    return float(gauss_newton.evaluate(graph.memory.head, np.empty((graph.n_nodes, 3)))[0])
+
+
+def _analysed(graph: Graph) -> symbolic.Cliques:
+    """Work out the cliques and make room for them."""
+    memory = graph.memory
+    analysis = symbolic.analyse(memory.head)
+    memory.ensure('pool_f', analysis.need_f)
+    memory.ensure('pool_i', analysis.need_i)
+    memory.ensure('work_f', analysis.largest)
+    return analysis.cliques
+
+
+def _descend(
+    graph: Graph, config: SolverConfig, cliques: symbolic.Cliques, chi2: float,
+) -> BatchResult:
+    """Optimise from the present poses; if that fails they may be anywhere."""
+    head = graph.memory.head
+    symbolic.plant(head, cliques)
+    end, iterations, after = descend(head, chi2, config)
+    if end is End.UNDETERMINED:
+        return _failed(f'hidden node {head[tb.BAD_NODE]} is not determined', chi2)
+    return BatchResult(_STATUS[end], '', iterations, chi2, after)
+
+
+def _finished(graph: Graph, poses: FloatArray, chi2: float, result: BatchResult) -> BatchResult:
+    """Return the result for the whole call, the poses as they were if it has failed."""
+    if result.status is Status.FAILED:
+        gauss_newton.put_poses(graph.memory.head, poses)
+        editing.restart(graph.memory.head)
+        return _failed(result.reason, chi2)
+    return replace(result, chi2_before=chi2)
 
 
 def _failed(reason: str, chi2: float) -> BatchResult:
-    return BatchResult(
-        Status.FAILED, reason, 0, chi2, chi2, None, np.empty(0, dtype=np.int64))
-
-
-def _converged(length: float, previous_length: float, tolerance: float) -> bool:
-    """
-    Tell from the lengths of the last two steps whether what is left is below the tolerance.
-
-    Gauss-Newton converges linearly where errors remain: with a ratio r of two steps, the steps
-    still to come add up to r / (1 - r) times the last one.
-    """
-    if length >= previous_length:
-        return length < NOISE_STEP
-    ratio = length / previous_length
-    return length < tolerance and length * ratio / (1.0 - ratio) < tolerance
-
-
-def _downhill(
-    graph: Graph, system: LinearSystem, poses: FloatArray, chi2: float, damping: float,
-) -> _Trial:
-    """Find a step that does not raise chi2, with as little damping as it takes."""
-    hessian, gradient = system.assemble(poses)
-    if not (np.all(np.isfinite(hessian.data)) and np.all(np.isfinite(gradient))):
-        raise LinearSolveError('H or b holds numbers that are not finite')
-    damped = hessian.copy()
-    failure: LinearSolveError | None = None
-    solved = False
-    while damping <= LARGEST_DAMPING:
-        try:
-            if damping > 0.0:
-                damped.setdiag((1.0 + damping) * hessian.diagonal())
-            factorization = Factorization(damped)
-            step = -factorization.solve(gradient)
-            solved = True
-            trial = graph.energies(system.moved(poses, step)).chi2
-            if trial <= chi2 + ROUNDING * max(chi2, 1.0):
-                shrunk = damping * DAMPING_DECAY
-                return _Trial(step, factorization if damping == 0.0 else None,
-                              shrunk if shrunk >= LEAST_DAMPING else 0.0, trial)
-        except LinearSolveError as error:
-            failure = error
-        damping = max(FIRST_DAMPING, damping * DAMPING_GROWTH)
-    if failure is not None and not solved:
-        raise failure
-    return _Trial(None, None, damping, chi2, _promises(hessian, gradient, chi2))
-
-
-def _promises(hessian: scipy.sparse.csc_array, gradient: FloatArray, chi2: float) -> bool:
-    """Tell whether b^T H^-1 b, by which a quadratic chi2 would fall, is more than rounding."""
-    try:
-        fall = float(gradient @ Factorization(hessian).solve(gradient))
-    except LinearSolveError:
-        return False
-    return fall > STALL * max(chi2, 1.0)
+    return BatchResult(Status.FAILED, reason, 0, chi2, chi2)

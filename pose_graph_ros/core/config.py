@@ -126,14 +126,33 @@ class SolverConfig:
 
 
 @dataclass(frozen=True, slots=True)
+class SmootherConfig:
+    """How exact the incremental smoother is, and how much work a step may do."""
+
+    alpha: float = 0.02
+    """A node that has moved by less than this many sigmas moves no other node."""
+    budget: float = 0.005
+    """Squared linearization error [sigma^2] that a step may leave in all that it has moved ..."""
+    budget_share: float = 4e-6
+    """... and for each constraint that it has moved: the smaller of both counts."""
+    max_iterations: int = 5
+    """Iterations of one update at the most; what is left over is done in the next."""
+
+    def __post_init__(self) -> None:
+        _require(self, 'alpha', 'budget', 'budget_share')
+        if self.max_iterations < 1:
+            raise ConfigError(f'SmootherConfig.max_iterations: expected >= 1, '
+                              f'got {self.max_iterations!r}')
+
+
+@dataclass(frozen=True, slots=True)
 class BackendConfig:
     """Settings of `PoseGraphBackend`."""
 
     nodes: NodePolicy = field(default_factory=NodePolicy)
     odometry_noise: OdometryNoise = field(default_factory=OdometryNoise)
     alignment: AlignmentPolicy = field(default_factory=AlignmentPolicy)
-    online: SolverConfig = field(
-        default_factory=lambda: SolverConfig(max_iterations=10, step_tolerance=1e-4))
+    smoother: SmootherConfig = field(default_factory=SmootherConfig)
     """For the timer: what is left over is done at the next update."""
     closing: SolverConfig = field(
         default_factory=lambda: SolverConfig(max_iterations=100, step_tolerance=1e-10))

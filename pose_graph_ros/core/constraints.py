@@ -56,6 +56,12 @@ class _Table:
         return cls(*(np.concatenate([getattr(table, item.name) for table in tables])
                      for item in fields(cls)))
 
+    @property
+    def weighted_information(self) -> FloatArray:
+        """Information times weight, shape (M, 3, 3)."""
+        information, weight = getattr(self, 'information'), getattr(self, 'weight')  # noqa: B009
+        return np.asarray(weight[:, None, None] * information)
+
     def rows(self, index: IntArray | npt.NDArray[np.bool_] | slice) -> Self:
         """Return the chosen rows."""
         return type(self)(*(getattr(self, item.name)[index] for item in fields(self)))
@@ -73,6 +79,10 @@ def _integers(values: npt.ArrayLike, dtype: type[np.generic]) -> npt.NDArray[Any
     return array.astype(dtype, copy=False)
 
 
+def _weights(weight: npt.ArrayLike | None, size: int) -> FloatArray:
+    return np.ones(size) if weight is None else np.asarray(weight, dtype=np.float64)
+
+
 @dataclass(frozen=True, slots=True)
 class Edges(_Table):
     """M directed edges."""
@@ -87,18 +97,21 @@ class Edges(_Table):
     """Inverse covariance of the error (3.48), in the frame of the measured pose, (M, 3, 3)."""
     kind: KindArray
     """`EdgeKind`, shape (M,)."""
+    weight: FloatArray
+    """Factor on the information, shape (M,); 0 for an edge that has been removed."""
 
-    def __init__(
+    def __init__(  # noqa: PLR0917  the columns
         self, i: npt.ArrayLike = (), j: npt.ArrayLike = (),
         mean: npt.ArrayLike | None = None, information: npt.ArrayLike | None = None,
-        kind: npt.ArrayLike = (),
+        kind: npt.ArrayLike = (), weight: npt.ArrayLike | None = None,
     ) -> None:
+        i = _integers(i, np.int64)
         set_columns(self, {
-            'i': _integers(i, np.int64), 'j': _integers(j, np.int64),
+            'i': i, 'j': _integers(j, np.int64),
             'mean': np.asarray(_empty(3) if mean is None else mean, dtype=np.float64),
             'information': np.asarray(
                 _empty(3, 3) if information is None else information, dtype=np.float64),
-            'kind': _integers(kind, np.uint8)})
+            'kind': _integers(kind, np.uint8), 'weight': _weights(weight, len(i))})
 
 
 @dataclass(frozen=True, slots=True)
@@ -118,11 +131,13 @@ class ObservedNodes(_Table):
     """Inverse covariance of the error (3.52), in the frame of the observed pose, (K, 3, 3)."""
     kind: KindArray
     """`ObservedKind`, shape (K,)."""
+    weight: FloatArray
+    """Factor on the information, shape (K,); 0 for one that has been removed."""
 
-    def __init__(
+    def __init__(  # noqa: PLR0917  the columns
         self, node: npt.ArrayLike = (), offset: npt.ArrayLike | None = None,
         mean: npt.ArrayLike | None = None, information: npt.ArrayLike | None = None,
-        kind: npt.ArrayLike = (),
+        kind: npt.ArrayLike = (), weight: npt.ArrayLike | None = None,
     ) -> None:
         node = _integers(node, np.int64)
         set_columns(self, {
@@ -132,7 +147,7 @@ class ObservedNodes(_Table):
             'mean': np.asarray(_empty(3) if mean is None else mean, dtype=np.float64),
             'information': np.asarray(
                 _empty(3, 3) if information is None else information, dtype=np.float64),
-            'kind': _integers(kind, np.uint8)})
+            'kind': _integers(kind, np.uint8), 'weight': _weights(weight, len(node))})
 
 
 def set_columns(table: _Table, columns: dict[str, npt.NDArray[np.generic]]) -> None:
@@ -141,25 +156,38 @@ def set_columns(table: _Table, columns: dict[str, npt.NDArray[np.generic]]) -> N
         object.__setattr__(table, name, column)
 
 
+_TAILS: dict[str, tuple[int, ...]] = {'mean': (3,), 'offset': (3,), 'information': (3, 3)}
+_COLUMNS = {table: [(item.name, _TAILS.get(item.name, ())) for item in fields(table)]
+            for table in (Edges, ObservedNodes)}
+
+
+def check_shapes(table: Edges | ObservedNodes) -> None:
+    """Raise GraphUpdateError unless all columns have the length and the shape they should."""
+    size = len(table)
+    for name, tail in _COLUMNS[type(table)]:
+        shape = getattr(table, name).shape
+        if shape != (size, *tail):
+            raise GraphUpdateError(
+                f'{type(table).__name__}.{name}: expected shape {(size, *tail)}, got {shape}')
+
+
 def check(table: Edges | ObservedNodes, n_nodes: int) -> None:
     """
     Raise unless the rows are sound constraints between hidden nodes 0 to n_nodes - 1.
 
+    Their shapes have been looked at by `check_shapes`.
+
     Raises
     ------
     GraphUpdateError
-        Says which row, what was expected and what came: shapes, node indices, an edge from a
+        Says which row, what was expected and what came: node indices, an edge from a
         node to itself, numbers that are not finite, an information matrix that is not symmetric
         or not positive semidefinite.
 
     """
-    name, size = type(table).__name__, len(table)
+    name = type(table).__name__
     for item in fields(table):
         column = getattr(table, item.name)
-        tail = {'mean': (3,), 'offset': (3,), 'information': (3, 3)}.get(item.name, ())
-        if column.shape != (size, *tail):
-            raise GraphUpdateError(
-                f'{name}.{item.name}: expected shape {(size, *tail)}, got {column.shape}')
         _refuse_rows(~np.isfinite(column), f'{name}.{item.name} is not finite', column)
     ends = (table.i, table.j) if isinstance(table, Edges) else (table.node,)
     for end in ends:
@@ -167,6 +195,7 @@ def check(table: Edges | ObservedNodes, n_nodes: int) -> None:
                      f'{name}: expected a hidden node in 0..{n_nodes - 1}', end)
     kinds = EdgeKind if isinstance(table, Edges) else ObservedKind
     _refuse_rows(table.kind >= len(kinds), f'{name}.kind is no {kinds.__name__}', table.kind)
+    _refuse_rows(table.weight < 0.0, f'{name}.weight is negative', table.weight)
     if isinstance(table, Edges):
         _refuse_rows(table.i == table.j, f'{name}: an edge leads from a node to itself', table.i)
     _check_information(f'{name}.information', table.information)

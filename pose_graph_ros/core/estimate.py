@@ -2,7 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """What the engine hands out: snapshots that do not change later."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from enum import Enum
 
 from pose_graph_ros.core.batch import Status
@@ -31,6 +31,19 @@ class UpdateReport:
     """Loop closures and observed nodes that joined the graph."""
     iterations: int
     chi2: float
+    relinearized: int = 0
+    """Constraints that the smoother linearized again."""
+    eliminated: int = 0
+    """Hidden nodes that it eliminated again."""
+    visited: int = 0
+    """Cliques of hidden nodes that it solved for again."""
+
+    def after(self, solved: 'UpdateReport') -> 'UpdateReport':
+        """Return the report of this update and of the optimisation of the whole after it."""
+        failed = next((part for part in (self, solved) if part.status is Status.FAILED), solved)
+        return replace(
+            self, status=failed.status, reason=failed.reason,
+            iterations=self.iterations + solved.iterations, chi2=solved.chi2)
 
 
 @dataclass(frozen=True, slots=True)

@@ -15,14 +15,19 @@ Where headings are not measured, positions tell them: a translation t_j = t_i + 
 in t and u at once. Solving for both together costs twice the unknowns and needs no heading.
 """
 
+import math
+
 import numpy as np
 import numpy.typing as npt
 import scipy.sparse
 import scipy.sparse.linalg
 
-from pose_graph_ros.core import se2
+from pose_graph_ros.core import complex_system, se2, symbolic, tables as tb
+from pose_graph_ros.core.complex_system import Terms
 from pose_graph_ros.core.exceptions import LinearSolveError
+from pose_graph_ros.core.factors import wrap
 from pose_graph_ros.core.graph import Graph
+from pose_graph_ros.core.jit import kernel
 from pose_graph_ros.core.se2 import FloatArray
 
 # A heading whose measurements cancel leaves less than this of a unit vector.
@@ -41,24 +46,88 @@ def chordal(graph: Graph) -> FloatArray:
         If headings or positions are not determined, as where only positions are observed.
 
     """
-    edges, observed = graph.edges, graph.observed
-    u = _solve(
-        graph, np.exp(1j * graph.poses[:, 2]), edges.information[:, 2, 2],
-        observed.information[:, 2, 2], factor=np.exp(1j * edges.mean[:, 2]),
-        shift=np.zeros(len(edges), dtype=complex),
-        target=np.exp(1j * (observed.mean[:, 2] - observed.offset[:, 2])))
-    if np.any(np.abs(u) < SMALLEST_ROTATION):
-        raise LinearSolveError('chordal start: the measured headings cancel each other out')
-    u /= np.abs(u)
+    head = graph.memory.head
+    return chordal_poses(head, symbolic.analyse(head).cliques)
 
-    # positions as complex numbers too: t_j = t_i + u_i t_z, t_i = t_z - u_i t_o
-    t = _solve(
-        graph, _complex(graph.poses), _isotropic(edges.information),
-        _isotropic(observed.information), factor=np.ones(len(edges), dtype=complex),
-        shift=u[edges.i] * _complex(edges.mean),
-        target=_complex(observed.mean) - u[observed.node] * _complex(observed.offset))
-    theta = np.where(graph.fixed, graph.poses[:, 2], se2.wrap(np.angle(u)))
-    return np.column_stack((t.real, t.imag, theta))
+
+def chordal_poses(head: tb.IntHead, cliques: symbolic.Cliques) -> FloatArray:
+    """Do what `chordal` does, where the cliques of the whole graph are known."""
+    u, bad = complex_system.solve(head, cliques, _rotation_terms(head))
+    length = np.hypot(u[:, 0], u[:, 1])
+    if bad >= 0:
+        raise LinearSolveError(
+            f'chordal start: the heading of hidden node {bad} is not determined')
+    if np.any(length < SMALLEST_ROTATION):
+        raise LinearSolveError('chordal start: the measured headings cancel each other out')
+    u /= length[:, None]
+    t, bad = complex_system.solve(head, cliques, _translation_terms(head, u))
+    if bad >= 0:
+        raise LinearSolveError(
+            f'chordal start: the position of hidden node {bad} is not determined')
+    return np.asarray(_poses(head, u, t))
+
+
+@kernel
+def _rotation_terms(head):  # type: ignore[no-untyped-def]
+    """Return what asks for u_j = exp(i th_z) u_i and u_i = exp(i (th_z - th_o))."""
+    node_f, edge_f, observed_f = tb.node_f(head), tb.edge_f(head), tb.observed_f(head)
+    known = np.empty((head[tb.N_NODES], 2))
+    for v in range(head[tb.N_NODES]):
+        theta = node_f[v, tb.POSE + 2]
+        known[v, 0], known[v, 1] = math.cos(theta), math.sin(theta)
+    of_edges = np.empty((head[tb.N_EDGES], 5))
+    for e in range(head[tb.N_EDGES]):
+        f = edge_f[e]
+        of_edges[e, 0] = f[tb.WEIGHT] * f[tb.INFO + 5]
+        of_edges[e, 1], of_edges[e, 2] = math.cos(f[tb.MEAN + 2]), math.sin(f[tb.MEAN + 2])
+        of_edges[e, 3] = of_edges[e, 4] = 0.0
+    of_observed = np.empty((head[tb.N_OBSERVED], 3))
+    for k in range(head[tb.N_OBSERVED]):
+        f = observed_f[k]
+        theta = f[tb.MEAN + 2] - f[tb.OBS_OFFSET + 2]
+        of_observed[k, 0] = f[tb.WEIGHT] * f[tb.INFO + 5]
+        of_observed[k, 1], of_observed[k, 2] = math.cos(theta), math.sin(theta)
+    return Terms(of_edges, of_observed, known)
+
+
+@kernel
+def _translation_terms(head, u):  # type: ignore[no-untyped-def]
+    """Return what asks for t_j = t_i + u_i t_z and t_i = t_z - u_i t_o, as complex numbers."""
+    node_f, edge_f, observed_f = tb.node_f(head), tb.edge_f(head), tb.observed_f(head)
+    edge_i, observed_i = tb.edge_i(head), tb.observed_i(head)
+    known = np.empty((head[tb.N_NODES], 2))
+    for v in range(head[tb.N_NODES]):
+        known[v, 0], known[v, 1] = node_f[v, tb.POSE], node_f[v, tb.POSE + 1]
+    of_edges = np.empty((head[tb.N_EDGES], 5))
+    for e in range(head[tb.N_EDGES]):
+        f, i = edge_f[e], edge_i[e, tb.END_I]
+        of_edges[e, 0] = 0.5 * f[tb.WEIGHT] * (f[tb.INFO] + f[tb.INFO + 3])
+        of_edges[e, 1], of_edges[e, 2] = 1.0, 0.0
+        of_edges[e, 3] = u[i, 0] * f[tb.MEAN] - u[i, 1] * f[tb.MEAN + 1]
+        of_edges[e, 4] = u[i, 1] * f[tb.MEAN] + u[i, 0] * f[tb.MEAN + 1]
+    of_observed = np.empty((head[tb.N_OBSERVED], 3))
+    for k in range(head[tb.N_OBSERVED]):
+        f, v = observed_f[k], observed_i[k, tb.OBS_NODE]
+        x, y = f[tb.OBS_OFFSET], f[tb.OBS_OFFSET + 1]
+        of_observed[k, 0] = 0.5 * f[tb.WEIGHT] * (f[tb.INFO] + f[tb.INFO + 3])
+        of_observed[k, 1] = f[tb.MEAN] - (u[v, 0] * x - u[v, 1] * y)
+        of_observed[k, 2] = f[tb.MEAN + 1] - (u[v, 1] * x + u[v, 0] * y)
+    return Terms(of_edges, of_observed, known)
+
+
+@kernel
+def _poses(head, u, t):  # type: ignore[no-untyped-def]
+    """Return the start, shape (N, 3); fixed nodes are where they are."""
+    node_f, node_i = tb.node_f(head), tb.node_i(head)
+    poses = np.empty((head[tb.N_NODES], 3))
+    for v in range(head[tb.N_NODES]):
+        if node_i[v, tb.FIXED] == 0:
+            poses[v, 0], poses[v, 1] = t[v, 0], t[v, 1]
+            poses[v, 2] = wrap(math.atan2(u[v, 1], u[v, 0]))
+        else:
+            for k in range(3):
+                poses[v, k] = node_f[v, tb.POSE + k]
+    return poses
 
 
 def joint(graph: Graph) -> FloatArray:
@@ -77,9 +146,10 @@ def joint(graph: Graph) -> FloatArray:
     """
     edges, observed, n = graph.edges, graph.observed, graph.n_nodes
     edge_rows, observed_rows = np.arange(len(edges)), np.arange(len(observed))
-    root_t, root_u = np.sqrt(_isotropic(edges.information)), np.sqrt(edges.information[:, 2, 2])
-    seen_t = np.sqrt(_isotropic(observed.information))
-    seen_u = np.sqrt(observed.information[:, 2, 2])
+    root_t = np.sqrt(_isotropic(edges.weighted_information))
+    root_u = np.sqrt(edges.weighted_information[:, 2, 2])
+    seen_t = np.sqrt(_isotropic(observed.weighted_information))
+    seen_u = np.sqrt(observed.weighted_information[:, 2, 2])
     # unknowns: all translations, then all rotations; a row for each term of the sum
     terms = (
         (edge_rows, edges.j, root_t),
@@ -111,28 +181,6 @@ def _complex(pose: FloatArray) -> ComplexArray:
 
 def _isotropic(information: FloatArray) -> FloatArray:
     return 0.5 * (information[:, 0, 0] + information[:, 1, 1])
-
-
-def _solve(
-    graph: Graph, known: ComplexArray, weight: FloatArray, unary_weight: FloatArray, *,
-    factor: ComplexArray, shift: ComplexArray, target: ComplexArray,
-) -> ComplexArray:
-    """
-    Minimise sum w |v_j - factor v_i - shift|^2 + sum w |v_node - target|^2.
-
-    The sums run over edges and observed nodes; v is `known` at the fixed nodes.
-    """
-    edges, node, fixed = graph.edges, graph.observed.node, graph.fixed
-    rows = np.arange(len(edges) + len(node))
-    edge_rows = rows[:len(edges)]
-    root, unary_root = np.sqrt(weight), np.sqrt(unary_weight)
-    matrix = scipy.sparse.coo_array((
-        np.concatenate((root, -root * factor, unary_root)),
-        (np.concatenate((edge_rows, edge_rows, rows[len(edges):])),
-         np.concatenate((edges.j, edges.i, node)))),
-        shape=(len(rows), graph.n_nodes), dtype=complex).tocsc()
-    right = np.concatenate((root * shift, unary_root * target))
-    return _least_squares(matrix, right, known, fixed)
 
 
 def _least_squares(

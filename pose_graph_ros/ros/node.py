@@ -8,6 +8,7 @@ newest estimate carried on by that odometry; the path goes out after an update.
 """
 
 from collections import Counter
+from collections.abc import Callable
 from functools import partial
 import time
 from typing import Any
@@ -85,7 +86,8 @@ class PoseGraphNode(Node):
         self._closed = True
 
         self._fresh = self.create_guard_condition(self._publish_path)
-        self._worker = Worker(PoseGraphBackend(config), lambda _: self._fresh.trigger())
+        self._worker = Worker(
+            PoseGraphBackend(config), lambda _: self._fresh.trigger(), self._warm_up)
         for source, topic, message_type, qos in INPUTS:
             self.create_subscription(
                 message_type, topic, partial(self._on_message, source), qos,
@@ -121,6 +123,19 @@ class PoseGraphNode(Node):
         """End the worker."""
         if not self._worker.stop(STOP_TIMEOUT):
             self.get_logger().warning('stopping although a solve is still under way')
+
+    def _warm_up(self, stopped: Callable[[], bool]) -> None:
+        """Have the kernels ready before the first measurement; runs in the worker's thread."""
+        # imported here, in the thread: the subscriptions need not wait for Numba
+        from pose_graph_ros.core.jit import is_cached  # noqa: PLC0415
+        from pose_graph_ros.core.warm_up import warm_up  # noqa: PLC0415
+
+        if not is_cached():
+            self.get_logger().info(
+                'compiling kernels, about 20 s on the first start; what comes in waits')
+        seconds = warm_up(stopped)
+        if not stopped():
+            self.get_logger().info(f'kernels ready after {seconds:.1f} s')
 
     def _on_message(self, source: str, message: Message) -> None:
         """Convert a message and post it; never raises, whatever the message holds."""
@@ -210,7 +225,7 @@ class PoseGraphNode(Node):
             'received': sum(self._received.values()),
             'processed': status.processed + sum(self._refused.values()),
             'pending': status.pending, 'quarantined': status.quarantined,
-            'updates': status.updates,
+            'updates': status.updates, 'prepared': int(self._worker.prepared),
             'solve_mean_ms': f'{1e3 * status.solve_mean:.3f}',
             'solve_max_ms': f'{1e3 * status.solve_max:.3f}'}
         for source, count in sorted(self._received.items()):
@@ -224,11 +239,14 @@ class PoseGraphNode(Node):
                 'hidden_nodes': estimate.n_hidden, 'edges': estimate.n_edges,
                 'observed_nodes': estimate.n_observed, 'chi2': f'{estimate.chi2:.6g}'})
         failed = status.report is not None and status.report.status is Status.FAILED
-        level, text = _health(estimate, failed=failed, alive=self._worker.alive)
+        level, text = _health(
+            estimate, failed=failed, alive=self._worker.alive, prepared=self._worker.prepared)
         self._out.publish_diagnostics(level, text, values)
 
 
-def _health(estimate: Estimate | None, *, failed: bool, alive: bool) -> tuple[bytes, str]:
+def _health(
+    estimate: Estimate | None, *, failed: bool, alive: bool, prepared: bool,
+) -> tuple[bytes, str]:
     """Return the level of the diagnostics and a sentence that says what to do."""
     if not alive:
         return DiagnosticStatus.ERROR, 'The worker has ended: start the node again.'
@@ -236,7 +254,9 @@ def _health(estimate: Estimate | None, *, failed: bool, alive: bool) -> tuple[by
         return (DiagnosticStatus.ERROR, 'The newest measurements made the solver fail and were '
                 'set aside; the last good estimate stays. See the log for the reason.')
     if estimate is None:
-        return DiagnosticStatus.WARN, 'No odometry yet: check the topic odom.'
+        return DiagnosticStatus.WARN, (
+            'No odometry yet: check the topic odom.' if prepared else
+            'Compiling, as at every first start: what comes in waits.')
     if estimate.alignment is AlignmentState.UNALIGNED:
         return (DiagnosticStatus.WARN, 'Unaligned: the angle between odometry and map is not '
                 'known yet. Drive some metres with a fix.')

@@ -44,8 +44,10 @@ LATCHED = QoSProfile(depth=1, reliability=QoSReliabilityPolicy.RELIABLE,
                      durability=QoSDurabilityPolicy.TRANSIENT_LOCAL)
 # Messages under way, well below the depth of the node's queues.
 WINDOW = 400
-# Patience with the node: to appear, to process another message, to answer [s].
+# Patience with the node: to appear, to compile at its first start, to process another message, to
+# answer [s].
 APPEAR_TIMEOUT = 30.0
+PREPARE_TIMEOUT = 300.0
 STALL_TIMEOUT = 20.0
 ANSWER_TIMEOUT = 90.0
 # Exit code where all was played and recorded, but the optimisation did not get to its end.
@@ -140,6 +142,8 @@ class Player(Node):
             lambda: all(writer.get_subscription_count() > 0 for writer in self._writers.values())
             and len(self.diagnostics) > 0 and self._optimize.service_is_ready(), APPEAR_TIMEOUT,
             'the node does not listen')
+        self.spin_until(lambda: self.diagnostics.get('prepared') != '0', PREPARE_TIMEOUT,
+                        'the node still compiles')
         # matching is not simultaneous on both sides
         settled = time.monotonic() + 0.5
         self.spin_until(lambda: time.monotonic() > settled, 2.0, '')

@@ -53,14 +53,21 @@ class Worker:
     backend : PoseGraphBackend
     on_estimate : callable
         Called in the worker's thread after each new estimate.
+    prepare : callable
+        Called in the worker's thread before its first work, while what is posted waits; gets a
+        function that tells whether the worker is to end.
 
     """
 
     def __init__(
         self, backend: PoseGraphBackend, on_estimate: Callable[[Estimate], None],
+        prepare: Callable[[Callable[[], bool]], None] | None = None,
     ) -> None:
         self._backend = backend
         self._on_estimate = on_estimate
+        self._prepare = prepare
+        self.prepared = False
+        """Whether the preparation is over."""
         self._inbox: deque[tuple[str, OdometrySample | Measurement]] = deque()
         self._update_wanted = False
         self._closings: list[Future[UpdateReport]] = []
@@ -68,7 +75,6 @@ class Worker:
         self._condition = threading.Condition()
         self._solves, self._solve_total, self._solve_max = 0, 0.0, 0.0
         self._said: set[tuple[str, str]] = set()
-        self._rest_until = -float('inf')
         self.estimate: Estimate | None = None
         """The newest estimate; replaced as a whole."""
         self.status = WorkerStatus()
@@ -116,14 +122,14 @@ class Worker:
         return future
 
     def _run(self) -> None:
+        self._run_preparation()
         while True:
             with self._condition:
                 self._condition.wait_for(lambda: (
                     self._stopping or self._update_wanted
                     or len(self._inbox) + len(self._closings) > 0))
                 batch, self._inbox = self._inbox, deque()
-                wanted = self._update_wanted and time.monotonic() >= self._rest_until
-                self._update_wanted = False
+                wanted, self._update_wanted = self._update_wanted, False
                 closings, self._closings = self._closings, []
                 if self._stopping:
                     for future in closings:
@@ -149,6 +155,15 @@ class Worker:
                     if not future.done():
                         future.set_exception(error)
 
+    def _run_preparation(self) -> None:
+        try:
+            if self._prepare is not None:
+                self._prepare(lambda: self._stopping)
+        except Exception:
+            # what was to be prepared is then made when it is first needed
+            logger.exception('the preparation of the worker failed')
+        self.prepared = True
+
     def _add(self, source: str, measurement: OdometrySample | Measurement) -> None:
         try:
             if isinstance(measurement, OdometrySample):
@@ -172,8 +187,6 @@ class Worker:
             self._solves += 1
             self._solve_total += seconds
             self._solve_max = max(self._solve_max, seconds)
-            # where a solve takes longer than the timer's period, half of the time stays free
-            self._rest_until = time.monotonic() + seconds
         if report.reason != '':
             logger.warning('the solver failed, the last good estimate stays: %s', report.reason)
         return report

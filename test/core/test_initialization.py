@@ -4,8 +4,9 @@
 
 from hypothesis import given, strategies as st
 import numpy as np
+import numpy.typing as npt
 import pytest
-from random_graphs import consistent_graph, random_observed, random_poses
+from random_graphs import consistent_graph, random_graph, random_observed, random_poses
 
 from pose_graph_ros.core import batch, initialization, se2
 from pose_graph_ros.core.config import SolverConfig
@@ -16,6 +17,9 @@ from pose_graph_ros.core.se2 import FloatArray
 
 # Two linear problems with condition numbers of some 1e3.
 EXACT = 1e-11
+
+TO_COMPLEX = np.array([1.0, 1j, 0.0])
+ComplexArray = npt.NDArray[np.complex128]
 
 seeds = st.integers(0, 2**32 - 1)
 
@@ -81,6 +85,53 @@ def test_it_reads_no_pose_that_is_not_fixed(seed: int) -> None:
     np.testing.assert_array_equal(initialization.chordal(graph), first)
     np.testing.assert_array_equal(graph.poses, before)     # nor does it write any
     np.testing.assert_array_equal(first[0], graph.poses[0])
+
+
+def dense_solution(
+    graph: Graph, known: ComplexArray, weight: FloatArray, unary_weight: FloatArray, *,
+    factor: ComplexArray, shift: ComplexArray, target: ComplexArray,
+) -> ComplexArray:
+    """Minimise sum w |v_j - factor v_i - shift|^2 + sum w |v_node - target|^2."""
+    m, rows = graph.n_edges, graph.n_edges + graph.n_observed
+    matrix, right = np.zeros((rows, graph.n_nodes), complex), np.zeros(rows, complex)
+    for k, (i, j) in enumerate(zip(graph.edges.i, graph.edges.j, strict=True)):
+        matrix[k, j] += np.sqrt(weight[k])
+        matrix[k, i] -= np.sqrt(weight[k]) * factor[k]
+        right[k] = np.sqrt(weight[k]) * shift[k]
+    for k, node in enumerate(graph.observed.node):
+        matrix[m + k, node] = np.sqrt(unary_weight[k])
+        right[m + k] = np.sqrt(unary_weight[k]) * target[k]
+    v = known.copy()
+    free = ~graph.fixed
+    right -= matrix[:, graph.fixed] @ known[graph.fixed]
+    v[free] = np.linalg.lstsq(matrix[:, free], right, rcond=None)[0]
+    return v
+
+
+@given(seeds, st.integers(2, 25), st.integers(0, 30), st.sets(st.integers(0, 1), min_size=1))
+def test_it_solves_two_linear_problems(
+    seed: int, n_nodes: int, extra: int, fix: set[int],
+) -> None:
+    graph = random_graph(seed, n_nodes, n_nodes - 1 + extra, 5, tuple(fix))
+    graph.apply(GraphUpdate(weigh_edges={0: 0.5, n_nodes - 1: 0.0}, weigh_observed={1: 3.0}))
+    edges, observed, poses = graph.edges, graph.observed, graph.poses
+    tables = edges.weighted_information, observed.weighted_information
+    heading = [table[:, 2, 2] for table in tables]
+    position = [0.5 * (table[:, 0, 0] + table[:, 1, 1]) for table in tables]
+    u = dense_solution(
+        graph, np.exp(1j * poses[:, 2]), *heading, factor=np.exp(1j * edges.mean[:, 2]),
+        shift=np.zeros(len(edges), complex),
+        target=np.exp(1j * (observed.mean[:, 2] - observed.offset[:, 2])))
+    if np.min(np.abs(u)) < 1e-2:
+        return  # hardly a heading
+    u /= np.abs(u)
+    t = dense_solution(
+        graph, poses @ TO_COMPLEX, *position, factor=np.ones(len(edges)),
+        shift=u[edges.i] * (edges.mean @ TO_COMPLEX),
+        target=observed.mean @ TO_COMPLEX - u[observed.node] * (observed.offset @ TO_COMPLEX))
+    start = initialization.chordal(graph)
+    np.testing.assert_allclose(np.exp(1j * start[:, 2]), u, atol=1e-7)
+    np.testing.assert_allclose(start @ TO_COMPLEX, t, atol=1e-6)
 
 
 @pytest.mark.parametrize('seed', range(10))

@@ -1,6 +1,9 @@
 # Copyright 2026 The pose_graph_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""H and b against dense loops, the states of the source's Figure 3.10, and the null space."""
+"""
+The sparse H and b that other tests go by: against dense loops, the states of the source's
+Figure 3.10, and the null space.
+"""
 
 from hypothesis import given, strategies as st
 import numpy as np
@@ -15,10 +18,10 @@ from random_graphs import (
     random_poses,
 )
 import scipy.sparse
+from sparse_system import Factorization, LinearSystem
 
 from pose_graph_ros.core.exceptions import LinearSolveError
 from pose_graph_ros.core.graph import Graph, GraphUpdate
-from pose_graph_ros.core.linear_system import Factorization, LinearSystem
 from pose_graph_ros.core.se2 import FloatArray
 
 # Sums of tens of products of some 1e4, each rounded at 1e-16.

@@ -17,11 +17,11 @@ from random_graphs import (
     slow_observed,
     vector,
 )
+from sparse_system import LinearSystem
 
 from pose_graph_ros.core import linearize, se2
 from pose_graph_ros.core.constraints import EdgeKind, Edges, ObservedKind, ObservedNodes
 from pose_graph_ros.core.graph import Graph, GraphUpdate
-from pose_graph_ros.core.linear_system import LinearSystem
 from pose_graph_ros.core.se2 import FloatArray
 
 # Numbers of some 10 m, turned three or four times: a few roundings of 2e-15 each.

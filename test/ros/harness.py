@@ -37,6 +37,8 @@ LATCHED = QoSProfile(depth=1, reliability=QoSReliabilityPolicy.RELIABLE,
 NANOSECONDS = 1_000_000_000
 PATIENCE = 20.0
 """How long a test waits for something that should come at once [s]."""
+PREPARE_PATIENCE = 100.0
+"""How long it waits for a node that may have to compile its kernels first [s]."""
 
 
 class NodeProcess:
@@ -104,6 +106,8 @@ class Client:
         self.spin_until(lambda: all(p.get_subscription_count() > 0 for p in inputs)
                         and len(self.diagnostics) > 0 and self._optimize.service_is_ready(),
                         'the node listens')
+        self.spin_until(lambda: self.values['prepared'] == '1', 'the node has compiled',
+                        PREPARE_PATIENCE)
         # the other side may know of the match a little later
         self.spin_for(0.3)
         return self
@@ -113,10 +117,12 @@ class Client:
         self.node.destroy_node()
         rclpy.shutdown(context=self._context)
 
-    def spin_until(self, done: Callable[[], bool], what: str) -> None:
-        end = time.monotonic() + PATIENCE
+    def spin_until(
+        self, done: Callable[[], bool], what: str, patience: float = PATIENCE,
+    ) -> None:
+        end = time.monotonic() + patience
         while not done():
-            assert time.monotonic() < end, f'waited {PATIENCE} s until {what}'
+            assert time.monotonic() < end, f'waited {patience} s until {what}'
             self._executor.spin_once(timeout_sec=0.05)
 
     def spin_for(self, seconds: float) -> None:

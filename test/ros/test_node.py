@@ -196,6 +196,54 @@ def path_error(client: Client) -> float:
                for x, y, _ in [true_pose(stamp_ns(item) * 1e-9 - START)])
 
 
+def test_the_path_is_current_without_an_optimisation(node: NodeProcess, client: Client) -> None:
+    """A pose that comes 18 s late turns the whole path; a loop closure mends what has drifted."""
+    drive(client, 20.0, fixes=False)
+    client.spin_until(lambda: len(client.paths) > 0 and path_error(client) > 1.0, 'a path comes')
+    client.global_pose.publish(pose(
+        START + 2.0, *true_pose(2.0).tolist(), variances=(1e-4, 1e-4, 1e-6)))
+    client.spin_until(lambda: path_error(client) < 1e-3, 'the path lies in the map')
+    client.spin_until(lambda: client.values['alignment'] == 'aligned', 'the diagnostics follow')
+
+    # on for a lap and a bit, with odometry that turns a little too much
+    newest = odometry_pose(19.9)
+    for step in range(200, 680):
+        seconds = step / 10.0
+        motion = se2.between(true_pose(seconds - 0.1), true_pose(seconds))
+        newest = se2.compose(newest, motion + np.array([0.0, 0.0, 0.0005]))
+        client.odom.publish(odometry(START + seconds, *newest.tolist(), speed=2.0))
+        client.spin_for(0.002)
+    client.wait_processed(200 + 1 + 480)
+    client.spin_until(lambda: stamp_ns(client.paths[-1].poses[-1]) > (START + 67.8) * 1e9,
+                      'the path reaches to the end')
+    drifted = path_error(client)
+    assert drifted > 1.0
+    seen = se2.between(true_pose(3.0), true_pose(67.0))
+    client.loop_closure.publish(pose(
+        START + 67.0, *seen.tolist(), frame=f'@{START + 3.0:.9f}', variances=(1e-4, 1e-4, 1e-6)))
+    client.spin_until(lambda: path_error(client) < 0.3 * drifted, 'the loop is closed')
+    client.spin_until(lambda: int(client.values['updates']) == 2, 'the updates are counted')
+    assert 0.0 < float(client.values['solve_mean_ms']) <= float(client.values['solve_max_ms'])
+
+
+def test_what_cannot_be_solved_for_is_set_aside_and_the_node_goes_on(
+    node: NodeProcess, client: Client,
+) -> None:
+    drive(client, 5.0, fixes=False)
+    # a sharp heading, but 100 km uncertain of the place: it holds the graph nowhere
+    client.global_pose.publish(pose(
+        START + 2.0, 0.0, 0.0, 1.0, variances=(1e10, 1e10, 1e-6)))
+    client.spin_until(lambda: client.values.get('quarantined') == '1', 'it is set aside')
+    assert client.values['solver.failed'] == '1'
+    assert client.diagnostics[-1].status[0].level == b'\x02'
+    assert client.values['alignment'] == 'local'
+    client.global_pose.publish(pose(START + 3.0, *true_pose(3.0).tolist()))
+    client.spin_until(lambda: client.values['alignment'] == 'aligned', 'it is aligned')
+    client.spin_until(lambda: len(client.paths) > 0 and path_error(client) < 1e-3,
+                      'the path lies in the map')
+    assert client.diagnostics[-1].status[0].level == b'\x00'
+
+
 def test_malformed_messages_are_counted_and_the_node_goes_on(
     node: NodeProcess, client: Client,
 ) -> None:

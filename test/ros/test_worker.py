@@ -47,6 +47,31 @@ def test_all_that_is_posted_is_processed_and_one_estimate_follows_the_other() ->
     assert worker.stop(PATIENCE)
 
 
+def test_every_update_hands_out_a_path_that_is_current() -> None:
+    estimates: list[Estimate] = []
+    worker = Worker(PoseGraphBackend(), estimates.append)
+    worker.start()
+    worker.post('odom', sample(1))
+    worker.post('pose', GlobalPose(100_000_000, np.array([5.0, 0.0, 0.0]), 0.01 * np.eye(3)))
+    for step in range(2, 40):
+        worker.post('odom', sample(step))
+        already = len(estimates)
+        worker.request_update()
+        wait_until(lambda already=already: len(estimates) > already)
+        path = worker.estimate.path
+        assert path.stamps_ns[-1] == step * 100_000_000
+        np.testing.assert_allclose(path.poses[-1], [4.7 + 0.3 * step, 0.0, 0.0], atol=1e-9)
+    # late by 3 s, and as certain as all the others together
+    worker.post('pose', GlobalPose(900_000_000, np.array([7.4, 1.0, 0.0]), 0.01 * np.eye(3)))
+    already = len(estimates)
+    worker.request_update()
+    wait_until(lambda: len(estimates) > already)
+    assert worker.status.updates == 2
+    assert worker.estimate.path.poses[-1, 1] > 0.1
+    assert worker.status.report.new_constraints == 1
+    assert worker.stop(PATIENCE)
+
+
 def test_an_engine_that_raises_is_counted_and_the_thread_goes_on() -> None:
     class Broken(PoseGraphBackend):
         def add_measurement(self, *_: object) -> None:
@@ -120,4 +145,36 @@ def test_stopping_does_not_wait_for_ever() -> None:
     time.sleep(0.05)
     assert not worker.stop(0.1)
     release.set()
+    assert worker.stop(PATIENCE)
+
+
+def test_what_comes_in_while_the_worker_is_prepared_waits() -> None:
+    release = threading.Event()
+    worker = Worker(PoseGraphBackend(), lambda _: None, lambda stopped: release.wait(PATIENCE))
+    worker.start()
+    for step in range(1, 50):
+        assert worker.post('odom', sample(step))
+    closing = worker.request_closing()
+    assert not worker.prepared
+    assert worker.status.processed == 0
+    release.set()
+    assert closing.result(PATIENCE).status is Status.CONVERGED
+    assert worker.prepared
+    assert worker.status.processed == 49
+    assert worker.stop(PATIENCE)
+
+
+def test_a_preparation_that_fails_or_is_stopped_does_not_hold_the_worker() -> None:
+    def fail(stopped: Callable[[], bool]) -> None:
+        raise OSError('no space')
+
+    worker = Worker(PoseGraphBackend(), lambda _: None, fail)
+    worker.start()
+    worker.post('odom', sample(1))
+    wait_until(lambda: worker.status.processed == 1)
+    assert worker.prepared
+    assert worker.stop(PATIENCE)
+
+    worker = Worker(PoseGraphBackend(), lambda _: None, wait_until)
+    worker.start()
     assert worker.stop(PATIENCE)

@@ -10,7 +10,7 @@ diagonal block of its hidden node and A^T W e to b (3.61): it never changes the 
 Fixed nodes have no unknown: their rows and columns are left out.
 
 The pattern depends on the structure alone. It is worked out once and filled again in every
-iteration.
+iteration. SciPy factorises it: another way from the constraints to a step than the package's.
 """
 
 from typing import cast
@@ -112,10 +112,10 @@ class LinearSystem:
         """Return the blocks for H, in the order of the constructor, and the rows for b."""
         edges, observed = self._graph.edges, self._graph.observed
         error, a, b = linearize.linearize_edges(poses, edges)
-        a_w = np.swapaxes(a, 1, 2) @ edges.information
-        b_w = np.swapaxes(b, 1, 2) @ edges.information
+        a_w = np.swapaxes(a, 1, 2) @ edges.weighted_information
+        b_w = np.swapaxes(b, 1, 2) @ edges.weighted_information
         unary_error, unary = linearize.linearize_observed(poses, observed)
-        unary_w = np.swapaxes(unary, 1, 2) @ observed.information
+        unary_w = np.swapaxes(unary, 1, 2) @ observed.weighted_information
         a_w_b = a_w @ b
         blocks = np.concatenate((
             np.zeros((len(self.free_nodes), BLOCK, BLOCK)),

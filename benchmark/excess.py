@@ -1,0 +1,75 @@
+# Copyright 2026 The pose_graph_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""
+How far estimates taken during a run are from the batch optimum of the graph as it was then.
+
+The excess is half the chi2 above that optimum, found from the estimate itself, each tool under its
+own error model. So it tells how well the tool follows the minimum that it is in; whether that is
+the best one, the final chi2 tells. The excess hides soft modes, hence the position distance.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from benchmark.runs import Run
+from benchmark.worlds import World
+from pose_graph_ros.core import batch
+from pose_graph_ros.core.config import SolverConfig
+from pose_graph_ros.core.se2 import FloatArray
+
+EXACT = SolverConfig(max_iterations=200, step_tolerance=1e-10)
+
+
+@dataclass(frozen=True, slots=True)
+class Excess:
+    """Figures of S samples of a run."""
+
+    steps: FloatArray
+    """After which each was taken, shape (S,)."""
+    half_chi2: FloatArray
+    """Half of chi2 above the optimum, shape (S,)."""
+    worst: FloatArray
+    """Largest distance of a node to its place in the optimum, shape (S,) [m]."""
+    final_chi2: float
+    """chi2 of the last sample, without a factor 1/2."""
+    optimum_chi2: float
+    """chi2 of the optimum that the last sample leads to."""
+
+    def figures(self) -> tuple[float, float, float]:
+        """Return median, 95 % and maximum of the excess."""
+        return (float(np.median(self.half_chi2)), float(np.percentile(self.half_chi2, 95)),
+                float(np.max(self.half_chi2)))
+
+
+def of_run(world: World, run: Run) -> Excess:
+    """Judge the samples of a run of either tool."""
+    judge = _by_gtsam if run.tool.startswith('GTSAM') else _by_ours
+    steps = sorted(run.samples)
+    rows = [judge(world, step, run.samples[step]) for step in steps]
+    table = np.array([(before, after, worst) for before, after, worst in rows])
+    return Excess(
+        np.array(steps, dtype=float), np.maximum(0.5 * (table[:, 0] - table[:, 1]), 0.0),
+        table[:, 2], float(table[-1, 0]), float(table[-1, 1]))
+
+
+def _by_ours(world: World, step: int, poses: FloatArray) -> tuple[float, float, float]:
+    """Return chi2 of the estimate, chi2 of the optimum and the largest distance between them."""
+    graph = world.graph(poses, step)
+    before = graph.energies().chi2
+    result = batch.optimize(graph, EXACT)
+    return before, result.chi2, _worst(poses, graph.poses)
+
+
+def _by_gtsam(world: World, step: int, poses: FloatArray) -> tuple[float, float, float]:
+    # only here: the rest of the benchmark can be imported without GTSAM
+    from benchmark import gtsam_peer  # noqa: PLC0415
+
+    graph, start = gtsam_peer.whole_graph(world, step), gtsam_peer.values_of(poses)
+    best = gtsam_peer.optimum(graph, start)
+    return (2.0 * graph.error(start), 2.0 * graph.error(best),
+            _worst(poses, gtsam_peer.poses_of(best)))
+
+
+def _worst(poses: FloatArray, others: FloatArray) -> float:
+    return float(np.max(np.hypot(*(poses - others)[:, :2].T)))

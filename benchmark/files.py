@@ -1,0 +1,89 @@
+# Copyright 2026 The pose_graph_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""
+Worlds from graph files: recordings and the public sets, put into the order of an online run.
+
+Node k comes with all edges whose later end is k. `EDGE2` is read in TORO's order.
+"""
+
+from pathlib import Path
+
+import numpy as np
+
+from benchmark.worlds import World
+from pose_graph_ros.core.constraints import EdgeKind, Edges
+from pose_graph_ros.core.exceptions import FileFormatError
+from pose_graph_ros.core.graph import Graph
+from pose_graph_ros.core.io.g2o import read_g2o
+
+DEFAULT_FOLDER = Path(__file__).resolve().parents[2] / 'shared' / 'data' / 'graphs'
+SUFFIXES = ('.g2o', '.graph')
+TRUTH_MARKS = ('_gt', 'groundtruth')
+"""What the names of ground-truth files hold; those are passed over."""
+
+
+def load_folder(folder: Path) -> tuple[list[World], list[str]]:
+    """
+    Read all graphs of a folder.
+
+    Returns
+    -------
+    worlds : list of World
+        In the order of their sizes.
+    complaints : list of str
+        One sentence for each file that could not be read, or not run online.
+
+    """
+    worlds, complaints = [], []
+    for path in sorted(folder.iterdir()):
+        truth = any(mark in path.stem.lower() for mark in TRUTH_MARKS)
+        if path.suffix not in SUFFIXES or truth:
+            continue
+        try:
+            worlds.append(load(path))
+        except (FileFormatError, ValueError) as error:
+            # without the folder: reports are made on one machine and read on another
+            where = str(error).removeprefix(str(path))
+            complaints.append(f'{path.name}{where}' if where.startswith(':')
+                              else f'{path.name}: {where}')
+    return sorted(worlds, key=lambda world: world.n_nodes), complaints
+
+
+def load(path: Path) -> World:
+    """
+    Read one graph.
+
+    Raises
+    ------
+    FileFormatError, ValueError
+        If the file cannot be read, or a node has no edge to an earlier one.
+
+    """
+    content = read_g2o(path, 'toro')
+    return online(path.stem, content.graph, has_start=content.has_start)
+
+
+def online(name: str, graph: Graph, *, has_start: bool) -> World:
+    """Put the constraints of a graph into the order of an online run."""
+    edges, n = graph.edges, graph.n_nodes
+    later, gap = np.maximum(edges.i, edges.j), np.abs(edges.j - edges.i)
+    # of the edges that arrive with a node the one from the node before it comes first, forward
+    # ones before backward ones, then in the order of the file
+    order = np.lexsort((edges.i > edges.j, np.minimum(gap, 2), later))
+    edges, later = edges.rows(order), later[order]
+    stops = np.searchsorted(later, np.arange(n), side='right')
+    alone = np.flatnonzero(np.diff(stops) == 0) + 1
+    if len(alone) > 0:
+        raise ValueError(f'node {alone[0]} has no edge to an earlier one, and {len(alone) - 1} '
+                         f'others: no online run')
+    first = np.concatenate(([0], stops[:-1]))[1:]
+    kind = np.full(len(edges), EdgeKind.LOOP_CLOSURE)
+    kind[first] = EdgeKind.ODOMETRY
+    edges = Edges(edges.i, edges.j, edges.mean, edges.information, kind)
+    observed = graph.observed
+    by_node = np.argsort(observed.node, kind='stable')
+    observed = observed.rows(by_node)
+    return World(
+        name, graph.poses[0].copy(), edges, stops, observed,
+        np.searchsorted(observed.node, np.arange(n), side='right'),
+        start=graph.poses.copy() if has_start else None)

@@ -1,0 +1,210 @@
+# Copyright 2026 The pose_graph_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""
+GTSAM on our worlds: iSAM2 step by step, and its batch optimisers.
+
+Kept in GTSAM's favour: of a step only `ISAM2.update` is timed, neither the building of factors nor
+`calculateEstimatePose2` of the node before, which runs the back-substitution that iSAM2 puts off.
+Node 0 has a tight prior. Cholesky is tried first; where it gives up, the run is done with QR.
+
+GTSAM's error is the logarithm in SE(2), not (3.48): its optima differ a little from ours, and its
+estimates are judged by its own `error`. Its recursion needs a large stack from about 100 000
+nodes on (`ulimit -s unlimited`); the benchmark stays below that.
+"""
+
+from dataclasses import dataclass
+import time
+
+import gtsam
+import numpy as np
+
+from benchmark.runs import Plan, quiet, Run
+from benchmark.worlds import World
+from pose_graph_ros.core import se2
+from pose_graph_ros.core.constraints import Edges, ObservedNodes
+from pose_graph_ros.core.se2 import FloatArray
+
+PRIOR_SIGMA = 1e-5
+"""Of the pose of node 0 [m, rad]: as good as fixed, and no harder for Cholesky than 1e-3."""
+MAX_ITERATIONS = 100
+
+
+@dataclass(frozen=True, slots=True)
+class Setting:
+    """How iSAM2 relinearizes."""
+
+    skip: int
+    """Every so many updates ..."""
+    threshold: float
+    """... the variables that have moved by more than this [m, rad]."""
+
+    @property
+    def name(self) -> str:
+        """As the tables have it."""
+        return f'GTSAM skip {self.skip}'
+
+    def __call__(self, world: World, plan: Plan) -> Run:
+        """Run iSAM2 over a world, with its fastest factorisation that works."""
+        try:
+            return self._run(world, plan, 'CHOLESKY')
+        except RuntimeError as error:
+            where = f'Cholesky gives up after {error.args[1]} of {world.n_nodes} steps'
+        run = self._run(world, plan, 'QR')
+        run.note = f'QR ({where})' + (f'; {run.note}' if run.note else '')
+        return run
+
+    def _run(self, world: World, plan: Plan, factorization: str) -> Run:
+        params = gtsam.ISAM2Params()
+        params.relinearizeSkip = self.skip
+        params.setRelinearizeThreshold(self.threshold)
+        params.setFactorization(factorization)
+        isam = gtsam.ISAM2(params)
+        models = Models()
+        seconds = np.zeros(world.n_nodes)
+        run = Run(self.name, seconds)
+        total = 0.0
+        with quiet():
+            for k in range(world.n_nodes):
+                factors, values = _step(world, k, isam, models)
+                begin = time.perf_counter()
+                try:
+                    isam.update(factors, values)
+                except RuntimeError as error:
+                    raise RuntimeError(str(error), k) from error
+                seconds[k] = time.perf_counter() - begin
+                total += seconds[k]
+                if k in plan.samples:
+                    run.samples[k] = poses_of(isam.calculateEstimate())
+                if total > plan.limit:
+                    run.seconds = seconds[:k + 1]
+                    run.samples[k] = poses_of(isam.calculateEstimate())
+                    run.note = f'first {k + 1} steps, {plan.limit:.0f} s'
+                    break
+        return run
+
+
+FAST, CAREFUL = Setting(10, 0.1), Setting(1, 0.01)
+
+
+class Models:
+    """Noise models by information matrix: most worlds have few different ones."""
+
+    def __init__(self) -> None:
+        self._models: dict[bytes, gtsam.noiseModel.Gaussian] = {}
+
+    def of(self, information: FloatArray) -> gtsam.noiseModel.Gaussian:
+        """Return the model; GTSAM makes a diagonal one where it can."""
+        key = information.tobytes()
+        if key not in self._models:
+            symmetric = 0.5 * (information + information.T)
+            self._models[key] = gtsam.noiseModel.Gaussian.Information(symmetric)
+        return self._models[key]
+
+
+def _step(
+    world: World, k: int, isam: gtsam.ISAM2, models: Models,
+) -> tuple[gtsam.NonlinearFactorGraph, gtsam.Values]:
+    """Return what arrives in step k: factors, and the new node's initial guess."""
+    before = (int(world.edge_stops[k - 1]), int(world.observed_stops[k - 1])) if k else (0, 0)
+    edges = world.edges.rows(slice(before[0], int(world.edge_stops[k])))
+    observed = world.observed.rows(slice(before[1], int(world.observed_stops[k])))
+    factors = graph_of(edges, observed, models)
+    values = gtsam.Values()
+    if k == 0:
+        factors.push_back(_gauge(world))
+        values.insert(0, _pose(world.first))
+    else:
+        i, j, mean = int(edges.i[0]), int(edges.j[0]), edges.mean[0]
+        if i > j:
+            i, mean = j, se2.inverse(mean)
+        values.insert(k, isam.calculateEstimatePose2(i).compose(_pose(mean)))
+    return factors, values
+
+
+def graph_of(
+    edges: Edges, observed: ObservedNodes, models: Models,
+) -> gtsam.NonlinearFactorGraph:
+    """Return the factors of constraints; those of observed nodes must have no offset."""
+    graph = gtsam.NonlinearFactorGraph()
+    for i, j, mean, information in zip(
+            edges.i.tolist(), edges.j.tolist(), edges.mean, edges.information, strict=True):
+        graph.push_back(gtsam.BetweenFactorPose2(i, j, _pose(mean), models.of(information)))
+    for node, mean, information in zip(
+            observed.node.tolist(), observed.mean, observed.information, strict=True):
+        if information[2, 2] == 0.0:
+            # the heading of the mean is zero: errors are in map axes, as GTSAM's are
+            graph.push_back(gtsam.PoseTranslationPrior2D(
+                node, mean[:2], models.of(np.ascontiguousarray(information[:2, :2]))))
+        else:
+            graph.push_back(gtsam.PriorFactorPose2(node, _pose(mean), models.of(information)))
+    return graph
+
+
+def whole_graph(world: World, step: int | None = None) -> gtsam.NonlinearFactorGraph:
+    """Return all factors that have arrived after a step (the last by default)."""
+    graph = graph_of(*world.part(world.n_nodes - 1 if step is None else step), Models())
+    graph.push_back(_gauge(world))
+    return graph
+
+
+def values_of(poses: FloatArray) -> gtsam.Values:
+    """Return poses, shape (N, 3), as GTSAM holds them."""
+    values = gtsam.Values()
+    for k, pose in enumerate(poses):
+        values.insert(k, _pose(pose))
+    return values
+
+
+def poses_of(values: gtsam.Values) -> FloatArray:
+    """Return the poses, shape (N, 3), in the order of their keys."""
+    return np.asarray(gtsam.utilities.extractPose2(values))
+
+
+def optimize(
+    graph: gtsam.NonlinearFactorGraph, start: gtsam.Values, method: str = 'lm', *,
+    tolerance: float = 1e-5,
+) -> gtsam.Values:
+    """
+    Optimise a whole graph.
+
+    Parameters
+    ----------
+    graph : NonlinearFactorGraph
+    start : Values
+    method : {'lm', 'gn'}
+        Levenberg-Marquardt or Gauss-Newton.
+    tolerance : float
+        On the relative and the absolute decrease of the error; the default is GTSAM's.
+
+    """
+    names = {'lm': ('LevenbergMarquardtParams', 'LevenbergMarquardtOptimizer'),
+             'gn': ('GaussNewtonParams', 'GaussNewtonOptimizer')}[method]
+    params = getattr(gtsam, names[0])()
+    params.setMaxIterations(MAX_ITERATIONS)
+    params.setRelativeErrorTol(tolerance)
+    params.setAbsoluteErrorTol(tolerance)
+    return getattr(gtsam, names[1])(graph, start, params).optimize()
+
+
+def optimum(graph: gtsam.NonlinearFactorGraph, start: gtsam.Values) -> gtsam.Values:
+    """Return the minimum that lies downhill, as exactly as GTSAM finds it."""
+    best = start
+    for method in ('gn', 'lm'):
+        try:
+            found = optimize(graph, best, method, tolerance=1e-12)
+        except RuntimeError:
+            continue
+        if graph.error(found) <= graph.error(best):
+            best = found
+            if method == 'gn':
+                break
+    return best
+
+
+def _gauge(world: World) -> gtsam.PriorFactorPose2:
+    return gtsam.PriorFactorPose2(
+        0, _pose(world.first), gtsam.noiseModel.Isotropic.Sigma(3, PRIOR_SIGMA))
+
+
+def _pose(pose: FloatArray) -> gtsam.Pose2:
+    return gtsam.Pose2(float(pose[0]), float(pose[1]), float(pose[2]))

@@ -1,0 +1,218 @@
+# Copyright 2026 The pose_graph_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""
+Our engine on the same worlds, the one module that knows its interface.
+
+A step's time is all that a caller from Python pays: building the tables and the update, the call,
+and with its return an estimate of all nodes that is up to date (`poses` is a view). A step that
+brings no more than the edge from the node before, and perhaps a global pose of the new node, goes
+through `extend`.
+"""
+
+from collections.abc import Callable
+import itertools
+import math
+import time
+from typing import Any
+
+import numpy as np
+
+from benchmark.runs import Plan, quiet, Run
+from benchmark.worlds import chain, laps, World
+from pose_graph_ros.core import batch, initialization, linearize, se2
+from pose_graph_ros.core.config import SolverConfig
+from pose_graph_ros.core.constraints import Edges
+from pose_graph_ros.core.graph import Graph, GraphUpdate
+from pose_graph_ros.core.incremental import IncrementalSmoother, UpdateResult
+from pose_graph_ros.core.se2 import FloatArray
+
+NAME = 'ours'
+BATCH = SolverConfig(max_iterations=100, step_tolerance=1e-8)
+SINGLE = SolverConfig(max_iterations=1)
+AfterStep = Callable[[IncrementalSmoother, int], None]
+
+
+def run(world: World, plan: Plan, after_step: AfterStep | None = None) -> Run:
+    """
+    Run the smoother over a world.
+
+    Parameters
+    ----------
+    world : World
+    plan : Plan
+    after_step : callable, optional
+        Called with the smoother and the step, outside of what is timed.
+
+    Raises
+    ------
+    RuntimeError
+        If a step fails, saying which and why.
+
+    """
+    smoother = IncrementalSmoother()
+    steps = _Steps(world)
+    seconds = np.zeros(world.n_nodes)
+    done = Run(NAME, seconds)
+    total = 0.0
+    with quiet():
+        for k in range(world.n_nodes):
+            step = steps.extending if steps.plain[k] else steps.updating
+            begin = time.perf_counter()
+            result = step(smoother, k)
+            seconds[k] = time.perf_counter() - begin
+            total += seconds[k]
+            if result.status is batch.Status.FAILED:
+                raise RuntimeError(f'{world.name}, step {k}: {result.reason}')
+            if after_step is not None:
+                after_step(smoother, k)
+            if k in plan.samples or total > plan.limit:
+                done.samples[k] = smoother.poses.copy()
+            if total > plan.limit:
+                done.seconds, done.note = seconds[:k + 1], f'first {k + 1} steps'
+                break
+    return done
+
+
+def warm_up() -> None:
+    """Run the smoother on small worlds, so that nothing is compiled while times are taken."""
+    for world in _small_worlds():
+        run(world, Plan())
+
+
+def warm_up_batch() -> None:
+    """Do the same with the batch optimiser."""
+    for world in _small_worlds():
+        graph = world.graph(world.dead_reckoning())
+        solve_from_nothing(graph)
+        solve(graph)
+
+
+def warm_up_covariances() -> None:
+    """Do the same with covariances."""
+    for world in _small_worlds():
+        smoother = smoothed(world)
+        smoother.newest_covariance()
+        smoother.covariances()
+        smoother.joint_covariance(1, 2)
+        iterate(world.graph(smoother.poses.copy()))
+
+
+def _small_worlds() -> tuple[World, ...]:
+    return chain(100), chain(100, 'late'), laps(120, 60)
+
+
+def smoothed(world: World) -> IncrementalSmoother:
+    """Return the smoother after all of a world."""
+    seen: dict[str, IncrementalSmoother] = {}
+    run(world, Plan(), lambda smoother, _: seen.update(last=smoother))
+    return seen['last']
+
+
+class _Steps:
+    """What arrives in each step, as a caller has it: lists of arrays, nothing prepared."""
+
+    def __init__(self, world: World) -> None:
+        edges, observed = world.edges, world.observed
+        self.world = world
+        self.edge_stops = [0, *world.edge_stops.tolist()]
+        self.observed_stops = [0, *world.observed_stops.tolist()]
+        self.i, self.j = edges.i.tolist(), edges.j.tolist()
+        self.mean, self.information = list(edges.mean), list(edges.information)
+        self.observed_mean = list(observed.mean)
+        self.observed_information = list(observed.information)
+        nodes = observed.node.tolist()
+        without_offset = ~np.any(observed.offset, axis=1)
+        self.ahead, self.plain = [], []
+        for k in range(world.n_nodes):
+            edge, edge_stop = self.edge_stops[k:k + 2]
+            seen, seen_stop = self.observed_stops[k:k + 2]
+            ahead = k > 0 and (self.i[edge], self.j[edge]) == (k - 1, k)
+            self.ahead.append(ahead)
+            self.plain.append(
+                ahead and edge_stop == edge + 1
+                and (seen_stop == seen or (seen_stop == seen + 1 and nodes[seen] == k
+                                           and bool(without_offset[seen]))))
+
+    def extending(self, smoother: IncrementalSmoother, k: int) -> UpdateResult:
+        """Do a step that only adds a node to the end."""
+        edge, seen = self.edge_stops[k], self.observed_stops[k]
+        if self.observed_stops[k + 1] == seen:
+            return smoother.extend(self.mean[edge], self.information[edge])
+        return smoother.extend(self.mean[edge], self.information[edge],
+                               self.observed_mean[seen], self.observed_information[seen])
+
+    def updating(self, smoother: IncrementalSmoother, k: int) -> UpdateResult:
+        """Do any other step; a node that goes on from the last one is added along the chain."""
+        if k == 0:
+            return smoother.update(GraphUpdate(hidden=self.world.first[None], fix=(0,)))
+        changes: dict[str, Any] = {}
+        begin, end = self.edge_stops[k:k + 2]
+        if self.ahead[k]:
+            smoother.extend(self.mean[begin], self.information[begin])
+            begin += 1
+        else:
+            changes['hidden'] = np.array([self._guess(smoother, begin)])
+        if end > begin:
+            rows, table = slice(begin, end), self.world.edges
+            changes['edges'] = Edges(table.i[rows], table.j[rows], table.mean[rows],
+                                     table.information[rows], table.kind[rows])
+        begin, end = self.observed_stops[k:k + 2]
+        if end > begin:
+            changes['observed'] = self.world.observed.rows(slice(begin, end))
+        return smoother.update(GraphUpdate(**changes))
+
+    def _guess(self, smoother: IncrementalSmoother, edge: int) -> tuple[float, float, float]:
+        """Compose the estimate of the node that the new one hangs on with their edge."""
+        i, j, mean = self.i[edge], self.j[edge], self.mean[edge]
+        if i > j:
+            i, mean = j, se2.inverse(mean)
+        x, y, theta = smoother.poses[i].tolist()
+        dx, dy, dtheta = mean.tolist()
+        c, s = math.cos(theta), math.sin(theta)
+        return x + c * dx - s * dy, y + s * dx + c * dy, theta + dtheta
+
+
+def solve_from_nothing(graph: Graph) -> float:
+    """Optimise a graph without a guess and return chi2."""
+    return float(batch.optimize_from_nothing(graph, BATCH).chi2)
+
+
+def solve(graph: Graph) -> float:
+    """Optimise a graph from its poses and return chi2."""
+    return float(batch.optimize(graph, BATCH).chi2)
+
+
+def iterate(graph: Graph) -> None:
+    """Linearize, factorise and solve once: what a factorisation costs with all around it."""
+    batch.optimize(graph, SINGLE)
+
+
+def polished(world: World, poses: FloatArray) -> float:
+    """Return chi2 of the minimum downhill of poses, shape (N, 3)."""
+    poses = poses.copy()
+    poses[0] = world.first      # fixed; GTSAM's prior gives way a little
+    graph = world.graph(poses)
+    return float(batch.optimize(graph, SolverConfig(max_iterations=300, step_tolerance=1e-9)).chi2)
+
+
+def chordal_start(world: World) -> FloatArray:
+    """Return the start that both tools are given in the batch comparison, shape (N, 3)."""
+    return initialization.chordal(world.graph(world.dead_reckoning()))
+
+
+def oracle_covariances(graph: Graph, nodes: list[int]) -> FloatArray:
+    """Return covariances, shape (len(nodes), 3, 3), from the dense inverse: slow, sure."""
+    edges, observed, n = graph.edges, graph.observed, graph.n_nodes
+    H = np.zeros((n, n, 3, 3))
+    _, A, B = linearize.linearize_edges(graph.poses, edges)
+    for (rows, left), (columns, right) in itertools.product(
+            ((edges.i, A), (edges.j, B)), repeat=2):
+        np.add.at(H, (rows, columns), np.swapaxes(left, 1, 2) @ edges.weighted_information @ right)
+    _, A = linearize.linearize_observed(graph.poses, observed)
+    np.add.at(H, (observed.node, observed.node),
+              np.swapaxes(A, 1, 2) @ observed.weighted_information @ A)
+    free = np.flatnonzero(~graph.fixed)
+    size = 3 * len(free)
+    inverse = np.linalg.inv(H[np.ix_(free, free)].transpose(0, 2, 1, 3).reshape(size, size))
+    blocks = 3 * np.searchsorted(free, nodes)
+    return np.array([inverse[b:b + 3, b:b + 3] for b in blocks])

@@ -1,0 +1,226 @@
+# Copyright 2026 The pose_graph_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""One clique: its front is assembled from constraints and children, factorised and stored."""
+
+
+from pose_graph_ros.core import factors, frames, tables as tb, undo
+from pose_graph_ros.core.cholesky import LEAST_PIVOT
+from pose_graph_ros.core.fronts import factorize, padded
+from pose_graph_ros.core.jit import kernel
+from pose_graph_ros.core.vectors import add, copy
+
+
+@kernel
+def eliminate_clique(head, c, afresh):  # type: ignore[no-untyped-def]
+    """
+    Assemble the front of a clique, factorise it and store the result.
+
+    Parameters
+    ----------
+    c : int
+    afresh : bool
+        Linearize the constraints at the present estimate as they are assembled: the frame that
+        they were linearized in may have turned. The work is logged for `undo`.
+
+    Returns
+    -------
+    int
+        Node with a bad pivot, or -1.
+
+    """
+    node_f = tb.node_f(head)
+    edge_f = tb.edge_f(head)
+    observed_f = tb.observed_f(head)
+    pool_f = tb.pool_f(head)
+    work_f = tb.work_f(head)
+    scalars = tb.scalars(head)
+    node_i = tb.node_i(head)
+    edge_i = tb.edge_i(head)
+    observed_i = tb.observed_i(head)
+    clique_f = tb.clique_f(head)
+    clique_i = tb.clique_i(head)
+    pool_i = tb.pool_i(head)
+    row = clique_i[c]
+    n_frontal, n_separator = row[tb.N_FRONTAL], row[tb.N_SEPARATOR]
+    n_all = n_frontal + n_separator
+    rows, n = 3 * n_frontal, 3 * n_all
+    ld = padded(n)
+    list_ = pool_i[row[tb.NODES]:row[tb.NODES] + n_all]
+    front = work_f[:n * ld]
+    least = work_f[n * ld:n * ld + rows]
+    front[:] = 0.0
+    serial = head[tb.FRONT_SERIAL] + 1
+    head[tb.FRONT_SERIAL] = serial
+    for k in range(n_all):
+        node_i[list_[k], tb.INDEX] = 3 * k
+        node_i[list_[k], tb.FRONT] = serial
+    any_fixed, anchored = False, 0
+    for k in range(n_frontal):
+        v = list_[k]
+        entry = node_i[v, tb.EDGE_LIST]
+        while entry >= 0:
+            e, side = entry >> 1, entry & 1
+            other = edge_i[e, tb.END_I if side == 1 else tb.END_J]
+            if node_i[other, tb.FRONT] == serial and edge_f[e, tb.WEIGHT] > 0.0:
+                at = node_i[other, tb.INDEX]
+                # an edge within the frontal nodes comes twice and counts at its start
+                if at >= rows or side == 0:
+                    if afresh:
+                        undo.log_edge(head, e)
+                        factors.linearize_edge(head, e)
+                    edge_i[e, tb.OWNER] = c
+                    if side == 0:
+                        factors.add_edge(head, e, 3 * k, at, front, ld)
+                    else:
+                        factors.add_edge(head, e, at, 3 * k, front, ld)
+            entry = edge_i[e, tb.NEXT_J if side == 1 else tb.NEXT_I]
+        entry = node_i[v, tb.OBSERVED_LIST]
+        while entry >= 0:
+            if observed_f[entry, tb.WEIGHT] > 0.0:
+                anchored = 1
+                if afresh:
+                    undo.log_observed(head, entry)
+                    factors.linearize_observed(head, entry)
+                factors.add_observed(head, entry, 3 * k, front, ld)
+            entry = observed_i[entry, tb.OBS_NEXT]
+        stiff_t = node_f[v, tb.STIFF_T] * node_f[v, tb.STIFF_T]
+        stiff_r = node_f[v, tb.STIFF_R] * node_f[v, tb.STIFF_R]
+        least[3 * k] = least[3 * k + 1] = LEAST_PIVOT * stiff_t
+        least[3 * k + 2] = LEAST_PIVOT * stiff_r
+        damping = scalars[tb.DAMPING]
+        if damping > 0.0:
+            for m in range(3):
+                more = damping * (stiff_t if m < 2 else stiff_r)
+                front[(3 * k + m) * ld + 3 * k + m] += more
+                front[(3 * k + m + 1) * ld - 1] += more * node_f[v, tb.DELTA + m]
+        if node_i[v, tb.FIXED] != 0:
+            any_fixed, anchored = True, 1
+    child = row[tb.CHILD]
+    while child >= 0:
+        _extend_add(head, child, front, ld)
+        anchored |= clique_i[child, tb.ANCHORED]
+        child = clique_i[child, tb.SIBLING]
+    row[tb.ANCHORED] = anchored
+    clique_f[c, tb.TURN] = clique_f[c, tb.TURN_SEEN] = 0.0
+    clique_f[c, tb.TURN_ZERO] = frames.mean_turn(head, c)
+    if any_fixed:
+        for k in range(n_frontal):
+            if node_i[list_[k], tb.FIXED] != 0:
+                _hold(head, list_[k], 3 * k, front, n, ld)
+                least[3 * k:3 * k + 3] = 0.0
+    bad = factorize(front, rows, n, ld, least)
+    if bad >= 0:
+        return list_[bad // 3]
+    at = row[tb.VALUES]
+    for k in range(rows):
+        copy(front, k * (ld + 1), pool_f, at + k, n - k)
+        at += n + 1
+        pool_f[at - 1] = front[(k + 1) * ld - 1]
+    rest = n - rows
+    for k in range(rest):
+        copy(front, (rows + k) * (ld + 1), pool_f, at + k, rest - k)
+        at += rest + 1
+        pool_f[at - 1] = front[(rows + k + 1) * ld - 1]
+    return -1
+
+
+@kernel
+def _extend_add(head, child, front, ld):  # type: ignore[no-untyped-def]
+    """Add the update matrix of a child to a front whose nodes have their indices set."""
+    pool_f = tb.pool_f(head)
+    node_i = tb.node_i(head)
+    clique_f = tb.clique_f(head)
+    node_f = tb.node_f(head)
+    work_f = tb.work_f(head)
+    clique_i = tb.clique_i(head)
+    pool_i = tb.pool_i(head)
+    row = clique_i[child]
+    n_frontal, n_separator = row[tb.N_FRONTAL], row[tb.N_SEPARATOR]
+    size = 3 * n_separator
+    if n_separator == 0:
+        return
+    update = pool_f[row[tb.VALUES] + 3 * n_frontal * (3 * n_frontal + size + 1):]
+    nodes = pool_i[row[tb.NODES] + n_frontal:row[tb.NODES] + n_frontal + n_separator]
+    phi = frames.present_turn(head, child)
+    if phi != clique_f[child, tb.TURN_SEEN]:
+        undo.log_clique(head, child)
+    clique_f[child, tb.TURN] = clique_f[child, tb.TURN_SEEN] = phi
+    if phi != 0.0:
+        turned = work_f[len(front) + len(front) // ld:]
+        frames.turned_update(update, n_separator, nodes, node_f, phi, turned)
+        update = turned
+    index = tb.work_i(head)[head[tb.N_NODES]:]
+    in_order = True
+    for a in range(n_separator):
+        index[a] = node_i[nodes[a], tb.INDEX]
+        in_order = in_order and (a == 0 or index[a] > index[a - 1])
+    for k in range(size):
+        front[(index[k // 3] + k % 3) * ld + ld - 1] += update[(k + 1) * (size + 1) - 1]
+    if not in_order:
+        _add_in_other_order(update, n_separator, index, front, ld)
+        return
+    # runs of columns that are neighbours in both
+    begin = 0
+    while begin < n_separator:
+        end = begin + 1
+        while end < n_separator and index[end] == index[end - 1] + 3:
+            end += 1
+        width, column = 3 * (end - begin), index[begin]
+        for a in range(begin):
+            source, target = 3 * a * (size + 1) + 3 * begin, index[a] * ld + column
+            for _ in range(3):
+                add(update, source, front, target, width)
+                source += size + 1
+                target += ld
+        source, target = 3 * begin * (size + 2), column * (ld + 1)
+        for a in range(width):
+            add(update, source, front, target, width - a)
+            source += size + 2
+            target += ld + 1
+        begin = end
+
+
+@kernel
+def _add_in_other_order(update, n_separator, index, front, ld):  # type: ignore[no-untyped-def]
+    """Add an update matrix where the parent has another order: entries may change sides."""
+    size = 3 * n_separator
+    for a in range(n_separator):
+        i = index[a]
+        for m in range(3):
+            source = update[(3 * a + m) * (size + 1):(3 * a + m + 1) * (size + 1)]
+            for q in range(m, 3):
+                front[(i + m) * ld + i + q] += source[3 * a + q]
+            for b in range(a + 1, n_separator):
+                j = index[b]
+                if j > i:
+                    to, step = (i + m) * ld + j, 1
+                else:
+                    to, step = j * ld + i + m, ld
+                front[to] += source[3 * b]
+                front[to + step] += source[3 * b + 1]
+                front[to + 2 * step] += source[3 * b + 2]
+
+
+@kernel
+def _hold(head, v, at, front, n, ld):  # type: ignore[no-untyped-def]
+    """Put the solution of a fixed node in: its columns go to the right-hand side."""
+    node_f = tb.node_f(head)
+    right = ld - 1
+    for m in range(3):
+        r = at + m
+        x = node_f[v, tb.DELTA + m]
+        for k in range(r):
+            front[k * ld + right] -= front[k * ld + r] * x
+            front[k * ld + r] = 0.0
+        for k in range(r + 1, n):
+            front[k * ld + right] -= front[r * ld + k] * x
+            front[r * ld + k] = 0.0
+        front[r * ld + r] = 1.0
+        front[r * ld + right] = x
+
+
+@kernel
+def work_size(n_nodes):  # type: ignore[no-untyped-def]
+    """Return the work space that a front takes, with another update matrix in it."""
+    n = 3 * n_nodes
+    return n * padded(n) + n + n * (n + 1)

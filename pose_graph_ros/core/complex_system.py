@@ -1,0 +1,341 @@
+# Copyright 2026 The pose_graph_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""
+Linear least squares with one complex unknown for each node, over the cliques of the whole graph.
+
+What is minimised over v, which is known at the fixed nodes, is
+
+    sum w |v_j - f v_i - s|^2 + sum w |v_node - g|^2
+
+over edges (w, f, s; |f| = 1) and observed nodes (w, g). The matrix of the normal equations is
+Hermitian and has a number where the pose graph has a 3x3 block, so the cliques and their order
+are the same, and a factorisation `R^H R` costs about a seventh. Real and imaginary parts are kept
+apart, so that rows are made of whole vectors. The update matrices lie on a stack: in postorder
+those of the children of a clique are always on top.
+"""
+
+import math
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from pose_graph_ros.core import tables as tb
+from pose_graph_ros.core.cholesky import LEAST_PIVOT
+from pose_graph_ros.core.fronts import padded
+from pose_graph_ros.core.jit import kernel
+from pose_graph_ros.core.vectors import add, copy, less, load, spread, store, times, WIDTH
+
+
+class Terms(NamedTuple):
+    """The sum that is minimised."""
+
+    edges: Any
+    """w, real and imaginary part of f, those of s, shape (E, 5)."""
+    observed: Any
+    """w, real and imaginary part of g, shape (K, 3)."""
+    known: Any
+    """Real and imaginary part of v, read at the fixed nodes, shape (N, 2)."""
+
+
+class _Front(NamedTuple):
+    """Equations of a clique: the upper triangle by rows of `ld` numbers, the last one the rhs."""
+
+    re: Any
+    im: Any
+    ld: Any
+
+
+@kernel
+def solve(head, cliques, terms):  # type: ignore[no-untyped-def]
+    """
+    Solve for all nodes.
+
+    Parameters
+    ----------
+    head : ndarray
+    cliques : symbolic.Cliques
+    terms : Terms
+
+    Returns
+    -------
+    v : ndarray, shape (N, 2)
+        Real and imaginary parts.
+    bad : int
+        A node that is not determined, or -1.
+
+    """
+    first, n_frontal, parent, nodes = cliques
+    n_cliques = len(n_frontal)
+    widest, n_values, update_size, deepest = _sizes(cliques)
+    values, stack = np.empty(n_values), np.empty(deepest)
+    planes = np.empty((2, widest * padded(widest)))
+    waiting = np.empty(n_cliques, np.int64)
+    n_waiting, depth, at = 0, 0, 0
+    least = _least_pivots(head, terms)
+    v = np.zeros((head[tb.N_NODES], 2))
+    for k in range(n_cliques):
+        list_, rows = nodes[first[k]:first[k + 1]], n_frontal[k]
+        ld = padded(len(list_))
+        front = _Front(planes[0, :len(list_) * ld], planes[1, :len(list_) * ld], ld)
+        front.re[:] = 0.0
+        front.im[:] = 0.0
+        _add_constraints(head, list_, rows, terms, front)
+        while n_waiting > 0 and parent[waiting[n_waiting - 1]] == k:
+            n_waiting -= 1
+            child = waiting[n_waiting]
+            depth -= update_size[child]
+            _add_update(head, nodes[first[child] + n_frontal[child]:first[child + 1]],
+                        stack[depth:depth + update_size[child]], front)
+        _hold_fixed(head, list_, rows, terms.known, front)
+        bad = _factorize(list_, rows, least, front)
+        if bad >= 0:
+            return v, bad
+        copy(front.re, 0, values, at, rows * ld)
+        copy(front.im, 0, values, at + rows * ld, rows * ld)
+        at += 2 * rows * ld
+        if parent[k] >= 0:
+            _put_update(front, rows, len(list_), stack[depth:depth + update_size[k]])
+            depth += update_size[k]
+            waiting[n_waiting] = k
+            n_waiting += 1
+    for k in range(n_cliques - 1, -1, -1):
+        used = n_frontal[k] * padded(first[k + 1] - first[k])
+        at -= 2 * used
+        _solve_rows(values[at:at + used], values[at + used:at + 2 * used], n_frontal[k],
+                    nodes[first[k]:first[k + 1]], v)
+    return v, -1
+
+
+@kernel
+def _sizes(cliques):  # type: ignore[no-untyped-def]
+    """
+    Return how much room everything takes.
+
+    Returns
+    -------
+    widest : int
+        Nodes of the largest clique.
+    n_values : int
+        Numbers in all rows of R.
+    update_size : ndarray, shape (C,)
+        Numbers in the update matrix of each clique.
+    deepest : int
+        Numbers in all update matrices that wait at a time.
+
+    """
+    n_cliques = len(cliques.n_frontal)
+    update_size = np.zeros(n_cliques, np.int64)
+    of_children = np.zeros(n_cliques, np.int64)
+    widest, n_values, depth, deepest = 0, 0, 0, 0
+    for k in range(n_cliques):
+        width = cliques.first[k + 1] - cliques.first[k]
+        widest = max(widest, width)
+        n_values += 2 * cliques.n_frontal[k] * padded(width)
+        n = width - cliques.n_frontal[k]
+        update_size[k] = 2 * n * (n + 1)
+        depth += update_size[k] - of_children[k]
+        deepest = max(deepest, depth)
+        if cliques.parent[k] >= 0:
+            of_children[cliques.parent[k]] += update_size[k]
+    return widest, n_values, update_size, deepest
+
+
+@kernel
+def _least_pivots(head, terms):  # type: ignore[no-untyped-def]
+    """Return what the pivot of each node must be larger than, by the sum of its weights."""
+    node_i, edge_i, observed_i = tb.node_i(head), tb.edge_i(head), tb.observed_i(head)
+    least = np.zeros(head[tb.N_NODES])
+    for e in range(head[tb.N_EDGES]):
+        least[edge_i[e, tb.END_I]] += LEAST_PIVOT * terms.edges[e, 0]
+        least[edge_i[e, tb.END_J]] += LEAST_PIVOT * terms.edges[e, 0]
+    for k in range(head[tb.N_OBSERVED]):
+        least[observed_i[k, tb.OBS_NODE]] += LEAST_PIVOT * terms.observed[k, 0]
+    for v in range(head[tb.N_NODES]):
+        if node_i[v, tb.FIXED] != 0:
+            least[v] = 0.0
+    return least
+
+
+@kernel
+def _add_constraints(head, list_, rows, terms, front):  # type: ignore[no-untyped-def]
+    """Add the constraints of the frontal nodes to a front."""
+    node_i, edge_i, observed_i = tb.node_i(head), tb.edge_i(head), tb.observed_i(head)
+    of_edges, of_observed = terms.edges, terms.observed
+    re, im, ld = front
+    right = ld - 1
+    serial = head[tb.FRONT_SERIAL] + 1
+    head[tb.FRONT_SERIAL] = serial
+    for k in range(len(list_)):
+        node_i[list_[k], tb.INDEX] = k
+        node_i[list_[k], tb.FRONT] = serial
+    for k in range(rows):
+        entry = node_i[list_[k], tb.EDGE_LIST]
+        while entry >= 0:
+            e, side = entry >> 1, entry & 1
+            other = edge_i[e, tb.END_I if side == 1 else tb.END_J]
+            entry = edge_i[e, tb.NEXT_J if side == 1 else tb.NEXT_I]
+            w = of_edges[e, 0]
+            if w <= 0.0 or node_i[other, tb.FRONT] != serial:
+                continue
+            at = node_i[other, tb.INDEX]
+            if at < rows and side == 1:
+                continue  # comes twice and counts at its start
+            i, j = (k, at) if side == 0 else (at, k)
+            f_re, f_im, s_re, s_im = of_edges[e, 1], of_edges[e, 2], of_edges[e, 3], of_edges[e, 4]
+            re[i * ld + i] += w
+            re[j * ld + j] += w
+            # entry ij is -w conj(f), entry ji its conjugate
+            if i < j:
+                re[i * ld + j] -= w * f_re
+                im[i * ld + j] += w * f_im
+            else:
+                re[j * ld + i] -= w * f_re
+                im[j * ld + i] -= w * f_im
+            re[j * ld + right] += w * s_re
+            im[j * ld + right] += w * s_im
+            re[i * ld + right] -= w * (f_re * s_re + f_im * s_im)
+            im[i * ld + right] -= w * (f_re * s_im - f_im * s_re)
+        entry = node_i[list_[k], tb.OBSERVED_LIST]
+        while entry >= 0:
+            w = of_observed[entry, 0]
+            re[k * ld + k] += w
+            re[k * ld + right] += w * of_observed[entry, 1]
+            im[k * ld + right] += w * of_observed[entry, 2]
+            entry = observed_i[entry, tb.OBS_NEXT]
+
+
+@kernel
+def _put_update(front, rows, width, update):  # type: ignore[no-untyped-def]
+    """Write what is left of a front: rows of n + 1 numbers, the real parts first."""
+    n, ld = width - rows, front.ld
+    half, to = n * (n + 1), 0
+    for i in range(n):
+        source = (rows + i) * (ld + 1)
+        copy(front.re, source, update, to + i, n - i)
+        copy(front.im, source, update, to + half + i, n - i)
+        to += n + 1
+        update[to - 1] = front.re[(rows + i + 1) * ld - 1]
+        update[to + half - 1] = front.im[(rows + i + 1) * ld - 1]
+
+
+@kernel
+def _add_update(head, separator, update, front):  # type: ignore[no-untyped-def]
+    """Add the update matrix of a child; its separator is sorted as the front is."""
+    node_i = tb.node_i(head)
+    re, im, ld = front
+    n = len(separator)
+    half = n * (n + 1)
+    begin = 0
+    while begin < n:  # runs of columns that are neighbours in both
+        column = np.int64(node_i[separator[begin], tb.INDEX])
+        end = begin + 1
+        while end < n and node_i[separator[end], tb.INDEX] == column + end - begin:
+            end += 1
+        for a in range(end):
+            row = node_i[separator[a], tb.INDEX] * ld
+            skip = max(a - begin, 0)
+            source, width = a * (n + 1) + begin + skip, end - begin - skip
+            add(update, source, re, row + column + skip, width)
+            add(update, half + source, im, row + column + skip, width)
+        begin = end
+    for a in range(n):
+        row = node_i[separator[a], tb.INDEX] * ld
+        re[row + ld - 1] += update[a * (n + 1) + n]
+        im[row + ld - 1] += update[half + a * (n + 1) + n]
+
+
+@kernel
+def _factorize(list_, rows, least, front):  # type: ignore[no-untyped-def]
+    """Factorise the frontal rows of a front in place; return a node with a bad pivot, or -1."""
+    for i in range(len(list_)):
+        _take_off(front, i, min(i, rows))
+        if i < rows and not _scale(front, i, least[list_[i]]):
+            return list_[i]
+    return -1
+
+
+@kernel
+def _hold_fixed(head, list_, rows, known, front):  # type: ignore[no-untyped-def]
+    """Put the known values of the fixed ones of the frontal nodes in."""
+    node_i = tb.node_i(head)
+    for i in range(rows):
+        if node_i[list_[i], tb.FIXED] != 0:
+            _hold(i, known[list_[i]], front, len(list_))
+
+
+@kernel
+def _hold(r, known, front, width):  # type: ignore[no-untyped-def]
+    """Put the known value of row r in: its column goes to the right-hand side."""
+    re, im, ld = front
+    x, y = known[0], known[1]
+    right = ld - 1
+    for k in range(width):
+        if k == r:
+            continue
+        # entry kr; below the diagonal it is the conjugate of entry rk
+        at = k * ld + r if k < r else r * ld + k
+        a, b = re[at], im[at] if k < r else -im[at]
+        re[k * ld + right] -= a * x - b * y
+        im[k * ld + right] -= a * y + b * x
+        re[at] = im[at] = 0.0
+    re[r * ld + r], im[r * ld + r] = 1.0, 0.0
+    re[r * ld + right], im[r * ld + right] = x, y
+
+
+@kernel
+def _take_off(front, i, n_rows):  # type: ignore[no-untyped-def]
+    """Take the finished rows, 0 to n_rows - 1, off row i: conj(r_ki) r_k each."""
+    re, im, ld = front
+    target, begin = i * ld, i // WIDTH * WIDTH
+    k = 0
+    while k + 1 < n_rows:
+        p, q = k * ld, (k + 1) * ld
+        a, b, b_ = spread(re[p + i]), spread(im[p + i]), spread(-im[p + i])
+        c, d, d_ = spread(re[q + i]), spread(im[q + i]), spread(-im[q + i])
+        for m in range(begin, ld, WIDTH):
+            x, y, z, w = load(re, p + m), load(im, p + m), load(re, q + m), load(im, q + m)
+            total = less(less(load(re, target + m), a, x), b, y)
+            store(re, target + m, less(less(total, c, z), d, w))
+            total = less(less(load(im, target + m), a, y), b_, x)
+            store(im, target + m, less(less(total, c, w), d_, z))
+        k += 2
+    if k < n_rows:
+        p = k * ld
+        a, b, b_ = spread(re[p + i]), spread(im[p + i]), spread(-im[p + i])
+        for m in range(begin, ld, WIDTH):
+            x, y = load(re, p + m), load(im, p + m)
+            store(re, target + m, less(less(load(re, target + m), a, x), b, y))
+            store(im, target + m, less(less(load(im, target + m), a, y), b_, x))
+
+
+@kernel
+def _scale(front, i, least):  # type: ignore[no-untyped-def]
+    """Divide row i by the root of its pivot, whose reciprocal is kept; False if too small."""
+    re, im, ld = front
+    at = i * ld
+    pivot = re[at + i]
+    if not pivot > least:
+        return False
+    inverse = 1.0 / math.sqrt(pivot)
+    f = spread(inverse)
+    for m in range(i // WIDTH * WIDTH, ld, WIDTH):
+        store(re, at + m, times(load(re, at + m), f))
+        store(im, at + m, times(load(im, at + m), f))
+    re[at + i] = inverse
+    return True
+
+
+@kernel
+def _solve_rows(re, im, rows, list_, v):  # type: ignore[no-untyped-def]
+    """Solve the rows of R of a clique from the last to the first."""
+    width = len(list_)
+    ld = padded(width)
+    for k in range(rows - 1, -1, -1):
+        at = k * ld
+        x, y = re[at + ld - 1], im[at + ld - 1]
+        for c in range(k + 1, width):
+            a, b = re[at + c], im[at + c]
+            p, q = v[list_[c], 0], v[list_[c], 1]
+            x -= a * p - b * q
+            y -= a * q + b * p
+        v[list_[k], 0], v[list_[k], 1] = x * re[at + k], y * re[at + k]

@@ -1,0 +1,273 @@
+# Copyright 2026 The pose_graph_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""
+What one constraint adds to a front, how far it is from linear, and its energy.
+
+The unknown of a node is its pose minus a constant reference, delta = x - x_ref, added in map
+axes: the translation and the heading are simply numbers, so every constraint may be linearized at
+a point of its own. Symbols as in `linearize`; phi = th_i + th_z is the direction of the measured
+frame, d = t_j - t_i, S = ((0, -1), (1, 0)), u = R_z^T t_z, and a bar marks the linearization.
+
+The error (3.48), `e = (R_phi^T d - u, wrap(th_j - th_i - th_z))`, linearized with (3.49) and
+(3.50) and turned into map axes by R_phi_bar, is
+
+    e' = h + delta_j - T delta_i,    T = ((1, 0, -d_y), (0, 1, d_x), (0, 0, 1)) at d_bar
+    h_t = x_ref_j - x_ref_i - R_phi_bar u + S d_bar delta_bar_th,   h_th constant
+
+and its information is turned likewise. How far the linear model is from the error,
+
+    r = e - R_phi_bar^T e',
+
+depends on the change of the heading since the linearization and on the present d alone; a
+translation of the whole costs nothing. The Jacobians have changed as well: a force W e acts
+along a direction that has turned, which is worth the fraction of e by which it has. Both together,
+`r^T W r + change^2 e^T W e`, the squared linearization error in units of sigma, say what is to be
+linearized again (a whitened version of fluid relinearization, M. Kaess et al., "iSAM2", IJRR
+2012). Its sum over all constraints is about what chi2 lies above its minimum.
+"""
+
+import math
+
+from pose_graph_ros.core import tables as tb
+from pose_graph_ros.core.jit import kernel
+
+
+@kernel
+def wrap(angle):  # type: ignore[no-untyped-def]
+    """Return the angle in [-pi, pi), as `se2.wrap` does."""
+    if -math.pi <= angle < math.pi:
+        return angle
+    wrapped = (angle + math.pi) % (2.0 * math.pi) - math.pi
+    return wrapped if wrapped < math.pi else -math.pi
+
+
+@kernel
+def linearize_edge(head, e):  # type: ignore[no-untyped-def]
+    """Linearize an edge at the present estimate; the caller has logged it."""
+    node_f, edge_f, edge_i = tb.node_f(head), tb.edge_f(head), tb.edge_i(head)
+    f = edge_f[e]
+    start, end = node_f[edge_i[e, tb.END_I]], node_f[edge_i[e, tb.END_J]]
+    phi = start[tb.POSE + 2] + f[tb.MEAN + 2]
+    f[tb.LIN_D] = end[tb.POSE] - start[tb.POSE]
+    f[tb.LIN_D + 1] = end[tb.POSE + 1] - start[tb.POSE + 1]
+    f[tb.LIN_COS], f[tb.LIN_SIN] = math.cos(phi), math.sin(phi)
+    f[tb.LIN_TH] = start[tb.DELTA + 2]
+    f[tb.LIN_K] = (wrap(end[tb.POSE + 2] - start[tb.POSE + 2] - f[tb.MEAN + 2])
+                   - (end[tb.DELTA + 2] - start[tb.DELTA + 2]))
+
+
+@kernel
+def check_edge(head, e, phi):  # type: ignore[no-untyped-def]
+    """
+    Set the squared linearization error and the energy of an edge; the caller has logged it.
+
+    The frame in which it was linearized has turned by phi since (see `frames`).
+    """
+    node_f, edge_f, edge_i = tb.node_f(head), tb.edge_f(head), tb.edge_i(head)
+    f = edge_f[e]
+    start, end = node_f[edge_i[e, tb.END_I]], node_f[edge_i[e, tb.END_J]]
+    dx, dy = end[tb.POSE] - start[tb.POSE], end[tb.POSE + 1] - start[tb.POSE + 1]
+    if phi != 0.0:
+        c, s = math.cos(phi), math.sin(phi)
+        dx, dy = c * dx + s * dy, c * dy - s * dx
+    c, s = f[tb.LIN_COS], f[tb.LIN_SIN]
+    qx, qy = c * dx + s * dy, c * dy - s * dx
+    gx = c * f[tb.LIN_D] + s * f[tb.LIN_D + 1]
+    gy = c * f[tb.LIN_D + 1] - s * f[tb.LIN_D]
+    turn = start[tb.DELTA + 2] - phi - f[tb.LIN_TH]
+    if abs(turn) < 0.1:
+        # series to the last bit: versine and sine
+        square = turn * turn
+        versine = -square * (0.5 - square * (1 / 24 - square * (1 / 720 - square * (
+            1 / 40320 - square / 3628800))))
+        sine = turn * (1.0 - square * (1 / 6 - square * (1 / 120 - square * (
+            1 / 5040 - square * (1 / 362880 - square / 39916800)))))
+    else:
+        versine, sine = math.cos(turn) - 1.0, math.sin(turn)
+    px, py = versine * qx + sine * qy, versine * qy - sine * qx
+    ex, ey = qx + px - f[tb.OWN_T], qy + py - f[tb.OWN_T + 1]
+    linear = f[tb.LIN_K] + end[tb.DELTA + 2] - start[tb.DELTA + 2]
+    eth = wrap(linear)
+    rx, ry, rth = px - gy * turn, py + gx * turn, eth - linear
+    if abs(rth) < 1.0:
+        rth = 0.0  # rounding of the wrap; at a jump it is a multiple of 2 pi
+    w = f[tb.WEIGHT]
+    energy = w * _form(f, ex, ey, eth)
+    # the Jacobian has turned, and its arm has become longer
+    iso = 0.5 * (f[tb.INFO] + f[tb.INFO + 3])
+    longer = (qx + px - gx) ** 2 + (qy + py - gy) ** 2
+    changed = turn * turn + longer * iso / (f[tb.INFO + 5] + iso * (gx * gx + gy * gy) + 1e-300)
+    f[tb.ERROR2] = w * _form(f, rx, ry, rth) + changed * energy
+    f[tb.ENERGY] = energy
+
+
+@kernel
+def _form(f, x, y, th):  # type: ignore[no-untyped-def]
+    """Return e^T information e."""
+    i = tb.INFO
+    return (x * (f[i] * x + 2.0 * (f[i + 1] * y + f[i + 2] * th))
+            + y * (f[i + 3] * y + 2.0 * f[i + 4] * th) + th * f[i + 5] * th)
+
+
+@kernel
+def _turned(f, c, s):  # type: ignore[no-untyped-def]
+    """Return the weighted information, turned by the angle with this cos and sin."""
+    i, w = tb.INFO, f[tb.WEIGHT]
+    xx, xy, xt, yy, yt, tt = f[i], f[i + 1], f[i + 2], f[i + 3], f[i + 4], f[i + 5]
+    cc, ss, cs = c * c, s * s, c * s
+    return (w * (cc * xx - 2.0 * cs * xy + ss * yy), w * (cs * (xx - yy) + (cc - ss) * xy),
+            w * (c * xt - s * yt), w * (ss * xx + 2.0 * cs * xy + cc * yy),
+            w * (s * xt + c * yt), w * tt)
+
+
+@kernel
+def add_edge(head, e, a, b, front, ld):  # type: ignore[no-untyped-def]
+    """
+    Add an edge to a front.
+
+    Parameters
+    ----------
+    e : int
+    a, b : int
+        Rows of the front at which the blocks of its ends i and j begin.
+    front : ndarray, flat
+        Upper triangle by rows of `ld` numbers, the last of them the right-hand side.
+
+    """
+    node_f, edge_f, edge_i = tb.node_f(head), tb.edge_f(head), tb.edge_i(head)
+    f = edge_f[e]
+    start, end = node_f[edge_i[e, tb.END_I]], node_f[edge_i[e, tb.END_J]]
+    c, s = f[tb.LIN_COS], f[tb.LIN_SIN]
+    xx, xy, xt, yy, yt, tt = _turned(f, c, s)
+    px, py = -f[tb.LIN_D + 1], f[tb.LIN_D]  # S d
+    ux, uy = f[tb.OWN_T], f[tb.OWN_T + 1]
+    hx = end[tb.REF] - start[tb.REF] - (c * ux - s * uy) + px * f[tb.LIN_TH]
+    hy = end[tb.REF + 1] - start[tb.REF + 1] - (s * ux + c * uy) + py * f[tb.LIN_TH]
+    hth = f[tb.LIN_K]
+    # W T: the third column is W (S d, 1)
+    wx, wy, wt = xx * px + xy * py + xt, xy * px + yy * py + yt, xt * px + yt * py + tt
+    # T^T W T
+    tt_i = px * wx + py * wy + wt
+    gx = xx * hx + xy * hy + xt * hth
+    gy = xy * hx + yy * hy + yt * hth
+    gth = xt * hx + yt * hy + tt * hth
+    r = a * ld + a
+    front[r] += xx
+    front[r + 1] += xy
+    front[r + 2] += wx
+    front[r + ld + 1] += yy
+    front[r + ld + 2] += wy
+    front[r + 2 * ld + 2] += tt_i
+    r = b * ld + b
+    front[r] += xx
+    front[r + 1] += xy
+    front[r + 2] += xt
+    front[r + ld + 1] += yy
+    front[r + ld + 2] += yt
+    front[r + 2 * ld + 2] += tt
+    right = ld - 1
+    front[a * ld + right] += gx
+    front[(a + 1) * ld + right] += gy
+    front[(a + 2) * ld + right] += px * gx + py * gy + gth
+    front[b * ld + right] -= gx
+    front[(b + 1) * ld + right] -= gy
+    front[(b + 2) * ld + right] -= gth
+    # block ij is -T^T W, block ji its transpose
+    if a < b:
+        r = a * ld + b
+        front[r] -= xx
+        front[r + 1] -= xy
+        front[r + 2] -= xt
+        front[r + ld] -= xy
+        front[r + ld + 1] -= yy
+        front[r + ld + 2] -= yt
+        front[r + 2 * ld] -= wx
+        front[r + 2 * ld + 1] -= wy
+        front[r + 2 * ld + 2] -= wt
+    else:
+        r = b * ld + a
+        front[r] -= xx
+        front[r + 1] -= xy
+        front[r + 2] -= wx
+        front[r + ld] -= xy
+        front[r + ld + 1] -= yy
+        front[r + ld + 2] -= wy
+        front[r + 2 * ld] -= xt
+        front[r + 2 * ld + 1] -= yt
+        front[r + 2 * ld + 2] -= wt
+
+
+@kernel
+def linearize_observed(head, k):  # type: ignore[no-untyped-def]
+    """Linearize an observed node at the present estimate; the caller has logged it."""
+    node_f, observed_f, observed_i = tb.node_f(head), tb.observed_f(head), tb.observed_i(head)
+    f, node = observed_f[k], node_f[observed_i[k, tb.OBS_NODE]]
+    f[tb.OBS_TH] = node[tb.DELTA + 2]
+    f[tb.OBS_K] = wrap(node[tb.POSE + 2] + f[tb.OBS_OFFSET + 2] - f[tb.MEAN + 2]) - (
+        node[tb.DELTA + 2])
+
+
+@kernel
+def check_observed(head, k):  # type: ignore[no-untyped-def]
+    """Set the squared linearization error and the energy; the caller has logged the row."""
+    node_f, observed_f, observed_i = tb.node_f(head), tb.observed_f(head), tb.observed_i(head)
+    f, node = observed_f[k], node_f[observed_i[k, tb.OBS_NODE]]
+    c, s = math.cos(f[tb.MEAN + 2]), math.sin(f[tb.MEAN + 2])
+    ex, ey = node[tb.POSE] - f[tb.MEAN], node[tb.POSE + 1] - f[tb.MEAN + 1]
+    linear = f[tb.OBS_K] + node[tb.DELTA + 2]
+    eth = wrap(linear)
+    rx = ry = changed = 0.0
+    rth = eth - linear
+    if abs(rth) < 1.0:
+        rth = 0.0
+    ox, oy = f[tb.OBS_OFFSET], f[tb.OBS_OFFSET + 1]
+    if ox != 0.0 or oy != 0.0:
+        heading = node[tb.POSE + 2]
+        turn = node[tb.DELTA + 2] - f[tb.OBS_TH]
+        ax, ay = math.cos(heading) * ox - math.sin(heading) * oy, (
+            math.sin(heading) * ox + math.cos(heading) * oy)
+        heading -= turn
+        bx, by = math.cos(heading) * ox - math.sin(heading) * oy, (
+            math.sin(heading) * ox + math.cos(heading) * oy)
+        rx, ry = ax - bx + by * turn, ay - by - bx * turn
+        rx, ry = c * rx + s * ry, c * ry - s * rx
+        ex, ey = ex + ax, ey + ay
+        changed = turn * turn
+    ex, ey = c * ex + s * ey, c * ey - s * ex
+    w = f[tb.WEIGHT]
+    energy = w * _form(f, ex, ey, eth)
+    f[tb.OBS_ERROR2] = w * _form(f, rx, ry, rth) + changed * energy
+    f[tb.OBS_ENERGY] = energy
+
+
+@kernel
+def add_observed(head, k, a, front, ld):  # type: ignore[no-untyped-def]
+    """Add an observed node to a front; parameters as of `add_edge`."""
+    node_f, observed_f, observed_i = tb.node_f(head), tb.observed_f(head), tb.observed_i(head)
+    f, node = observed_f[k], node_f[observed_i[k, tb.OBS_NODE]]
+    xx, xy, xt, yy, yt, tt = _turned(f, math.cos(f[tb.MEAN + 2]), math.sin(f[tb.MEAN + 2]))
+    hx, hy = node[tb.REF] - f[tb.MEAN], node[tb.REF + 1] - f[tb.MEAN + 1]
+    px = py = 0.0
+    ox, oy = f[tb.OBS_OFFSET], f[tb.OBS_OFFSET + 1]
+    if ox != 0.0 or oy != 0.0:
+        heading = node[tb.REF + 2] + f[tb.OBS_TH]
+        c, s = math.cos(heading), math.sin(heading)
+        ax, ay = c * ox - s * oy, s * ox + c * oy
+        px, py = -ay, ax
+        hx, hy = hx + ax - px * f[tb.OBS_TH], hy + ay - py * f[tb.OBS_TH]
+    hth = f[tb.OBS_K]
+    wx, wy, wt = xx * px + xy * py + xt, xy * px + yy * py + yt, xt * px + yt * py + tt
+    gx = xx * hx + xy * hy + xt * hth
+    gy = xy * hx + yy * hy + yt * hth
+    gth = xt * hx + yt * hy + tt * hth
+    r = a * ld + a
+    front[r] += xx
+    front[r + 1] += xy
+    front[r + 2] += wx
+    front[r + ld + 1] += yy
+    front[r + ld + 2] += wy
+    front[r + 2 * ld + 2] += px * wx + py * wy + wt
+    right = ld - 1
+    front[a * ld + right] -= gx
+    front[(a + 1) * ld + right] -= gy
+    front[(a + 2) * ld + right] -= px * gx + py * gy + gth

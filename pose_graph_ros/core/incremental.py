@@ -1,0 +1,287 @@
+# Copyright 2026 The pose_graph_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""
+The incremental smoother: an estimate of all poses that is kept up to date, step by step.
+
+A step costs what it changes. What an edit touches is eliminated again, from there to the root of
+the tree of cliques (`elimination`); the solution is passed down as far as values move
+(`back_substitution`); what has become wrong by linearization is linearized again, and the loop
+goes on until the rest of that is below a budget. Along a chain a step is a constant amount of work
+(`chain`). `docs/solver.md` tells the whole story.
+"""
+
+from typing import NamedTuple
+
+from numba import types
+import numpy as np
+
+from pose_graph_ros.core import (
+    back_substitution,
+    chain,
+    elimination,
+    marginals,
+    rescue,
+    se2,
+    tables as tb,
+    undo,
+)
+from pose_graph_ros.core.batch import Status
+from pose_graph_ros.core.config import SmootherConfig
+from pose_graph_ros.core.constraints import EdgeKind, Edges, ObservedKind, ObservedNodes
+from pose_graph_ros.core.exceptions import GraphUpdateError
+from pose_graph_ros.core.graph import Checkpoint, Graph, GraphUpdate
+from pose_graph_ros.core.jit import compile_only
+from pose_graph_ros.core.se2 import FloatArray
+
+# Where a step leaves more squared linearization error than this, it has not worked [sigma^2] ...
+DOUBT = 1.0
+# ... if there is no iteration left, or the last one has not at least halved it, or there is so
+# much of it that the next one can only make it worse.
+HOPELESS = 1e6
+NAN = float('nan')
+
+
+class UpdateResult(NamedTuple):
+    """What an update did."""
+
+    status: Status
+    """
+    CONVERGED; MAX_ITERATIONS if linearization errors above the budget are left over for the next
+    update; FAILED if the update was undone.
+    """
+    reason: str
+    """One sentence when the status is FAILED, else empty."""
+    relinearized: int
+    """Constraints, and turned frames of cliques, that were linearized again."""
+    eliminated: int
+    """Nodes whose cliques were eliminated again, counted in each iteration."""
+    visited: int
+    """Cliques that were solved for, counted in each iteration."""
+    iterations: int
+    chi2: float
+    """Energy of the whole graph after the update, if it was asked for, else NaN."""
+
+
+_ALONG_THE_CHAIN = UpdateResult(Status.CONVERGED, '', 0, 1, 1, 1, NAN)
+_NO_POSE: FloatArray = np.zeros(3)
+_NO_MATRIX: FloatArray = np.zeros((3, 3))
+_EXTEND = (types.int64[::1], types.float64[::1], types.float64[:, ::1], types.float64[::1],
+           types.float64[:, ::1], types.boolean)
+
+
+class IncrementalSmoother:
+    """
+    Keeps the estimate of a growing pose graph at the minimum of chi2, to a stated tolerance.
+
+    Parameters
+    ----------
+    config : SmootherConfig
+
+    Notes
+    -----
+    Every part of the graph must be tied to the map, by a fixed or an observed node. An update that
+    would leave a node undetermined is undone, bit for bit.
+
+    """
+
+    def __init__(self, config: SmootherConfig | None = None) -> None:
+        self._config = SmootherConfig() if config is None else config
+        self.graph = Graph()
+        """The pose graph, which only this object edits."""
+        self._memory = self.graph.memory
+        scalars = self._memory['scalars']
+        scalars[tb.SETTING_ALPHA] = self._config.alpha
+        scalars[tb.SETTING_BUDGET] = self._config.budget
+        scalars[tb.SETTING_SHARE] = self._config.budget_share
+        compile_only(chain.extend, _EXTEND)  # `extend` converts other arrays
+
+    @property
+    def poses(self) -> FloatArray:
+        """Estimates of all hidden nodes in the map, shape (N, 3): a view, always up to date."""
+        return self.graph.poses
+
+    def update(self, update: GraphUpdate, *, chi2: bool = False) -> UpdateResult:
+        """
+        Edit the graph and bring the estimate up to date.
+
+        Parameters
+        ----------
+        update : GraphUpdate
+        chi2 : bool
+            Evaluate chi2, which takes time in proportion to the graph.
+
+        Raises
+        ------
+        GraphUpdateError
+            If a part of the update does not fit the graph; nothing has changed then.
+
+        """
+        before = self.graph.begin()
+        self.graph.apply(update)
+        self._memory.head[tb.N_RELINEARIZED:tb.N_ITERATIONS + 1] = 0
+        result = self._step(before)
+        return result._replace(chi2=self.chi2()) if chi2 else result
+
+    def extend(
+        self, mean: FloatArray, information: FloatArray,
+        observed_mean: FloatArray | None = None, observed_information: FloatArray | None = None,
+    ) -> UpdateResult:
+        """
+        Append a hidden node behind the newest one, tied by odometry: the step along a chain.
+
+        The same as an update with one hidden node, where odometry puts it, one edge and perhaps
+        one observed node, at a fraction of the cost.
+
+        Parameters
+        ----------
+        mean : ndarray, shape (3,)
+            Pose of the new node in the newest one [m, m, rad].
+        information : ndarray, shape (3, 3)
+        observed_mean : ndarray, shape (3,), optional
+            Observed pose of the new node in the map.
+        observed_information : ndarray, shape (3, 3), optional
+
+        Raises
+        ------
+        GraphUpdateError
+            As `update`, and if there is no node yet.
+
+        """
+        head = self._memory.head
+        with_observed = observed_mean is not None
+        if observed_mean is None or observed_information is None:
+            observed_mean, observed_information = _NO_POSE, _NO_MATRIX
+        try:
+            code = chain.extend(
+                head, mean, information, observed_mean, observed_information, with_observed)
+        except TypeError:
+            # not the arrays that the kernel is compiled for
+            mean, information, observed_mean, observed_information = (
+                np.array(argument, dtype=np.float64, order='C')
+                for argument in (mean, information, observed_mean, observed_information))
+            code = chain.NO_ROOM
+        if code == chain.EXTENDED:
+            return self._solve_extended() if with_observed else _ALONG_THE_CHAIN
+        arguments = (mean, information, observed_mean, observed_information)
+        shapes = tuple(np.shape(argument) for argument in arguments)
+        if shapes != ((3,), (3, 3), (3,), (3, 3)):
+            raise GraphUpdateError(
+                f'extend: expected arrays of shapes (3,) and (3, 3), got {shapes}')
+        if code == chain.NO_ROOM:
+            self.graph.ensure(*(int(count) + 1 for count in head[tb.N_NODES:tb.N_OBSERVED + 1]))
+            self._make_room(int(head[tb.POOL_F_END]) + 256, int(head[tb.POOL_I_END]) + 8, 256)
+            return self.extend(*(arguments if with_observed else arguments[:2]))
+        return self._extend_in_general(arguments, with_observed=with_observed)
+
+    def newest_covariance(self) -> FloatArray:
+        """Return the covariance of the newest hidden node in map axes, shape (3, 3)."""
+        covariance = np.empty((3, 3))
+        if not marginals.newest_covariance(self._memory.head, covariance):
+            raise GraphUpdateError('newest_covariance: expected a hidden node, there is none')
+        return covariance
+
+    def covariance(self, node: int) -> FloatArray:
+        """Return the covariance of a hidden node in map axes, shape (3, 3)."""
+        return marginals.covariance(self.graph, node)
+
+    def joint_covariance(self, i: int, j: int) -> FloatArray:
+        """Return the covariance of two hidden nodes together in map axes, shape (6, 6)."""
+        return marginals.joint_covariance(self.graph, i, j)
+
+    def covariances(self) -> FloatArray:
+        """Return the covariances of all hidden nodes in map axes, shape (N, 3, 3)."""
+        return marginals.covariances(self.graph)
+
+    def chi2(self) -> float:
+        """Return the energy of all constraints; takes time in proportion to the graph."""
+        return self.graph.energies().chi2
+
+    def _solve_extended(self) -> UpdateResult:
+        """Solve after a chain was extended by an observed node."""
+        head = self._memory.head
+        head[tb.N_RELINEARIZED:tb.N_ITERATIONS + 1] = 0
+        head[tb.N_ELIMINATED] = 1
+        if back_substitution.solve(head):
+            return self._result(Status.CONVERGED)
+        # the node has its place already, whatever becomes of the next iterations
+        undo.commit(head)
+        return self._step(self.graph.begin())
+
+    def _extend_in_general(
+        self, arguments: tuple[FloatArray, ...], *, with_observed: bool,
+    ) -> UpdateResult:
+        mean, information, observed_mean, observed_information = arguments
+        node = self.graph.n_nodes
+        if node == 0:
+            raise GraphUpdateError('extend: expected a graph with a hidden node to go on from')
+        observed = ObservedNodes()
+        if with_observed:
+            observed = ObservedNodes([node], None, observed_mean[None], observed_information[None],
+                                     [ObservedKind.GLOBAL_POSE])
+        return self.update(GraphUpdate(
+            hidden=se2.compose(self.graph.poses[node - 1], mean)[None],
+            edges=Edges([node - 1], [node], mean[None], information[None], [EdgeKind.ODOMETRY]),
+            observed=observed))
+
+    def _step(self, before: Checkpoint) -> UpdateResult:
+        """Eliminate, solve and linearize again until the estimate is good, or undo it all."""
+        head, scalars = self._memory.head, self._memory['scalars']
+        error2 = 0.0
+        if head[tb.N_WAITING] > 0:
+            back_substitution.relinearize(head)  # what the last update has left over
+        while head[tb.N_SEEDS] > 0:
+            code = self._eliminate()
+            if code == elimination.BAD_PIVOT:
+                reason = f'hidden node {head[tb.BAD_NODE]} is not determined'
+                self.graph.undo(before)
+                return UpdateResult(Status.FAILED, reason, 0, 0, 0, 0, NAN)
+            if back_substitution.solve(head):
+                break
+            error2, error2_before = float(scalars[tb.ERROR2_SUM]), error2
+            out_of_iterations = head[tb.N_ITERATIONS] >= self._config.max_iterations
+            if not error2 <= DOUBT and (
+                    out_of_iterations or 0.0 < error2_before < 2.0 * error2
+                    or not error2 < HOPELESS):
+                return self._rescue(before)
+            if out_of_iterations:
+                break
+            back_substitution.relinearize(head)
+        undo.commit(head)
+        return self._result(
+            Status.CONVERGED if head[tb.N_WAITING] == 0 else Status.MAX_ITERATIONS)
+
+    def _eliminate(self) -> int:
+        """Eliminate what the seeds touch, with as much memory as it takes."""
+        while (code := elimination.eliminate(self._memory.head)) == elimination.MORE_MEMORY:
+            self._make_room(*self._memory.head[tb.NEED_F:tb.NEED_WORK + 1].tolist())
+        return int(code)
+
+    def _make_room(self, floats: int, integers: int, work: int) -> None:
+        memory, head = self._memory, self._memory.head
+        memory.ensure('pool_f', floats, keep=int(head[tb.POOL_F_END]))
+        memory.ensure('pool_i', integers, keep=int(head[tb.POOL_I_END]))
+        memory.ensure('work_f', work)
+
+    def _rescue(self, before: Checkpoint) -> UpdateResult:
+        """Take the poses that the batch optimiser finds; the whole graph is eliminated anew."""
+        graph, head = self.graph, self._memory.head
+        poses = np.empty((graph.n_nodes, 3))
+        undo.poses_before(head, poses)
+        found = rescue.optimized_poses(graph, poses)
+        if found is None:
+            graph.undo(before)
+            return UpdateResult(
+                Status.FAILED, 'the iterations do not converge, and there is no batch solution',
+                0, 0, 0, 0, NAN)
+        undo.commit(head)
+        graph.set_poses(found)
+        graph.begin()
+        self._eliminate()
+        settled = back_substitution.solve(head)
+        undo.commit(head)
+        return self._result(Status.CONVERGED if settled else Status.MAX_ITERATIONS)
+
+    def _result(self, status: Status) -> UpdateResult:
+        relinearized, eliminated, visited, iterations = (
+            self._memory.head[tb.N_RELINEARIZED:tb.N_ITERATIONS + 1].tolist())
+        return UpdateResult(status, '', relinearized, eliminated, visited, iterations, NAN)

@@ -1,0 +1,266 @@
+# Copyright 2026 The pose_graph_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""
+Covariances from the tree of cliques: of one node, of two, of all of them.
+
+With `H = R^T R`, the covariance of two nodes is the product `Y_i^T Y_j` of the solutions of
+`R^T Y_i = E_i`, E_i the three columns of the identity that belong to node i. Y_i is zero but for
+the frontal rows of the cliques from that of i up to its root, so that two solutions meet where
+both ways have become one, and nowhere if they end in different roots.
+
+All of them at once come in one sweep (`sparse_inverse`).
+
+Rows of R hold the reciprocal of their diagonal. A fixed node has the rows of the identity there;
+with 0 for their reciprocals, all formulas give it no uncertainty. The rows of a clique are
+equations in its frame (see `frames`): what goes in and comes out is turned by its angle. A node is
+updated by adding to its pose in map axes, so these covariances are in map axes [m, m, rad].
+"""
+
+import math
+from typing import Any
+
+import numpy as np
+
+from pose_graph_ros.core import tables as tb
+from pose_graph_ros.core.graph import Graph
+from pose_graph_ros.core.jit import kernel
+from pose_graph_ros.core.se2 import FloatArray
+from pose_graph_ros.core.sparse_inverse import all_covariances
+
+_FAST = {'reassoc', 'contract', 'nsz'}
+
+
+def covariance(graph: Graph, node: int) -> FloatArray:
+    """
+    Return the covariance of one hidden node, shape (3, 3).
+
+    Raises
+    ------
+    ValueError
+        If there is no such node, or edits of the graph still wait for the next step.
+
+    """
+    _require_eliminated(graph)
+    _require_node(graph, node)
+    out = np.empty((3, 3))
+    node_covariance(graph.memory.head, node, out)
+    return out
+
+
+def joint_covariance(graph: Graph, i: int, j: int) -> FloatArray:
+    """
+    Return the covariance of two hidden nodes, i's coordinates first, shape (6, 6).
+
+    Raises as `covariance`.
+    """
+    _require_eliminated(graph)
+    _require_node(graph, i)
+    _require_node(graph, j)
+    out = np.zeros((6, 6))
+    pair_covariance(graph.memory.head, i, j, out)
+    return out
+
+
+def covariances(graph: Graph) -> FloatArray:
+    """
+    Return the covariances of all hidden nodes, shape (N, 3, 3), in one sweep.
+
+    Raises as `covariance`.
+    """
+    _require_eliminated(graph)
+    out = np.zeros((graph.n_nodes, 3, 3))
+    all_covariances(graph.memory.head, out)
+    return out
+
+
+def _require_eliminated(graph: Graph) -> None:
+    waiting = int(graph.memory.head[tb.N_SEEDS])
+    if waiting > 0:
+        raise ValueError(
+            f'covariances: expected a graph whose edits have all been solved for, got one with '
+            f'{waiting} hidden nodes that wait for it')
+
+
+def _require_node(graph: Graph, node: Any) -> None:
+    n_nodes = graph.n_nodes
+    if not (isinstance(node, int | np.integer) and 0 <= node < n_nodes):
+        expected = f'a hidden node in 0..{n_nodes - 1}' if n_nodes > 0 else 'a graph with nodes'
+        raise ValueError(f'covariances: expected {expected}, got {node}')
+
+
+@kernel
+def newest_covariance(head, out):  # type: ignore[no-untyped-def]
+    """
+    Write the covariance of the newest node, shape (3, 3): at once where it is alone in a root.
+
+    Returns
+    -------
+    bool
+        Whether there is a node, and no edit waits for the next step.
+
+    """
+    v = head[tb.N_NODES] - 1
+    if v < 0 or head[tb.N_SEEDS] > 0:
+        return False
+    pool_f, node_i, clique_i = tb.pool_f(head), tb.node_i(head), tb.clique_i(head)
+    row = clique_i[node_i[v, tb.CLIQUE]]
+    if row[tb.N_FRONTAL] != 1 or row[tb.N_SEPARATOR] != 0:
+        node_covariance(head, v, out)
+        return True
+    if node_i[v, tb.FIXED] != 0:
+        out[:] = 0.0
+        return True
+    # the inverse of R, row by row, and its product with its transpose
+    at = row[tb.VALUES]
+    a, d, f = pool_f[at], pool_f[at + 5], pool_f[at + 10]
+    e = -d * pool_f[at + 6] * f
+    b = -a * pool_f[at + 1] * d
+    c = -a * (pool_f[at + 1] * e + pool_f[at + 2] * f)
+    out[0, 0], out[1, 1], out[2, 2] = a * a + b * b + c * c, d * d + e * e, f * f
+    out[0, 1] = out[1, 0] = b * d + c * e
+    out[0, 2] = out[2, 0] = c * f
+    out[1, 2] = out[2, 1] = e * f
+    return True
+
+
+@kernel
+def node_covariance(head, v, out):  # type: ignore[no-untyped-def]
+    """Write the covariance, shape (3, 3), of a node."""
+    way, n_rows = _way_up(head, v)
+    y = _solution(head, v, way, n_rows)
+    _product(y, y, n_rows, out)
+
+
+@kernel
+def pair_covariance(head, i, j, out):  # type: ignore[no-untyped-def]
+    """Write the joint covariance, shape (6, 6), of two nodes; `out` holds zeros."""
+    clique_i = tb.clique_i(head)
+    way_i, rows_i = _way_up(head, i)
+    way_j, rows_j = _way_up(head, j)
+    y_i, y_j = _solution(head, i, way_i, rows_i), _solution(head, j, way_j, rows_j)
+    _product(y_i, y_i, rows_i, out[:3, :3])
+    _product(y_j, y_j, rows_j, out[3:, 3:])
+    # the end of both ways, as far as it is the same, from the root down
+    common, k = 0, 1
+    while k <= min(len(way_i), len(way_j)) and way_i[len(way_i) - k] == way_j[len(way_j) - k]:
+        common += 3 * clique_i[way_i[len(way_i) - k], tb.N_FRONTAL]
+        k += 1
+    _product(y_i, y_j, common, out[:3, 3:])
+    for m in range(3):
+        for n in range(3):
+            out[3 + n, m] = out[m, 3 + n]
+
+
+@kernel
+def _way_up(head, v):  # type: ignore[no-untyped-def]
+    """Return the cliques from that of a node to its root, and how many frontal rows they have."""
+    node_i, clique_i = tb.node_i(head), tb.clique_i(head)
+    n, n_rows = 0, 0
+    c = node_i[v, tb.CLIQUE]
+    while c >= 0:
+        n += 1
+        n_rows += 3 * clique_i[c, tb.N_FRONTAL]
+        c = clique_i[c, tb.PARENT]
+    way = np.empty(n, np.int32)
+    c = node_i[v, tb.CLIQUE]
+    for k in range(n):
+        way[k] = c
+        c = clique_i[c, tb.PARENT]
+    return way, n_rows
+
+
+@kernel
+def _solution(head, v, way, n_rows):  # type: ignore[no-untyped-def]
+    """
+    Solve R^T Y = E for a node.
+
+    Returns
+    -------
+    ndarray, shape (3, n_rows)
+        Y^T in the frontal rows of the cliques of `way`.
+
+    """
+    pool_f = tb.pool_f(head)
+    node_i = tb.node_i(head)
+    clique_i = tb.clique_i(head)
+    clique_f = tb.clique_f(head)
+    pool_i = tb.pool_i(head)
+    y = np.empty((3, n_rows))
+    # right-hand sides of the clique at hand and of the next one
+    here, above = np.empty((3, 48)), np.empty((3, 48))
+    end = 0
+    for k in range(len(way)):
+        row = clique_i[way[k]]
+        n_frontal, n_separator = row[tb.N_FRONTAL], row[tb.N_SEPARATOR]
+        rows, n = 3 * n_frontal, 3 * (n_frontal + n_separator)
+        nodes = pool_i[row[tb.NODES]:row[tb.NODES] + n_frontal + n_separator]
+        first = 0
+        if k == 0:
+            here = _cleared(here, n)
+            while nodes[first] != v:
+                first += 1
+            cos, sin = math.cos(clique_f[way[k], tb.TURN]), math.sin(clique_f[way[k], tb.TURN])
+            here[0, 3 * first], here[0, 3 * first + 1] = cos, -sin
+            here[1, 3 * first], here[1, 3 * first + 1] = sin, cos
+            here[2, 3 * first + 2] = 1.0
+            y[:, :3 * first] = 0.0
+        values = pool_f[row[tb.VALUES]:row[tb.VALUES] + rows * (n + 1)]
+        for f in range(first, n_frontal):
+            if node_i[nodes[f], tb.FIXED] != 0:
+                y[:, end + 3 * f:end + 3 * f + 3] = 0.0
+            else:
+                at = 3 * f * (n + 1)
+                _solve_block(values[at:at + 3 * (n + 1)], 3 * f, here, y[:, end:])
+        end += rows
+        if n_separator > 0:
+            parent = clique_i[row[tb.PARENT]]
+            n_above = parent[tb.N_FRONTAL] + parent[tb.N_SEPARATOR]
+            above = _cleared(above, 3 * n_above)
+            for m in range(n_above):
+                node_i[pool_i[parent[tb.NODES] + m], tb.INDEX] = 3 * m
+            turn = clique_f[way[k], tb.TURN] - clique_f[row[tb.PARENT], tb.TURN]
+            cos, sin = math.cos(turn), math.sin(turn)
+            for s in range(n_frontal, n_frontal + n_separator):
+                at = node_i[nodes[s], tb.INDEX]
+                for m in range(3):
+                    p, q = here[m, 3 * s], here[m, 3 * s + 1]
+                    above[m, at], above[m, at + 1] = cos * p - sin * q, sin * p + cos * q
+                    above[m, at + 2] = here[m, 3 * s + 2]
+            here, above = above, here
+    return y
+
+
+@kernel
+def _cleared(vectors, n):  # type: ignore[no-untyped-def]
+    """Return vectors that hold n zeros each, the same ones if they are long enough."""
+    if vectors.shape[1] < n:
+        return np.zeros((3, 2 * n))
+    vectors[:, :n] = 0.0
+    return vectors
+
+
+@kernel(fastmath=_FAST)
+def _solve_block(three, k, rhs, y):  # type: ignore[no-untyped-def]
+    """Solve for the three rows of R from row k on, and take them off the right-hand sides."""
+    n = len(three) // 3 - 1
+    for m in range(3):
+        r, row = k + m, three[m * (n + 1):m * (n + 1) + n]
+        a, b, c = rhs[0, r] * row[r], rhs[1, r] * row[r], rhs[2, r] * row[r]
+        y[0, r], y[1, r], y[2, r] = a, b, c
+        first, second, third = rhs[0, :n], rhs[1, :n], rhs[2, :n]
+        for q in range(r + 1, n):
+            first[q] -= a * row[q]
+            second[q] -= b * row[q]
+            third[q] -= c * row[q]
+
+
+@kernel(fastmath=_FAST)
+def _product(a, b, n, out):  # type: ignore[no-untyped-def]
+    """Write the 3x3 products of the last n entries of the rows of a with those of b."""
+    for i in range(3):
+        for j in range(3):
+            x, y = a[i, a.shape[1] - n:], b[j, b.shape[1] - n:]
+            total = 0.0
+            for k in range(n):
+                total += x[k] * y[k]
+            out[i, j] = total

@@ -1,0 +1,114 @@
+# Copyright 2026 The pose_graph_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""
+Writing new rows behind the ends of the tables, and telling whether they are sound.
+
+What is not plainly sound here is judged, and refused with words, by `constraints.check`.
+"""
+
+import math
+
+from pose_graph_ros.core import tables as tb
+from pose_graph_ros.core.jit import kernel
+
+# Of the scaled information matrix; a tenth of what `constraints.check` lets pass.
+_TOLERANCE = 1e-6
+
+
+@kernel
+def is_finite(x):  # type: ignore[no-untyped-def]
+    """Tell whether a number is neither infinite nor NaN."""
+    return abs(x) <= 1e300
+
+
+@kernel
+def pack_information(to, w):  # type: ignore[no-untyped-def]
+    """
+    Write the upper triangle of an information matrix to a row.
+
+    Returns
+    -------
+    bool
+        Whether it is plainly finite, symmetric, positive semidefinite and not zero.
+
+    """
+    at = tb.INFO
+    xx, yy, tt = w[0, 0], w[1, 1], w[2, 2]
+    xy, xt, yt = 0.5 * (w[0, 1] + w[1, 0]), 0.5 * (w[0, 2] + w[2, 0]), 0.5 * (w[1, 2] + w[2, 1])
+    to[at], to[at + 1], to[at + 2] = xx, xy, xt
+    to[at + 3], to[at + 4], to[at + 5] = yy, yt, tt
+    total = xx + yy + tt
+    if not (is_finite(total) and xx >= 0.0 and yy >= 0.0 and tt >= 0.0 and total > 0.0):
+        return False
+    sx, sy, st = math.sqrt(xx), math.sqrt(yy), math.sqrt(tt)
+    skew = max(abs(w[0, 1] - w[1, 0]) - _TOLERANCE * sx * sy,
+               abs(w[0, 2] - w[2, 0]) - _TOLERANCE * sx * st,
+               abs(w[1, 2] - w[2, 1]) - _TOLERANCE * sy * st)
+    if not skew <= 0.0:
+        return False
+    # correlations, with a little more on the diagonal
+    a = xy / (sx * sy) if xy != 0.0 else 0.0
+    b = xt / (sx * st) if xt != 0.0 else 0.0
+    c = yt / (sy * st) if yt != 0.0 else 0.0
+    d = 1.0 + _TOLERANCE
+    return (d * d - a * a > 0.0
+            and d * (d * d - c * c) - a * (a * d - b * c) + b * (a * c - b * d) > 0.0)
+
+
+@kernel
+def _copy_pose(to, at, pose):  # type: ignore[no-untyped-def]
+    to[at], to[at + 1], to[at + 2] = pose[0], pose[1], pose[2]
+    return is_finite(pose[0]) and is_finite(pose[1]) and is_finite(pose[2])
+
+
+@kernel
+def write_edge(head, e, i, j, mean, information, kind, weight):  # type: ignore[no-untyped-def]
+    """Write row e; return whether it is plainly sound."""
+    edge_f, edge_i = tb.edge_f(head), tb.edge_i(head)
+    f, row = edge_f[e], edge_i[e]
+    row[tb.END_I], row[tb.END_J], row[tb.EDGE_KIND] = i, j, kind
+    f[tb.WEIGHT] = weight
+    sound = _copy_pose(f, tb.MEAN, mean) and is_finite(weight) and weight >= 0.0 and i != j
+    return pack_information(f, information) and sound
+
+
+@kernel
+def write_observed(  # type: ignore[no-untyped-def]
+    head, k, node, offset, mean, information, kind, weight,
+):
+    """Write row k; return whether it is plainly sound."""
+    observed_f, observed_i = tb.observed_f(head), tb.observed_i(head)
+    f, row = observed_f[k], observed_i[k]
+    row[tb.OBS_NODE], row[tb.OBS_KIND] = node, kind
+    f[tb.WEIGHT] = weight
+    sound = _copy_pose(f, tb.MEAN, mean) and is_finite(weight) and weight >= 0.0
+    sound = _copy_pose(f, tb.OBS_OFFSET, offset) and sound
+    return pack_information(f, information) and sound
+
+
+@kernel
+def write_edges(  # type: ignore[no-untyped-def]
+    head, n_nodes, i, j, mean, information, kind, weight,
+):
+    """Write edges behind the last row; return whether all are plainly sound."""
+    sound = True
+    for k in range(len(i)):
+        inside = 0 <= i[k] < n_nodes and 0 <= j[k] < n_nodes and kind[k] <= 1
+        if not (write_edge(head, head[tb.N_EDGES] + k, i[k], j[k], mean[k], information[k],
+                           kind[k], weight[k]) and inside):
+            sound = False
+    return sound
+
+
+@kernel
+def write_all_observed(  # type: ignore[no-untyped-def]
+    head, n_nodes, node, offset, mean, information, kind, weight,
+):
+    """Write observed nodes behind the last row; return whether all are plainly sound."""
+    sound = True
+    for k in range(len(node)):
+        inside = 0 <= node[k] < n_nodes and kind[k] <= 1
+        if not (write_observed(head, head[tb.N_OBSERVED] + k, node[k], offset[k], mean[k],
+                               information[k], kind[k], weight[k]) and inside):
+            sound = False
+    return sound

@@ -1,0 +1,161 @@
+# Copyright 2026 The pose_graph_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""What is to be ordered in an update, and which of the resulting cliques are better joined."""
+
+import numpy as np
+
+from pose_graph_ros.core import tables as tb
+from pose_graph_ros.core.jit import kernel
+
+# So many of the newest nodes are eliminated last: the next constraints will touch them.
+NEWEST_LAST = 10
+# Cliques are joined if that stores at most so many zero blocks, up to so many frontal nodes.
+RELAXED_ZEROS = 6
+RELAXED_FRONTAL = 16
+
+
+@kernel
+def newest_last(affected):  # type: ignore[no-untyped-def]
+    """Move the newest of the affected nodes to the end, in order; return how many."""
+    n = len(affected)
+    n_last = min(NEWEST_LAST, n)
+    for k in range(n_last):
+        best = 0
+        for i in range(1, n - k):
+            if affected[i] > affected[best]:
+                best = i
+        last = n - k - 1
+        affected[best], affected[last] = affected[last], affected[best]
+    return n_last
+
+
+@kernel
+def structure(head, marked, affected):  # type: ignore[no-untyped-def]
+    """
+    Return the graph that is to be ordered: the affected nodes, the orphans as elements.
+
+    Returns
+    -------
+    orphans : ndarray of int32
+    start, adjacency : ndarray of int32
+        As `ordering.minimum_degree` takes them.
+
+    """
+    edge_f = tb.edge_f(head)
+    node_i = tb.node_i(head)
+    edge_i = tb.edge_i(head)
+    clique_i = tb.clique_i(head)
+    pool_i = tb.pool_i(head)
+    n = len(affected)
+    serial = head[tb.FRONT_SERIAL] + 1
+    head[tb.FRONT_SERIAL] = serial
+    for k in range(n):
+        node_i[affected[k], tb.INDEX] = k
+        node_i[affected[k], tb.FRONT] = serial
+    stamp = serial - 1
+    # orphans, and for each node how many entries its list has at most
+    n_orphans = 0
+    count = np.zeros(n + 1, np.int32)
+    for k in range(len(marked)):
+        c = clique_i[marked[k], tb.CHILD]
+        while c >= 0:
+            if clique_i[c, tb.MARKED] != stamp:
+                n_orphans += 1
+                row = clique_i[c]
+                begin = row[tb.NODES] + row[tb.N_FRONTAL]
+                for m in range(begin, begin + row[tb.N_SEPARATOR]):
+                    count[node_i[pool_i[m], tb.INDEX]] += 1
+            c = clique_i[c, tb.SIBLING]
+    orphans = np.empty(n_orphans, np.int32)
+    for k in range(n):
+        entry = node_i[affected[k], tb.EDGE_LIST]
+        while entry >= 0:
+            e, side = entry >> 1, entry & 1
+            other = edge_i[e, tb.END_I if side == 1 else tb.END_J]
+            if node_i[other, tb.FRONT] == serial and edge_f[e, tb.WEIGHT] > 0.0:
+                count[k] += 1
+            entry = edge_i[e, tb.NEXT_J if side == 1 else tb.NEXT_I]
+    start = np.empty(n + n_orphans + 1, np.int32)
+    start[0] = 0
+    for k in range(n):
+        start[k + 1] = start[k] + count[k]
+    position = start[:n].copy()
+    adjacency = np.empty(2 * start[n] + 16, np.int32)
+    end = start[n]
+    n_orphans = 0
+    for k in range(len(marked)):
+        c = clique_i[marked[k], tb.CHILD]
+        while c >= 0:
+            if clique_i[c, tb.MARKED] != stamp:
+                orphans[n_orphans] = c
+                row = clique_i[c]
+                begin = row[tb.NODES] + row[tb.N_FRONTAL]
+                for m in range(begin, begin + row[tb.N_SEPARATOR]):
+                    i = node_i[pool_i[m], tb.INDEX]
+                    adjacency[end] = i
+                    end += 1
+                    adjacency[position[i]] = n + n_orphans
+                    position[i] += 1
+                n_orphans += 1
+                start[n + n_orphans] = end
+            c = clique_i[c, tb.SIBLING]
+    # neighbours, each once
+    last_seen = np.full(n, -1, np.int32)
+    to = 0
+    for k in range(n):
+        begin, begin_neighbours = start[k], position[k]
+        entry = node_i[affected[k], tb.EDGE_LIST]
+        end = begin_neighbours
+        while entry >= 0:
+            e, side = entry >> 1, entry & 1
+            other = edge_i[e, tb.END_I if side == 1 else tb.END_J]
+            if node_i[other, tb.FRONT] == serial and edge_f[e, tb.WEIGHT] > 0.0:
+                i = node_i[other, tb.INDEX]
+                if last_seen[i] != k:
+                    last_seen[i] = k
+                    adjacency[end] = i
+                    end += 1
+            entry = edge_i[e, tb.NEXT_J if side == 1 else tb.NEXT_I]
+        # close the gaps that repetitions leave
+        for m in range(begin, end):
+            adjacency[to + m - begin] = adjacency[m]
+        start[k], to = to, to + end - begin
+    if to < start[n]:
+        gap = start[n] - to
+        for m in range(start[n], start[n + n_orphans]):
+            adjacency[m - gap] = adjacency[m]
+        for k in range(n, n + n_orphans + 1):
+            start[k] -= gap
+    return orphans, start, adjacency
+
+
+@kernel
+def amalgamate(n_cliques, n_frontal, offset, parent):  # type: ignore[no-untyped-def]
+    """
+    Join cliques to their parents where that stores few zeros; the last one stays alone.
+
+    Returns
+    -------
+    into : ndarray of int32
+        For each clique the one that it becomes a part of: itself, or a later one.
+    frontal : ndarray of int32
+        Frontal nodes of the result.
+
+    """
+    into = np.arange(n_cliques).astype(np.int32)
+    frontal = n_frontal[:n_cliques].copy()
+    zeros = np.zeros(n_cliques, np.int32)
+    for k in range(n_cliques - 1):
+        q = parent[k]
+        if q < 0 or q == n_cliques - 1:
+            continue
+        separator = offset[k + 1] - offset[k] - n_frontal[k]
+        width = frontal[q] + offset[q + 1] - offset[q] - n_frontal[q]
+        added = zeros[k] + zeros[q] + frontal[k] * (width - separator)
+        if added <= RELAXED_ZEROS and frontal[k] + frontal[q] <= RELAXED_FRONTAL:
+            into[k] = q
+            frontal[q] += frontal[k]
+            zeros[q] = added
+    for k in range(n_cliques - 1, -1, -1):
+        into[k] = into[into[k]]
+    return into, frontal

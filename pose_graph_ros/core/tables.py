@@ -1,0 +1,281 @@
+# Copyright 2026 The pose_graph_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""
+The memory of the engine: flat tables that grow, and how kernels get at them.
+
+Nodes, edges, observed nodes and cliques are rows of 2-D arrays, one array of numbers and one of
+integers each, so that what a step needs of a row lies on two or three cache lines. The values of
+a clique (its rows of R and its update matrix) and its list of nodes lie in two pools.
+
+Handing a dozen arrays to a kernel costs more than a step along a chain. A kernel that Python calls
+therefore gets one array, the *head*: counters, and the address and capacity of each table.
+Every kernel asks it for the tables that it works on, which costs nothing: `tb.node_f(head)`. The
+addresses are taken anew whenever a table grows, in `Memory.ensure` alone.
+"""
+
+from typing import Any, Final
+
+from numba import carray, types
+from numba.extending import intrinsic
+import numpy as np
+import numpy.typing as npt
+
+from pose_graph_ros.core.jit import kernel
+
+# --- columns ------------------------------------------------------------------------------------
+
+# node_f: pose in the map (theta wrapped), reference, solution (pose minus reference, theta not
+# wrapped), the solution that the cliques below have seen, square roots of the information that
+# the node's constraints have on position and on heading
+POSE, REF, DELTA, SEEN, STIFF_T, STIFF_R, NODE_F = 0, 3, 6, 9, 12, 13, 14
+# node_i: clique that it is frontal in; heads of the lists of edges (2 * edge + side) and of
+# observed nodes; whether it is fixed; whether it is a seed of the next elimination; index in a
+# front and the stamp that makes it valid; stamp of the last change that matters; undo log of the
+# row and of the solution alone
+(CLIQUE, EDGE_LIST, OBSERVED_LIST, FIXED, SEEDED, INDEX, FRONT, CHANGED, NODE_UNDO, SOLUTION_UNDO,
+ NODE_I) = range(11)
+
+# edge_f: mean, information (xx, xy, xt, yy, yt, tt), weight; translation of the mean in its own
+# axes; linearization: t_j - t_i, cos and sin of the direction of the measured frame, solution of
+# the heading of i, constant of the heading error; squared linearization error, energy
+(MEAN, INFO, WEIGHT, OWN_T, LIN_D, LIN_COS, LIN_SIN, LIN_TH, LIN_K, ERROR2, ENERGY, EDGE_F) = (
+    0, 3, 9, 10, 12, 14, 15, 16, 17, 18, 19, 20)
+# edge_i: ends; next entries of the lists of both ends; `EdgeKind`; stamp of the last check;
+# whether it waits to be relinearized; undo log of the row and of error, energy and waiting alone;
+# the clique that it was assembled in
+(END_I, END_J, NEXT_I, NEXT_J, EDGE_KIND, EDGE_CHECKED, EDGE_WAITS, EDGE_UNDO, ENERGY_UNDO,
+ OWNER, EDGE_I) = range(11)
+
+# observed_f: mean, information, weight as for edges; offset; solution of the heading at the
+# linearization, constant of the heading error; squared linearization error, energy
+OBS_OFFSET, OBS_TH, OBS_K, OBS_ERROR2, OBS_ENERGY, OBS_F = 10, 13, 14, 15, 16, 17
+# observed_i: hidden node, next entry of its list, `ObservedKind`, stamp, flag and log as for edges
+OBS_NODE, OBS_NEXT, OBS_KIND, OBS_CHECKED, OBS_WAITS, OBS_UNDO, OBS_I = range(7)
+
+# clique_i: parent (-1: root), first child, next sibling; numbers of frontal and of separator
+# nodes; where its nodes and values lie in the pools; stamps: to be eliminated again; iteration
+# that built it; updates that took it, took its values, logged it; a counter for walks;
+# whether a node at or below it is fixed or observed
+(PARENT, CHILD, SIBLING, N_FRONTAL, N_SEPARATOR, NODES, VALUES, MARKED, BUILT, BORN, VALUES_BORN,
+ CLIQUE_UNDO, COUNT, ANCHORED, CLIQUE_I) = range(15)
+# clique_f: angle of the clique's frame in the map; that which the parent was eliminated with; mean
+# solution of the headings of the separator when the clique was eliminated; squared error of the
+# parent's model of what it has turned since (see `frames`)
+TURN, TURN_SEEN, TURN_ZERO, SLIP_ERROR2, CLIQUE_F = range(5)
+
+FLOAT_TABLES: Final = {'node_f': NODE_F, 'edge_f': EDGE_F, 'observed_f': OBS_F, 'pool_f': 1,
+                       'log_f': 1, 'work_f': 1, 'scalars': 1, 'clique_f': CLIQUE_F}
+INT_TABLES: Final = {'node_i': NODE_I, 'edge_i': EDGE_I, 'observed_i': OBS_I,
+                     'clique_i': CLIQUE_I, 'pool_i': 1, 'log_i': 1, 'work_i': 1, 'seeds': 1,
+                     'freed': 1, 'waiting': 1}
+NAMES: Final = (*FLOAT_TABLES, *INT_TABLES)
+
+# --- the head: addresses and capacities first, then counters ------------------------------------
+
+(N_NODES, N_EDGES, N_OBSERVED, N_CLIQUES, FREE_CLIQUE, POOL_F_END, POOL_I_END, N_SEEDS, N_FREED,
+ N_WAITING, LOG_F_END, LOG_I_END, UPDATE, ITERATION, FRONT_SERIAL, STRUCTURE, NEED_F,
+ NEED_I, NEED_WORK, BAD_NODE, N_RELINEARIZED, N_ELIMINATED, N_VISITED, N_ITERATIONS, N_ROOTS,
+ N_CHANGED, N_TURNED, NODE_ROOM, EDGE_ROOM, OBSERVED_ROOM, COUNTERS_END) = range(
+     2 * len(NAMES), 2 * len(NAMES) + 31)
+# heads of the free lists of the pools, one for each size class
+SIZES: Final = [*range(65)]
+while SIZES[-1] < 2**31:
+    SIZES.append(int(np.ceil(1.125 * SIZES[-1])))
+N_SIZES: Final = len(SIZES)
+FREE_F, FREE_I = COUNTERS_END, COUNTERS_END + N_SIZES
+HEAD_SIZE: Final = COUNTERS_END + 2 * N_SIZES
+
+# scalars: sum of the squared linearization errors of the constraints that were looked at, how many
+# they were, settings of the step, three zeros, energy of the whole
+(ERROR2_SUM, N_LOOKED, SETTING_ALPHA, SETTING_BUDGET, SETTING_SHARE, DAMPING, ZEROS, CHI2,
+ N_SCALARS) = (0, 1, 2, 3, 4, 5, 6, 9, 10)
+
+# Counters whose values are written into rows as stamps of 32 bits begin anew beyond this: in some
+# hundred days, or hours, for that of the fronts.
+LAST_STAMP: Final = 2**30
+COUNTERS_OF_STAMPS: Final = (UPDATE, ITERATION, FRONT_SERIAL)
+STAMPS: Final = {
+    'node_i': (FRONT, CHANGED, NODE_UNDO, SOLUTION_UNDO),
+    'edge_i': (EDGE_CHECKED, EDGE_UNDO, ENERGY_UNDO),
+    'observed_i': (OBS_CHECKED, OBS_UNDO),
+    'clique_i': (MARKED, BUILT, BORN, VALUES_BORN, CLIQUE_UNDO),
+}
+
+IntHead = npt.NDArray[np.int64]
+
+
+def _pointer_to(number: types.Number) -> Any:
+    """Return an intrinsic that makes a pointer to such numbers from an address."""
+
+    @intrinsic  # type: ignore[untyped-decorator]
+    def pointer(typing_context: Any, address: Any) -> Any:
+        def codegen(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
+            return builder.inttoptr(
+                arguments[0], context.get_value_type(signature.return_type))
+        return types.CPointer(number)(types.int64), codegen
+
+    return pointer
+
+
+_floats = _pointer_to(types.float64)
+_integers = _pointer_to(types.int32)
+
+
+@kernel
+def node_f(head):  # type: ignore[no-untyped-def]
+    """Return this table."""
+    return carray(_floats(head[0]), (head[1], NODE_F))
+
+
+@kernel
+def edge_f(head):  # type: ignore[no-untyped-def]
+    """Return this table."""
+    return carray(_floats(head[2]), (head[3], EDGE_F))
+
+
+@kernel
+def observed_f(head):  # type: ignore[no-untyped-def]
+    """Return this table."""
+    return carray(_floats(head[4]), (head[5], OBS_F))
+
+
+@kernel
+def pool_f(head):  # type: ignore[no-untyped-def]
+    """Return this table."""
+    return carray(_floats(head[6]), (head[7],))
+
+
+@kernel
+def log_f(head):  # type: ignore[no-untyped-def]
+    """Return this table."""
+    return carray(_floats(head[8]), (head[9],))
+
+
+@kernel
+def work_f(head):  # type: ignore[no-untyped-def]
+    """Return this table."""
+    return carray(_floats(head[10]), (head[11],))
+
+
+@kernel
+def scalars(head):  # type: ignore[no-untyped-def]
+    """Return this table."""
+    return carray(_floats(head[12]), (head[13],))
+
+
+@kernel
+def clique_f(head):  # type: ignore[no-untyped-def]
+    """Return this table."""
+    return carray(_floats(head[14]), (head[15], CLIQUE_F))
+
+
+@kernel
+def node_i(head):  # type: ignore[no-untyped-def]
+    """Return this table."""
+    return carray(_integers(head[16]), (head[17], NODE_I))
+
+
+@kernel
+def edge_i(head):  # type: ignore[no-untyped-def]
+    """Return this table."""
+    return carray(_integers(head[18]), (head[19], EDGE_I))
+
+
+@kernel
+def observed_i(head):  # type: ignore[no-untyped-def]
+    """Return this table."""
+    return carray(_integers(head[20]), (head[21], OBS_I))
+
+
+@kernel
+def clique_i(head):  # type: ignore[no-untyped-def]
+    """Return this table."""
+    return carray(_integers(head[22]), (head[23], CLIQUE_I))
+
+
+@kernel
+def pool_i(head):  # type: ignore[no-untyped-def]
+    """Return this table."""
+    return carray(_integers(head[24]), (head[25],))
+
+
+@kernel
+def log_i(head):  # type: ignore[no-untyped-def]
+    """Return this table."""
+    return carray(_integers(head[26]), (head[27],))
+
+
+@kernel
+def work_i(head):  # type: ignore[no-untyped-def]
+    """Return this table."""
+    return carray(_integers(head[28]), (head[29],))
+
+
+@kernel
+def seeds(head):  # type: ignore[no-untyped-def]
+    """Return this table."""
+    return carray(_integers(head[30]), (head[31],))
+
+
+@kernel
+def freed(head):  # type: ignore[no-untyped-def]
+    """Return this table."""
+    return carray(_integers(head[32]), (head[33],))
+
+
+@kernel
+def waiting(head):  # type: ignore[no-untyped-def]
+    """Return this table."""
+    return carray(_integers(head[34]), (head[35],))
+
+
+class Memory:
+    """Owns the tables and the head of one graph."""
+
+    def __init__(self) -> None:
+        self.head: IntHead = np.zeros(HEAD_SIZE, dtype=np.int64)
+        self.head[FREE_CLIQUE] = -1
+        self.head[FREE_F:] = -1
+        self._tables: dict[str, npt.NDArray[Any]] = {}
+        for name in NAMES:
+            self.ensure(name, 16)
+        self.ensure('work_f', 256)  # whatever the fronts take, the chain and the bins take this
+        self['scalars'][:] = 0.0
+
+    def __getitem__(self, name: str) -> npt.NDArray[Any]:
+        """Return a table with all its capacity; stale after the next `ensure`."""
+        return self._tables[name]
+
+    def capacity(self, name: str) -> int:
+        """Return how many rows a table holds."""
+        return int(self.head[2 * NAMES.index(name) + 1])
+
+    def ensure(self, name: str, rows: int, *, keep: int = 0) -> None:
+        """
+        Make a table hold so many rows.
+
+        Parameters
+        ----------
+        name : str
+        rows : int
+        keep : int
+            Rows in use; what lies behind them may be lost.
+
+        """
+        at = 2 * NAMES.index(name)
+        if name in self._tables and rows <= self.head[at + 1]:
+            return
+        columns = FLOAT_TABLES.get(name, 0) or INT_TABLES[name]
+        dtype = np.float64 if name in FLOAT_TABLES else np.int32
+        capacity = max(rows, 16, int(1.5 * self.head[at + 1]))
+        grown = np.empty(capacity if columns == 1 else (capacity, columns), dtype=dtype)
+        if keep > 0:
+            grown[:keep] = self._tables[name][:keep]
+        self._tables[name] = grown
+        self.head[at], self.head[at + 1] = grown.ctypes.data, capacity
+
+    def restart_stamps(self) -> None:
+        """Let the counters of stamps begin anew; between two updates alone."""
+        for name, columns in STAMPS.items():
+            self._tables[name][:, columns] = 0
+        self.head[list(COUNTERS_OF_STAMPS)] = 0

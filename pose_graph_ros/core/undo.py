@@ -1,0 +1,352 @@
+# Copyright 2026 The pose_graph_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""
+The log that undoes an update bit for bit, and the pools of memory that it has to know of.
+
+Whoever writes to a row that was there before the update logs the row first; only the first time
+counts, which a stamp in the row tells. Values of cliques are never written over: new ones get
+memory of their own, and old ones are given back when the update is sure (`commit`).
+"""
+
+from typing import Final
+
+import numpy as np
+
+from pose_graph_ros.core import tables as tb
+from pose_graph_ros.core.jit import kernel
+
+# What an entry of the log holds.
+NODE, EDGE, OBSERVED, CLIQUE, TAKEN_CLIQUE, SOLUTION, EDGE_ENERGY = range(7)
+
+_SIZES: Final = np.array(tb.SIZES, dtype=np.int64)
+
+
+@kernel
+def _log_row(head, code, row, numbers, integers):  # type: ignore[no-untyped-def]
+    log_f, log_i = tb.log_f(head), tb.log_i(head)
+    end_f, end_i = head[tb.LOG_F_END], head[tb.LOG_I_END]
+    for k in range(len(numbers)):
+        log_f[end_f + k] = numbers[k]
+    for k in range(len(integers)):
+        log_i[end_i + k] = integers[k]
+    log_i[end_i + len(integers)] = row
+    log_i[end_i + len(integers) + 1] = code
+    head[tb.LOG_F_END] = end_f + len(numbers)
+    head[tb.LOG_I_END] = end_i + len(integers) + 2
+
+
+@kernel
+def log_node(head, v):  # type: ignore[no-untyped-def]
+    """Remember a node's row before it changes."""
+    node_f, node_i = tb.node_f(head), tb.node_i(head)
+    if node_i[v, tb.NODE_UNDO] != head[tb.UPDATE]:
+        _log_row(head, NODE, v, node_f[v], node_i[v])
+        node_i[v, tb.NODE_UNDO] = head[tb.UPDATE]
+
+
+@kernel
+def log_solution(head, v):  # type: ignore[no-untyped-def]
+    """Remember the pose and the solution of a node before they change."""
+    node_f = tb.node_f(head)
+    log_f = tb.log_f(head)
+    node_i = tb.node_i(head)
+    log_i = tb.log_i(head)
+    row = node_i[v]
+    if row[tb.SOLUTION_UNDO] != head[tb.UPDATE] and row[tb.NODE_UNDO] != head[tb.UPDATE]:
+        row[tb.SOLUTION_UNDO] = head[tb.UPDATE]
+        end_f, end_i = head[tb.LOG_F_END], head[tb.LOG_I_END]
+        for k in range(tb.STIFF_T):
+            log_f[end_f + k] = node_f[v, k]
+        log_i[end_i], log_i[end_i + 1] = v, SOLUTION
+        head[tb.LOG_F_END], head[tb.LOG_I_END] = end_f + tb.STIFF_T, end_i + 2
+
+
+@kernel
+def log_energy(head, e):  # type: ignore[no-untyped-def]
+    """Remember the linearization error and the energy of an edge before they change."""
+    edge_f = tb.edge_f(head)
+    log_f = tb.log_f(head)
+    edge_i = tb.edge_i(head)
+    log_i = tb.log_i(head)
+    row = edge_i[e]
+    if row[tb.ENERGY_UNDO] != head[tb.UPDATE] and row[tb.EDGE_UNDO] != head[tb.UPDATE]:
+        row[tb.ENERGY_UNDO] = head[tb.UPDATE]
+        end_f, end_i = head[tb.LOG_F_END], head[tb.LOG_I_END]
+        log_f[end_f] = edge_f[e, tb.ERROR2]
+        log_f[end_f + 1] = edge_f[e, tb.ENERGY]
+        log_i[end_i], log_i[end_i + 1], log_i[end_i + 2] = row[tb.EDGE_WAITS], e, EDGE_ENERGY
+        head[tb.LOG_F_END], head[tb.LOG_I_END] = end_f + 2, end_i + 3
+
+
+@kernel
+def log_edge(head, e):  # type: ignore[no-untyped-def]
+    """Remember an edge's row before it changes."""
+    edge_f, edge_i = tb.edge_f(head), tb.edge_i(head)
+    if edge_i[e, tb.EDGE_UNDO] != head[tb.UPDATE]:
+        _log_row(head, EDGE, e, edge_f[e], edge_i[e])
+        edge_i[e, tb.EDGE_UNDO] = head[tb.UPDATE]
+
+
+@kernel
+def log_observed(head, k):  # type: ignore[no-untyped-def]
+    """Remember an observed node's row before it changes."""
+    observed_f, observed_i = tb.observed_f(head), tb.observed_i(head)
+    if observed_i[k, tb.OBS_UNDO] != head[tb.UPDATE]:
+        _log_row(head, OBSERVED, k, observed_f[k], observed_i[k])
+        observed_i[k, tb.OBS_UNDO] = head[tb.UPDATE]
+
+
+@kernel
+def log_clique(head, c):  # type: ignore[no-untyped-def]
+    """Remember a clique's row before it changes."""
+    clique_f, clique_i = tb.clique_f(head), tb.clique_i(head)
+    if clique_i[c, tb.CLIQUE_UNDO] != head[tb.UPDATE]:
+        _log_row(head, CLIQUE, c, clique_f[c], clique_i[c])
+        clique_i[c, tb.CLIQUE_UNDO] = head[tb.UPDATE]
+
+
+@kernel
+def size_class(n):  # type: ignore[no-untyped-def]
+    """Return the size class that holds n numbers."""
+    if n <= 64:
+        return n
+    low, high = 64, len(_SIZES) - 1
+    while low < high:
+        middle = (low + high) // 2
+        if _SIZES[middle] < n:
+            low = middle + 1
+        else:
+            high = middle
+    return low
+
+
+@kernel
+def rounded(n):  # type: ignore[no-untyped-def]
+    """Return how much of a pool n numbers take."""
+    return _SIZES[size_class(n)]
+
+
+@kernel
+def take_values(head, n):  # type: ignore[no-untyped-def]
+    """Take memory for n numbers from the pool; the caller has made sure that there is enough."""
+    pool_f = tb.pool_f(head)
+    size = size_class(n)
+    at = head[tb.FREE_F + size]
+    if at >= 0:
+        head[tb.FREE_F + size] = np.int64(pool_f[at])
+        return at
+    at = head[tb.POOL_F_END]
+    head[tb.POOL_F_END] = at + _SIZES[size]
+    return at
+
+
+@kernel
+def give_values(head, at, n):  # type: ignore[no-untyped-def]
+    """Give memory back."""
+    pool_f = tb.pool_f(head)
+    size = size_class(n)
+    pool_f[at] = head[tb.FREE_F + size]
+    head[tb.FREE_F + size] = at
+
+
+@kernel
+def take_nodes(head, n):  # type: ignore[no-untyped-def]
+    """Take memory for a list of n nodes."""
+    pool_i = tb.pool_i(head)
+    size = size_class(n)
+    at = head[tb.FREE_I + size]
+    if at >= 0:
+        head[tb.FREE_I + size] = pool_i[at]
+        return at
+    at = head[tb.POOL_I_END]
+    head[tb.POOL_I_END] = at + _SIZES[size]
+    return at
+
+
+@kernel
+def give_nodes(head, at, n):  # type: ignore[no-untyped-def]
+    """Give memory back."""
+    pool_i = tb.pool_i(head)
+    size = size_class(n)
+    pool_i[at] = head[tb.FREE_I + size]
+    head[tb.FREE_I + size] = at
+
+
+@kernel
+def n_values(n_frontal, n_separator):  # type: ignore[no-untyped-def]
+    """Return how many numbers a clique holds: rows of R, then the update matrix."""
+    rows, rest = 3 * n_frontal, 3 * n_separator
+    return rows * (rows + rest + 1) + rest * (rest + 1)
+
+
+@kernel
+def take_clique(head, n_frontal, n_separator):  # type: ignore[no-untyped-def]
+    """Return the row of a new clique with memory for its nodes and values."""
+    clique_i, log_i = tb.clique_i(head), tb.log_i(head)
+    c = head[tb.FREE_CLIQUE]
+    if c >= 0:
+        head[tb.FREE_CLIQUE] = clique_i[c, tb.SIBLING]
+    else:
+        c = head[tb.N_CLIQUES]
+        head[tb.N_CLIQUES] = c + 1
+    row = clique_i[c]
+    row[tb.PARENT] = row[tb.CHILD] = row[tb.SIBLING] = -1
+    row[tb.N_FRONTAL], row[tb.N_SEPARATOR] = n_frontal, n_separator
+    row[tb.NODES] = take_nodes(head, n_frontal + n_separator)
+    row[tb.VALUES] = take_values(head, n_values(n_frontal, n_separator))
+    row[tb.MARKED] = row[tb.COUNT] = row[tb.ANCHORED] = 0
+    row[tb.BUILT] = head[tb.ITERATION]
+    row[tb.BORN] = row[tb.VALUES_BORN] = row[tb.CLIQUE_UNDO] = head[tb.UPDATE]
+    end = head[tb.LOG_I_END]
+    log_i[end], log_i[end + 1] = c, TAKEN_CLIQUE
+    head[tb.LOG_I_END] = end + 2
+    return c
+
+
+@kernel
+def _give_clique(head, c):  # type: ignore[no-untyped-def]
+    clique_i = tb.clique_i(head)
+    row = clique_i[c]
+    give_nodes(head, row[tb.NODES], row[tb.N_FRONTAL] + row[tb.N_SEPARATOR])
+    give_values(head, row[tb.VALUES], n_values(row[tb.N_FRONTAL], row[tb.N_SEPARATOR]))
+    row[tb.N_FRONTAL] = 0
+    row[tb.SIBLING] = head[tb.FREE_CLIQUE]
+    head[tb.FREE_CLIQUE] = c
+
+
+@kernel
+def drop_clique(head, c):  # type: ignore[no-untyped-def]
+    """Let a clique go: at once if this update has made it, else when the update is sure."""
+    clique_i = tb.clique_i(head)
+    if clique_i[c, tb.BORN] == head[tb.UPDATE]:
+        _give_clique(head, c)
+    else:
+        _give_later(head, c, -1)
+
+
+@kernel
+def _give_later(head, c, values):  # type: ignore[no-untyped-def]
+    """Note a clique, or old values of one, for the end of the update."""
+    freed = tb.freed(head)
+    end = head[tb.N_FREED]
+    freed[end], freed[end + 1] = c, values
+    head[tb.N_FREED] = end + 2
+
+
+@kernel
+def renew_values(head, c):  # type: ignore[no-untyped-def]
+    """Give a clique new memory for its values, unless this update has done that before."""
+    clique_i = tb.clique_i(head)
+    row = clique_i[c]
+    if row[tb.VALUES_BORN] == head[tb.UPDATE]:
+        return
+    log_clique(head, c)
+    _give_later(head, c, row[tb.VALUES])
+    row[tb.VALUES] = take_values(head, n_values(row[tb.N_FRONTAL], row[tb.N_SEPARATOR]))
+    row[tb.VALUES_BORN] = head[tb.UPDATE]
+
+
+@kernel
+def begin(head):  # type: ignore[no-untyped-def]
+    """Start an update: from here on changes are logged."""
+    head[tb.UPDATE] += 1
+    head[tb.LOG_F_END] = head[tb.LOG_I_END] = head[tb.N_FREED] = 0
+
+
+@kernel
+def commit(head):  # type: ignore[no-untyped-def]
+    """End an update that has worked."""
+    clique_i, freed = tb.clique_i(head), tb.freed(head)
+    for k in range(0, head[tb.N_FREED], 2):
+        c, values = freed[k], freed[k + 1]
+        if values < 0:
+            _give_clique(head, c)
+        else:
+            row = clique_i[c]
+            give_values(head, values, n_values(row[tb.N_FRONTAL], row[tb.N_SEPARATOR]))
+    head[tb.N_FREED] = head[tb.LOG_F_END] = head[tb.LOG_I_END] = 0
+
+
+@kernel
+def undo(head):  # type: ignore[no-untyped-def]
+    """Bring every logged row back, the newest entry first; the caller restores the counters."""
+    node_f = tb.node_f(head)
+    edge_f = tb.edge_f(head)
+    observed_f = tb.observed_f(head)
+    log_f = tb.log_f(head)
+    node_i = tb.node_i(head)
+    edge_i = tb.edge_i(head)
+    observed_i = tb.observed_i(head)
+    clique_i = tb.clique_i(head)
+    clique_f = tb.clique_f(head)
+    log_i = tb.log_i(head)
+    end_f, end_i = head[tb.LOG_F_END], head[tb.LOG_I_END]
+    while end_i > 0:
+        row, code = log_i[end_i - 2], log_i[end_i - 1]
+        end_i -= 2
+        if code == TAKEN_CLIQUE:
+            if clique_i[row, tb.N_FRONTAL] > 0:  # else it was let go in the same update
+                _give_clique(head, row)
+        elif code == SOLUTION:
+            end_f -= tb.STIFF_T
+            node_f[row, :tb.STIFF_T] = log_f[end_f:end_f + tb.STIFF_T]
+        elif code == EDGE_ENERGY:
+            end_f -= 2
+            end_i -= 1
+            edge_f[row, tb.ERROR2:tb.ENERGY + 1] = log_f[end_f:end_f + 2]
+            edge_i[row, tb.EDGE_WAITS] = log_i[end_i]
+        elif code == CLIQUE:
+            end_i -= tb.CLIQUE_I
+            values = clique_i[row, tb.VALUES]
+            if values != log_i[end_i + tb.VALUES]:
+                give_values(head, values, n_values(
+                    clique_i[row, tb.N_FRONTAL], clique_i[row, tb.N_SEPARATOR]))
+            for k in range(tb.CLIQUE_I):
+                clique_i[row, k] = log_i[end_i + k]
+            end_f -= tb.CLIQUE_F
+            for k in range(tb.CLIQUE_F):
+                clique_f[row, k] = log_f[end_f + k]
+        else:
+            if code == NODE:
+                numbers, integers = node_f[row], node_i[row]
+            elif code == EDGE:
+                numbers, integers = edge_f[row], edge_i[row]
+            else:
+                numbers, integers = observed_f[row], observed_i[row]
+            end_f -= len(numbers)
+            end_i -= len(integers)
+            for k in range(len(numbers)):
+                numbers[k] = log_f[end_f + k]
+            for k in range(len(integers)):
+                integers[k] = log_i[end_i + k]
+    head[tb.N_FREED] = head[tb.LOG_F_END] = head[tb.LOG_I_END] = 0
+
+
+@kernel
+def poses_before(head, poses):  # type: ignore[no-untyped-def]
+    """Write the poses as they were when the update began, shape (N, 3), from the log."""
+    node_f, log_f, log_i = tb.node_f(head), tb.log_f(head), tb.log_i(head)
+    for v in range(head[tb.N_NODES]):
+        for k in range(3):
+            poses[v, k] = node_f[v, tb.POSE + k]
+    end_f, end_i = head[tb.LOG_F_END], head[tb.LOG_I_END]
+    while end_i > 0:
+        row, code = log_i[end_i - 2], log_i[end_i - 1]
+        end_i -= 2
+        if code in (NODE, SOLUTION):
+            end_f -= tb.NODE_F if code == NODE else tb.STIFF_T
+            end_i -= tb.NODE_I if code == NODE else 0
+            for k in range(3):
+                poses[row, k] = log_f[end_f + tb.POSE + k]
+        elif code == EDGE:
+            end_f -= tb.EDGE_F
+            end_i -= tb.EDGE_I
+        elif code == EDGE_ENERGY:
+            end_f -= 2
+            end_i -= 1
+        elif code == OBSERVED:
+            end_f -= tb.OBS_F
+            end_i -= tb.OBS_I
+        elif code == CLIQUE:
+            end_f -= tb.CLIQUE_F
+            end_i -= tb.CLIQUE_I

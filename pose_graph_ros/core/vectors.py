@@ -1,0 +1,128 @@
+# Copyright 2026 The pose_graph_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""
+Vectors of four numbers for the innermost loops of kernels.
+
+A loop over two rows of a front is too short for the compiler's own vectorisation: it first tests
+whether the rows overlap, and does the last columns one by one. With rows padded to whole vectors
+and loads and stores written out, neither is left. The compiler makes of it what the processor has.
+"""
+
+from collections.abc import Callable
+from typing import Any, Final
+
+from numba import types
+from numba.core.cgutils import ir  # llvmlite, which Numba brings along
+from numba.core.datamodel import models
+from numba.extending import intrinsic, register_model
+
+from pose_graph_ros.core.jit import kernel
+
+WIDTH: Final = 4
+
+_LLVM = ir.VectorType(ir.DoubleType(), WIDTH)
+
+
+class _VectorType(types.Type):  # type: ignore[misc]  # Numba is not looked into
+    def __init__(self) -> None:
+        super().__init__(name='Vector')
+
+
+VECTOR: Final = _VectorType()
+
+
+@register_model(_VectorType)
+class _VectorModel(models.PrimitiveModel):  # type: ignore[misc]
+    def __init__(self, manager: Any, type_: Any) -> None:
+        super().__init__(manager, type_, _LLVM)
+
+
+def _intrinsic(function: Callable[..., Any]) -> Callable[..., Any]:
+    """Do what Numba's decorator does, which has no types."""
+    compiled: Callable[..., Any] = intrinsic(function)
+    return compiled
+
+
+def _address(context: Any, builder: Any, array_type: Any, array: Any, at: Any) -> Any:
+    data = context.make_array(array_type)(context, builder, array).data
+    return builder.bitcast(builder.gep(data, [at]), _LLVM.as_pointer())
+
+
+@_intrinsic
+def load(typing_context: Any, array: Any, at: Any) -> Any:
+    """Return the four numbers of a flat array from an index on."""
+    def codegen(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
+        pointer = _address(context, builder, signature.args[0], *arguments)
+        return builder.load(pointer, align=8)
+    return VECTOR(array, types.int64), codegen
+
+
+@_intrinsic
+def store(typing_context: Any, array: Any, at: Any, vector: Any) -> Any:
+    """Write four numbers into a flat array from an index on."""
+    def codegen(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
+        pointer = _address(context, builder, signature.args[0], *arguments[:2])
+        builder.store(arguments[2], pointer, align=8)
+        return context.get_dummy_value()
+    return types.void(array, types.int64, VECTOR), codegen
+
+
+@_intrinsic
+def spread(typing_context: Any, number: Any) -> Any:
+    """Return a vector of four times the same number."""
+    def codegen(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
+        vector = ir.Constant(_LLVM, ir.Undefined)
+        for k in range(WIDTH):
+            vector = builder.insert_element(vector, arguments[0], ir.IntType(32)(k))
+        return vector
+    return VECTOR(types.float64), codegen
+
+
+@_intrinsic
+def less(typing_context: Any, total: Any, a: Any, b: Any) -> Any:
+    """Return `total - a * b`, rounded once where the processor can."""
+    def codegen(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
+        total, a, b = arguments
+        product = builder.fmul(a, b, flags=('contract',))
+        return builder.fsub(total, product, flags=('contract',))
+    return VECTOR(VECTOR, VECTOR, VECTOR), codegen
+
+
+@_intrinsic
+def times(typing_context: Any, a: Any, b: Any) -> Any:
+    """Return `a * b`."""
+    def codegen(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
+        return builder.fmul(*arguments)
+    return VECTOR(VECTOR, VECTOR), codegen
+
+
+@_intrinsic
+def plus(typing_context: Any, a: Any, b: Any) -> Any:
+    """Return `a + b`."""
+    def codegen(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
+        return builder.fadd(*arguments)
+    return VECTOR(VECTOR, VECTOR), codegen
+
+
+@kernel(inline='always')
+def copy(source, begin, target, to, n):  # type: ignore[no-untyped-def]
+    """Copy n numbers of a flat array into another one."""
+    k = 0
+    while k + WIDTH <= n:
+        store(target, to + k, load(source, begin + k))
+        k += WIDTH
+    while k < n:
+        target[to + k] = source[begin + k]
+        k += 1
+
+
+@kernel(inline='always')
+def add(source, begin, target, to, n):  # type: ignore[no-untyped-def]
+    """Add n numbers of a flat array to those of another one."""
+    k = 0
+    while k + WIDTH <= n:
+        store(target, to + k, plus(load(target, to + k), load(source, begin + k)))
+        k += WIDTH
+    while k < n:
+        target[to + k] += source[begin + k]
+        k += 1

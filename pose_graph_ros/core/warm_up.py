@@ -1,0 +1,146 @@
+# Copyright 2026 The pose_graph_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""
+Compile all kernels before the first measurement, or load them from the cache.
+
+Importing this module imports all modules that hold kernels, so that `jit.registered` is complete.
+Each step is a small job for the engine, through its own front doors: what a kernel is called with
+is then what it will be called with.
+"""
+
+from collections.abc import Callable
+import time
+
+import numpy as np
+
+from pose_graph_ros.core import batch, se2
+from pose_graph_ros.core.backend import PoseGraphBackend
+from pose_graph_ros.core.config import SmootherConfig, SolverConfig
+from pose_graph_ros.core.constraints import EdgeKind, Edges, ObservedKind, ObservedNodes
+from pose_graph_ros.core.graph import GraphUpdate
+from pose_graph_ros.core.incremental import IncrementalSmoother
+from pose_graph_ros.core.measurements import GlobalPose, LoopClosure, OdometrySample, Position
+from pose_graph_ros.core.se2 import FloatArray
+from pose_graph_ros.core.starts import solve_from_two_starts
+
+# Of a drive in circles, a lap in so many nodes. Odometry is a little wrong, so that there is
+# something to correct.
+LAP = 12
+STEP: FloatArray = np.array([1.0, 0.0, 2.0 * np.pi / LAP])
+ERROR: FloatArray = np.array([0.02, -0.01, 0.01])
+INFORMATION: FloatArray = np.diag((400.0, 900.0, 2500.0))
+# More nodes than the first tables hold.
+N_NODES = 4 * LAP
+
+
+def warm_up(stopped: Callable[[], bool] = lambda: False) -> float:
+    """
+    Run all kernels once, on a few numbers.
+
+    Parameters
+    ----------
+    stopped : callable
+        Asked before each step; once it says yes, the rest is left out.
+
+    Returns
+    -------
+    seconds : float
+        How long it took [s].
+
+    """
+    start = time.perf_counter()
+    for step in STEPS:
+        if stopped():
+            break
+        step()
+    return time.perf_counter() - start
+
+
+def _chain(config: SmootherConfig | None = None) -> IncrementalSmoother:
+    """Return a chain that is held at its first node, and by every fifth."""
+    smoother, truth = IncrementalSmoother(config), np.zeros(3)
+    smoother.update(GraphUpdate(hidden=truth[None], fix=(0,)))
+    for k in range(1, N_NODES):
+        truth = se2.compose(truth, STEP)
+        smoother.extend(STEP + ERROR, INFORMATION, *((truth, INFORMATION) if k % 5 == 0 else ()))
+    return smoother
+
+
+def _closures(node: int) -> Edges:
+    """Return the edges that say that this node and the next are where they were a lap before."""
+    return Edges([node - LAP, node - LAP + 1], [node, node + 1], np.zeros((2, 3)),
+                 np.repeat(INFORMATION[None], 2, axis=0), [EdgeKind.LOOP_CLOSURE] * 2)
+
+
+def _pose_of(node: int) -> ObservedNodes:
+    return ObservedNodes(
+        [node], [STEP], np.zeros((1, 3)), INFORMATION[None], [ObservedKind.GLOBAL_POSE])
+
+
+def _update() -> None:
+    """Tie far nodes together, observe an old one, weigh, remove, fix and free."""
+    # with hardly any budget, so that something is linearized again
+    smoother = _chain(SmootherConfig(alpha=1e-6, budget=1e-12, budget_share=1e-12))
+    for update in (
+            GraphUpdate(edges=_closures(N_NODES - 5)), GraphUpdate(observed=_pose_of(3)),
+            GraphUpdate(weigh_edges={N_NODES - 1: 0.5}, weigh_observed={0: 0.5}),
+            GraphUpdate(remove_edges=(N_NODES,), remove_observed=(1,)),
+            GraphUpdate(fix=(5,)), GraphUpdate(free=(0, 5)), GraphUpdate()):
+        smoother.update(update, chi2=True)
+
+
+def _rescue() -> None:
+    """Tie far nodes together as they cannot be."""
+    _chain().update(GraphUpdate(edges=Edges(
+        [2], [N_NODES - 3], [[40.0, -30.0, 2.5]], 1e4 * INFORMATION[None],
+        [EdgeKind.LOOP_CLOSURE])))
+
+
+def _undo() -> None:
+    """Add a node that nothing holds, and go on without it."""
+    smoother = _chain()
+    smoother.update(GraphUpdate(hidden=np.zeros((1, 3)), edges=_closures(N_NODES - 5)))
+    smoother.update(GraphUpdate(edges=_closures(N_NODES - 5)))
+
+
+def _covariances() -> None:
+    smoother = _chain()
+    smoother.newest_covariance()
+    smoother.covariance(3)
+    smoother.joint_covariance(3, N_NODES - 3)
+    smoother.covariances()
+
+
+def _optimize() -> None:
+    """Optimise a whole graph, with damping and without, from all starts."""
+    graph = _chain().graph
+    graph.apply(GraphUpdate(edges=_closures(N_NODES - 5), free=(0,)))
+    batch.optimize(graph, SolverConfig(initial_damping=1.0))
+    batch.optimize_from_nothing(graph, SolverConfig())
+    solve_from_two_starts(graph, SolverConfig(), batch.optimize, closing=True)
+
+
+def _drive() -> None:
+    """Drive the whole engine: align with positions, take what comes late, optimise at the end."""
+    backend, truth = PoseGraphBackend(), np.zeros(3)
+    for k in range(1, N_NODES):
+        stamp_ns = k * 1_000_000_000
+        backend.add_odometry(OdometrySample(stamp_ns, truth))
+        backend.add_measurement(
+            Position(stamp_ns, 3.0 - truth[:2], 0.01 * np.eye(2), np.zeros(2)), 'position')
+        truth = se2.compose(truth, STEP + ERROR)
+        backend.update()
+        backend.estimate()
+    stamp_ns = (N_NODES - LAP) * 1_000_000_000
+    pose = np.array([3.0, 3.0, np.pi])
+    backend.add_measurement(GlobalPose(stamp_ns, pose, 0.01 * np.eye(3)), 'pose')
+    backend.add_measurement(
+        LoopClosure(stamp_ns, np.zeros(3), 0.01 * np.eye(3), reference_node=3), 'closure')
+    backend.update()
+    backend.optimize()
+    backend.estimate()
+
+
+# Between two of them the warm-up can be stopped.
+STEPS: tuple[Callable[[], object], ...] = (
+    IncrementalSmoother, _chain, _update, _undo, _covariances, _optimize, _rescue, _drive)

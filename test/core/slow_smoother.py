@@ -1,0 +1,365 @@
+# Copyright 2026 The pose_graph_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""
+The incremental smoother once more, slowly; random worlds to drive through; a look at its tables.
+
+`SlowGraph` keeps its own books on what an update means, and solves densely what `linearize` says;
+it shares no code with the tables, the tree of cliques and their kernels.
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass, field, replace
+from typing import Any
+
+import numpy as np
+
+from pose_graph_ros.core import linearize, se2, tables as tb
+from pose_graph_ros.core.config import SmootherConfig
+from pose_graph_ros.core.constraints import EdgeKind, Edges, ObservedKind, ObservedNodes
+from pose_graph_ros.core.graph import Graph, GraphUpdate
+from pose_graph_ros.core.se2 import FloatArray
+
+# Nothing is left out: every step ends at the minimum.
+EXACT = SmootherConfig(alpha=0.0, budget=1e-20, budget_share=1e-22, max_iterations=60)
+
+
+@dataclass(frozen=True)
+class SlowGraph:
+    """A pose graph whose every question is answered by dense matrices."""
+
+    poses: FloatArray = field(default_factory=lambda: np.empty((0, 3)))
+    fixed: Any = field(default_factory=lambda: np.zeros(0, dtype=bool))
+    edges: Edges = field(default_factory=Edges)
+    observed: ObservedNodes = field(default_factory=ObservedNodes)
+
+    def edited(self, update: GraphUpdate) -> 'SlowGraph':
+        poses = np.vstack((self.poses, se2.wrapped(update.hidden)))
+        fixed = np.append(self.fixed, np.zeros(len(update.hidden), dtype=bool))
+        fixed[list(update.fix)] = True
+        fixed[list(update.free)] = False
+        return SlowGraph(
+            poses, fixed,
+            _weighed(Edges.joined([self.edges, update.edges]),
+                     update.remove_edges, update.weigh_edges),
+            _weighed(ObservedNodes.joined([self.observed, update.observed]),
+                     update.remove_observed, update.weigh_observed))
+
+    def at(self, poses: FloatArray) -> 'SlowGraph':
+        return replace(self, poses=poses.copy())
+
+    def chi2(self) -> float:
+        errors = (linearize.edge_errors(self.poses, self.edges),
+                  linearize.observed_errors(self.poses, self.observed))
+        return float(sum(
+            np.sum(linearize.energies(error, table.weighted_information))
+            for error, table in zip(errors, (self.edges, self.observed), strict=True)))
+
+    def system(self) -> tuple[FloatArray, FloatArray]:
+        """Return H, shape (3N, 3N), and b, shape (3N,), of all nodes, fixed or not."""
+        edge = linearize.linearize_edges(self.poses, self.edges)
+        unary = linearize.linearize_observed(self.poses, self.observed)
+        return _normal_equations(len(self.poses), (
+            (self.edges.weighted_information, edge.error,
+             ((self.edges.i, edge.jacobian_i), (self.edges.j, edge.jacobian_j))),
+            (self.observed.weighted_information, unary.error,
+             ((self.observed.node, unary.jacobian),))))
+
+    @property
+    def unknown(self) -> Any:
+        """Rows of H that belong to free nodes."""
+        return np.flatnonzero(np.repeat(~self.fixed, 3))
+
+    def scaled(self, H: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Return the free part of H with ones on its diagonal, and what its rows are worth."""
+        free = H[np.ix_(self.unknown, self.unknown)]
+        root = np.sqrt(np.where(np.diag(free) > 0.0, np.diag(free), 1.0))
+        return free / root / root[:, None], 1.0 / root
+
+    def null_space(self) -> tuple[float, FloatArray]:
+        """Return the smallest eigenvalue of the scaled H, and all vectors (3N,) like its own."""
+        matrix, _ = self.scaled(self.system()[0])
+        if len(matrix) == 0:
+            return 1.0, np.zeros((3 * len(self.poses), 0))
+        values, vectors = np.linalg.eigh(matrix)
+        full = np.zeros((3 * len(self.poses), int(np.sum(values < 2.0 * abs(values[0]) + 1e-13))))
+        full[self.unknown] = vectors[:, :full.shape[1]]
+        return float(values[0]), full
+
+    def step(self) -> FloatArray:
+        """Return the next step of Gauss-Newton, shape (N, 3)."""
+        H, b = self.system()
+        matrix, scale = self.scaled(H)
+        step = np.zeros(len(b))
+        step[self.unknown] = -scale * np.linalg.solve(matrix, scale * b[self.unknown])
+        return step.reshape(-1, 3)
+
+    def optimized(self, steps: int = 50) -> 'SlowGraph':
+        """Return the minimum that Gauss-Newton finds from here."""
+        graph = self
+        for _ in range(steps):
+            step = graph.step()
+            graph = graph.at(se2.wrapped(graph.poses + step))
+            if np.max(np.abs(step), initial=0.0) < 1e-11:
+                break
+        return graph
+
+    def covariance(self, H: FloatArray | None = None) -> FloatArray:
+        """Return the inverse of H, shape (3N, 3N), 0 for fixed nodes."""
+        matrix, scale = self.scaled(self.system()[0] if H is None else H)
+        full = np.zeros((3 * len(self.poses),) * 2)
+        full[np.ix_(self.unknown, self.unknown)] = (
+            np.linalg.inv(matrix) * scale * scale[:, None])
+        return full
+
+
+def _weighed(table: Any, removed: Any, weights: Any) -> Any:
+    weight = table.weight.copy()
+    weight[list(removed)] = 0.0
+    for row, value in weights.items():
+        weight[row] = value
+    return _with_weight(table, weight)
+
+
+def _with_weight(table: Any, weight: FloatArray) -> Any:
+    columns = {name: getattr(table, name) for name in table.__dataclass_fields__}
+    return type(table)(**{**columns, 'weight': weight})
+
+
+def information(graph: Graph, nodes: list[int] | None = None) -> FloatArray:
+    """
+    Return the H, shape (3N, 3N), that the tables stand for, or that of all that touches nodes.
+
+    There each constraint is linearized at a point of its own: here it gets nodes of its own.
+    """
+    edges, observed = graph.edges, graph.observed
+    if nodes is not None:
+        edges = _with_weight(edges, edges.weight * (
+            np.isin(edges.i, nodes) | np.isin(edges.j, nodes)))
+        observed = _with_weight(observed, observed.weight * np.isin(observed.node, nodes))
+    m, k = len(edges), len(observed)
+    rows, unary = graph.memory['edge_f'][:m], graph.memory['observed_f'][:k]
+    ends, hidden = np.zeros((2 * m, 3)), np.zeros((k, 3))
+    # what a clique holds turns with its frame
+    turn = graph.memory['clique_f'][graph.memory['edge_i'][:m, tb.OWNER], tb.TURN]
+    ends[:m, 2] = (np.arctan2(rows[:, tb.LIN_SIN], rows[:, tb.LIN_COS]) - edges.mean[:, 2] + turn)
+    difference = rows[:, tb.LIN_D:tb.LIN_D + 2]
+    ends[m:, :2] = np.einsum('mij,mj->mi', se2.rotation(turn), difference)
+    hidden[:, 2] = graph.memory['node_f'][observed.node, tb.REF + 2] + unary[:, tb.OBS_TH]
+    edge = linearize.linearize_edges(ends, Edges(
+        np.arange(m), m + np.arange(m), edges.mean, edges.information, edges.kind))
+    single = linearize.linearize_observed(hidden, ObservedNodes(
+        np.arange(k), observed.offset, observed.mean, observed.information, observed.kind))
+    return _normal_equations(graph.n_nodes, (
+        (edges.weighted_information, edge.error,
+         ((edges.i, edge.jacobian_i), (edges.j, edge.jacobian_j))),
+        (observed.weighted_information, single.error, ((observed.node, single.jacobian),))))[0]
+
+
+def _normal_equations(n: int, constraints: Any) -> tuple[FloatArray, FloatArray]:
+    H, b = np.zeros((n, 3, n, 3)), np.zeros((n, 3))
+    blocks = H.transpose(0, 2, 1, 3)
+    for W, error, ends in constraints:
+        for row, J_row in ends:
+            np.add.at(b, row, np.einsum('mji,mjk,mk->mi', J_row, W, error))
+            for column, J_column in ends:
+                np.add.at(blocks, (row, column),
+                          np.einsum('mji,mjk,mkl->mil', J_row, W, J_column))
+    return H.reshape(3 * n, 3 * n), b.ravel()
+
+
+@dataclass
+class World:
+    """Where the nodes truly are, and what is measured there."""
+
+    rng: np.random.Generator
+    truth: list[FloatArray]
+    stride: float = 1.0
+    turn: float = 0.6
+    noise: tuple[float, float, float] = (0.05, 0.05, 0.02)
+    """Of all measurements [m, m, rad]."""
+    guess: tuple[float, float, float] = (0.1, 0.1, 0.05)
+    """Of the poses that new nodes come with."""
+    weight: Callable[[np.random.Generator], float] | None = None
+    """Factor on the information of each measurement."""
+
+    def informative(self) -> FloatArray:
+        root = self.rng.normal(size=(3, 3))
+        factor = 1.0 if self.weight is None else self.weight(self.rng)
+        return factor * (root @ root.T * 30.0 + np.diag([100.0, 100.0, 400.0]))
+
+    def drive(self, start: int) -> FloatArray:
+        """Put a node somewhere in front of another; return the guess of its pose."""
+        move = self.rng.normal((self.stride, 0.0, 0.0),
+                               (0.3 * self.stride, 0.3 * self.stride, self.turn))
+        self.truth.append(se2.compose(self.truth[start], move))
+        return self.disturbed(self.truth[-1], self.guess)
+
+    def disturbed(self, pose: FloatArray, sigma: tuple[float, float, float]) -> FloatArray:
+        return se2.wrapped(pose + self.rng.normal(size=3) * sigma)
+
+    def edges(self, pairs: list[tuple[int, int]]) -> Edges:
+        return Edges(
+            [i for i, _ in pairs], [j for _, j in pairs],
+            np.reshape([self.disturbed(se2.between(self.truth[i], self.truth[j]), self.noise)
+                        for i, j in pairs], (-1, 3)),
+            np.reshape([self.informative() for _ in pairs], (-1, 3, 3)),
+            [EdgeKind.LOOP_CLOSURE] * len(pairs))
+
+    def observed(
+        self, nodes: list[int], *, position: bool = False, offset: bool = False,
+    ) -> ObservedNodes:
+        offsets = self.rng.normal(size=(len(nodes), 3)) * offset
+        mean = np.reshape([
+            self.disturbed(se2.compose(self.truth[node], shift), self.noise)
+            for node, shift in zip(nodes, offsets, strict=True)], (-1, 3))
+        information = np.reshape([self.informative() for _ in nodes], (-1, 3, 3))
+        if position:
+            information[:, 2, :] = information[:, :, 2] = mean[:, 2] = 0.0
+        kind = ObservedKind.POSITION if position else ObservedKind.GLOBAL_POSE
+        return ObservedNodes(nodes, offsets, mean, information, [kind] * len(nodes))
+
+    def new_nodes(self, count: int) -> GraphUpdate:
+        """Return nodes that branch off somewhere, with edges in both directions."""
+        hidden, pairs = [], []
+        for _ in range(count):
+            node = len(self.truth)
+            start = int(self.rng.integers(max(0, node - 4) if self.rng.random() < 0.8 else 0,
+                                          node))
+            hidden.append(self.drive(start))
+            pairs.append((start, node) if self.rng.random() < 0.7 else (node, start))
+        return GraphUpdate(hidden=np.reshape(hidden, (-1, 3)), edges=self.edges(pairs))
+
+    def new_part(self, anchor: str) -> GraphUpdate:
+        """Return a node that nothing ties to the others, held by itself or not at all."""
+        node = len(self.truth)
+        hidden = self.drive(node - 1)[None]
+        if anchor == 'fixed':
+            return GraphUpdate(hidden=hidden, fix=[node])
+        if anchor == 'pose':
+            return GraphUpdate(hidden=hidden, observed=self.observed([node], offset=True))
+        if anchor == 'positions':
+            return GraphUpdate(hidden=hidden, observed=ObservedNodes.joined([
+                self.observed([node], position=True),
+                self.observed([node], position=True, offset=True)]))
+        if anchor == 'position':
+            return GraphUpdate(hidden=hidden, observed=self.observed([node], position=True))
+        return GraphUpdate(hidden=hidden)
+
+    def pairs(self, count: int) -> list[tuple[int, int]]:
+        """Return so many pairs of different nodes, now and then one twice."""
+        if len(self.truth) < 2:
+            return []
+        pairs = [tuple(self.rng.choice(len(self.truth), 2, replace=False).tolist())
+                 for _ in range(count)]
+        return pairs + pairs[:1] if self.rng.random() < 0.2 else pairs
+
+    def joined(self, first: GraphUpdate, **more: Any) -> GraphUpdate:
+        """Add to an update; constraints come on top of its own."""
+        for name, table in (('edges', Edges), ('observed', ObservedNodes)):
+            if name in more:
+                more[name] = table.joined([getattr(first, name), more[name]])
+        return replace(first, **more)
+
+    def mixture(self, graph: SlowGraph) -> GraphUpdate:
+        """Return an update of any size that does everything at once."""
+        rng = self.rng
+        update = self.new_nodes(int(rng.integers(0, 4)))
+        n = len(self.truth)
+        nodes = rng.integers(0, n, int(rng.integers(0, 3))).tolist()
+        update = self.joined(
+            update, edges=self.edges(self.pairs(int(rng.integers(0, 3)))),
+            observed=self.observed(nodes, position=bool(rng.random() < 0.4),
+                                   offset=bool(rng.random() < 0.5)))
+        for table, remove, weigh in ((graph.edges, 'remove_edges', 'weigh_edges'),
+                                     (graph.observed, 'remove_observed', 'weigh_observed')):
+            if len(table) > 0 and rng.random() < 0.3:
+                update = replace(update, **{remove: [int(rng.integers(len(table)))]})
+            if len(table) > 0 and rng.random() < 0.4:
+                update = replace(update, **{weigh: {
+                    int(rng.integers(len(table))): float(rng.choice([0.0, 1.0, rng.uniform()]))}})
+        if rng.random() < 0.15:
+            update = replace(update, fix=[int(rng.integers(n))])
+        if rng.random() < 0.15:
+            update = replace(update, free=[int(rng.integers(n))])
+        return update
+
+
+def world(seed: int, *, origin: tuple[float, float] = (0.0, 0.0), **how: Any) -> World:
+    """Return a world with one node."""
+    rng = np.random.default_rng(seed)
+    return World(rng, [np.array([*origin, rng.uniform(-np.pi, np.pi)])], **how)
+
+
+# --- the tables ---------------------------------------------------------------------------------
+
+_USED = {'node_f': tb.N_NODES, 'node_i': tb.N_NODES, 'edge_f': tb.N_EDGES, 'edge_i': tb.N_EDGES,
+         'observed_f': tb.N_OBSERVED, 'observed_i': tb.N_OBSERVED, 'seeds': tb.N_SEEDS,
+         'waiting': tb.N_WAITING}
+
+
+@dataclass(frozen=True)
+class Clique:
+    """One clique, read from the tables."""
+
+    parent: int
+    children: list[int]
+    frontal: list[int]
+    separator: list[int]
+    R: FloatArray
+    """Rows of R of the frontal nodes in map axes, shape (3 F, 3 F + 3 S)."""
+    rhs: FloatArray
+    update: FloatArray
+    """Update matrix in map axes, shape (3 S, 3 S)."""
+
+
+def cliques(graph: Graph) -> dict[int, Clique]:
+    """Return all cliques by their rows."""
+    memory, found = graph.memory, {}
+    for c, row in enumerate(memory['clique_i'][:memory.head[tb.N_CLIQUES]]):
+        n_frontal, n_separator = int(row[tb.N_FRONTAL]), int(row[tb.N_SEPARATOR])
+        if n_frontal == 0:
+            continue
+        nodes = memory['pool_i'][row[tb.NODES]:][:n_frontal + n_separator].tolist()
+        rows, rest = 3 * n_frontal, 3 * n_separator
+        values = memory['pool_f'][row[tb.VALUES]:]
+        block = values[:rows * (rows + rest + 1)].reshape(rows, rows + rest + 1)
+        R = np.triu(block[:, :-1])
+        R[np.diag_indices(rows)] = 1.0 / R[np.diag_indices(rows)]
+        update = np.triu(
+            values[block.size:][:rest * (rest + 1)].reshape(rest, rest + 1)[:, :-1])
+        children, child = [], int(row[tb.CHILD])
+        while child >= 0:
+            children.append(child)
+            child = int(memory['clique_i'][child, tb.SIBLING])
+        # what it holds is in its own frame
+        M = np.eye(3 * len(nodes))
+        M.reshape(len(nodes), 3, len(nodes), 3)[
+            np.arange(len(nodes)), :2, np.arange(len(nodes)), :2] = (
+                se2.rotation(memory['clique_f'][c, tb.TURN]).T)
+        rest = M[rows:, rows:]
+        found[c] = Clique(
+            int(row[tb.PARENT]), children, nodes[:n_frontal], nodes[n_frontal:], R @ M,
+            block[:, -1].copy(), rest.T @ (update + np.triu(update, 1).T) @ rest)
+    return found
+
+
+def state(graph: Graph) -> dict[str, bytes]:
+    """Return everything that later steps depend on, for comparing bit by bit."""
+    memory = graph.memory
+    copies = {name: memory[name][:memory.head[count]].copy() for name, count in _USED.items()}
+    for name, columns in tb.STAMPS.items():
+        if name in copies:
+            copies[name][:, columns] = 0
+    copies['node_i'][:, tb.INDEX] = 0  # work space
+    parts = {name: table.tobytes() for name, table in copies.items()}
+    parts['cliques'] = b''.join(
+        np.array([row, c.parent, -1, *c.children, -1, *c.frontal, -1, *c.separator]).tobytes()
+        + c.R.tobytes() + c.rhs.tobytes() + c.update.tobytes()
+        for row, c in cliques(graph).items())
+    parts['structure'] = bytes([int(memory.head[tb.STRUCTURE]) != 0])
+    return parts
+
+
+def differences(before: dict[str, bytes], after: dict[str, bytes]) -> list[str]:
+    """Return the names of the tables that differ."""
+    return [name for name in before if before[name] != after[name]]

@@ -1,0 +1,128 @@
+# Copyright 2026 The pose_graph_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""What is undone has never been, and no memory of the pools is lost, shared or given twice."""
+
+from hypothesis import given, settings, strategies as st
+import numpy as np
+import pytest
+from slow_smoother import differences, EXACT, SlowGraph, state, World, world
+
+from pose_graph_ros.core import tables as tb, undo
+from pose_graph_ros.core.batch import Status
+from pose_graph_ros.core.graph import Graph, GraphUpdate
+from pose_graph_ros.core.incremental import IncrementalSmoother
+
+seeds = st.integers(0, 2**32 - 1)
+
+
+def begun(seed: int) -> tuple[World, IncrementalSmoother, SlowGraph]:
+    here, smoother = world(seed), IncrementalSmoother(EXACT)
+    first = GraphUpdate(hidden=np.array(here.truth), fix=[0])
+    smoother.update(first)
+    return here, smoother, SlowGraph().edited(first)
+
+
+def free_blocks(graph: Graph, heads: int, pool: np.ndarray) -> list[tuple[int, int]]:
+    """Return the blocks (begin, size) of the free lists of a pool."""
+    blocks = []
+    for size, first in enumerate(graph.memory.head[heads:heads + tb.N_SIZES].tolist()):
+        at = first
+        while at >= 0:
+            blocks.append((at, tb.SIZES[size]))
+            at = int(pool[at])
+    return blocks
+
+
+def used_blocks(graph: Graph) -> tuple[list[tuple[int, int]], list[tuple[int, int]]]:
+    """Return the blocks of the lists of nodes and of the values of all cliques."""
+    nodes, values = [], []
+    for row in graph.memory['clique_i'][:graph.memory.head[tb.N_CLIQUES]]:
+        if row[tb.N_FRONTAL] > 0:
+            frontal, separator = int(row[tb.N_FRONTAL]), int(row[tb.N_SEPARATOR])
+            nodes.append((int(row[tb.NODES]), int(undo.rounded(frontal + separator))))
+            values.append((int(row[tb.VALUES]),
+                           int(undo.rounded(undo.n_values(frontal, separator)))))
+    return nodes, values
+
+
+def assert_pools_are_whole(graph: Graph) -> None:
+    """Each number of a pool is in one block: of one clique, or of a free list."""
+    head = graph.memory.head
+    nodes, values = used_blocks(graph)
+    for used, heads, name, end in ((nodes, tb.FREE_I, 'pool_i', tb.POOL_I_END),
+                                   (values, tb.FREE_F, 'pool_f', tb.POOL_F_END)):
+        blocks = sorted(used + free_blocks(graph, heads, graph.memory[name]))
+        ends = np.cumsum([0, *(size for _, size in blocks)])
+        assert [begin for begin, _ in blocks] == ends[:-1].tolist()
+        assert ends[-1] == head[end]
+    assert (head[tb.LOG_F_END], head[tb.LOG_I_END], head[tb.N_FREED]) == (0, 0, 0)
+
+
+@given(seeds, st.integers(1, 30))
+@settings(max_examples=40)
+def test_every_number_of_the_pools_belongs_to_one_clique_or_to_none(
+    seed: int, steps: int,
+) -> None:
+    here, smoother, slow = begun(seed)
+    for _ in range(steps):
+        update = here.mixture(slow)
+        if smoother.update(update).status is not Status.FAILED:
+            slow = slow.edited(update)
+        del here.truth[len(slow.poses):]
+        assert_pools_are_whole(smoother.graph)
+
+
+@given(seeds, st.integers(1, 15), st.integers(1, 3))
+@settings(max_examples=40)
+def test_edits_without_a_step_are_undone_bit_for_bit(seed: int, steps: int, edits: int) -> None:
+    here, smoother, slow = begun(seed)
+    spared = begun(seed)[1]
+    for _ in range(steps):
+        update = here.mixture(slow)
+        before = state(smoother.graph)
+        checkpoint = smoother.graph.begin()
+        smoother.graph.apply(update)
+        for _ in range(edits - 1):
+            smoother.graph.apply(GraphUpdate(fix=[0], weigh_edges=dict.fromkeys(
+                range(min(smoother.graph.n_edges, 2)), 0.5)))
+        smoother.graph.undo(checkpoint)
+        assert differences(before, state(smoother.graph)) == []
+        results = [each.update(update) for each in (smoother, spared)]
+        assert results[0][:2] == results[1][:2]
+        if results[0].status is not Status.FAILED:
+            slow = slow.edited(update)
+        del here.truth[len(slow.poses):]
+        assert differences(state(spared.graph), state(smoother.graph)) in ([], ['cliques'])
+        assert spared.poses.tobytes() == smoother.poses.tobytes()
+
+
+def test_undoing_many_times_takes_no_memory() -> None:
+    here, smoother, slow = begun(7)
+    for _ in range(10):
+        smoother.update(here.new_nodes(3))
+    ends = []
+    for _ in range(50):
+        # a closure that reaches far, and a node that nothing holds
+        update = here.joined(here.new_part('none'), edges=here.edges([(1, 25)]))
+        del here.truth[-1:]
+        assert smoother.update(update).status is Status.FAILED
+        assert_pools_are_whole(smoother.graph)
+        ends.append(smoother.graph.memory.head[[tb.POOL_F_END, tb.POOL_I_END, tb.N_CLIQUES]])
+    assert np.all(ends[-1] == ends[1])
+    del slow
+
+
+@pytest.mark.parametrize('n', [1, 2, 12, 64, 65, 66, 73, 1000, 12345, 10**7])
+def test_blocks_are_large_enough_and_not_much_larger(n: int) -> None:
+    size = undo.rounded(n)
+    assert n <= size <= max(n, 1.125 * n + 1)
+    assert undo.rounded(size) == size
+
+
+def test_what_is_given_back_is_taken_again() -> None:
+    head = Graph().memory.head
+    taken = [undo.take_nodes(head, n) for n in (3, 5, 3, 1)]
+    assert taken == [0, 3, 8, 11]
+    undo.give_nodes(head, 0, 3)
+    undo.give_nodes(head, 8, 3)
+    assert [undo.take_nodes(head, 3) for _ in range(3)] == [8, 0, 12]
