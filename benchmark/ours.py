@@ -27,7 +27,7 @@ from pose_graph_ros.core.incremental import IncrementalSmoother, UpdateResult
 from pose_graph_ros.core.se2 import FloatArray
 
 NAME = 'ours'
-BATCH = SolverConfig(max_iterations=100, step_tolerance=1e-8)
+BATCH = SolverConfig(max_iterations=100, step_tolerance=1e-5)
 SINGLE = SolverConfig(max_iterations=1)
 AfterStep = Callable[[IncrementalSmoother, int], None]
 

@@ -31,6 +31,9 @@ import math
 from pose_graph_ros.core import tables as tb
 from pose_graph_ros.core.jit import kernel
 
+# Square of the fraction from which on a change of the arm counts by itself.
+MUCH_LONGER = 1e-4
+
 
 @kernel
 def wrap(angle):  # type: ignore[no-untyped-def]
@@ -93,11 +96,13 @@ def check_edge(head, e, phi):  # type: ignore[no-untyped-def]
         rth = 0.0  # rounding of the wrap; at a jump it is a multiple of 2 pi
     w = f[tb.WEIGHT]
     energy = w * _form(f, ex, ey, eth)
-    # the Jacobian has turned, and its arm has become longer
+    # the Jacobian has turned, and its arm has become longer; a much longer one would falsify the
+    # covariances even where it bears no force
     iso = 0.5 * (f[tb.INFO] + f[tb.INFO + 3])
     longer = (qx + px - gx) ** 2 + (qy + py - gy) ** 2
-    changed = turn * turn + longer * iso / (f[tb.INFO + 5] + iso * (gx * gx + gy * gy) + 1e-300)
-    f[tb.ERROR2] = w * _form(f, rx, ry, rth) + changed * energy
+    longer *= iso / (f[tb.INFO + 5] + iso * (gx * gx + gy * gy) + 1e-300)
+    f[tb.ERROR2] = w * _form(f, rx, ry, rth) + (turn * turn + longer) * energy + (
+        longer if longer > MUCH_LONGER else 0.0)
     f[tb.ENERGY] = energy
 
 

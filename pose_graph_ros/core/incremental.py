@@ -177,7 +177,8 @@ class IncrementalSmoother:
         """Return the covariance of the newest hidden node in map axes, shape (3, 3)."""
         covariance = np.empty((3, 3))
         if not marginals.newest_covariance(self._memory.head, covariance):
-            raise GraphUpdateError('newest_covariance: expected a hidden node, there is none')
+            # it says what is missing
+            return marginals.covariance(self.graph, self.graph.n_nodes - 1)
         return covariance
 
     def covariance(self, node: int) -> FloatArray:
@@ -205,7 +206,10 @@ class IncrementalSmoother:
             return self._result(Status.CONVERGED)
         # the node has its place already, whatever becomes of the next iterations
         undo.commit(head)
-        return self._step(self.graph.begin())
+        before = self.graph.begin()
+        back_substitution.relinearize(head)
+        result = self._step(before)
+        return result._replace(status=Status.MAX_ITERATIONS) if result.reason else result
 
     def _extend_in_general(
         self, arguments: tuple[FloatArray, ...], *, with_observed: bool,
@@ -223,23 +227,26 @@ class IncrementalSmoother:
             edges=Edges([node - 1], [node], mean[None], information[None], [EdgeKind.ODOMETRY]),
             observed=observed))
 
-    def _step(self, before: Checkpoint) -> UpdateResult:
+    def _step(self, before: Checkpoint, *, rescued: bool = False) -> UpdateResult:
         """Eliminate, solve and linearize again until the estimate is good, or undo it all."""
         head, scalars = self._memory.head, self._memory['scalars']
-        error2 = 0.0
+        error2, settled = 0.0, True
         if head[tb.N_WAITING] > 0:
-            back_substitution.relinearize(head)  # what the last update has left over
+            # what the last update has left over; the frames that had turned may be gone by now
+            head[tb.N_TURNED] = 0
+            back_substitution.relinearize(head)
         while head[tb.N_SEEDS] > 0:
             code = self._eliminate()
             if code == elimination.BAD_PIVOT:
                 reason = f'hidden node {head[tb.BAD_NODE]} is not determined'
                 self.graph.undo(before)
                 return UpdateResult(Status.FAILED, reason, 0, 0, 0, 0, NAN)
-            if back_substitution.solve(head):
+            settled = bool(back_substitution.solve(head))
+            if settled:
                 break
             error2, error2_before = float(scalars[tb.ERROR2_SUM]), error2
             out_of_iterations = head[tb.N_ITERATIONS] >= self._config.max_iterations
-            if not error2 <= DOUBT and (
+            if not rescued and not error2 <= DOUBT and (
                     out_of_iterations or 0.0 < error2_before < 2.0 * error2
                     or not error2 < HOPELESS):
                 return self._rescue(before)
@@ -247,8 +254,7 @@ class IncrementalSmoother:
                 break
             back_substitution.relinearize(head)
         undo.commit(head)
-        return self._result(
-            Status.CONVERGED if head[tb.N_WAITING] == 0 else Status.MAX_ITERATIONS)
+        return self._result(Status.CONVERGED if settled else Status.MAX_ITERATIONS)
 
     def _eliminate(self) -> int:
         """Eliminate what the seeds touch, with as much memory as it takes."""
@@ -275,11 +281,7 @@ class IncrementalSmoother:
                 0, 0, 0, 0, NAN)
         undo.commit(head)
         graph.set_poses(found)
-        graph.begin()
-        self._eliminate()
-        settled = back_substitution.solve(head)
-        undo.commit(head)
-        return self._result(Status.CONVERGED if settled else Status.MAX_ITERATIONS)
+        return self._step(graph.begin(), rescued=True)
 
     def _result(self, status: Status) -> UpdateResult:
         relinearized, eliminated, visited, iterations = (

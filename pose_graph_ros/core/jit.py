@@ -25,7 +25,7 @@ from pose_graph_ros.core.kernel_cache import KernelCache
 # Arguments may be what only Numba knows, so signatures are not handed through to the type checker.
 Function = Callable[..., Any]
 
-OPTIONS = MappingProxyType({'nogil': True, 'error_model': 'numpy'})
+OPTIONS = MappingProxyType({'nogil': True, 'error_model': 'numpy', 'no_cfunc_wrapper': True})
 
 _registered: dict[str, Dispatcher] = {}
 
@@ -54,7 +54,8 @@ def kernel(function: Any = None, **options: Any) -> Any:
     compiled = numba.njit(**{**OPTIONS, **options})(function)
     if isinstance(compiled, Dispatcher):    # NUMBA_DISABLE_JIT=1 leaves functions as they are
         _widen_calls(compiled)
-        _registered[f'{function.__module__}.{function.__qualname__}'] = compiled
+        if options.get('inline') != 'always':   # such a one is compiled as a part of others alone
+            _registered[f'{function.__module__}.{function.__qualname__}'] = compiled
         with suppress(RuntimeError):    # there is no folder for it; kernel_cache has said why
             # what njit(cache=True) does, with a cache of our own
             compiled._cache = KernelCache(compiled)  # noqa: SLF001

@@ -181,7 +181,8 @@ class _Locator:
     def __init__(self, source: Path, folder: Path) -> None:
         self._py_file = str(source)     # Numba names it in warnings
         self._folder = folder
-        self._stamp = hashlib.sha256(OWNER.encode() + source.read_bytes()).digest()
+        # what code is made from is in its fingerprint; the rest of the file does not matter
+        self._stamp = hashlib.sha256(OWNER.encode()).digest()
 
     @classmethod
     def from_function(cls, _: FunctionType, py_file: str) -> '_Locator | None':

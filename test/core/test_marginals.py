@@ -230,7 +230,7 @@ def test_asking_changes_nothing() -> None:
 def test_an_empty_graph_has_no_covariances() -> None:
     smoother = IncrementalSmoother()
     assert smoother.covariances().shape == (0, 3, 3)
-    with pytest.raises(ValueError, match='expected a hidden node'):
+    with pytest.raises(ValueError, match='a graph with nodes, got -1'):
         smoother.newest_covariance()
     with pytest.raises(ValueError, match='a graph with nodes, got 0'):
         smoother.covariance(0)
