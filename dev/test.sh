@@ -24,6 +24,9 @@ if [ -z "${ROS_DISTRO:-}" ]; then
 else
     echo '--- mypy: left out, it is exact only with the NumPy of requirements.lock'
 fi
+# once, not in each of the processes that tests start
+run kernels "$VENV/bin/python" -c 'from pose_graph_ros.core.warm_up import warm_up
+print(f"compiled, or loaded, in {warm_up():.1f} s")'
 run pytest "$VENV/bin/python" -m pytest -ra --durations=10 "$@"
 
 if [ "${#failed[@]}" -gt 0 ]; then

@@ -155,8 +155,8 @@ class BackendConfig:
     smoother: SmootherConfig = field(default_factory=SmootherConfig)
     """For the timer: what is left over is done at the next update."""
     closing: SolverConfig = field(
-        default_factory=lambda: SolverConfig(max_iterations=100, step_tolerance=1e-10))
-    """For the full optimisation at the end of a stream."""
+        default_factory=lambda: SolverConfig(max_iterations=400, step_tolerance=1e-10))
+    """For the full optimisation at the end of a stream; an outage can make it converge slowly."""
     position_sigma_floor: float = 0.01
     """No position or pose is believed to be better than this [m]."""
     heading_sigma_floor: float = 0.001

@@ -33,8 +33,10 @@ from pose_graph_ros.core.graph import Checkpoint, Graph, GraphUpdate
 from pose_graph_ros.core.jit import compile_only
 from pose_graph_ros.core.se2 import FloatArray
 
-# Where a step leaves more squared linearization error than this, it has not worked [sigma^2] ...
+# Where a step leaves more squared linearization error than this [sigma^2], and than this fraction of
+# chi2 (a false constraint strains the graph, and all its errors), it has not worked ...
 DOUBT = 1.0
+DOUBT_RATIO = 1e-3
 # ... if there is no iteration left, or the last one has not at least halved it, or there is so
 # much of it that the next one can only make it worse.
 HOPELESS = 1e6
@@ -246,7 +248,8 @@ class IncrementalSmoother:
                 break
             error2, error2_before = float(scalars[tb.ERROR2_SUM]), error2
             out_of_iterations = head[tb.N_ITERATIONS] >= self._config.max_iterations
-            if not rescued and not error2 <= DOUBT and (
+            doubt = max(DOUBT, DOUBT_RATIO * float(scalars[tb.CHI2]))
+            if not rescued and not error2 <= doubt and (
                     out_of_iterations or 0.0 < error2_before < 2.0 * error2
                     or not error2 < HOPELESS):
                 return self._rescue(before)

@@ -47,7 +47,7 @@ WINDOW = 400
 # Patience with the node: to appear, to compile at its first start, to process another message, to
 # answer [s].
 APPEAR_TIMEOUT = 30.0
-PREPARE_TIMEOUT = 300.0
+PREPARE_TIMEOUT = 600.0
 STALL_TIMEOUT = 20.0
 ANSWER_TIMEOUT = 90.0
 # Exit code where all was played and recorded, but the optimisation did not get to its end.

@@ -900,10 +900,14 @@ def drive_with_outage(
     return np.array([truth[round((stamp * 1e-9 - 1.0) / period)] for stamp in stamps])
 
 
-@pytest.mark.parametrize('drift', [-2.0, -1.0, 0.5, 1.0, 2.0])
-def test_a_heading_that_drifts_far_in_a_long_outage_is_wound_the_right_way(drift: float) -> None:
+# with seed 1 a step is only 8 % shorter than the one before
+@pytest.mark.parametrize(
+    ('drift', 'seed'), [(-2.0, 5), (-1.0, 5), (0.5, 5), (1.0, 5), (2.0, 5), (2.0, 1)])
+def test_a_heading_that_drifts_far_in_a_long_outage_is_wound_the_right_way(
+    drift: float, seed: int,
+) -> None:
     backend = PoseGraphBackend()
-    truth = drive_with_outage(backend, drift, seed=5, update_every=1)
+    truth = drive_with_outage(backend, drift, seed, update_every=1)
     assert backend.optimize().status is Status.CONVERGED
     found = backend.energies().chi2
     backend.graph.set_poses(truth)

@@ -37,7 +37,7 @@ LATCHED = QoSProfile(depth=1, reliability=QoSReliabilityPolicy.RELIABLE,
 NANOSECONDS = 1_000_000_000
 PATIENCE = 20.0
 """How long a test waits for something that should come at once [s]."""
-PREPARE_PATIENCE = 100.0
+PREPARE_PATIENCE = 300.0
 """How long it waits for a node that may have to compile its kernels first [s]."""
 
 
