@@ -121,6 +121,13 @@ def eliminate_clique(head, c, afresh):  # type: ignore[no-untyped-def]
         copy(front, (rows + k) * (ld + 1), pool_f, at + k, rest - k)
         at += rest + 1
         pool_f[at - 1] = front[(rows + k + 1) * ld - 1]
+    # what a turn of all separator nodes about the first one would cost, to the fourth power of it
+    stiff, first = 0.0, node_f[list_[n_frontal]] if n_separator > 0 else node_f[list_[0]]
+    for k in range(n_frontal + 1, n_all):
+        f, i = node_f[list_[k]], 3 * k * ld + 3 * k
+        arm2 = (f[tb.POSE] - first[tb.POSE]) ** 2 + (f[tb.POSE + 1] - first[tb.POSE + 1]) ** 2
+        stiff += arm2 * (front[i] + front[i + ld + 1])
+    clique_f[c, tb.SLIP_STIFF] = 0.25 * stiff
     return -1
 
 

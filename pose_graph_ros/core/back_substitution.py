@@ -19,17 +19,17 @@ from pose_graph_ros.core.jit import kernel
 LEAST_SHARE = 0.01
 # What linearizing again leaves of the budget.
 LEFT_OVER = 0.4
-# Turns against the clique's frame from this fraction of alpha on, and moves from so many times
-# alpha on, are worth a look at the constraints of a node: linearization goes wrong where a heading
-# changes.
-LOOK_AT_TURN = 0.3
+# Constraints are looked at where the turn of a node could matter: linearization goes wrong where a
+# heading changes. Of the energy of a constraint that much is assumed. Moves are looked at from so
+# many times alpha on.
+USUAL_ENERGY = 0.1
 LOOK_AT_MOVE = 100.0
 
 
 @kernel
-def _move(head, v, dx, dy, dth, turn, alpha):  # type: ignore[no-untyped-def]
+def _move(head, v, dx, dy, dth, phi, alpha):  # type: ignore[no-untyped-def]
     """
-    Give a node its new solution; the frame of its clique has just turned by `turn`.
+    Give a node its new solution; phi is the angle of its clique's frame.
 
     Returns
     -------
@@ -50,8 +50,13 @@ def _move(head, v, dx, dy, dth, turn, alpha):  # type: ignore[no-untyped-def]
         return 0
     f[tb.SEEN], f[tb.SEEN + 1], f[tb.SEEN + 2] = dx, dy, dth
     node_i[v, tb.CHANGED] = head[tb.ITERATION]
-    bent = abs(turned - turn) * f[tb.STIFF_R]
-    return 2 if bent > LOOK_AT_TURN * alpha or moved > LOOK_AT_MOVE * alpha else 1
+    # about the squared linearization error that the turn since the last look makes
+    bent = (dth - phi - f[tb.LOOKED]) ** 2
+    error2 = bent * (bent * f[tb.STIFF_R] * f[tb.STIFF_R] + USUAL_ENERGY)
+    if error2 <= tb.scalars(head)[tb.SETTING_SHARE] and moved <= LOOK_AT_MOVE * alpha:
+        return 1
+    f[tb.LOOKED] = dth - phi
+    return 2
 
 
 @kernel
@@ -71,12 +76,10 @@ def _visit(head, c, alpha, looks, n_looks):  # type: ignore[no-untyped-def]
     """Solve for the frontal nodes of a clique; return how many nodes are to be looked at."""
     node_i, clique_i, pool_i = tb.node_i(head), tb.clique_i(head), tb.pool_i(head)
     node_f, pool_f, work_f = tb.node_f(head), tb.pool_f(head), tb.work_f(head)
-    clique_f = tb.clique_f(head)
     row = clique_i[c]
     n_frontal, n_separator = row[tb.N_FRONTAL], row[tb.N_SEPARATOR]
     rows, n = 3 * n_frontal, 3 * (n_frontal + n_separator)
     nodes = pool_i[row[tb.NODES]:row[tb.NODES] + n_frontal + n_separator]
-    before = clique_f[c, tb.TURN]
     phi = _turn(head, c)
     if phi == 0.0 and n_frontal == 1 and n_separator == 1:
         v = nodes[0]
@@ -105,7 +108,7 @@ def _visit(head, c, alpha, looks, n_looks):  # type: ignore[no-untyped-def]
             dx, dy = frames.map_delta(node_f[v], dx, dy, px, py, cos, sin)
             dth += phi
         if node_i[v, tb.FIXED] == 0 and _move(
-                head, v, dx, dy, dth, phi - before, alpha) == 2:
+                head, v, dx, dy, dth, phi, alpha) == 2:
             looks[n_looks] = v
             n_looks += 1
     return n_looks
@@ -122,7 +125,9 @@ def _turn(head, c):  # type: ignore[no-untyped-def]
         undo.log_clique(head, c)
         clique_f[c, tb.TURN] = phi
     slip = frames.frame_slip(head, c)
-    if slip * slip > LEAST_SHARE * tb.scalars(head)[tb.SETTING_SHARE]:
+    slip2 = slip * slip
+    error2 = slip2 * (slip2 * clique_f[c, tb.SLIP_STIFF] + USUAL_ENERGY)
+    if error2 > tb.scalars(head)[tb.SETTING_SHARE]:
         work_i[2 * head[tb.N_NODES] + head[tb.N_TURNED]] = c
         head[tb.N_TURNED] += 1
     return phi

@@ -34,7 +34,7 @@ def _write_node(head, v, last, mean):  # type: ignore[no-untyped-def]
     f[tb.POSE + 2] = factors.wrap(p[tb.POSE + 2] + mean[2])
     for k in range(3):
         f[tb.REF + k] = f[tb.POSE + k]
-        f[tb.DELTA + k] = f[tb.SEEN + k] = 0.0
+        f[tb.DELTA + k] = f[tb.SEEN + k] = f[tb.LOOKED] = 0.0
     f[tb.STIFF_T] = f[tb.STIFF_R] = 0.0
     i[:] = 0
     i[tb.CLIQUE] = i[tb.EDGE_LIST] = i[tb.OBSERVED_LIST] = -1
@@ -190,7 +190,7 @@ def extend(  # type: ignore[no-untyped-def]
     clique_i[r, tb.CHILD] = c
     clique_i[r, tb.ANCHORED] = 1 if with_observed else old[tb.ANCHORED]
     for m in range(tb.CLIQUE_F):
-        clique_f[r, m] = clique_f[c, m] = 0.0
+        clique_f[r, m] = clique_f[c, m] = 0.0  # with one separator node nothing is stiff
     old[tb.PARENT], old[tb.SIBLING], old[tb.N_SEPARATOR] = r, -1, 1
     old[tb.NODES], old[tb.VALUES] = undo.take_nodes(head, 2), undo.take_values(head, _PAIR)
     pool_i[old[tb.NODES]], pool_i[old[tb.NODES] + 1] = last, v

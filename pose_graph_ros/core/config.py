@@ -133,7 +133,7 @@ class SmootherConfig:
     """A node that has moved by less than this many sigmas moves no other node."""
     budget: float = 0.005
     """Squared linearization error [sigma^2] that a step may leave in all that it has moved ..."""
-    budget_share: float = 4e-6
+    budget_share: float = 8e-6
     """... and for each constraint that it has moved: the smaller of both counts."""
     max_iterations: int = 5
     """Iterations of one update at the most; what is left over is done in the next."""

@@ -21,7 +21,7 @@ def start_nodes(head, first, last):  # type: ignore[no-untyped-def]
         f, i = node_f[v], node_i[v]
         for k in range(3):
             f[tb.REF + k] = f[tb.POSE + k]
-            f[tb.DELTA + k] = f[tb.SEEN + k] = 0.0
+            f[tb.DELTA + k] = f[tb.SEEN + k] = f[tb.LOOKED] = 0.0
         f[tb.STIFF_T] = f[tb.STIFF_R] = 0.0
         i[:] = 0
         i[tb.CLIQUE] = i[tb.EDGE_LIST] = i[tb.OBSERVED_LIST] = -1
@@ -209,7 +209,7 @@ def restart(head):  # type: ignore[no-untyped-def]
         f = node_f[v]
         for k in range(3):
             f[tb.REF + k] = f[tb.POSE + k]
-            f[tb.DELTA + k] = f[tb.SEEN + k] = 0.0
+            f[tb.DELTA + k] = f[tb.SEEN + k] = f[tb.LOOKED] = 0.0
         node_i[v, tb.CLIQUE] = -1
         node_i[v, tb.SEEDED] = 0
         add_seed(head, v)

@@ -52,7 +52,7 @@ def refer_to_poses(head):  # type: ignore[no-untyped-def]
         f = node_f[v]
         for k in range(3):
             f[tb.REF + k] = f[tb.POSE + k]
-            f[tb.DELTA + k] = f[tb.SEEN + k] = 0.0
+            f[tb.DELTA + k] = f[tb.SEEN + k] = f[tb.LOOKED] = 0.0
 
 
 @kernel

@@ -33,8 +33,8 @@ from pose_graph_ros.core.graph import Checkpoint, Graph, GraphUpdate
 from pose_graph_ros.core.jit import compile_only
 from pose_graph_ros.core.se2 import FloatArray
 
-# Where a step leaves more squared linearization error than this [sigma^2], and than this fraction of
-# chi2 (a false constraint strains the graph, and all its errors), it has not worked ...
+# Where a step leaves more squared linearization error than this [sigma^2], and than this fraction
+# of chi2 (a false constraint strains the graph, and all its errors), it has not worked ...
 DOUBT = 1.0
 DOUBT_RATIO = 1e-3
 # ... if there is no iteration left, or the last one has not at least halved it, or there is so

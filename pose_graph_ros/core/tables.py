@@ -25,9 +25,10 @@ from pose_graph_ros.core.jit import kernel
 # --- columns ------------------------------------------------------------------------------------
 
 # node_f: pose in the map (theta wrapped), reference, solution (pose minus reference, theta not
-# wrapped), the solution that the cliques below have seen, square roots of the information that
-# the node's constraints have on position and on heading
-POSE, REF, DELTA, SEEN, STIFF_T, STIFF_R, NODE_F = 0, 3, 6, 9, 12, 13, 14
+# wrapped), the solution that the cliques below have seen, the turn against the clique's frame when
+# its constraints were last looked at, square roots of the information that the node's constraints
+# have on position and on heading
+POSE, REF, DELTA, SEEN, LOOKED, STIFF_T, STIFF_R, NODE_F = 0, 3, 6, 9, 12, 13, 14, 15
 # node_i: clique that it is frontal in; heads of the lists of edges (2 * edge + side) and of
 # observed nodes; whether it is fixed; whether it is a seed of the next elimination; index in a
 # front and the stamp that makes it valid; stamp of the last change that matters; undo log of the
@@ -60,8 +61,9 @@ OBS_NODE, OBS_NEXT, OBS_KIND, OBS_CHECKED, OBS_WAITS, OBS_UNDO, OBS_I = range(7)
  CLIQUE_UNDO, COUNT, ANCHORED, CLIQUE_I) = range(15)
 # clique_f: angle of the clique's frame in the map; that which the parent was eliminated with; mean
 # solution of the headings of the separator when the clique was eliminated; squared error of the
-# parent's model of what it has turned since (see `frames`)
-TURN, TURN_SEEN, TURN_ZERO, SLIP_ERROR2, CLIQUE_F = range(5)
+# parent's model of what it has turned since; how stiff the update matrix is against that, about
+# (see `frames`)
+TURN, TURN_SEEN, TURN_ZERO, SLIP_ERROR2, SLIP_STIFF, CLIQUE_F = range(6)
 
 FLOAT_TABLES: Final = {'node_f': NODE_F, 'edge_f': EDGE_F, 'observed_f': OBS_F, 'pool_f': 1,
                        'log_f': 1, 'work_f': 1, 'scalars': 1, 'clique_f': CLIQUE_F}
