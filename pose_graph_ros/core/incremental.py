@@ -19,6 +19,7 @@ from pose_graph_ros.core import (
     back_substitution,
     chain,
     elimination,
+    gauss_newton,
     marginals,
     rescue,
     se2,
@@ -197,7 +198,8 @@ class IncrementalSmoother:
 
     def chi2(self) -> float:
         """Return the energy of all constraints; takes time in proportion to the graph."""
-        return self.graph.energies().chi2
+        gradient = np.empty((self.graph.n_nodes, 3))
+        return float(gauss_newton.evaluate(self._memory.head, gradient)[0])
 
     def _solve_extended(self) -> UpdateResult:
         """Solve after a chain was extended by an observed node."""

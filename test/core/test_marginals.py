@@ -255,7 +255,7 @@ def test_edits_that_were_not_solved_for_are_waited_for() -> None:
         with pytest.raises(ValueError, match='4 hidden nodes that wait'):
             ask()
     assert not marginals.newest_covariance(smoother.graph.memory.head, np.empty((3, 3)))
-    with pytest.raises(ValueError, match='newest_covariance'):
+    with pytest.raises(ValueError, match='4 hidden nodes that wait'):
         smoother.newest_covariance()
     smoother.update(GraphUpdate())
     assert smoother.covariances().shape == (4, 3, 3)
