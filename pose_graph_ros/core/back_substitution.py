@@ -50,6 +50,7 @@ def _move(head, v, dx, dy, dth, phi, alpha):  # type: ignore[no-untyped-def]
         return 0
     f[tb.SEEN], f[tb.SEEN + 1], f[tb.SEEN + 2] = dx, dy, dth
     node_i[v, tb.CHANGED] = head[tb.ITERATION]
+    tb.scalars(head)[tb.N_MOVED] += 1.0
     # about the squared linearization error that the turn since the last look makes
     bent = (dth - phi - f[tb.LOOKED]) ** 2
     error2 = bent * (bent * f[tb.STIFF_R] * f[tb.STIFF_R] + USUAL_ENERGY)
@@ -156,6 +157,7 @@ def _back_substitute(head, alpha):  # type: ignore[no-untyped-def]
     depth, n_looks, n_visited = head[tb.N_ROOTS], 0, 0
     iteration = head[tb.ITERATION]
     head[tb.N_TURNED] = 0
+    tb.scalars(head)[tb.N_MOVED] = 0.0
     while depth > 0:
         depth -= 1
         c = stack[depth]
@@ -191,7 +193,6 @@ def _look_at_edge(head, e):  # type: ignore[no-untyped-def]
     scalars[tb.CHI2] -= f[tb.ENERGY]
     factors.check_edge(head, e, tb.clique_f(head)[tb.edge_i(head)[e, tb.OWNER], tb.TURN])
     scalars[tb.CHI2] += f[tb.ENERGY]
-    scalars[tb.N_LOOKED] += 1.0
     scalars[tb.ERROR2_SUM] += f[tb.ERROR2]
     if f[tb.ERROR2] > LEAST_SHARE * scalars[tb.SETTING_SHARE] and edge_i[e, tb.EDGE_WAITS] == 0:
         edge_i[e, tb.EDGE_WAITS] = 1
@@ -207,7 +208,6 @@ def _look_at_observed(head, k):  # type: ignore[no-untyped-def]
     scalars[tb.CHI2] -= f[tb.OBS_ENERGY]
     factors.check_observed(head, k)
     scalars[tb.CHI2] += f[tb.OBS_ENERGY]
-    scalars[tb.N_LOOKED] += 1.0
     scalars[tb.ERROR2_SUM] += f[tb.OBS_ERROR2]
     if (f[tb.OBS_ERROR2] > LEAST_SHARE * scalars[tb.SETTING_SHARE]
             and observed_i[k, tb.OBS_WAITS] == 0):
@@ -227,7 +227,7 @@ def _look(head):  # type: ignore[no-untyped-def]
     work_i = tb.work_i(head)
     iteration = head[tb.ITERATION]
     looks = work_i[head[tb.N_NODES]:]
-    scalars[tb.N_LOOKED] = scalars[tb.ERROR2_SUM] = 0.0
+    scalars[tb.ERROR2_SUM] = 0.0
     for n in range(head[tb.N_CHANGED]):
         v = looks[n]
         entry = node_i[v, tb.EDGE_LIST]
@@ -256,7 +256,6 @@ def _look_at_turned(head):  # type: ignore[no-untyped-def]
         slip = frames.frame_slip(head, c)
         error2 = frames.interface_error2(head, c, slip, tb.work_f(head))
         scalars[tb.ERROR2_SUM] += error2
-        scalars[tb.N_LOOKED] += 1.0
         if error2 > LEAST_SHARE * scalars[tb.SETTING_SHARE]:
             clique_f[c, tb.SLIP_ERROR2] = error2
             turned[kept] = c
@@ -360,7 +359,7 @@ def _bin(ratio):  # type: ignore[no-untyped-def]
 def _budget(head):  # type: ignore[no-untyped-def]
     """Return the squared linearization error that a step may leave."""
     scalars = tb.scalars(head)
-    return min(scalars[tb.SETTING_BUDGET], scalars[tb.SETTING_SHARE] * scalars[tb.N_LOOKED])
+    return min(scalars[tb.SETTING_BUDGET], scalars[tb.SETTING_SHARE] * scalars[tb.N_MOVED])
 
 
 @kernel

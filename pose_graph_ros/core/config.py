@@ -134,7 +134,7 @@ class SmootherConfig:
     budget: float = 0.005
     """Squared linearization error [sigma^2] that a step may leave in all that it has moved ..."""
     budget_share: float = 8e-6
-    """... and for each constraint that it has moved: the smaller of both counts."""
+    """... and for each node that it has moved: the smaller of both counts."""
     max_iterations: int = 5
     """Iterations of one update at the most; what is left over is done in the next."""
 
