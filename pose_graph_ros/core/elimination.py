@@ -19,6 +19,9 @@ from pose_graph_ros.core.structure import amalgamate, newest_last, structure
 
 # Answers of the kernels.
 DONE, MORE_MEMORY, BAD_PIVOT = range(3)
+# Cliques are joined if that stores at most so many zero blocks, up to so many frontal nodes.
+RELAXED_ZEROS = 6
+RELAXED_FRONTAL = 16
 
 
 @kernel
@@ -104,7 +107,8 @@ def rebuild(head, marked, affected):  # type: ignore[no-untyped-def]
     orphans, start, adjacency = structure(head, marked, affected)
     n_cliques, offset, n_frontal, parent, nodes = minimum_degree(
         len(affected), len(orphans), n_last, start, adjacency)
-    into, frontal = amalgamate(n_cliques, n_frontal, offset, parent)
+    into, frontal = amalgamate(
+        n_cliques, n_frontal, offset, parent, RELAXED_ZEROS, RELAXED_FRONTAL)
     need_f, need_i, largest = np.int64(0), np.int64(0), np.int64(0)
     for k in range(n_cliques):
         if into[k] == k:

@@ -9,9 +9,6 @@ from pose_graph_ros.core.jit import kernel
 
 # So many of the newest nodes are eliminated last: the next constraints will touch them.
 NEWEST_LAST = 10
-# Cliques are joined if that stores at most so many zero blocks, up to so many frontal nodes.
-RELAXED_ZEROS = 6
-RELAXED_FRONTAL = 16
 
 
 @kernel
@@ -130,9 +127,13 @@ def structure(head, marked, affected):  # type: ignore[no-untyped-def]
 
 
 @kernel
-def amalgamate(n_cliques, n_frontal, offset, parent):  # type: ignore[no-untyped-def]
+def amalgamate(  # type: ignore[no-untyped-def]
+    n_cliques, n_frontal, offset, parent, most_zeros, most_frontal,
+):
     """
-    Join cliques to their parents where that stores few zeros; the last one stays alone.
+    Join cliques to their parents where that stores few zero blocks, up to so many frontal nodes.
+
+    The last one, that of the newest node, stays alone: the next edge will touch it.
 
     Returns
     -------
@@ -152,7 +153,7 @@ def amalgamate(n_cliques, n_frontal, offset, parent):  # type: ignore[no-untyped
         separator = offset[k + 1] - offset[k] - n_frontal[k]
         width = frontal[q] + offset[q + 1] - offset[q] - n_frontal[q]
         added = zeros[k] + zeros[q] + frontal[k] * (width - separator)
-        if added <= RELAXED_ZEROS and frontal[k] + frontal[q] <= RELAXED_FRONTAL:
+        if added <= most_zeros and frontal[k] + frontal[q] <= most_frontal:
             into[k] = q
             frontal[q] += frontal[k]
             zeros[q] = added

@@ -18,7 +18,7 @@ from pose_graph_ros.core import tables as tb, undo
 from pose_graph_ros.core.assembly import work_size
 from pose_graph_ros.core.jit import kernel
 from pose_graph_ros.core.ordering import minimum_degree
-from pose_graph_ros.core.structure import NEWEST_LAST, structure
+from pose_graph_ros.core.structure import amalgamate, NEWEST_LAST, structure
 
 # Cliques are joined if that stores at most so many zero blocks, up to so many frontal nodes: more
 # than while driving, as here every clique is met in every iteration.
@@ -68,7 +68,8 @@ def _adjacency(head):  # type: ignore[no-untyped-def]
 def _arranged(n, eliminated):  # type: ignore[no-untyped-def]
     """Return the cliques that `minimum_degree` has found, joined where that is of use."""
     n_raw, offset, raw_frontal, raw_parent, raw_nodes = eliminated
-    into = _amalgamated(n_raw, raw_frontal, offset, raw_parent)
+    into, _ = amalgamate(
+        n_raw, raw_frontal, offset, raw_parent, RELAXED_ZEROS, RELAXED_FRONTAL)
     raw_order = _postorder(n_raw, into, raw_parent)
     n_cliques = len(raw_order)
     place = np.full(n_raw, -1, np.int32)
@@ -112,30 +113,6 @@ def _needs(cliques):  # type: ignore[no-untyped-def]
         need_i += undo.rounded(n_all)
         largest = max(largest, work_size(n_all))
     return need_f, need_i, largest
-
-
-@kernel
-def _amalgamated(n_cliques, n_frontal, offset, parent):  # type: ignore[no-untyped-def]
-    """Return for each clique the one that it becomes a part of: itself, or a later one."""
-    into = np.arange(n_cliques).astype(np.int32)
-    frontal = n_frontal[:n_cliques].copy()
-    zeros = np.zeros(n_cliques, np.int32)
-    for k in range(n_cliques - 1):
-        q = parent[k]
-        # the last clique, that of the newest node, stays alone: the next edge will touch it
-        if q < 0 or q == n_cliques - 1:
-            continue
-        separator = offset[k + 1] - offset[k] - n_frontal[k]
-        width = frontal[q] + offset[q + 1] - offset[q] - n_frontal[q]
-        added = zeros[k] + zeros[q] + frontal[k] * (width - separator)
-        joined = frontal[k] + frontal[q]
-        if added <= RELAXED_ZEROS and joined <= RELAXED_FRONTAL:
-            into[k] = q
-            frontal[q] += frontal[k]
-            zeros[q] = added
-    for k in range(n_cliques - 1, -1, -1):
-        into[k] = into[into[k]]
-    return into
 
 
 @kernel
