@@ -15,6 +15,7 @@ from pose_graph_ros.core import factors, rows, tables as tb, undo
 from pose_graph_ros.core.cholesky import LEAST_PIVOT
 from pose_graph_ros.core.editing import stiffen_by_edge, stiffen_by_observed
 from pose_graph_ros.core.jit import kernel
+from pose_graph_ros.core.vectors import copy
 
 # Answers of `extend`.
 EXTENDED, NO_ROOM, NOT_A_CHAIN = range(3)
@@ -186,7 +187,7 @@ def extend(  # type: ignore[no-untyped-def]
     undo.give_nodes(head, nodes, 1)
     r = undo.take_clique(head, 1, 0)
     pool_i[clique_i[r, tb.NODES]] = v
-    pool_f[clique_i[r, tb.VALUES]:clique_i[r, tb.VALUES] + _ROOT] = root
+    copy(root, 0, pool_f, clique_i[r, tb.VALUES], _ROOT)
     clique_i[r, tb.CHILD] = c
     clique_i[r, tb.ANCHORED] = 1 if with_observed else old[tb.ANCHORED]
     for m in range(tb.CLIQUE_F):
@@ -195,7 +196,7 @@ def extend(  # type: ignore[no-untyped-def]
     old[tb.NODES], old[tb.VALUES] = undo.take_nodes(head, 2), undo.take_values(head, _PAIR)
     pool_i[old[tb.NODES]], pool_i[old[tb.NODES] + 1] = last, v
     at = old[tb.VALUES]
-    pool_f[at:at + 21] = front[:21]
+    copy(front, 0, pool_f, at, 21)
     for m in range(3):
         for n in range(4):
             pool_f[at + 21 + 4 * m + n] = front[7 * (m + 3) + n + 3]

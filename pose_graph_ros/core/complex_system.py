@@ -45,7 +45,7 @@ class _Front(NamedTuple):
     ld: Any
 
 
-@kernel
+@kernel(allocates=True)
 def solve(head, cliques, terms):  # type: ignore[no-untyped-def]
     """
     Solve for all nodes.
@@ -106,7 +106,7 @@ def solve(head, cliques, terms):  # type: ignore[no-untyped-def]
     return v, -1
 
 
-@kernel
+@kernel(allocates=True)
 def _sizes(cliques):  # type: ignore[no-untyped-def]
     """
     Return how much room everything takes.
@@ -140,7 +140,7 @@ def _sizes(cliques):  # type: ignore[no-untyped-def]
     return widest, n_values, update_size, deepest
 
 
-@kernel
+@kernel(allocates=True)
 def _least_pivots(head, terms):  # type: ignore[no-untyped-def]
     """Return what the pivot of each node must be larger than, by the sum of its weights."""
     node_i, edge_i, observed_i = tb.node_i(head), tb.edge_i(head), tb.observed_i(head)
@@ -156,7 +156,7 @@ def _least_pivots(head, terms):  # type: ignore[no-untyped-def]
     return least
 
 
-@kernel
+@kernel(allocates=True)
 def _add_constraints(head, list_, rows, terms, front):  # type: ignore[no-untyped-def]
     """Add the constraints of the frontal nodes to a front."""
     node_i, edge_i, observed_i = tb.node_i(head), tb.edge_i(head), tb.observed_i(head)
@@ -204,7 +204,7 @@ def _add_constraints(head, list_, rows, terms, front):  # type: ignore[no-untype
             entry = observed_i[entry, tb.OBS_NEXT]
 
 
-@kernel
+@kernel(allocates=True)
 def _put_update(front, rows, width, update):  # type: ignore[no-untyped-def]
     """Write what is left of a front: rows of n + 1 numbers, the real parts first."""
     n, ld = width - rows, front.ld
@@ -218,7 +218,7 @@ def _put_update(front, rows, width, update):  # type: ignore[no-untyped-def]
         update[to + half - 1] = front.im[(rows + i + 1) * ld - 1]
 
 
-@kernel
+@kernel(allocates=True)
 def _add_update(head, separator, update, front):  # type: ignore[no-untyped-def]
     """Add the update matrix of a child; its separator is sorted as the front is."""
     node_i = tb.node_i(head)
@@ -244,7 +244,7 @@ def _add_update(head, separator, update, front):  # type: ignore[no-untyped-def]
         im[row + ld - 1] += update[half + a * (n + 1) + n]
 
 
-@kernel
+@kernel(allocates=True)
 def _factorize(list_, rows, least, front):  # type: ignore[no-untyped-def]
     """Factorise the frontal rows of a front in place; return a node with a bad pivot, or -1."""
     for i in range(len(list_)):
@@ -254,7 +254,7 @@ def _factorize(list_, rows, least, front):  # type: ignore[no-untyped-def]
     return -1
 
 
-@kernel
+@kernel(allocates=True)
 def _hold_fixed(head, list_, rows, known, front):  # type: ignore[no-untyped-def]
     """Put the known values of the fixed ones of the frontal nodes in."""
     node_i = tb.node_i(head)
@@ -263,7 +263,7 @@ def _hold_fixed(head, list_, rows, known, front):  # type: ignore[no-untyped-def
             _hold(i, known[list_[i]], front, len(list_))
 
 
-@kernel
+@kernel(allocates=True)
 def _hold(r, known, front, width):  # type: ignore[no-untyped-def]
     """Put the known value of row r in: its column goes to the right-hand side."""
     re, im, ld = front
@@ -282,7 +282,7 @@ def _hold(r, known, front, width):  # type: ignore[no-untyped-def]
     re[r * ld + right], im[r * ld + right] = x, y
 
 
-@kernel
+@kernel(allocates=True)
 def _take_off(front, i, n_rows):  # type: ignore[no-untyped-def]
     """Take the finished rows, 0 to n_rows - 1, off row i: conj(r_ki) r_k each."""
     re, im, ld = front
@@ -308,7 +308,7 @@ def _take_off(front, i, n_rows):  # type: ignore[no-untyped-def]
             store(im, target + m, less(less(load(im, target + m), a, y), b_, x))
 
 
-@kernel
+@kernel(allocates=True)
 def _scale(front, i, least):  # type: ignore[no-untyped-def]
     """Divide row i by the root of its pivot, whose reciprocal is kept; False if too small."""
     re, im, ld = front
@@ -325,7 +325,7 @@ def _scale(front, i, least):  # type: ignore[no-untyped-def]
     return True
 
 
-@kernel
+@kernel(allocates=True)
 def _solve_rows(re, im, rows, list_, v):  # type: ignore[no-untyped-def]
     """Solve the rows of R of a clique from the last to the first."""
     width = len(list_)

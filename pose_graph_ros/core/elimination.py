@@ -34,7 +34,7 @@ def add_seed(head, v):  # type: ignore[no-untyped-def]
         head[tb.N_SEEDS] += 1
 
 
-@kernel
+@kernel(allocates=True)
 def mark(head):  # type: ignore[no-untyped-def]
     """
     Mark the cliques from all seeds to the roots.
@@ -85,7 +85,7 @@ def mark(head):  # type: ignore[no-untyped-def]
     return marked[:n_marked], affected
 
 
-@kernel
+@kernel(allocates=True)
 def rebuild(head, marked, affected):  # type: ignore[no-untyped-def]
     """
     Replace the marked cliques: order the affected nodes anew and eliminate them.
@@ -232,7 +232,7 @@ def _find_roots(head, cliques):  # type: ignore[no-untyped-def]
     head[tb.N_ROOTS] = n_roots
 
 
-@kernel
+@kernel(allocates=True)
 def eliminate(head):  # type: ignore[no-untyped-def]
     """
     Eliminate again what the seeds touch; there are none afterwards.

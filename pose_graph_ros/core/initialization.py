@@ -67,7 +67,7 @@ def chordal_poses(head: tb.IntHead, cliques: symbolic.Cliques) -> FloatArray:
     return np.asarray(_poses(head, u, t))
 
 
-@kernel
+@kernel(allocates=True)
 def _rotation_terms(head):  # type: ignore[no-untyped-def]
     """Return what asks for u_j = exp(i th_z) u_i and u_i = exp(i (th_z - th_o))."""
     node_f, edge_f, observed_f = tb.node_f(head), tb.edge_f(head), tb.observed_f(head)
@@ -90,7 +90,7 @@ def _rotation_terms(head):  # type: ignore[no-untyped-def]
     return Terms(of_edges, of_observed, known)
 
 
-@kernel
+@kernel(allocates=True)
 def _translation_terms(head, u):  # type: ignore[no-untyped-def]
     """Return what asks for t_j = t_i + u_i t_z and t_i = t_z - u_i t_o, as complex numbers."""
     node_f, edge_f, observed_f = tb.node_f(head), tb.edge_f(head), tb.observed_f(head)
@@ -115,7 +115,7 @@ def _translation_terms(head, u):  # type: ignore[no-untyped-def]
     return Terms(of_edges, of_observed, known)
 
 
-@kernel
+@kernel(allocates=True)
 def _poses(head, u, t):  # type: ignore[no-untyped-def]
     """Return the start, shape (N, 3); fixed nodes are where they are."""
     node_f, node_i = tb.node_f(head), tb.node_i(head)

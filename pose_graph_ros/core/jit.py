@@ -26,6 +26,8 @@ from pose_graph_ros.core.kernel_cache import KernelCache
 Function = Callable[..., Any]
 
 OPTIONS = MappingProxyType({'nogil': True, 'error_model': 'numpy', 'no_cfunc_wrapper': True})
+# Counting references to arrays, which is what Numba's run time is for, took a fifth of the time.
+BORROWS = MappingProxyType({'_nrt': False})
 
 _registered: dict[str, Dispatcher] = {}
 
@@ -35,23 +37,29 @@ def kernel(function: Function) -> Function: ...
 
 
 @overload
-def kernel(**options: Any) -> Callable[[Function], Function]: ...
+def kernel(*, allocates: bool = False, **options: Any) -> Callable[[Function], Function]: ...
 
 
-def kernel(function: Any = None, **options: Any) -> Any:
+def kernel(
+    function: Function | None = None, *, allocates: bool = False, **options: Any,
+) -> Any:
     """
     Compile a function at its first call with each signature: `@kernel`, `@kernel(fastmath=True)`.
 
     Parameters
     ----------
     function : callable
+    allocates : bool
+        Whether it makes arrays, or is handed back one that another kernel has made: only then are
+        references counted. Without it all arrays are those of the caller or of `tables`.
     **options
         Those of `numba.njit`, on top of `OPTIONS`.
 
     """
     if function is None:
-        return lambda function: kernel(function, **options)
-    compiled = numba.njit(**{**OPTIONS, **options})(function)
+        return lambda function: kernel(function, allocates=allocates, **options)
+    ownership = {} if allocates else BORROWS
+    compiled = numba.njit(**{**OPTIONS, **ownership, **options})(function)
     if isinstance(compiled, Dispatcher):    # NUMBA_DISABLE_JIT=1 leaves functions as they are
         _widen_calls(compiled)
         if options.get('inline') != 'always':   # such a one is compiled as a part of others alone

@@ -88,7 +88,7 @@ def _require_node(graph: Graph, node: Any) -> None:
         raise ValueError(f'covariances: expected {expected}, got {node}')
 
 
-@kernel
+@kernel(allocates=True)
 def newest_covariance(head, out):  # type: ignore[no-untyped-def]
     """
     Write the covariance of the newest node, shape (3, 3): at once where it is alone in a root.
@@ -123,7 +123,7 @@ def newest_covariance(head, out):  # type: ignore[no-untyped-def]
     return True
 
 
-@kernel
+@kernel(allocates=True)
 def node_covariance(head, v, out):  # type: ignore[no-untyped-def]
     """Write the covariance, shape (3, 3), of a node."""
     way, n_rows = _way_up(head, v)
@@ -131,7 +131,7 @@ def node_covariance(head, v, out):  # type: ignore[no-untyped-def]
     _product(y, y, n_rows, out)
 
 
-@kernel
+@kernel(allocates=True)
 def pair_covariance(head, i, j, out):  # type: ignore[no-untyped-def]
     """Write the joint covariance, shape (6, 6), of two nodes; `out` holds zeros."""
     clique_i = tb.clique_i(head)
@@ -151,7 +151,7 @@ def pair_covariance(head, i, j, out):  # type: ignore[no-untyped-def]
             out[3 + n, m] = out[m, 3 + n]
 
 
-@kernel
+@kernel(allocates=True)
 def _way_up(head, v):  # type: ignore[no-untyped-def]
     """Return the cliques from that of a node to its root, and how many frontal rows they have."""
     node_i, clique_i = tb.node_i(head), tb.clique_i(head)
@@ -169,7 +169,7 @@ def _way_up(head, v):  # type: ignore[no-untyped-def]
     return way, n_rows
 
 
-@kernel
+@kernel(allocates=True)
 def _solution(head, v, way, n_rows):  # type: ignore[no-untyped-def]
     """
     Solve R^T Y = E for a node.
@@ -230,7 +230,7 @@ def _solution(head, v, way, n_rows):  # type: ignore[no-untyped-def]
     return y
 
 
-@kernel
+@kernel(allocates=True)
 def _cleared(vectors, n):  # type: ignore[no-untyped-def]
     """Return vectors that hold n zeros each, the same ones if they are long enough."""
     if vectors.shape[1] < n:
@@ -239,7 +239,7 @@ def _cleared(vectors, n):  # type: ignore[no-untyped-def]
     return vectors
 
 
-@kernel(fastmath=_FAST)
+@kernel(allocates=True, fastmath=_FAST)
 def _solve_block(three, k, rhs, y):  # type: ignore[no-untyped-def]
     """Solve for the three rows of R from row k on, and take them off the right-hand sides."""
     n = len(three) // 3 - 1
@@ -254,7 +254,7 @@ def _solve_block(three, k, rhs, y):  # type: ignore[no-untyped-def]
             third[q] -= c * row[q]
 
 
-@kernel(fastmath=_FAST)
+@kernel(allocates=True, fastmath=_FAST)
 def _product(a, b, n, out):  # type: ignore[no-untyped-def]
     """Write the 3x3 products of the last n entries of the rows of a with those of b."""
     for i in range(3):

@@ -18,7 +18,7 @@ import numpy as np
 from pose_graph_ros.core.jit import kernel
 
 
-@kernel
+@kernel(allocates=True)
 def _grown(array, size):  # type: ignore[no-untyped-def]
     grown = np.empty(max(size, 2 * len(array)), np.int32)
     grown[:len(array)] = array
@@ -55,7 +55,7 @@ def _put(i, member, nodes, end):  # type: ignore[no-untyped-def]
     return end
 
 
-@kernel
+@kernel(allocates=True)
 def minimum_degree(n, n_elements, n_last, start, adjacency):  # type: ignore[no-untyped-def]
     """
     Order n nodes and return the cliques of the elimination, children before parents.

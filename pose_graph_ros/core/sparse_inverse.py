@@ -22,7 +22,7 @@ from pose_graph_ros.core.jit import kernel
 _FAST = {'reassoc', 'contract', 'nsz'}
 
 
-@kernel
+@kernel(allocates=True)
 def all_covariances(head, out):  # type: ignore[no-untyped-def]
     """
     Write the covariances, shape (N, 3, 3), of all nodes.
@@ -79,7 +79,7 @@ def all_covariances(head, out):  # type: ignore[no-untyped-def]
                 child = clique_i[child, tb.SIBLING]
 
 
-@kernel
+@kernel(allocates=True)
 def _turn(block, size, angle):  # type: ignore[no-untyped-def]
     """Express a covariance in axes in which vectors have this much larger angles."""
     cos, sin = math.cos(angle), math.sin(angle)
@@ -95,12 +95,12 @@ def _turn(block, size, angle):  # type: ignore[no-untyped-def]
             row[q], row[q + 1] = cos * x - sin * y, sin * x + cos * y
 
 
-@kernel
+@kernel(allocates=True)
 def _room(work, n):  # type: ignore[no-untyped-def]
     return work if len(work) >= n else np.empty(2 * n)
 
 
-@kernel
+@kernel(allocates=True)
 def _put_separator(block, inverse, n, rest):  # type: ignore[no-untyped-def]
     """Copy Z_ss to the end of the inverse of a clique."""
     rows = n - rest
@@ -111,7 +111,7 @@ def _put_separator(block, inverse, n, rest):  # type: ignore[no-untyped-def]
             target[q] = source[q]
 
 
-@kernel
+@kernel(allocates=True)
 def _take_separator(head, child, inverse, n, block):  # type: ignore[no-untyped-def]
     """Copy what a child needs of the inverse of its parent, whose nodes have their indices set."""
     node_i, clique_i, pool_i = tb.node_i(head), tb.clique_i(head), tb.pool_i(head)
@@ -131,7 +131,7 @@ def _take_separator(head, child, inverse, n, block):  # type: ignore[no-untyped-
                     block[(3 * b + q) * size + 3 * a + m] = x
 
 
-@kernel
+@kernel(allocates=True)
 def _invert_clique(head, row, inverse, product, out):  # type: ignore[no-untyped-def]
     """Fill the inverse of a clique, whose separator is there, from its last node to its first."""
     pool_f, node_i, pool_i = tb.pool_f(head), tb.node_i(head), tb.pool_i(head)
@@ -152,7 +152,7 @@ def _invert_clique(head, row, inverse, product, out):  # type: ignore[no-untyped
         _finish_block(three, k, inverse, product, out[v])
 
 
-@kernel(fastmath=_FAST)
+@kernel(allocates=True, fastmath=_FAST)
 def _multiply(three, k, inverse, product):  # type: ignore[no-untyped-def]
     """Set `product` to three rows of R, right of their block at k, times the inverse."""
     n = len(three) // 3 - 1
@@ -192,7 +192,7 @@ def _multiply(three, k, inverse, product):  # type: ignore[no-untyped-def]
             j += 3
 
 
-@kernel(fastmath=_FAST)
+@kernel(allocates=True, fastmath=_FAST)
 def _finish_block(three, k, inverse, product, out):  # type: ignore[no-untyped-def]
     """Solve with the 3x3 block of R at k; write the rows and columns of its node, and `out`."""
     n = len(three) // 3 - 1

@@ -26,7 +26,7 @@ def newest_last(affected):  # type: ignore[no-untyped-def]
     return n_last
 
 
-@kernel
+@kernel(allocates=True)
 def structure(head, marked, affected):  # type: ignore[no-untyped-def]
     """
     Return the graph that is to be ordered: the affected nodes, the orphans as elements.
@@ -126,7 +126,7 @@ def structure(head, marked, affected):  # type: ignore[no-untyped-def]
     return orphans, start, adjacency
 
 
-@kernel
+@kernel(allocates=True)
 def amalgamate(  # type: ignore[no-untyped-def]
     n_cliques, n_frontal, offset, parent, most_zeros, most_frontal,
 ):

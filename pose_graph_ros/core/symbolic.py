@@ -56,7 +56,7 @@ def analyse(head: tb.IntHead) -> Analysis:
     return Analysis(cliques, *_needs(cliques))
 
 
-@kernel
+@kernel(allocates=True)
 def _adjacency(head):  # type: ignore[no-untyped-def]
     """Return the graph of all nodes as `minimum_degree` takes it."""
     _, start, adjacency = structure(
@@ -64,7 +64,7 @@ def _adjacency(head):  # type: ignore[no-untyped-def]
     return start, adjacency
 
 
-@kernel
+@kernel(allocates=True)
 def _arranged(n, eliminated):  # type: ignore[no-untyped-def]
     """Return the cliques that `minimum_degree` has found, joined where that is of use."""
     n_raw, offset, raw_frontal, raw_parent, raw_nodes = eliminated
@@ -102,7 +102,7 @@ def _arranged(n, eliminated):  # type: ignore[no-untyped-def]
     return cliques
 
 
-@kernel
+@kernel(allocates=True)
 def _needs(cliques):  # type: ignore[no-untyped-def]
     """Return the memory that cliques take in both pools, and the work space of the largest."""
     need_f, need_i, largest = np.int64(0), np.int64(0), np.int64(0)
@@ -115,7 +115,7 @@ def _needs(cliques):  # type: ignore[no-untyped-def]
     return need_f, need_i, largest
 
 
-@kernel
+@kernel(allocates=True)
 def _postorder(n_cliques, into, parent):  # type: ignore[no-untyped-def]
     """Return the cliques that are left, children before parents, each subtree in one piece."""
     child = np.full(n_cliques, -1, np.int32)
@@ -145,7 +145,7 @@ def _postorder(n_cliques, into, parent):  # type: ignore[no-untyped-def]
     return order
 
 
-@kernel
+@kernel(allocates=True)
 def _put_separators(cliques, separators, raw_nodes, n):  # type: ignore[no-untyped-def]
     """Write the separators, each sorted by the order of elimination: two transpositions."""
     first, n_frontal, nodes = cliques.first, cliques.n_frontal, cliques.nodes
@@ -178,7 +178,7 @@ def _put_separators(cliques, separators, raw_nodes, n):  # type: ignore[no-untyp
             filled[holders[m]] += 1
 
 
-@kernel
+@kernel(allocates=True)
 def plant(head, cliques):  # type: ignore[no-untyped-def]
     """
     Replace all cliques in the tables by these, without values; there is room for them.
@@ -210,7 +210,7 @@ def plant(head, cliques):  # type: ignore[no-untyped-def]
     head[tb.LOG_F_END] = head[tb.LOG_I_END] = head[tb.N_FREED] = 0
 
 
-@kernel
+@kernel(allocates=True)
 def loose_part(head):  # type: ignore[no-untyped-def]
     """
     Look for parts of the graph that are tied to no fixed and no observed node.
@@ -249,7 +249,7 @@ def loose_part(head):  # type: ignore[no-untyped-def]
     return node, count
 
 
-@kernel
+@kernel(allocates=True)
 def _top(part, v):  # type: ignore[no-untyped-def]
     while part[v] != v:
         part[v] = part[part[v]]

@@ -13,14 +13,14 @@ Every kernel asks it for the tables that it works on, which costs nothing: `tb.n
 addresses are taken anew whenever a table grows, in `Memory.ensure` alone.
 """
 
+from collections.abc import Callable
 from typing import Any, Final
 
-from numba import carray, types
+from numba import types
 from numba.extending import intrinsic
+from numba.np.arrayobj import populate_array
 import numpy as np
 import numpy.typing as npt
-
-from pose_graph_ros.core.jit import kernel
 
 # --- columns ------------------------------------------------------------------------------------
 
@@ -106,129 +106,53 @@ STAMPS: Final = {
 IntHead = npt.NDArray[np.int64]
 
 
-def _pointer_to(number: types.Number) -> Any:
-    """Return an intrinsic that makes a pointer to such numbers from an address."""
+def _table(name: str) -> Callable[[Any], Any]:
+    """Return an intrinsic that makes a table's array from the head, without any call."""
+    at, number, columns = 2 * NAMES.index(name), types.int32, INT_TABLES.get(name, 0)
+    if name in FLOAT_TABLES:
+        number, columns = types.float64, FLOAT_TABLES[name]
+    array_type = types.Array(number, 1 if columns == 1 else 2, 'C')
+    size = number.bitwidth // 8
 
-    @intrinsic  # type: ignore[untyped-decorator]
-    def pointer(typing_context: Any, address: Any) -> Any:
+    def table(typing_context: Any, head: Any) -> Any:
         def codegen(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
-            return builder.inttoptr(
-                arguments[0], context.get_value_type(signature.return_type))
-        return types.CPointer(number)(types.int64), codegen
+            entries = context.make_array(signature.args[0])(context, builder, arguments[0]).data
+            address, rows = (
+                builder.load(builder.gep(entries, [context.get_constant(types.intp, at + k)]))
+                for k in range(2))
+            array = context.make_array(array_type)(context, builder)
+            rest = () if columns == 1 else (columns,)
+            shape = [rows, *(context.get_constant(types.intp, n) for n in rest)]
+            strides = [context.get_constant(types.intp, n)
+                       for n in (columns * size, *(size for _ in rest))]
+            populate_array(
+                array, builder.inttoptr(address, array.data.type), shape, strides,
+                context.get_constant(types.intp, size), None)
+            return array._getvalue()  # noqa: SLF001  as all of Numba does
+        return array_type(head), codegen
 
-    return pointer
-
-
-_floats = _pointer_to(types.float64)
-_integers = _pointer_to(types.int32)
-
-
-@kernel
-def node_f(head):  # type: ignore[no-untyped-def]
-    """Return this table."""
-    return carray(_floats(head[0]), (head[1], NODE_F))
-
-
-@kernel
-def edge_f(head):  # type: ignore[no-untyped-def]
-    """Return this table."""
-    return carray(_floats(head[2]), (head[3], EDGE_F))
+    made: Callable[[Any], Any] = intrinsic(table)
+    return made
 
 
-@kernel
-def observed_f(head):  # type: ignore[no-untyped-def]
-    """Return this table."""
-    return carray(_floats(head[4]), (head[5], OBS_F))
-
-
-@kernel
-def pool_f(head):  # type: ignore[no-untyped-def]
-    """Return this table."""
-    return carray(_floats(head[6]), (head[7],))
-
-
-@kernel
-def log_f(head):  # type: ignore[no-untyped-def]
-    """Return this table."""
-    return carray(_floats(head[8]), (head[9],))
-
-
-@kernel
-def work_f(head):  # type: ignore[no-untyped-def]
-    """Return this table."""
-    return carray(_floats(head[10]), (head[11],))
-
-
-@kernel
-def scalars(head):  # type: ignore[no-untyped-def]
-    """Return this table."""
-    return carray(_floats(head[12]), (head[13],))
-
-
-@kernel
-def clique_f(head):  # type: ignore[no-untyped-def]
-    """Return this table."""
-    return carray(_floats(head[14]), (head[15], CLIQUE_F))
-
-
-@kernel
-def node_i(head):  # type: ignore[no-untyped-def]
-    """Return this table."""
-    return carray(_integers(head[16]), (head[17], NODE_I))
-
-
-@kernel
-def edge_i(head):  # type: ignore[no-untyped-def]
-    """Return this table."""
-    return carray(_integers(head[18]), (head[19], EDGE_I))
-
-
-@kernel
-def observed_i(head):  # type: ignore[no-untyped-def]
-    """Return this table."""
-    return carray(_integers(head[20]), (head[21], OBS_I))
-
-
-@kernel
-def clique_i(head):  # type: ignore[no-untyped-def]
-    """Return this table."""
-    return carray(_integers(head[22]), (head[23], CLIQUE_I))
-
-
-@kernel
-def pool_i(head):  # type: ignore[no-untyped-def]
-    """Return this table."""
-    return carray(_integers(head[24]), (head[25],))
-
-
-@kernel
-def log_i(head):  # type: ignore[no-untyped-def]
-    """Return this table."""
-    return carray(_integers(head[26]), (head[27],))
-
-
-@kernel
-def work_i(head):  # type: ignore[no-untyped-def]
-    """Return this table."""
-    return carray(_integers(head[28]), (head[29],))
-
-
-@kernel
-def seeds(head):  # type: ignore[no-untyped-def]
-    """Return this table."""
-    return carray(_integers(head[30]), (head[31],))
-
-
-@kernel
-def freed(head):  # type: ignore[no-untyped-def]
-    """Return this table."""
-    return carray(_integers(head[32]), (head[33],))
-
-
-@kernel
-def waiting(head):  # type: ignore[no-untyped-def]
-    """Return this table."""
-    return carray(_integers(head[34]), (head[35],))
+node_f = _table('node_f')
+edge_f = _table('edge_f')
+observed_f = _table('observed_f')
+pool_f = _table('pool_f')
+log_f = _table('log_f')
+work_f = _table('work_f')
+scalars = _table('scalars')
+clique_f = _table('clique_f')
+node_i = _table('node_i')
+edge_i = _table('edge_i')
+observed_i = _table('observed_i')
+clique_i = _table('clique_i')
+pool_i = _table('pool_i')
+log_i = _table('log_i')
+work_i = _table('work_i')
+seeds = _table('seeds')
+freed = _table('freed')
+waiting = _table('waiting')
 
 
 class Memory:

@@ -289,11 +289,12 @@ def undo(head):  # type: ignore[no-untyped-def]
                 _give_clique(head, row)
         elif code == SOLUTION:
             end_f -= tb.STIFF_T
-            node_f[row, :tb.STIFF_T] = log_f[end_f:end_f + tb.STIFF_T]
+            for k in range(tb.STIFF_T):
+                node_f[row, k] = log_f[end_f + k]
         elif code == EDGE_ENERGY:
             end_f -= 2
             end_i -= 1
-            edge_f[row, tb.ERROR2:tb.ENERGY + 1] = log_f[end_f:end_f + 2]
+            edge_f[row, tb.ERROR2], edge_f[row, tb.ENERGY] = log_f[end_f], log_f[end_f + 1]
             edge_i[row, tb.EDGE_WAITS] = log_i[end_i]
         elif code == CLIQUE:
             end_i -= tb.CLIQUE_I

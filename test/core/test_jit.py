@@ -15,6 +15,7 @@ from types import ModuleType
 import numba
 from numba.core.caching import FunctionCache, NullCache
 from numba.core.dispatcher import Dispatcher
+from numba.core.runtime import _nrt_python, rtsys
 import numpy as np
 import pytest
 
@@ -143,6 +144,20 @@ def test_warm_up_can_be_stopped(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 # --- what is kept is used, and only if it is right ----------------------------------------------
+
+def test_kernels_free_every_array_that_they_make() -> None:
+    """Those that count no references must not be handed arrays to keep (`allocates`)."""
+    warm_up()
+    _nrt_python.memsys_enable_stats()
+    try:
+        before = rtsys.get_allocation_stats()
+        warm_up()
+        after = rtsys.get_allocation_stats()
+    finally:
+        _nrt_python.memsys_disable_stats()
+    assert after.alloc > before.alloc
+    assert after.alloc - before.alloc == after.free - before.free
+
 
 def test_second_start_takes_all_from_the_cache(folder: Path) -> None:
     first = start()
