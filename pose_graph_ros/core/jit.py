@@ -57,7 +57,11 @@ def kernel(
 
     """
     if function is None:
-        return lambda function: kernel(function, allocates=allocates, **options)
+        return lambda function: _compiled(function, allocates, options)
+    return _compiled(function, allocates, options)
+
+
+def _compiled(function: Function, allocates: bool, options: dict[str, Any]) -> Any:  # noqa: FBT001
     ownership = {} if allocates else BORROWS
     compiled = numba.njit(**{**OPTIONS, **ownership, **options})(function)
     if isinstance(compiled, Dispatcher):    # NUMBA_DISABLE_JIT=1 leaves functions as they are
