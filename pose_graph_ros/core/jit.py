@@ -61,7 +61,7 @@ def kernel(
     return _compiled(function, allocates, options)
 
 
-def _compiled(function: Function, allocates: bool, options: dict[str, Any]) -> Any:  # noqa: FBT001
+def _compiled(function: Function, allocates: bool, options: dict[str, Any]) -> Any:
     ownership = {} if allocates else BORROWS
     compiled = numba.njit(**{**OPTIONS, **ownership, **options})(function)
     if isinstance(compiled, Dispatcher):    # NUMBA_DISABLE_JIT=1 leaves functions as they are
