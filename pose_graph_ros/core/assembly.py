@@ -101,7 +101,7 @@ def eliminate_clique(head, c, afresh):  # type: ignore[no-untyped-def]
         anchored |= clique_i[child, tb.ANCHORED]
         child = clique_i[child, tb.SIBLING]
     row[tb.ANCHORED] = anchored
-    clique_f[c, tb.TURN] = clique_f[c, tb.TURN_SEEN] = 0.0
+    clique_f[c, tb.TURN_SEEN] = 0.0
     clique_f[c, tb.TURN_ZERO] = frames.mean_turn(head, c)
     if any_fixed:
         for k in range(n_frontal):
@@ -151,7 +151,7 @@ def _extend_add(head, child, front, ld):  # type: ignore[no-untyped-def]
     phi = frames.present_turn(head, child)
     if phi != clique_f[child, tb.TURN_SEEN]:
         undo.log_clique(head, child)
-    clique_f[child, tb.TURN] = clique_f[child, tb.TURN_SEEN] = phi
+    clique_f[child, tb.TURN_SEEN] = phi
     if phi != 0.0:
         turned = work_f[len(front) + len(front) // ld:]
         frames.turned_update(update, n_separator, nodes, node_f, phi, turned)

@@ -45,25 +45,30 @@ def forward_rows(values, rows, n, x):  # type: ignore[no-untyped-def]
 
 
 @kernel(fastmath=_FAST)
+def _backward_block(values, k, n, x, a, b, c):  # type: ignore[no-untyped-def]
+    """Solve the three rows of R from row k on for the right-hand sides a, b, c."""
+    ld = n + 1
+    r0 = values[k * ld:(k + 1) * ld]
+    r1 = values[(k + 1) * ld:(k + 2) * ld]
+    r2 = values[(k + 2) * ld:(k + 3) * ld]
+    for m in range(k + 3, n):
+        a -= r0[m] * x[m]
+        b -= r1[m] * x[m]
+        c -= r2[m] * x[m]
+    c *= r2[k + 2]
+    b = (b - r1[k + 2] * c) * r1[k + 1]
+    x[k] = (a - r0[k + 1] * b - r0[k + 2] * c) * r0[k]
+    x[k + 1], x[k + 2] = b, c
+
+
+@kernel
 def backward_rows(values, rows, n, x):  # type: ignore[no-untyped-def]
     """Solve `R x = y` as `solve_rows` does, y being the frontal part of x instead of a column."""
-    ld = n + 1
     for k in range(rows - 3, -1, -3):
-        r0 = values[k * ld:(k + 1) * ld]
-        r1 = values[(k + 1) * ld:(k + 2) * ld]
-        r2 = values[(k + 2) * ld:(k + 3) * ld]
-        a, b, c = x[k], x[k + 1], x[k + 2]
-        for m in range(k + 3, n):
-            a -= r0[m] * x[m]
-            b -= r1[m] * x[m]
-            c -= r2[m] * x[m]
-        c *= r2[k + 2]
-        b = (b - r1[k + 2] * c) * r1[k + 1]
-        x[k] = (a - r0[k + 1] * b - r0[k + 2] * c) * r0[k]
-        x[k + 1], x[k + 2] = b, c
+        _backward_block(values, k, n, x, x[k], x[k + 1], x[k + 2])
 
 
-@kernel(fastmath=_FAST)
+@kernel
 def solve_rows(values, rows, n, x):  # type: ignore[no-untyped-def]
     """
     Solve the rows of R of a clique from the last to the first.
@@ -76,6 +81,7 @@ def solve_rows(values, rows, n, x):  # type: ignore[no-untyped-def]
         Holds the solution of the separator from `rows` on; the frontal part is written.
 
     """
-    for k in range(rows):
-        x[k] = values[k * (n + 1) + n]
-    backward_rows(values, rows, n, x)
+    for k in range(rows - 3, -1, -3):
+        at = k * (n + 1) + n
+        _backward_block(
+            values, k, n, x, values[at], values[at + n + 1], values[at + 2 * (n + 1)])

@@ -131,9 +131,9 @@ class SmootherConfig:
 
     alpha: float = 0.02
     """A node that has moved by less than this many sigmas moves no other node."""
-    budget: float = 0.005
+    budget: float = 0.002
     """Squared linearization error [sigma^2] that a step may leave in all that it has moved ..."""
-    budget_share: float = 8e-6
+    budget_share: float = 6e-6
     """... and for each node that it has moved: the smaller of both counts."""
     max_iterations: int = 5
     """Iterations of one update at the most; what is left over is done in the next."""

@@ -122,6 +122,7 @@ def rebuild(head, marked, affected):  # type: ignore[no-untyped-def]
     if (head[tb.NEED_F] > len(pool_f) or head[tb.NEED_I] > len(pool_i)
             or largest > len(work_f)):
         return MORE_MEMORY
+    _hand_drift_on(head, marked, orphans)
     for k in range(len(marked)):
         undo.drop_clique(head, marked[k])
     # the rows of the new cliques; joined ones put their nodes in front of the others
@@ -157,6 +158,25 @@ def rebuild(head, marked, affected):  # type: ignore[no-untyped-def]
                 return BAD_PIVOT
     _find_roots(head, clique)
     return DONE
+
+
+@kernel
+def _hand_drift_on(head, marked, orphans):  # type: ignore[no-untyped-def]
+    """Give the orphans the drift of all cliques above them, which are about to go."""
+    clique_i, clique_f = tb.clique_i(head), tb.clique_f(head)
+    drifting = False
+    for k in range(len(marked)):
+        drifting = drifting or clique_f[marked[k], tb.DRIFT] > 0.0
+    if not drifting:
+        return
+    for k in range(len(orphans)):
+        drift, c = 0.0, clique_i[orphans[k], tb.PARENT]
+        while c >= 0:
+            drift += clique_f[c, tb.DRIFT]
+            c = clique_i[c, tb.PARENT]
+        if drift > 0.0:
+            undo.log_clique(head, orphans[k])
+            clique_f[orphans[k], tb.DRIFT] += drift
 
 
 @kernel

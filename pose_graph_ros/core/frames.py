@@ -146,7 +146,7 @@ def frame_slip(head, c):  # type: ignore[no-untyped-def]
     f, parent = clique_f[c], clique_i[c, tb.PARENT]
     if clique_i[c, tb.ANCHORED] != 0 or parent < 0:
         return 0.0
-    return f[tb.TURN] - f[tb.TURN_SEEN] - clique_f[parent, tb.TURN]
+    return present_turn(head, c) - f[tb.TURN_SEEN] - present_turn(head, parent)
 
 
 @kernel
@@ -158,14 +158,14 @@ def interface_error2(head, c, beta, work):  # type: ignore[no-untyped-def]
     coordinates v it only feels `w = ((1 - cos beta) + (beta - sin beta) S) v`; and its force
     g = U delta' - u has turned as well.
     """
-    clique_i, clique_f = tb.clique_i(head), tb.clique_f(head)
+    clique_i = tb.clique_i(head)
     pool_i, pool_f, node_f = tb.pool_i(head), tb.pool_f(head), tb.node_f(head)
     row = clique_i[c]
     n_frontal, n = row[tb.N_FRONTAL], row[tb.N_SEPARATOR]
     nodes = pool_i[row[tb.NODES] + n_frontal:row[tb.NODES] + n_frontal + n]
     ld = 3 * n + 1
     update = pool_f[row[tb.VALUES] + 3 * n_frontal * (3 * (n_frontal + n) + 1):]
-    phi = clique_f[c, tb.TURN]
+    phi = present_turn(head, c)
     cos, sin = math.cos(phi), math.sin(phi)
     first = node_f[nodes[0]]
     px, py = first[tb.POSE], first[tb.POSE + 1]

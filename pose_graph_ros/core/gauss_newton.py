@@ -16,9 +16,9 @@ import math
 
 from pose_graph_ros.core import factors, tables as tb
 from pose_graph_ros.core.assembly import eliminate_clique
-from pose_graph_ros.core.back_substitution import LEAST_SHARE
 from pose_graph_ros.core.cholesky import backward_rows, forward_rows, solve_rows
 from pose_graph_ros.core.jit import kernel
+from pose_graph_ros.core.relinearization import LEAST_SHARE
 
 # Relative rounding of a sum of many numbers and of a coordinate.
 SUM_ROUNDING = 1e-12

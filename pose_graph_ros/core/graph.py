@@ -200,7 +200,7 @@ class Graph:
             memory.ensure(name, 2 * nodes, keep=int(head[tb.N_CLIQUES]))
         memory.ensure('seeds', nodes, keep=int(head[tb.N_SEEDS]))
         memory.ensure('freed', 4 * nodes, keep=int(head[tb.N_FREED]))
-        memory.ensure('work_i', 3 * nodes)
+        memory.ensure('work_i', 4 * nodes)
         memory.ensure('waiting', edges + observed, keep=int(head[tb.N_WAITING]))
         memory.ensure('log_f', nodes * (tb.NODE_F + tb.STIFF_T + tb.CLIQUE_F)
                       + edges * (tb.EDGE_F + 2) + observed * tb.OBS_F,

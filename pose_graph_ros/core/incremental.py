@@ -5,7 +5,8 @@ The incremental smoother: an estimate of all poses that is kept up to date, step
 
 A step costs what it changes. What an edit touches is eliminated again, from there to the root of
 the tree of cliques (`elimination`); the solution is passed down as far as values move
-(`back_substitution`); what has become wrong by linearization is linearized again, and the loop
+(`back_substitution`); what has become wrong by linearization is linearized again
+(`relinearization`), and the loop
 goes on until the rest of that is below a budget. Along a chain a step is a constant amount of work
 (`chain`). `docs/solver.md` tells the whole story.
 """
@@ -16,11 +17,11 @@ from numba import types
 import numpy as np
 
 from pose_graph_ros.core import (
-    back_substitution,
     chain,
     elimination,
     gauss_newton,
     marginals,
+    relinearization,
     rescue,
     se2,
     tables as tb,
@@ -206,12 +207,12 @@ class IncrementalSmoother:
         head = self._memory.head
         head[tb.N_RELINEARIZED:tb.N_ITERATIONS + 1] = 0
         head[tb.N_ELIMINATED] = 1
-        if back_substitution.solve(head):
+        if relinearization.solve(head):
             return self._result(Status.CONVERGED)
         # the node has its place already, whatever becomes of the next iterations
         undo.commit(head)
         before = self.graph.begin()
-        back_substitution.relinearize(head)
+        relinearization.relinearize(head)
         result = self._step(before)
         return result._replace(status=Status.MAX_ITERATIONS) if result.reason else result
 
@@ -238,14 +239,14 @@ class IncrementalSmoother:
         if head[tb.N_WAITING] > 0:
             # what the last update has left over; the frames that had turned may be gone by now
             head[tb.N_TURNED] = 0
-            back_substitution.relinearize(head)
+            relinearization.relinearize(head)
         while head[tb.N_SEEDS] > 0:
             code = self._eliminate()
             if code == elimination.BAD_PIVOT:
                 reason = f'hidden node {head[tb.BAD_NODE]} is not determined'
                 self.graph.undo(before)
                 return UpdateResult(Status.FAILED, reason, 0, 0, 0, 0, NAN)
-            settled = bool(back_substitution.solve(head))
+            settled = bool(relinearization.solve(head))
             if settled:
                 break
             error2, error2_before = float(scalars[tb.ERROR2_SUM]), error2
@@ -257,7 +258,7 @@ class IncrementalSmoother:
                 return self._rescue(before)
             if out_of_iterations:
                 break
-            back_substitution.relinearize(head)
+            relinearization.relinearize(head)
         undo.commit(head)
         return self._result(Status.CONVERGED if settled else Status.MAX_ITERATIONS)
 

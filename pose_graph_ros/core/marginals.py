@@ -21,7 +21,7 @@ from typing import Any
 
 import numpy as np
 
-from pose_graph_ros.core import tables as tb
+from pose_graph_ros.core import frames, tables as tb
 from pose_graph_ros.core.graph import Graph
 from pose_graph_ros.core.jit import kernel
 from pose_graph_ros.core.se2 import FloatArray
@@ -183,7 +183,6 @@ def _solution(head, v, way, n_rows):  # type: ignore[no-untyped-def]
     pool_f = tb.pool_f(head)
     node_i = tb.node_i(head)
     clique_i = tb.clique_i(head)
-    clique_f = tb.clique_f(head)
     pool_i = tb.pool_i(head)
     y = np.empty((3, n_rows))
     # right-hand sides of the clique at hand and of the next one
@@ -199,7 +198,8 @@ def _solution(head, v, way, n_rows):  # type: ignore[no-untyped-def]
             here = _cleared(here, n)
             while nodes[first] != v:
                 first += 1
-            cos, sin = math.cos(clique_f[way[k], tb.TURN]), math.sin(clique_f[way[k], tb.TURN])
+            turn = frames.present_turn(head, way[k])
+            cos, sin = math.cos(turn), math.sin(turn)
             here[0, 3 * first], here[0, 3 * first + 1] = cos, -sin
             here[1, 3 * first], here[1, 3 * first + 1] = sin, cos
             here[2, 3 * first + 2] = 1.0
@@ -218,7 +218,8 @@ def _solution(head, v, way, n_rows):  # type: ignore[no-untyped-def]
             above = _cleared(above, 3 * n_above)
             for m in range(n_above):
                 node_i[pool_i[parent[tb.NODES] + m], tb.INDEX] = 3 * m
-            turn = clique_f[way[k], tb.TURN] - clique_f[row[tb.PARENT], tb.TURN]
+            turn = (frames.present_turn(head, way[k])
+                    - frames.present_turn(head, row[tb.PARENT]))
             cos, sin = math.cos(turn), math.sin(turn)
             for s in range(n_frontal, n_frontal + n_separator):
                 at = node_i[nodes[s], tb.INDEX]

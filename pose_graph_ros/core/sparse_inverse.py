@@ -16,7 +16,7 @@ import math
 
 import numpy as np
 
-from pose_graph_ros.core import tables as tb
+from pose_graph_ros.core import frames, tables as tb
 from pose_graph_ros.core.jit import kernel
 
 _FAST = {'reassoc', 'contract', 'nsz'}
@@ -30,7 +30,6 @@ def all_covariances(head, out):  # type: ignore[no-untyped-def]
     From the roots down with a stack of cliques, and beside it one of their Z_ss.
     """
     node_i, clique_i, pool_i = tb.node_i(head), tb.clique_i(head), tb.pool_i(head)
-    clique_f = tb.clique_f(head)
     cliques = np.empty(64, np.int32)
     blocks = np.empty(1024)
     inverse = np.empty(1024)
@@ -50,7 +49,7 @@ def all_covariances(head, out):  # type: ignore[no-untyped-def]
             end -= rest * rest
             _put_separator(blocks[end:end + rest * rest], inverse, n, rest)
             _invert_clique(head, row, inverse, row_f, out)
-            turn = clique_f[c, tb.TURN]
+            turn = frames.present_turn(head, c)
             if turn != 0.0:
                 for m in range(row[tb.NODES], row[tb.NODES] + row[tb.N_FRONTAL]):
                     _turn(out[pool_i[m]].reshape(9), 3, turn)
@@ -67,8 +66,9 @@ def all_covariances(head, out):  # type: ignore[no-untyped-def]
                     blocks = longer
                 block = blocks[end:end + size * size]
                 _take_separator(head, child, inverse, n, block)
-                if clique_f[child, tb.TURN] != turn:
-                    _turn(block, size, turn - clique_f[child, tb.TURN])
+                turn_below = frames.present_turn(head, child)
+                if turn_below != turn:
+                    _turn(block, size, turn - turn_below)
                 end += size * size
                 if depth == len(cliques):
                     more = np.empty(2 * depth, np.int32)

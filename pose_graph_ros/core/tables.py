@@ -24,11 +24,11 @@ import numpy.typing as npt
 
 # --- columns ------------------------------------------------------------------------------------
 
-# node_f: pose in the map (theta wrapped), reference, solution (pose minus reference, theta not
-# wrapped), the solution that the cliques below have seen, the turn against the clique's frame when
-# its constraints were last looked at, square roots of the information that the node's constraints
-# have on position and on heading
-POSE, REF, DELTA, SEEN, LOOKED, STIFF_T, STIFF_R, NODE_F = 0, 3, 6, 9, 12, 13, 14, 15
+# node_f: pose in the map (theta wrapped), solution (pose minus reference, theta not wrapped), the
+# solution that the cliques below have seen, the turn against the clique's frame when its
+# constraints were last looked at: what a solution changes; square roots of the information that
+# the node's constraints have on position and on heading, reference
+POSE, DELTA, SEEN, LOOKED, STIFF_T, STIFF_R, REF, NODE_F = 0, 3, 6, 9, 10, 11, 12, 15
 # node_i: clique that it is frontal in; heads of the lists of edges (2 * edge + side) and of
 # observed nodes; whether it is fixed; whether it is a seed of the next elimination; index in a
 # front and the stamp that makes it valid; stamp of the last change that matters; undo log of the
@@ -59,11 +59,11 @@ OBS_NODE, OBS_NEXT, OBS_KIND, OBS_CHECKED, OBS_WAITS, OBS_UNDO, OBS_I = range(7)
 # whether a node at or below it is fixed or observed
 (PARENT, CHILD, SIBLING, N_FRONTAL, N_SEPARATOR, NODES, VALUES, MARKED, BUILT, BORN, VALUES_BORN,
  CLIQUE_UNDO, COUNT, ANCHORED, CLIQUE_I) = range(15)
-# clique_f: angle of the clique's frame in the map; that which the parent was eliminated with; mean
-# solution of the headings of the separator when the clique was eliminated; squared error of the
-# parent's model of what it has turned since; how stiff the update matrix is against that, about
-# (see `frames`)
-TURN, TURN_SEEN, TURN_ZERO, SLIP_ERROR2, SLIP_STIFF, CLIQUE_F = range(6)
+# clique_f: angle of the clique's frame that the parent was eliminated with; mean solution of the
+# headings of the separator when the clique was eliminated; squared error of the parent's model of
+# what it has turned since; how stiff the update matrix is against that, about (see `frames`); how
+# many sigmas its separator may have moved in itself since the clique was solved for
+TURN_SEEN, TURN_ZERO, SLIP_ERROR2, SLIP_STIFF, DRIFT, TURN, CLIQUE_F = range(7)
 
 FLOAT_TABLES: Final = {'node_f': NODE_F, 'edge_f': EDGE_F, 'observed_f': OBS_F, 'pool_f': 1,
                        'log_f': 1, 'work_f': 1, 'scalars': 1, 'clique_f': CLIQUE_F}
@@ -77,8 +77,8 @@ NAMES: Final = (*FLOAT_TABLES, *INT_TABLES)
 (N_NODES, N_EDGES, N_OBSERVED, N_CLIQUES, FREE_CLIQUE, POOL_F_END, POOL_I_END, N_SEEDS, N_FREED,
  N_WAITING, LOG_F_END, LOG_I_END, UPDATE, ITERATION, FRONT_SERIAL, STRUCTURE, NEED_F,
  NEED_I, NEED_WORK, BAD_NODE, N_RELINEARIZED, N_ELIMINATED, N_VISITED, N_ITERATIONS, N_ROOTS,
- N_CHANGED, N_TURNED, NODE_ROOM, EDGE_ROOM, OBSERVED_ROOM, COUNTERS_END) = range(
-     2 * len(NAMES), 2 * len(NAMES) + 31)
+ N_LOOKS, N_CHANGED, N_TURNED, NODE_ROOM, EDGE_ROOM, OBSERVED_ROOM, COUNTERS_END) = range(
+     2 * len(NAMES), 2 * len(NAMES) + 32)
 # heads of the free lists of the pools, one for each size class
 SIZES: Final = [*range(65)]
 while SIZES[-1] < 2**31:

@@ -68,6 +68,23 @@ def store(typing_context: Any, array: Any, at: Any, vector: Any) -> Any:
 
 
 @_intrinsic
+def fetch(typing_context: Any, array: Any, at: Any) -> Any:
+    """Have the cache line of an entry of a flat array fetched: it is needed soon."""
+    def codegen(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
+        byte = ir.IntType(8).as_pointer()
+        three = [ir.IntType(32)] * 3
+        function = builder.module.declare_intrinsic(
+            'llvm.prefetch', (byte,), ir.FunctionType(ir.VoidType(), [byte, *three]))
+        address = builder.bitcast(
+            _address(context, builder, signature.args[0], *arguments), byte)
+        # to read, to stay in all caches, data
+        builder.call(function, [address, *(kind(value) for kind, value in zip(
+            three, (0, 3, 1), strict=True))])
+        return context.get_dummy_value()
+    return types.void(array, types.int64), codegen
+
+
+@_intrinsic
 def spread(typing_context: Any, number: Any) -> Any:
     """Return a vector of four times the same number."""
     def codegen(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:

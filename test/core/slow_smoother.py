@@ -125,6 +125,17 @@ def _with_weight(table: Any, weight: FloatArray) -> Any:
     return type(table)(**{**columns, 'weight': weight})
 
 
+def frame_turn(graph: Graph, c: int) -> float:
+    """Return the angle of a clique's frame: the mean turn of its separator, unless anchored."""
+    row = graph.memory['clique_i'][c]
+    begin = row[tb.NODES] + row[tb.N_FRONTAL]
+    separator = graph.memory['pool_i'][begin:begin + row[tb.N_SEPARATOR]]
+    if row[tb.ANCHORED] != 0 or len(separator) == 0:
+        return 0.0
+    turns = graph.memory['node_f'][separator, tb.DELTA + 2]
+    return float(np.mean(turns) - graph.memory['clique_f'][c, tb.TURN_ZERO])
+
+
 def information(graph: Graph, nodes: list[int] | None = None) -> FloatArray:
     """
     Return the H, shape (3N, 3N), that the tables stand for, or that of all that touches nodes.
@@ -140,7 +151,7 @@ def information(graph: Graph, nodes: list[int] | None = None) -> FloatArray:
     rows, unary = graph.memory['edge_f'][:m], graph.memory['observed_f'][:k]
     ends, hidden = np.zeros((2 * m, 3)), np.zeros((k, 3))
     # what a clique holds turns with its frame
-    turn = graph.memory['clique_f'][graph.memory['edge_i'][:m, tb.OWNER], tb.TURN]
+    turn = np.array([frame_turn(graph, c) for c in graph.memory['edge_i'][:m, tb.OWNER]])
     ends[:m, 2] = (np.arctan2(rows[:, tb.LIN_SIN], rows[:, tb.LIN_COS]) - edges.mean[:, 2] + turn)
     difference = rows[:, tb.LIN_D:tb.LIN_D + 2]
     ends[m:, :2] = np.einsum('mij,mj->mi', se2.rotation(turn), difference)
@@ -335,7 +346,7 @@ def cliques(graph: Graph) -> dict[int, Clique]:
         M = np.eye(3 * len(nodes))
         M.reshape(len(nodes), 3, len(nodes), 3)[
             np.arange(len(nodes)), :2, np.arange(len(nodes)), :2] = (
-                se2.rotation(memory['clique_f'][c, tb.TURN]).T)
+                se2.rotation(frame_turn(graph, c)).T)
         rest = M[rows:, rows:]
         found[c] = Clique(
             int(row[tb.PARENT]), children, nodes[:n_frontal], nodes[n_frontal:], R @ M,

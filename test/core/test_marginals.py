@@ -5,7 +5,7 @@
 from hypothesis import given, settings, strategies as st
 import numpy as np
 import pytest
-from slow_smoother import cliques, EXACT, SlowGraph, world
+from slow_smoother import cliques, EXACT, frame_turn, SlowGraph, world
 
 from pose_graph_ros.core import marginals, se2, tables as tb
 from pose_graph_ros.core.batch import Status
@@ -193,7 +193,8 @@ def test_it_does_not_matter_in_which_frame_a_clique_holds_its_rows(seed: int, st
         at, width = memory['clique_i'][c, tb.VALUES], clique.R.shape[1] + 1
         values = memory['pool_f'][at:at + n * width].reshape(n, width)
         values[:, :-1] = triangle
-        memory['clique_f'][c, tb.TURN] = angle
+        memory['clique_i'][c, tb.ANCHORED] = 0
+        memory['clique_f'][c, tb.TURN_ZERO] += frame_turn(graph, c) - angle
     np.testing.assert_allclose(smoother.covariances(), expected, rtol=1e-8, atol=1e-13)
     np.testing.assert_allclose(
         smoother.joint_covariance(*pair), expected_joint, rtol=1e-8, atol=1e-13)

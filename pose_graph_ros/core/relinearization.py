@@ -1,0 +1,235 @@
+# Copyright 2026 The pose_graph_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""
+What the new values mean for the constraints: which of them are to be linearized again.
+
+The constraints of nodes that have turned are looked at, and the frames of cliques that have turned
+against their parents'. If their squared linearization errors add up to more than the budget of the
+step, the worst of them are linearized again, and their nodes are seeds of the next iteration
+(fluid relinearization, M. Kaess et al., "iSAM2", IJRR 2012, with whitened errors).
+"""
+
+import math
+
+from pose_graph_ros.core import factors, frames, tables as tb, undo
+from pose_graph_ros.core.back_substitution import back_substitute
+from pose_graph_ros.core.elimination import add_seed
+from pose_graph_ros.core.jit import kernel
+
+# A constraint is worth linearizing again from this fraction of its share of the budget on.
+LEAST_SHARE = 0.01
+# What linearizing again leaves of the budget.
+LEFT_OVER = 0.4
+
+
+@kernel
+def _wait(head, entry):  # type: ignore[no-untyped-def]
+    waiting = tb.waiting(head)
+    waiting[head[tb.N_WAITING]] = entry
+    head[tb.N_WAITING] += 1
+
+
+@kernel
+def _look_at_edge(head, e):  # type: ignore[no-untyped-def]
+    """Evaluate an edge at the present estimate and keep the sums."""
+    edge_f, scalars, edge_i = tb.edge_f(head), tb.scalars(head), tb.edge_i(head)
+    undo.log_energy(head, e)
+    f = edge_f[e]
+    scalars[tb.CHI2] -= f[tb.ENERGY]
+    factors.check_edge(head, e, frames.present_turn(head, edge_i[e, tb.OWNER]))
+    scalars[tb.CHI2] += f[tb.ENERGY]
+    scalars[tb.ERROR2_SUM] += f[tb.ERROR2]
+    if f[tb.ERROR2] > LEAST_SHARE * scalars[tb.SETTING_SHARE] and edge_i[e, tb.EDGE_WAITS] == 0:
+        edge_i[e, tb.EDGE_WAITS] = 1
+        _wait(head, e)
+
+
+@kernel
+def _look_at_observed(head, k):  # type: ignore[no-untyped-def]
+    """Evaluate an observed node at the present estimate and keep the sums."""
+    observed_f, scalars, observed_i = tb.observed_f(head), tb.scalars(head), tb.observed_i(head)
+    undo.log_observed(head, k)
+    f = observed_f[k]
+    scalars[tb.CHI2] -= f[tb.OBS_ENERGY]
+    factors.check_observed(head, k)
+    scalars[tb.CHI2] += f[tb.OBS_ENERGY]
+    scalars[tb.ERROR2_SUM] += f[tb.OBS_ERROR2]
+    if (f[tb.OBS_ERROR2] > LEAST_SHARE * scalars[tb.SETTING_SHARE]
+            and observed_i[k, tb.OBS_WAITS] == 0):
+        observed_i[k, tb.OBS_WAITS] = 1
+        _wait(head, -1 - k)
+
+
+@kernel
+def _look(head):  # type: ignore[no-untyped-def]
+    """Look at the constraints of all nodes on the list, at each once, and sum up."""
+    edge_f = tb.edge_f(head)
+    observed_f = tb.observed_f(head)
+    scalars = tb.scalars(head)
+    node_i = tb.node_i(head)
+    edge_i = tb.edge_i(head)
+    observed_i = tb.observed_i(head)
+    work_i = tb.work_i(head)
+    iteration = head[tb.ITERATION]
+    looks = work_i[head[tb.N_NODES]:]
+    scalars[tb.ERROR2_SUM] = 0.0
+    for n in range(head[tb.N_LOOKS]):
+        v = looks[n]
+        entry = node_i[v, tb.EDGE_LIST]
+        while entry >= 0:
+            e, side = entry >> 1, entry & 1
+            if edge_i[e, tb.EDGE_CHECKED] != iteration:
+                edge_i[e, tb.EDGE_CHECKED] = iteration
+                if edge_f[e, tb.WEIGHT] > 0.0:
+                    _look_at_edge(head, e)
+            entry = edge_i[e, tb.NEXT_J if side == 1 else tb.NEXT_I]
+        k = node_i[v, tb.OBSERVED_LIST]
+        while k >= 0:
+            if observed_f[k, tb.WEIGHT] > 0.0:
+                _look_at_observed(head, k)
+            k = observed_i[k, tb.OBS_NEXT]
+
+
+@kernel
+def _look_at_turned(head):  # type: ignore[no-untyped-def]
+    """Add what frames have turned against those of their parents to the sum; keep the worst."""
+    scalars, clique_f, work_i = tb.scalars(head), tb.clique_f(head), tb.work_i(head)
+    turned = work_i[2 * head[tb.N_NODES]:]
+    kept = 0
+    for k in range(head[tb.N_TURNED]):
+        c = turned[k]
+        slip = frames.frame_slip(head, c)
+        error2 = frames.interface_error2(head, c, slip, tb.work_f(head))
+        scalars[tb.ERROR2_SUM] += error2
+        if error2 > LEAST_SHARE * scalars[tb.SETTING_SHARE]:
+            clique_f[c, tb.SLIP_ERROR2] = error2
+            turned[kept] = c
+            kept += 1
+    head[tb.N_TURNED] = kept
+
+
+@kernel
+def forget_waiting(head):  # type: ignore[no-untyped-def]
+    """Leave the constraints that wait as they are: together they are linear enough."""
+    edge_i, observed_i, waiting = tb.edge_i(head), tb.observed_i(head), tb.waiting(head)
+    for n in range(head[tb.N_WAITING]):
+        entry = waiting[n]
+        if entry >= 0:
+            edge_i[entry, tb.EDGE_WAITS] = 0
+        else:
+            observed_i[-1 - entry, tb.OBS_WAITS] = 0
+    head[tb.N_WAITING] = head[tb.N_TURNED] = 0
+
+
+@kernel
+def _error2(head, entry):  # type: ignore[no-untyped-def]
+    edge_f, observed_f = tb.edge_f(head), tb.observed_f(head)
+    if entry >= 0:
+        return edge_f[entry, tb.ERROR2]
+    return observed_f[-1 - entry, tb.OBS_ERROR2]
+
+
+@kernel
+def _relinearize_worst(head, allowed):  # type: ignore[no-untyped-def]
+    """
+    Linearize the worst of the waiting constraints again, so that the rest has `allowed` at most.
+
+    Their nodes become seeds of the next elimination, and nothing waits any more.
+    """
+    work_f = tb.work_f(head)
+    edge_i = tb.edge_i(head)
+    observed_i = tb.observed_i(head)
+    waiting = tb.waiting(head)
+    clique_f, clique_i, pool_i = tb.clique_f(head), tb.clique_i(head), tb.pool_i(head)
+    work_i = tb.work_i(head)
+    # sums by powers of two below what is allowed, largest first
+    bins = work_f[:64]
+    bins[:] = 0.0
+    left, cut = 0.0, 0
+    for n in range(head[tb.N_WAITING]):
+        error2 = _error2(head, waiting[n])
+        bins[_bin(error2 / allowed)] += error2
+        left += error2
+    turned = work_i[2 * head[tb.N_NODES]:]
+    for n in range(head[tb.N_TURNED]):
+        error2 = clique_f[turned[n], tb.SLIP_ERROR2]
+        bins[_bin(error2 / allowed)] += error2
+        left += error2
+    while cut < 64 and left > allowed:
+        left -= bins[cut]
+        cut += 1
+    for n in range(head[tb.N_WAITING]):
+        entry = waiting[n]
+        worst = _bin(_error2(head, entry) / allowed) < cut
+        if entry >= 0:
+            undo.log_edge(head, entry)
+            edge_i[entry, tb.EDGE_WAITS] = 0
+            if worst:
+                head[tb.N_RELINEARIZED] += 1
+                factors.linearize_edge(head, entry)
+                _seed(head, edge_i[entry, tb.END_I])
+                _seed(head, edge_i[entry, tb.END_J])
+        else:
+            k = -1 - entry
+            undo.log_observed(head, k)
+            observed_i[k, tb.OBS_WAITS] = 0
+            if worst:
+                head[tb.N_RELINEARIZED] += 1
+                factors.linearize_observed(head, k)
+                _seed(head, observed_i[k, tb.OBS_NODE])
+    for n in range(head[tb.N_TURNED]):
+        c = turned[n]
+        if _bin(clique_f[c, tb.SLIP_ERROR2] / allowed) < cut:
+            # its parent takes the update matrix in anew, as it has turned
+            head[tb.N_RELINEARIZED] += 1
+            _seed(head, pool_i[clique_i[clique_i[c, tb.PARENT], tb.NODES]])
+    head[tb.N_WAITING] = head[tb.N_TURNED] = 0
+
+
+@kernel
+def _seed(head, v):  # type: ignore[no-untyped-def]
+    undo.log_node(head, v)
+    add_seed(head, v)
+
+
+@kernel
+def _bin(ratio):  # type: ignore[no-untyped-def]
+    """Return 0 for a ratio of 2 or more, then one more for each halving."""
+    if ratio <= 0.0:
+        return 63
+    return min(max(int(1.0 - math.floor(math.log2(ratio))), 0), 63)
+
+
+@kernel
+def _budget(head):  # type: ignore[no-untyped-def]
+    """Return the squared linearization error that a step may leave."""
+    scalars = tb.scalars(head)
+    return min(scalars[tb.SETTING_BUDGET], scalars[tb.SETTING_SHARE] * scalars[tb.N_MOVED])
+
+
+@kernel
+def solve(head):  # type: ignore[no-untyped-def]
+    """
+    Solve from the roots on the stack down, and see how far that is from linear.
+
+    Returns
+    -------
+    bool
+        Whether it is within the budget. If not, the constraints that matter wait.
+
+    """
+    scalars = tb.scalars(head)
+    back_substitute(head)
+    _look(head)
+    _look_at_turned(head)
+    head[tb.N_ITERATIONS] += 1
+    if scalars[tb.ERROR2_SUM] <= _budget(head):
+        forget_waiting(head)
+        return True
+    return False
+
+
+@kernel
+def relinearize(head):  # type: ignore[no-untyped-def]
+    """Linearize the worst of what waits again; the nodes there become seeds."""
+    _relinearize_worst(head, LEFT_OVER * _budget(head))
