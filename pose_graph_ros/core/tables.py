@@ -14,6 +14,7 @@ addresses are taken anew whenever a table grows, in `Memory.ensure` alone.
 """
 
 from collections.abc import Callable
+import mmap
 from typing import Any, Final
 
 from numba import types
@@ -103,6 +104,11 @@ STAMPS: Final = {
     'clique_i': (MARKED, BUILT, BORN, VALUES_BORN, CLIQUE_UNDO),
 }
 
+# Tables of so many bytes lie on pages of their own. What they have left costs address space alone,
+# so they grow by much: seldom is a table copied.
+OWN_PAGES: Final = 2**18
+GROWTH: Final = 4
+
 IntHead = npt.NDArray[np.int64]
 
 
@@ -155,6 +161,19 @@ freed = _table('freed')
 waiting = _table('waiting')
 
 
+def _pages(shape: int | tuple[int, int], dtype: type[np.generic]) -> npt.NDArray[Any]:
+    """
+    Return an array of zeros, a large one on pages of its own: they take memory when written to.
+
+    What NumPy allocates is taken in huge pages, and stays with the process when a table has grown
+    out of it: together as much again as the tables hold.
+    """
+    size = int(np.prod(shape)) * np.dtype(dtype).itemsize
+    if size < OWN_PAGES:
+        return np.zeros(shape, dtype)
+    return np.frombuffer(mmap.mmap(-1, size), dtype).reshape(shape)
+
+
 class Memory:
     """Owns the tables and the head of one graph."""
 
@@ -166,7 +185,6 @@ class Memory:
         for name in NAMES:
             self.ensure(name, 16)
         self.ensure('work_f', 256)  # whatever the fronts take, the chain and the bins take this
-        self['scalars'][:] = 0.0
 
     def __getitem__(self, name: str) -> npt.NDArray[Any]:
         """Return a table with all its capacity; stale after the next `ensure`."""
@@ -193,8 +211,8 @@ class Memory:
             return
         columns = FLOAT_TABLES.get(name, 0) or INT_TABLES[name]
         dtype = np.float64 if name in FLOAT_TABLES else np.int32
-        capacity = max(rows, 16, int(1.5 * self.head[at + 1]))
-        grown = np.empty(capacity if columns == 1 else (capacity, columns), dtype=dtype)
+        capacity = max(rows, 16, GROWTH * int(self.head[at + 1]))
+        grown = _pages(capacity if columns == 1 else (capacity, columns), dtype)
         if keep > 0:
             grown[:keep] = self._tables[name][:keep]
         self._tables[name] = grown
