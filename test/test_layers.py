@@ -21,8 +21,9 @@ CORE = (
     # the engine
     'tables', 'vectors', 'factors', 'undo', 'rows', 'ordering', 'frames', 'cholesky', 'fronts',
     'structure', 'assembly', 'elimination', 'editing', 'graph', 'symbolic', 'complex_system',
-    'initialization', 'carrying', 'back_substitution', 'relinearization', 'gauss_newton',
-    'descent', 'batch', 'starts', 'chain', 'sparse_inverse', 'marginals', 'rescue', 'incremental',
+    'initialization', 'carrying', 'back_substitution', 'relinearization', 'step',
+    'gauss_newton', 'descent', 'batch', 'starts', 'chain', 'sparse_inverse', 'marginals',
+    'rescue', 'incremental',
     # what drives it
     'timeline', 'trajectory', 'alignment', 'tangent_plane', 'binding', 'estimate', 'backend',
     'prediction', 'io', 'io.g2o', 'io.tum', 'warm_up',

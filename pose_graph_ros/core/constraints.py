@@ -45,9 +45,6 @@ class ObservedKind(IntEnum):
 class _Table:
     """Columns of equal length; `joined` and `rows` work on all of them."""
 
-    def __len__(self) -> int:
-        return len(getattr(self, fields(self)[0].name))
-
     @classmethod
     def joined(cls, tables: Sequence[Self]) -> Self:
         """Return the rows of all tables, in order."""
@@ -67,12 +64,28 @@ class _Table:
         return type(self)(*(getattr(self, item.name)[index] for item in fields(self)))
 
 
+# the tables are frozen, but in their constructors
+_set = object.__setattr__
+
+
 def _empty(*shape: int) -> FloatArray:
     return np.empty((0, *shape))
 
 
-def _integers(values: npt.ArrayLike, dtype: type[np.generic]) -> npt.NDArray[Any]:
+_FLOAT, _INT, _KIND = (np.dtype(kind) for kind in (np.float64, np.int64, np.uint8))
+
+
+def _numbers(values: npt.ArrayLike) -> FloatArray:
+    """Return an array of numbers."""
+    if type(values) is np.ndarray and values.dtype is _FLOAT:
+        return values   # as nearly always, and in a third of the time
+    return np.asarray(values, dtype=_FLOAT)
+
+
+def _integers(values: npt.ArrayLike, dtype: np.dtype[Any]) -> npt.NDArray[Any]:
     """Return an array of integers; nothing is rounded to one."""
+    if type(values) is np.ndarray and values.dtype is dtype:
+        return values
     array = np.asarray(values)
     if array.size > 0 and array.dtype.kind not in 'iu':
         raise GraphUpdateError(f'expected integers, got {array.dtype} {array.tolist()}')
@@ -80,7 +93,11 @@ def _integers(values: npt.ArrayLike, dtype: type[np.generic]) -> npt.NDArray[Any
 
 
 def _weights(weight: npt.ArrayLike | None, size: int) -> FloatArray:
-    return np.ones(size) if weight is None else np.asarray(weight, dtype=np.float64)
+    if weight is not None:
+        return _numbers(weight)
+    ones = np.empty(size)
+    ones.fill(1.0)  # np.ones takes three times as long for a few
+    return ones
 
 
 @dataclass(frozen=True, slots=True)
@@ -105,13 +122,21 @@ class Edges(_Table):
         mean: npt.ArrayLike | None = None, information: npt.ArrayLike | None = None,
         kind: npt.ArrayLike = (), weight: npt.ArrayLike | None = None,
     ) -> None:
-        i = _integers(i, np.int64)
-        set_columns(self, {
-            'i': i, 'j': _integers(j, np.int64),
-            'mean': np.asarray(_empty(3) if mean is None else mean, dtype=np.float64),
-            'information': np.asarray(
-                _empty(3, 3) if information is None else information, dtype=np.float64),
-            'kind': _integers(kind, np.uint8), 'weight': _weights(weight, len(i))})
+        i = _integers(i, _INT)
+        _set(self, 'i', i)
+        _set(self, 'j', _integers(j, _INT))
+        _set(self, 'mean', _numbers(_empty(3) if mean is None else mean))
+        _set(self, 'information', _numbers(_empty(3, 3) if information is None else information))
+        _set(self, 'kind', _integers(kind, _KIND))
+        _set(self, 'weight', _weights(weight, len(i)))
+
+    def __len__(self) -> int:
+        return len(self.i)
+
+    @property
+    def columns(self) -> tuple[npt.NDArray[Any], ...]:
+        """All columns, in their order."""
+        return self.i, self.j, self.mean, self.information, self.kind, self.weight
 
 
 @dataclass(frozen=True, slots=True)
@@ -139,21 +164,21 @@ class ObservedNodes(_Table):
         mean: npt.ArrayLike | None = None, information: npt.ArrayLike | None = None,
         kind: npt.ArrayLike = (), weight: npt.ArrayLike | None = None,
     ) -> None:
-        node = _integers(node, np.int64)
-        set_columns(self, {
-            'node': node,
-            'offset': np.asarray(
-                np.zeros((len(node), 3)) if offset is None else offset, dtype=np.float64),
-            'mean': np.asarray(_empty(3) if mean is None else mean, dtype=np.float64),
-            'information': np.asarray(
-                _empty(3, 3) if information is None else information, dtype=np.float64),
-            'kind': _integers(kind, np.uint8), 'weight': _weights(weight, len(node))})
+        node = _integers(node, _INT)
+        _set(self, 'node', node)
+        _set(self, 'offset', _numbers(np.zeros((len(node), 3)) if offset is None else offset))
+        _set(self, 'mean', _numbers(_empty(3) if mean is None else mean))
+        _set(self, 'information', _numbers(_empty(3, 3) if information is None else information))
+        _set(self, 'kind', _integers(kind, _KIND))
+        _set(self, 'weight', _weights(weight, len(node)))
 
+    def __len__(self) -> int:
+        return len(self.node)
 
-def set_columns(table: _Table, columns: dict[str, npt.NDArray[np.generic]]) -> None:
-    """Fill a frozen table once, in its constructor."""
-    for name, column in columns.items():
-        object.__setattr__(table, name, column)
+    @property
+    def columns(self) -> tuple[npt.NDArray[Any], ...]:
+        """All columns, in their order."""
+        return self.node, self.offset, self.mean, self.information, self.kind, self.weight
 
 
 _TAILS: dict[str, tuple[int, ...]] = {'mean': (3,), 'offset': (3,), 'information': (3, 3)}
@@ -161,8 +186,8 @@ _COLUMNS = {table: [(item.name, _TAILS.get(item.name, ())) for item in fields(ta
             for table in (Edges, ObservedNodes)}
 
 
-def check_shapes(table: Edges | ObservedNodes) -> None:
-    """Raise GraphUpdateError unless all columns have the length and the shape they should."""
+def _check_shapes(table: Edges | ObservedNodes) -> None:
+    """Refuse columns of other lengths and shapes than they should have."""
     size = len(table)
     for name, tail in _COLUMNS[type(table)]:
         shape = getattr(table, name).shape
@@ -175,16 +200,15 @@ def check(table: Edges | ObservedNodes, n_nodes: int) -> None:
     """
     Raise unless the rows are sound constraints between hidden nodes 0 to n_nodes - 1.
 
-    Their shapes have been looked at by `check_shapes`.
-
     Raises
     ------
     GraphUpdateError
-        Says which row, what was expected and what came: node indices, an edge from a
+        Says which row, what was expected and what came: shapes, node indices, an edge from a
         node to itself, numbers that are not finite, an information matrix that is not symmetric
         or not positive semidefinite.
 
     """
+    _check_shapes(table)
     name = type(table).__name__
     for item in fields(table):
         column = getattr(table, item.name)

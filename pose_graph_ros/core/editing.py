@@ -3,14 +3,19 @@
 """
 What new rows, new weights and fixed nodes mean for the tables: lists, sums, seeds.
 
-The rows themselves have been checked and written by `graph.Graph`.
+What is not plainly sound has been checked by `graph.Graph`.
 """
 
 import math
 
-from pose_graph_ros.core import factors, tables as tb, undo
+from pose_graph_ros.core import factors, rows, tables as tb, undo
 from pose_graph_ros.core.elimination import add_seed
 from pose_graph_ros.core.jit import kernel
+
+# Answers of `add_rows`.
+ADDED, NO_ROOM, UNSOUND = range(3)
+# What `edit` does to a row.
+WEIGH_EDGE, WEIGH_OBSERVED, FIX = range(3)
 
 
 @kernel
@@ -179,14 +184,73 @@ def set_fixed(head, v, fixed):  # type: ignore[no-untyped-def]
 
 
 @kernel
-def start_rows(head, n_nodes, n_edges, n_observed):  # type: ignore[no-untyped-def]
-    """Take in what was written behind the present ends of the tables, up to these numbers."""
+def edit(head, what, number, value):  # type: ignore[no-untyped-def]
+    """Set the weight of an edge or an observed node, or fix (1) or free (0) a hidden node."""
+    if what == WEIGH_EDGE:
+        weigh_edge(head, number, value)
+    elif what == WEIGH_OBSERVED:
+        weigh_observed(head, number, value)
+    else:
+        set_fixed(head, number, value)
+
+
+@kernel
+def _lengths_agree(n, mean, information, kind, weight):  # type: ignore[no-untyped-def]
+    return (mean.shape == (n, 3) and information.shape == (n, 3, 3) and len(kind) == n
+            and len(weight) == n)
+
+
+@kernel
+def add_rows(  # type: ignore[no-untyped-def]
+    head, hidden, i, j, mean, information, kind, weight, node, offset, observed_mean,
+    observed_information, observed_kind, observed_weight, checked,
+):
+    """
+    Add hidden nodes, edges and observed nodes, all of them or none.
+
+    Parameters
+    ----------
+    hidden : ndarray, shape (N, 3)
+    i, j, mean, information, kind, weight : ndarray
+        Columns of `Edges`.
+    node, offset, observed_mean, observed_information, observed_kind, observed_weight : ndarray
+        Columns of `ObservedNodes`.
+    checked : bool
+        Whether all of it has been found to be sound.
+
+    Returns
+    -------
+    int
+        ADDED; NO_ROOM: a table is full; UNSOUND: not plainly sound, and not checked either.
+
+    """
+    n_nodes = head[tb.N_NODES] + len(hidden)
+    n_edges = head[tb.N_EDGES] + len(i)
+    n_observed = head[tb.N_OBSERVED] + len(node)
+    if (hidden.shape[1] != 3 or len(j) != len(i)
+            or not _lengths_agree(len(i), mean, information, kind, weight)
+            or offset.shape != (len(node), 3)
+            or not _lengths_agree(len(node), observed_mean, observed_information, observed_kind,
+                                  observed_weight)):
+        return UNSOUND
+    if (n_nodes > head[tb.NODE_ROOM] or n_edges > head[tb.EDGE_ROOM]
+            or n_observed > head[tb.OBSERVED_ROOM]):
+        return NO_ROOM
+    # rows behind the ends count for nothing yet
+    sound = rows.write_nodes(head, hidden)
+    sound = rows.write_edges(head, n_nodes, i, j, mean, information, kind, weight) and sound
+    sound = rows.write_all_observed(
+        head, n_nodes, node, offset, observed_mean, observed_information, observed_kind,
+        observed_weight) and sound
+    if not sound and not checked:
+        return UNSOUND
     first, head[tb.N_NODES] = head[tb.N_NODES], n_nodes
     start_nodes(head, first, n_nodes)
     first, head[tb.N_EDGES] = head[tb.N_EDGES], n_edges
     start_edges(head, first, n_edges)
     first, head[tb.N_OBSERVED] = head[tb.N_OBSERVED], n_observed
     start_observed(head, first, n_observed)
+    return ADDED
 
 
 @kernel

@@ -85,7 +85,7 @@ def mark(head):  # type: ignore[no-untyped-def]
     return marked[:n_marked], affected
 
 
-@kernel(allocates=True)
+@kernel(allocates=True, inline='always')    # all three: what they call is compiled once
 def rebuild(head, marked, affected):  # type: ignore[no-untyped-def]
     """
     Replace the marked cliques: order the affected nodes anew and eliminate them.
@@ -187,7 +187,7 @@ def _adopt(head, parent, child):  # type: ignore[no-untyped-def]
     clique_i[parent, tb.CHILD] = child
 
 
-@kernel
+@kernel(inline='always')
 def refresh(head, marked):  # type: ignore[no-untyped-def]
     """
     Eliminate the marked cliques again as they are: where only numbers have changed.
@@ -252,7 +252,7 @@ def _find_roots(head, cliques):  # type: ignore[no-untyped-def]
     head[tb.N_ROOTS] = n_roots
 
 
-@kernel(allocates=True)
+@kernel(allocates=True, inline='always')
 def eliminate(head):  # type: ignore[no-untyped-def]
     """
     Eliminate again what the seeds touch; there are none afterwards.

@@ -8,16 +8,17 @@ tables and write the poses of the hidden nodes.
 """
 
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass, field
 from types import MappingProxyType
-from typing import Final, NamedTuple
+from typing import Any, Final, NamedTuple
 
+from numba import types
 import numpy as np
 import numpy.typing as npt
 
-from pose_graph_ros.core import editing, linearize, rows, se2, tables as tb, undo
-from pose_graph_ros.core.constraints import check, check_shapes, Edges, ObservedNodes
+from pose_graph_ros.core import editing, linearize, se2, tables as tb, undo
+from pose_graph_ros.core.constraints import check, Edges, ObservedNodes
 from pose_graph_ros.core.exceptions import GraphUpdateError
+from pose_graph_ros.core.jit import compile_only
 from pose_graph_ros.core.se2 import FloatArray, IntArray
 from pose_graph_ros.core.tables import Memory
 
@@ -29,16 +30,22 @@ NO_EDGES: Final = Edges()
 NOTHING_OBSERVED: Final = ObservedNodes()
 NO_WEIGHTS: Final[Mapping[int, float]] = MappingProxyType({})
 
+_NUMBERS, _INTEGERS, _POSES, _MATRICES, _KINDS = (
+    types.float64[::1], types.int64[::1], types.float64[:, ::1], types.float64[:, :, ::1],
+    types.uint8[::1])
+_ADD_ROWS = (
+    _INTEGERS, _POSES, _INTEGERS, _INTEGERS, _POSES, _MATRICES, _KINDS, _NUMBERS,
+    _INTEGERS, _POSES, _POSES, _MATRICES, _KINDS, _NUMBERS, types.boolean)
 
-@dataclass(frozen=True, slots=True)
-class GraphUpdate:
+
+class GraphUpdate(NamedTuple):
     """Everything that changes in one step; new hidden nodes are numbered from the end."""
 
-    hidden: FloatArray = field(default_factory=lambda: NO_POSES)
+    hidden: FloatArray = NO_POSES
     """Initial poses of new hidden nodes in the map, shape (N, 3) [m, m, rad]."""
-    edges: Edges = field(default_factory=lambda: NO_EDGES)
+    edges: Edges = NO_EDGES
     """New edges, also to the new hidden nodes."""
-    observed: ObservedNodes = field(default_factory=lambda: NOTHING_OBSERVED)
+    observed: ObservedNodes = NOTHING_OBSERVED
     """New observed nodes, also on the new hidden nodes."""
     fix: Sequence[int] = ()
     """Hidden nodes that keep their pose from now on (the gauge)."""
@@ -48,22 +55,10 @@ class GraphUpdate:
     """Edges that do not count any more: their weight becomes 0, their number stays theirs."""
     remove_observed: Sequence[int] = ()
     """Observed nodes that do not count any more."""
-    weigh_edges: Mapping[int, float] = field(default_factory=lambda: NO_WEIGHTS)
+    weigh_edges: Mapping[int, float] = NO_WEIGHTS
     """New weights (factors on the information) of edges; a removed one comes back by it."""
-    weigh_observed: Mapping[int, float] = field(default_factory=lambda: NO_WEIGHTS)
+    weigh_observed: Mapping[int, float] = NO_WEIGHTS
     """New weights of observed nodes."""
-
-
-class Checkpoint(NamedTuple):
-    """The counts, sums and lists that `Graph.undo` goes back to."""
-
-    n_nodes: int
-    n_edges: int
-    n_observed: int
-    structure: int
-    scalars: FloatArray
-    seeds: IntArray
-    waiting: IntArray
 
 
 class Energies(NamedTuple):
@@ -84,6 +79,7 @@ class Graph:
     def __init__(self) -> None:
         self.memory = Memory()
         """The tables, which solvers work on."""
+        compile_only(editing.add_rows, _ADD_ROWS)   # `apply` converts other arrays
 
     @property
     def n_nodes(self) -> int:
@@ -142,45 +138,62 @@ class Graph:
             If any part does not fit, saying which; the graph is unchanged then.
 
         """
-        hidden, edges, observed = _checked_hidden(update.hidden), update.edges, update.observed
-        n_nodes = self.n_nodes + len(hidden)
-        n_edges, n_observed = self.n_edges + len(edges), self.n_observed + len(observed)
+        hidden, edges, observed, *by_number = update
+        edits = any(map(len, by_number))
+        if edits:
+            self._check_edits(update)
+        columns, checked = (hidden, *edges.columns, *observed.columns), False
+        try:
+            code = editing.add_rows(self.memory.head, *columns, checked)
+        except (TypeError, ValueError):
+            code = editing.UNSOUND  # other arrays than those that it is compiled for
+        while code != editing.ADDED:
+            if code == editing.NO_ROOM:
+                self.ensure(*self._sizes_after(update))
+            else:
+                columns, checked = self._checked_columns(update), True
+            code = editing.add_rows(self.memory.head, *columns, checked)
+        if edits:
+            self._edit(update)
+
+    def _sizes_after(self, update: GraphUpdate) -> tuple[int, int, int]:
+        """Return how many hidden nodes, edges and observed nodes there will be."""
+        return (self.n_nodes + len(update.hidden), self.n_edges + len(update.edges),
+                self.n_observed + len(update.observed))
+
+    def _check_edits(self, update: GraphUpdate) -> None:
+        """Refuse numbers and weights that do not fit the graph with its new rows."""
+        n_nodes, n_edges, n_observed = self._sizes_after(update)
         _check_numbers('fix', update.fix, 'hidden nodes', n_nodes)
         _check_numbers('free', update.free, 'hidden nodes', n_nodes)
         _check_numbers('remove_edges', update.remove_edges, 'edges', n_edges)
         _check_numbers('remove_observed', update.remove_observed, 'observed nodes', n_observed)
         _check_weights('weigh_edges', update.weigh_edges, 'edges', n_edges)
         _check_weights('weigh_observed', update.weigh_observed, 'observed nodes', n_observed)
-        self.ensure(n_nodes, n_edges, n_observed)
-        # rows behind the end count for nothing until `start_rows`
-        if len(edges) > 0:
-            check_shapes(edges)
-            if not rows.write_edges(self.memory.head, n_nodes, edges.i, edges.j, edges.mean,
-                                    edges.information, edges.kind, edges.weight):
-                check(edges, n_nodes)
-        if len(observed) > 0:
-            check_shapes(observed)
-            if not rows.write_all_observed(
-                    self.memory.head, n_nodes, observed.node, observed.offset, observed.mean,
-                    observed.information, observed.kind, observed.weight):
-                check(observed, n_nodes)
-        if len(hidden) > 0:
-            poses = self.memory['node_f'][self.n_nodes:n_nodes, tb.POSE:tb.POSE + 3]
-            poses[:] = se2.wrapped(hidden)
-        head = self.memory.head
-        editing.start_rows(head, n_nodes, n_edges, n_observed)
-        for e in update.remove_edges:
-            editing.weigh_edge(head, int(e), 0.0)
-        for k in update.remove_observed:
-            editing.weigh_observed(head, int(k), 0.0)
-        for e, weight in update.weigh_edges.items():
-            editing.weigh_edge(head, int(e), float(weight))
-        for k, weight in update.weigh_observed.items():
-            editing.weigh_observed(head, int(k), float(weight))
-        for node in update.fix:
-            editing.set_fixed(head, int(node), 1)
-        for node in update.free:
-            editing.set_fixed(head, int(node), 0)
+
+    def _edit(self, update: GraphUpdate) -> None:
+        """Make the edits of rows that are there, which have been checked."""
+        for what, rows in (
+                (editing.WEIGH_EDGE, dict.fromkeys(update.remove_edges, 0.0)),
+                (editing.WEIGH_OBSERVED, dict.fromkeys(update.remove_observed, 0.0)),
+                (editing.WEIGH_EDGE, update.weigh_edges),
+                (editing.WEIGH_OBSERVED, update.weigh_observed),
+                (editing.FIX, dict.fromkeys(update.fix, 1.0)),
+                (editing.FIX, dict.fromkeys(update.free, 0.0))):
+            for number, value in rows.items():
+                editing.edit(self.memory.head, what, int(number), float(value))
+
+    def _checked_columns(self, update: GraphUpdate) -> tuple[npt.NDArray[Any], ...]:
+        """Refuse rows that are not sound; return them as the kernel wants them."""
+        hidden, edges, observed = _checked_hidden(update.hidden), update.edges, update.observed
+        n_nodes = self.n_nodes + len(hidden)
+        for table in (edges, observed):
+            if len(table) > 0:
+                check(table, n_nodes)
+        edges = edges if len(edges) > 0 else NO_EDGES
+        observed = observed if len(observed) > 0 else NOTHING_OBSERVED
+        return tuple(np.array(column, order='C')
+                     for column in (hidden, *edges.columns, *observed.columns))
 
     def ensure(self, n_nodes: int, n_edges: int, n_observed: int) -> None:
         """Make all tables hold a graph of such a size, and one update of all of it."""
@@ -203,10 +216,10 @@ class Graph:
         memory.ensure('work_i', 4 * nodes)
         memory.ensure('waiting', edges + observed, keep=int(head[tb.N_WAITING]))
         memory.ensure('log_f', nodes * (tb.NODE_F + tb.STIFF_T + tb.CLIQUE_F)
-                      + edges * (tb.EDGE_F + 2) + observed * tb.OBS_F,
+                      + edges * (tb.EDGE_F + 2) + observed * tb.OBS_F + tb.N_SCALARS,
                       keep=int(head[tb.LOG_F_END]))
         memory.ensure('log_i', nodes * (tb.NODE_I + tb.CLIQUE_I + 16)
-                      + edges * (tb.EDGE_I + 5) + observed * (tb.OBS_I + 2),
+                      + edges * (tb.EDGE_I + 6) + observed * (tb.OBS_I + 3),
                       keep=int(head[tb.LOG_I_END]))
         head[tb.NODE_ROOM], head[tb.EDGE_ROOM], head[tb.OBSERVED_ROOM] = nodes, edges, observed
 
@@ -232,27 +245,15 @@ class Graph:
             linearize.energies(
                 linearize.observed_errors(poses, observed), observed.weighted_information))
 
-    def begin(self) -> Checkpoint:
+    def begin(self) -> None:
         """Begin an update: everything from here on can be undone."""
-        memory, head = self.memory, self.memory.head
-        if head[tb.FRONT_SERIAL] > tb.LAST_STAMP or head[tb.UPDATE] > tb.LAST_STAMP:
-            memory.restart_stamps()
-        undo.begin(head)
-        return Checkpoint(self.n_nodes, self.n_edges, self.n_observed, int(head[tb.STRUCTURE]),
-                          memory['scalars'].copy(), memory['seeds'][:head[tb.N_SEEDS]].copy(),
-                          memory['waiting'][:head[tb.N_WAITING]].copy())
+        if not undo.begin(self.memory.head):
+            self.memory.restart_stamps()
+            undo.begin(self.memory.head)
 
-    def undo(self, checkpoint: Checkpoint) -> None:
+    def undo(self) -> None:
         """Undo the edits and steps since `begin`, bit for bit."""
-        memory, head = self.memory, self.memory.head
-        undo.undo(head)
-        head[tb.N_NODES], head[tb.N_EDGES], head[tb.N_OBSERVED] = checkpoint[:3]
-        head[tb.STRUCTURE] = checkpoint.structure
-        memory['scalars'][:] = checkpoint.scalars
-        for name, count, entries in (('seeds', tb.N_SEEDS, checkpoint.seeds),
-                                     ('waiting', tb.N_WAITING, checkpoint.waiting)):
-            head[count] = len(entries)
-            memory[name][:len(entries)] = entries
+        undo.undo(self.memory.head)
 
 
 _FULL: IntArray = np.array((0, 1, 2, 1, 3, 4, 2, 4, 5))

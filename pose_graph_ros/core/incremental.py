@@ -6,9 +6,8 @@ The incremental smoother: an estimate of all poses that is kept up to date, step
 A step costs what it changes. What an edit touches is eliminated again, from there to the root of
 the tree of cliques (`elimination`); the solution is passed down as far as values move
 (`back_substitution`); what has become wrong by linearization is linearized again
-(`relinearization`), and the loop
-goes on until the rest of that is below a budget. Along a chain a step is a constant amount of work
-(`chain`). `docs/solver.md` tells the whole story.
+(`relinearization`), and the loop (`step`) goes on until the rest is below a budget. Along a
+chain a step is a constant amount of work (`chain`). `docs/solver.md` tells the whole story.
 """
 
 from typing import NamedTuple
@@ -18,12 +17,11 @@ import numpy as np
 
 from pose_graph_ros.core import (
     chain,
-    elimination,
     gauss_newton,
     marginals,
-    relinearization,
     rescue,
     se2,
+    step,
     tables as tb,
     undo,
 )
@@ -31,17 +29,10 @@ from pose_graph_ros.core.batch import Status
 from pose_graph_ros.core.config import SmootherConfig
 from pose_graph_ros.core.constraints import EdgeKind, Edges, ObservedKind, ObservedNodes
 from pose_graph_ros.core.exceptions import GraphUpdateError
-from pose_graph_ros.core.graph import Checkpoint, Graph, GraphUpdate
+from pose_graph_ros.core.graph import Graph, GraphUpdate
 from pose_graph_ros.core.jit import compile_only
 from pose_graph_ros.core.se2 import FloatArray
 
-# Where a step leaves more squared linearization error than this [sigma^2], and than this fraction
-# of chi2 (a false constraint strains the graph, and all its errors), it has not worked ...
-DOUBT = 1.0
-DOUBT_RATIO = 1e-3
-# ... if there is no iteration left, or the last one has not at least halved it, or there is so
-# much of it that the next one can only make it worse.
-HOPELESS = 1e6
 NAN = float('nan')
 
 
@@ -120,10 +111,9 @@ class IncrementalSmoother:
             If a part of the update does not fit the graph; nothing has changed then.
 
         """
-        before = self.graph.begin()
+        self.graph.begin()
         self.graph.apply(update)
-        self._memory.head[tb.N_RELINEARIZED:tb.N_ITERATIONS + 1] = 0
-        result = self._step(before)
+        result = self._step(step.FIRST)
         return result._replace(chi2=self.chi2()) if chi2 else result
 
     def extend(
@@ -203,17 +193,8 @@ class IncrementalSmoother:
         return float(gauss_newton.evaluate(self._memory.head, gradient)[0])
 
     def _solve_extended(self) -> UpdateResult:
-        """Solve after a chain was extended by an observed node."""
-        head = self._memory.head
-        head[tb.N_RELINEARIZED:tb.N_ITERATIONS + 1] = 0
-        head[tb.N_ELIMINATED] = 1
-        if relinearization.solve(head):
-            return self._result(Status.CONVERGED)
-        # the node has its place already, whatever becomes of the next iterations
-        undo.commit(head)
-        before = self.graph.begin()
-        relinearization.relinearize(head)
-        result = self._step(before)
+        """Solve after a chain was extended by an observed node, which stays in any case."""
+        result = self._step(step.EXTENDED)
         return result._replace(status=Status.MAX_ITERATIONS) if result.reason else result
 
     def _extend_in_general(
@@ -232,41 +213,24 @@ class IncrementalSmoother:
             edges=Edges([node - 1], [node], mean[None], information[None], [EdgeKind.ODOMETRY]),
             observed=observed))
 
-    def _step(self, before: Checkpoint, *, rescued: bool = False) -> UpdateResult:
-        """Eliminate, solve and linearize again until the estimate is good, or undo it all."""
-        head, scalars = self._memory.head, self._memory['scalars']
-        error2, settled = 0.0, True
-        if head[tb.N_WAITING] > 0:
-            # what the last update has left over; the frames that had turned may be gone by now
-            head[tb.N_TURNED] = 0
-            relinearization.relinearize(head)
-        while head[tb.N_SEEDS] > 0:
-            code = self._eliminate()
-            if code == elimination.BAD_PIVOT:
-                reason = f'hidden node {head[tb.BAD_NODE]} is not determined'
-                self.graph.undo(before)
-                return UpdateResult(Status.FAILED, reason, 0, 0, 0, 0, NAN)
-            settled = bool(relinearization.solve(head))
-            if settled:
-                break
-            error2, error2_before = float(scalars[tb.ERROR2_SUM]), error2
-            out_of_iterations = head[tb.N_ITERATIONS] >= self._config.max_iterations
-            doubt = max(DOUBT, DOUBT_RATIO * float(scalars[tb.CHI2]))
-            if not rescued and not error2 <= doubt and (
-                    out_of_iterations or 0.0 < error2_before < 2.0 * error2
-                    or not error2 < HOPELESS):
-                return self._rescue(before)
-            if out_of_iterations:
-                break
-            relinearization.relinearize(head)
-        undo.commit(head)
-        return self._result(Status.CONVERGED if settled else Status.MAX_ITERATIONS)
-
-    def _eliminate(self) -> int:
-        """Eliminate what the seeds touch, with as much memory as it takes."""
-        while (code := elimination.eliminate(self._memory.head)) == elimination.MORE_MEMORY:
-            self._make_room(*self._memory.head[tb.NEED_F:tb.NEED_WORK + 1].tolist())
-        return int(code)
+    def _step(self, entered: int) -> UpdateResult:
+        """Bring the estimate up to date, with as much memory as it takes, or undo the update."""
+        head = self._memory.head
+        code = step.run(head, self._config.max_iterations, entered)
+        while code == step.MORE_MEMORY:
+            self._make_room(*head[tb.NEED_F:tb.NEED_WORK + 1].tolist())
+            entered = step.RESCUED if entered == step.RESCUED else step.RESUMED
+            code = step.run(head, self._config.max_iterations, entered)
+        if code == step.ASTRAY:
+            return self._rescue()
+        if code == step.BAD_PIVOT:
+            reason = f'hidden node {head[tb.BAD_NODE]} is not determined'
+            self.graph.undo()
+            return UpdateResult(Status.FAILED, reason, 0, 0, 0, 0, NAN)
+        status = Status.CONVERGED if code == step.SETTLED else Status.MAX_ITERATIONS
+        relinearized, eliminated, visited, iterations = (
+            head[tb.N_RELINEARIZED:tb.N_ITERATIONS + 1].tolist())
+        return UpdateResult(status, '', relinearized, eliminated, visited, iterations, NAN)
 
     def _make_room(self, floats: int, integers: int, work: int) -> None:
         memory, head = self._memory, self._memory.head
@@ -274,22 +238,18 @@ class IncrementalSmoother:
         memory.ensure('pool_i', integers, keep=int(head[tb.POOL_I_END]))
         memory.ensure('work_f', work)
 
-    def _rescue(self, before: Checkpoint) -> UpdateResult:
+    def _rescue(self) -> UpdateResult:
         """Take the poses that the batch optimiser finds; the whole graph is eliminated anew."""
         graph, head = self.graph, self._memory.head
         poses = np.empty((graph.n_nodes, 3))
         undo.poses_before(head, poses)
         found = rescue.optimized_poses(graph, poses)
         if found is None:
-            graph.undo(before)
+            graph.undo()
             return UpdateResult(
                 Status.FAILED, 'the iterations do not converge, and there is no batch solution',
                 0, 0, 0, 0, NAN)
         undo.commit(head)
         graph.set_poses(found)
-        return self._step(graph.begin(), rescued=True)
-
-    def _result(self, status: Status) -> UpdateResult:
-        relinearized, eliminated, visited, iterations = (
-            self._memory.head[tb.N_RELINEARIZED:tb.N_ITERATIONS + 1].tolist())
-        return UpdateResult(status, '', relinearized, eliminated, visited, iterations, NAN)
+        graph.begin()
+        return self._step(step.RESCUED)

@@ -8,7 +8,7 @@ What is not plainly sound here is judged, and refused with words, by `constraint
 
 import math
 
-from pose_graph_ros.core import tables as tb
+from pose_graph_ros.core import factors, tables as tb
 from pose_graph_ros.core.jit import kernel
 
 # Of the scaled information matrix; a tenth of what `constraints.check` lets pass.
@@ -84,6 +84,19 @@ def write_observed(  # type: ignore[no-untyped-def]
     sound = _copy_pose(f, tb.MEAN, mean) and is_finite(weight) and weight >= 0.0
     sound = _copy_pose(f, tb.OBS_OFFSET, offset) and sound
     return pack_information(f, information) and sound
+
+
+@kernel
+def write_nodes(head, poses):  # type: ignore[no-untyped-def]
+    """Write hidden nodes behind the last row, headings wrapped; tell if all are plainly finite."""
+    node_f = tb.node_f(head)
+    sound = True
+    for k in range(len(poses)):
+        f = node_f[head[tb.N_NODES] + k]
+        if not _copy_pose(f, tb.POSE, poses[k]):
+            sound = False
+        f[tb.POSE + 2] = factors.wrap(f[tb.POSE + 2])
+    return sound
 
 
 @kernel

@@ -89,9 +89,10 @@ FREE_F, FREE_I = COUNTERS_END, COUNTERS_END + N_SIZES
 HEAD_SIZE: Final = COUNTERS_END + 2 * N_SIZES
 
 # scalars: sum of the squared linearization errors of the constraints that were looked at, how many
-# nodes have moved, settings of the step, three zeros, energy of the whole
+# nodes have moved, settings of the step, three zeros, energy of the whole, that sum one iteration
+# before
 (ERROR2_SUM, N_MOVED, SETTING_ALPHA, SETTING_BUDGET, SETTING_SHARE, DAMPING, ZEROS, CHI2,
- N_SCALARS) = (0, 1, 2, 3, 4, 5, 6, 9, 10)
+ ERROR2_BEFORE, N_SCALARS) = (0, 1, 2, 3, 4, 5, 6, 9, 10, 11)
 
 # Counters whose values are written into rows as stamps of 32 bits begin anew beyond this: in some
 # hundred days, or hours, for that of the fronts.

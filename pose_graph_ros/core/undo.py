@@ -5,7 +5,8 @@ The log that undoes an update bit for bit, and the pools of memory that it has t
 
 Whoever writes to a row that was there before the update logs the row first; only the first time
 counts, which a stamp in the row tells. Values of cliques are never written over: new ones get
-memory of their own, and old ones are given back when the update is sure (`commit`).
+memory of their own, and old ones are given back when the update is sure (`commit`). The first
+entry of the log holds the counts, sums and lists that an update begins with.
 """
 
 from typing import Final
@@ -16,7 +17,9 @@ from pose_graph_ros.core import tables as tb
 from pose_graph_ros.core.jit import kernel
 
 # What an entry of the log holds.
-NODE, EDGE, OBSERVED, CLIQUE, TAKEN_CLIQUE, SOLUTION, EDGE_ENERGY = range(7)
+NODE, EDGE, OBSERVED, CLIQUE, TAKEN_CLIQUE, SOLUTION, EDGE_ENERGY, START = range(8)
+# Counters that the first entry brings back.
+STARTED_WITH = (tb.N_NODES, tb.N_EDGES, tb.N_OBSERVED, tb.STRUCTURE, tb.N_SEEDS, tb.N_WAITING)
 
 _SIZES: Final = np.array(tb.SIZES, dtype=np.int64)
 
@@ -249,9 +252,42 @@ def renew_values(head, c):  # type: ignore[no-untyped-def]
 
 @kernel
 def begin(head):  # type: ignore[no-untyped-def]
-    """Start an update: from here on changes are logged."""
+    """Start an update: changes are logged from here on; return whether stamps are small enough."""
+    scalars, seeds, waiting = tb.scalars(head), tb.seeds(head), tb.waiting(head)
+    log_f, log_i = tb.log_f(head), tb.log_i(head)
     head[tb.UPDATE] += 1
-    head[tb.LOG_F_END] = head[tb.LOG_I_END] = head[tb.N_FREED] = 0
+    for k in range(tb.N_SCALARS):
+        log_f[k] = scalars[k]
+    end = 0
+    for k in range(head[tb.N_SEEDS]):
+        log_i[end] = seeds[k]
+        end += 1
+    for k in range(head[tb.N_WAITING]):
+        log_i[end] = waiting[k]
+        end += 1
+    for counter in STARTED_WITH:
+        log_i[end] = head[counter]
+        end += 1
+    log_i[end] = START
+    head[tb.LOG_F_END], head[tb.LOG_I_END], head[tb.N_FREED] = tb.N_SCALARS, end + 1, 0
+    return head[tb.FRONT_SERIAL] <= tb.LAST_STAMP and head[tb.UPDATE] <= tb.LAST_STAMP + 1
+
+
+@kernel
+def _restart(head):  # type: ignore[no-untyped-def]
+    """Bring back what the update began with, which is all that is left of the log."""
+    scalars, seeds, waiting = tb.scalars(head), tb.seeds(head), tb.waiting(head)
+    log_f, log_i = tb.log_f(head), tb.log_i(head)
+    for k in range(tb.N_SCALARS):
+        scalars[k] = log_f[k]
+    at = head[tb.LOG_I_END] - 1 - len(STARTED_WITH)
+    for counter in STARTED_WITH:
+        head[counter] = log_i[at]
+        at += 1
+    for k in range(head[tb.N_SEEDS]):
+        seeds[k] = log_i[k]
+    for k in range(head[tb.N_WAITING]):
+        waiting[k] = log_i[head[tb.N_SEEDS] + k]
 
 
 @kernel
@@ -270,7 +306,7 @@ def commit(head):  # type: ignore[no-untyped-def]
 
 @kernel
 def undo(head):  # type: ignore[no-untyped-def]
-    """Bring every logged row back, the newest entry first; the caller restores the counters."""
+    """Bring everything back that was logged since `begin`, the newest entry first."""
     node_f = tb.node_f(head)
     edge_f = tb.edge_f(head)
     observed_f = tb.observed_f(head)
@@ -284,6 +320,10 @@ def undo(head):  # type: ignore[no-untyped-def]
     end_f, end_i = head[tb.LOG_F_END], head[tb.LOG_I_END]
     while end_i > 0:
         row, code = log_i[end_i - 2], log_i[end_i - 1]
+        if code == START:
+            head[tb.LOG_I_END] = end_i
+            _restart(head)
+            break
         end_i -= 2
         if code == TAKEN_CLIQUE:
             if clique_i[row, tb.N_FRONTAL] > 0:  # else it was let go in the same update
@@ -332,7 +372,7 @@ def poses_before(head, poses):  # type: ignore[no-untyped-def]
         for k in range(3):
             poses[v, k] = node_f[v, tb.POSE + k]
     end_f, end_i = head[tb.LOG_F_END], head[tb.LOG_I_END]
-    while end_i > 0:
+    while end_i > 0 and log_i[end_i - 1] != START:
         row, code = log_i[end_i - 2], log_i[end_i - 1]
         end_i -= 2
         if code in (NODE, SOLUTION):

@@ -269,7 +269,7 @@ class World:
         for name, table in (('edges', Edges), ('observed', ObservedNodes)):
             if name in more:
                 more[name] = table.joined([getattr(first, name), more[name]])
-        return replace(first, **more)
+        return first._replace(**more)
 
     def mixture(self, graph: SlowGraph) -> GraphUpdate:
         """Return an update of any size that does everything at once."""
@@ -284,14 +284,14 @@ class World:
         for table, remove, weigh in ((graph.edges, 'remove_edges', 'weigh_edges'),
                                      (graph.observed, 'remove_observed', 'weigh_observed')):
             if len(table) > 0 and rng.random() < 0.3:
-                update = replace(update, **{remove: [int(rng.integers(len(table)))]})
+                update = update._replace(**{remove: [int(rng.integers(len(table)))]})
             if len(table) > 0 and rng.random() < 0.4:
-                update = replace(update, **{weigh: {
+                update = update._replace(**{weigh: {
                     int(rng.integers(len(table))): float(rng.choice([0.0, 1.0, rng.uniform()]))}})
         if rng.random() < 0.15:
-            update = replace(update, fix=[int(rng.integers(n))])
+            update = update._replace(fix=[int(rng.integers(n))])
         if rng.random() < 0.15:
-            update = replace(update, free=[int(rng.integers(n))])
+            update = update._replace(free=[int(rng.integers(n))])
         return update
 
 

@@ -462,9 +462,9 @@ class Flaky(IncrementalSmoother):
     def update(self, update: GraphUpdate, **options: bool) -> UpdateResult:
         if not self.broken:
             return super().update(update, **options)
-        before = self.graph.begin()
+        self.graph.begin()
         self.graph.apply(update)
-        self.graph.undo(before)
+        self.graph.undo()
         return UpdateResult(Status.FAILED, 'broken on purpose', 0, 0, 0, 0, np.nan)
 
 
