@@ -107,7 +107,7 @@ STAMPS: Final = {
 
 # Tables of so many bytes lie on pages of their own. What they have left costs address space alone,
 # so they grow by much: seldom is a table copied.
-OWN_PAGES: Final = 2**18
+OWN_PAGES: Final = 2**20
 GROWTH: Final = 4
 
 IntHead = npt.NDArray[np.int64]
