@@ -19,7 +19,7 @@ CORE = (
     'kernel_cache', 'jit', 'exceptions', 'arrays', 'config', 'se2', 'covariance', 'measurements',
     'constraints', 'linearize',
     # the engine
-    'tables', 'vectors', 'factors', 'undo', 'rows', 'ordering', 'frames', 'cholesky', 'fronts',
+    'tables', 'vectors', 'cholesky', 'factors', 'undo', 'rows', 'ordering', 'frames', 'fronts',
     'structure', 'assembly', 'elimination', 'editing', 'graph', 'symbolic', 'complex_system',
     'initialization', 'carrying', 'back_substitution', 'relinearization', 'step',
     'gauss_newton', 'descent', 'batch', 'starts', 'chain', 'sparse_inverse', 'marginals',

@@ -4,7 +4,7 @@
 
 
 from pose_graph_ros.core import factors, frames, tables as tb, undo
-from pose_graph_ros.core.cholesky import LEAST_PIVOT
+from pose_graph_ros.core.cholesky import LEAST_PIVOT, row_start, triangle_size
 from pose_graph_ros.core.fronts import factorize, padded
 from pose_graph_ros.core.jit import kernel
 from pose_graph_ros.core.vectors import add, copy
@@ -111,16 +111,12 @@ def eliminate_clique(head, c, afresh):  # type: ignore[no-untyped-def]
     bad = factorize(front, rows, n, ld, least)
     if bad >= 0:
         return list_[bad // 3]
+    # the rows of R, and right behind them the update matrix
     at = row[tb.VALUES]
-    for k in range(rows):
-        copy(front, k * (ld + 1), pool_f, at + k, n - k)
-        at += n + 1
+    for k in range(n):
+        copy(front, k * (ld + 1), pool_f, at, n - k)
+        at += n - k + 1
         pool_f[at - 1] = front[(k + 1) * ld - 1]
-    rest = n - rows
-    for k in range(rest):
-        copy(front, (rows + k) * (ld + 1), pool_f, at + k, rest - k)
-        at += rest + 1
-        pool_f[at - 1] = front[(rows + k + 1) * ld - 1]
     # what a turn of all separator nodes about the first one would cost, to the fourth power of it
     stiff, first = 0.0, node_f[list_[n_frontal]] if n_separator > 0 else node_f[list_[0]]
     for k in range(n_frontal + 1, n_all):
@@ -146,7 +142,7 @@ def _extend_add(head, child, front, ld):  # type: ignore[no-untyped-def]
     size = 3 * n_separator
     if n_separator == 0:
         return
-    update = pool_f[row[tb.VALUES] + 3 * n_frontal * (3 * n_frontal + size + 1):]
+    update = pool_f[row[tb.VALUES] + triangle_size(3 * n_frontal, 3 * n_frontal + size):]
     nodes = pool_i[row[tb.NODES] + n_frontal:row[tb.NODES] + n_frontal + n_separator]
     phi = frames.present_turn(head, child)
     if phi != clique_f[child, tb.TURN_SEEN]:
@@ -162,7 +158,7 @@ def _extend_add(head, child, front, ld):  # type: ignore[no-untyped-def]
         index[a] = node_i[nodes[a], tb.INDEX]
         in_order = in_order and (a == 0 or index[a] > index[a - 1])
     for k in range(size):
-        front[(index[k // 3] + k % 3) * ld + ld - 1] += update[(k + 1) * (size + 1) - 1]
+        front[(index[k // 3] + k % 3) * ld + ld - 1] += update[row_start(k, size) + size]
     if not in_order:
         _add_in_other_order(update, n_separator, index, front, ld)
         return
@@ -174,15 +170,13 @@ def _extend_add(head, child, front, ld):  # type: ignore[no-untyped-def]
             end += 1
         width, column = 3 * (end - begin), index[begin]
         for a in range(begin):
-            source, target = 3 * a * (size + 1) + 3 * begin, index[a] * ld + column
-            for _ in range(3):
-                add(update, source, front, target, width)
-                source += size + 1
+            target = index[a] * ld + column
+            for k in range(3 * a, 3 * a + 3):
+                add(update, row_start(k, size) + 3 * begin, front, target, width)
                 target += ld
-        source, target = 3 * begin * (size + 2), column * (ld + 1)
-        for a in range(width):
-            add(update, source, front, target, width - a)
-            source += size + 2
+        target = column * (ld + 1)
+        for k in range(3 * begin, 3 * end):
+            add(update, row_start(k, size) + k, front, target, 3 * end - k)
             target += ld + 1
         begin = end
 
@@ -194,7 +188,7 @@ def _add_in_other_order(update, n_separator, index, front, ld):  # type: ignore[
     for a in range(n_separator):
         i = index[a]
         for m in range(3):
-            source = update[(3 * a + m) * (size + 1):(3 * a + m + 1) * (size + 1)]
+            source = update[row_start(3 * a + m, size):]
             for q in range(m, 3):
                 front[(i + m) * ld + i + q] += source[3 * a + q]
             for b in range(a + 1, n_separator):
@@ -230,4 +224,4 @@ def _hold(head, v, at, front, n, ld):  # type: ignore[no-untyped-def]
 def work_size(n_nodes):  # type: ignore[no-untyped-def]
     """Return the work space that a front takes, with another update matrix in it."""
     n = 3 * n_nodes
-    return n * padded(n) + n + n * (n + 1)
+    return n * padded(n) + n + triangle_size(n, n)

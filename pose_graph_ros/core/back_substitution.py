@@ -14,7 +14,7 @@ import math
 
 from pose_graph_ros.core import factors, frames, tables as tb, undo
 from pose_graph_ros.core.carrying import carry, rigid_motion
-from pose_graph_ros.core.cholesky import solve_rows
+from pose_graph_ros.core.cholesky import solve_rows, triangle_size
 from pose_graph_ros.core.jit import kernel
 from pose_graph_ros.core.vectors import fetch
 
@@ -64,10 +64,10 @@ def _move(head, v, dx, dy, dth, phi, alpha):  # type: ignore[no-untyped-def]
 def _visit_pair(head, values, v, other, alpha):  # type: ignore[no-untyped-def]
     """Solve a clique of a node and a separator node, as along a chain."""
     node_f, pool_f = tb.node_f(head), tb.pool_f(head)
-    r, f = pool_f[values:values + 21], node_f[other]
+    r, f = pool_f[values:values + 18], node_f[other]
     a, b, c = f[tb.DELTA], f[tb.DELTA + 1], f[tb.DELTA + 2]
-    z = (r[20] - (r[17] * a + r[18] * b + r[19] * c)) * r[16]
-    y = (r[13] - (r[10] * a + r[11] * b + r[12] * c) - r[9] * z) * r[8]
+    z = (r[17] - (r[14] * a + r[15] * b + r[16] * c)) * r[13]
+    y = (r[12] - (r[9] * a + r[10] * b + r[11] * c) - r[8] * z) * r[7]
     x = (r[6] - (r[3] * a + r[4] * b + r[5] * c) - r[2] * z - r[1] * y) * r[0]
     _move(head, v, x, y, z, 0.0, alpha)
 
@@ -101,7 +101,7 @@ def _visit(head, c):  # type: ignore[no-untyped-def]
             x[3 * k], x[3 * k + 1], x[3 * k + 2] = f[tb.DELTA], f[tb.DELTA + 1], f[tb.DELTA + 2]
         else:
             x[3 * k], x[3 * k + 1], x[3 * k + 2] = frames.local_delta(f, px, py, cos, sin, phi)
-    solve_rows(pool_f[row[tb.VALUES]:row[tb.VALUES] + rows * (n + 1)], rows, n, x)
+    solve_rows(pool_f[row[tb.VALUES]:], rows, n, x)
     for k in range(n_frontal):
         v = nodes[k]
         dx, dy, dth = x[3 * k], x[3 * k + 1], x[3 * k + 2]
@@ -169,9 +169,9 @@ def _fetch_rows(head, c):  # type: ignore[no-untyped-def]
     """Have the rows of R of a clique fetched: they are used once, and then from memory."""
     clique_i, pool_f = tb.clique_i(head), tb.pool_f(head)
     row = clique_i[c]
-    rows = 3 * row[tb.N_FRONTAL]
-    begin = row[tb.VALUES]
-    for at in range(begin, begin + rows * (rows + 3 * row[tb.N_SEPARATOR] + 1), 8):
+    rows, begin = 3 * row[tb.N_FRONTAL], row[tb.VALUES]
+    size = triangle_size(rows, rows + 3 * row[tb.N_SEPARATOR])
+    for at in range(begin, begin + size, 8):
         fetch(pool_f, at)
 
 

@@ -15,13 +15,12 @@ from pose_graph_ros.core import factors, rows, tables as tb, undo
 from pose_graph_ros.core.cholesky import LEAST_PIVOT
 from pose_graph_ros.core.editing import stiffen_by_edge, stiffen_by_observed
 from pose_graph_ros.core.jit import kernel
-from pose_graph_ros.core.vectors import copy
 
 # Answers of `extend`.
 EXTENDED, NO_ROOM, NOT_A_CHAIN = range(3)
 
-_PAIR = 33  # numbers of a clique of a node and a separator node
-_ROOT = 12
+_PAIR = 27  # numbers of a clique of a node and a separator node
+_ROOT = 9
 
 
 @kernel
@@ -50,8 +49,8 @@ def _root_equations(head, v, values, front, ld):  # type: ignore[no-untyped-def]
         return  # they do not matter
     r = pool_f[values:values + _ROOT]
     a, b, c, x = 1.0 / r[0], r[1], r[2], r[3]
-    d, e, y = 1.0 / r[5], r[6], r[7]
-    g, z = 1.0 / r[10], r[11]
+    d, e, y = 1.0 / r[4], r[5], r[6]
+    g, z = 1.0 / r[7], r[8]
     right = ld - 1
     front[0], front[1], front[2], front[right] = a * a, a * b, a * c, a * x
     front[ld + 1], front[ld + 2] = b * b + d * d, b * c + d * e
@@ -93,6 +92,15 @@ def _eliminate_3(front, n, least):  # type: ignore[no-untyped-def]
             for c in range(i, ld):
                 front[i * ld + c] -= a * front[k * ld + c]
     return -1
+
+
+@kernel
+def _store(front, ld, begin, end, at, pool_f):  # type: ignore[no-untyped-def]
+    """Store the upper triangle of rows of a front, with their right-hand sides, without gaps."""
+    for k in range(begin, end):
+        for c in range(k, ld):
+            pool_f[at] = front[k * ld + c]
+            at += 1
 
 
 @kernel
@@ -187,7 +195,7 @@ def extend(  # type: ignore[no-untyped-def]
     undo.give_nodes(head, nodes, 1)
     r = undo.take_clique(head, 1, 0)
     pool_i[clique_i[r, tb.NODES]] = v
-    copy(root, 0, pool_f, clique_i[r, tb.VALUES], _ROOT)
+    _store(root, 4, 0, 3, clique_i[r, tb.VALUES], pool_f)
     clique_i[r, tb.CHILD] = c
     clique_i[r, tb.ANCHORED] = 1 if with_observed else old[tb.ANCHORED]
     for m in range(tb.CLIQUE_F):
@@ -195,11 +203,7 @@ def extend(  # type: ignore[no-untyped-def]
     old[tb.PARENT], old[tb.SIBLING], old[tb.N_SEPARATOR] = r, -1, 1
     old[tb.NODES], old[tb.VALUES] = undo.take_nodes(head, 2), undo.take_values(head, _PAIR)
     pool_i[old[tb.NODES]], pool_i[old[tb.NODES] + 1] = last, v
-    at = old[tb.VALUES]
-    copy(front, 0, pool_f, at, 21)
-    for m in range(3):
-        for n in range(4):
-            pool_f[at + 21 + 4 * m + n] = front[7 * (m + 3) + n + 3]
+    _store(front, 7, 0, 6, old[tb.VALUES], pool_f)
     node_i[v, tb.CLIQUE] = r
     edge_i[e, tb.NEXT_I], node_i[last, tb.EDGE_LIST] = node_i[last, tb.EDGE_LIST], 2 * e
     edge_i[e, tb.NEXT_J], node_i[v, tb.EDGE_LIST] = -1, 2 * e + 1

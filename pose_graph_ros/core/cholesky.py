@@ -7,7 +7,7 @@ A *front* is the upper triangle of the equations of one clique, `(H | rhs)`, its
 first. Factorising the frontal rows leaves rows of R with `R^T R = H` and, in the other rows, the
 Schur complement: the *update matrix*, which is added to the front of the parent (J. Liu, "The
 multifrontal method for sparse matrix solution", SIAM Review 34 (1992)). Rows of R hold the
-reciprocal of their diagonal.
+reciprocal of their diagonal. Both are stored as upper triangles by rows, without gaps.
 """
 
 from pose_graph_ros.core.jit import kernel
@@ -19,6 +19,22 @@ LEAST_PIVOT = 1e-12
 _FAST = {'reassoc', 'contract', 'nsz', 'arcp'}
 
 
+@kernel
+def row_start(k, n):  # type: ignore[no-untyped-def]
+    """
+    Return where column 0 of row k would be, in the upper triangle of n columns stored by rows.
+
+    A row holds its columns from k on, and its right-hand side as column n.
+    """
+    return k * n - k * (k - 1) // 2
+
+
+@kernel
+def triangle_size(rows, n):  # type: ignore[no-untyped-def]
+    """Return how many numbers the first rows of such a triangle are."""
+    return rows * (n + 1) - rows * (rows - 1) // 2
+
+
 @kernel(fastmath=_FAST)
 def forward_rows(values, rows, n, x):  # type: ignore[no-untyped-def]
     """
@@ -27,15 +43,13 @@ def forward_rows(values, rows, n, x):  # type: ignore[no-untyped-def]
     Parameters
     ----------
     values : ndarray, flat
-        `rows` rows of n + 1 numbers.
+        Upper triangle of n columns, its first `rows` rows.
     x : ndarray, shape (n,)
 
     """
-    ld = n + 1
     for k in range(0, rows, 3):
-        r0 = values[k * ld:(k + 1) * ld]
-        r1 = values[(k + 1) * ld:(k + 2) * ld]
-        r2 = values[(k + 2) * ld:(k + 3) * ld]
+        r0, r1, r2 = (values[row_start(k, n):], values[row_start(k + 1, n):],
+                      values[row_start(k + 2, n):])
         a = x[k] * r0[k]
         b = (x[k + 1] - r0[k + 1] * a) * r1[k + 1]
         c = (x[k + 2] - r0[k + 2] * a - r1[k + 2] * b) * r2[k + 2]
@@ -47,10 +61,8 @@ def forward_rows(values, rows, n, x):  # type: ignore[no-untyped-def]
 @kernel(fastmath=_FAST)
 def _backward_block(values, k, n, x, a, b, c):  # type: ignore[no-untyped-def]
     """Solve the three rows of R from row k on for the right-hand sides a, b, c."""
-    ld = n + 1
-    r0 = values[k * ld:(k + 1) * ld]
-    r1 = values[(k + 1) * ld:(k + 2) * ld]
-    r2 = values[(k + 2) * ld:(k + 3) * ld]
+    r0, r1, r2 = (values[row_start(k, n):], values[row_start(k + 1, n):],
+                  values[row_start(k + 2, n):])
     for m in range(k + 3, n):
         a -= r0[m] * x[m]
         b -= r1[m] * x[m]
@@ -76,12 +88,12 @@ def solve_rows(values, rows, n, x):  # type: ignore[no-untyped-def]
     Parameters
     ----------
     values : ndarray, flat
-        `rows` rows of n + 1 numbers.
+        Upper triangle of n columns, its first `rows` rows.
     x : ndarray, shape (n,)
         Holds the solution of the separator from `rows` on; the frontal part is written.
 
     """
     for k in range(rows - 3, -1, -3):
-        at = k * (n + 1) + n
+        at = row_start(k, n) + n
         _backward_block(
-            values, k, n, x, values[at], values[at + n + 1], values[at + 2 * (n + 1)])
+            values, k, n, x, values[at], values[at + n - k], values[at + 2 * (n - k) - 1])

@@ -28,6 +28,7 @@ linearization error of a constraint.
 import math
 
 from pose_graph_ros.core import tables as tb
+from pose_graph_ros.core.cholesky import row_start, triangle_size
 from pose_graph_ros.core.jit import kernel
 
 # A smaller turn is none [rad].
@@ -79,7 +80,7 @@ def turned_update(update, n, nodes, node_f, phi, to):  # type: ignore[no-untyped
     Parameters
     ----------
     update : ndarray, flat
-        Rows of 3n + 1 numbers; only the upper triangle counts.
+        Upper triangle of 3n columns and the right-hand side, as `cholesky.row_start` tells.
     n : int
         Number of separator nodes.
     nodes : ndarray of int32, shape (n,)
@@ -89,23 +90,26 @@ def turned_update(update, n, nodes, node_f, phi, to):  # type: ignore[no-untyped
         As `update`.
 
     """
-    ld = 3 * n + 1
+    size = 3 * n
     cos, sin = math.cos(phi), math.sin(phi)
     first = node_f[nodes[0]]
     px, py = first[tb.POSE], first[tb.POSE + 1]
     for a in range(n):
-        r0, r1, r2 = 3 * a * ld, (3 * a + 1) * ld, (3 * a + 2) * ld
+        r0, r1, r2 = (row_start(3 * a, size), row_start(3 * a + 1, size),
+                      row_start(3 * a + 2, size))
         # u - U m, in local axes; m of each node is its local reference minus its reference
-        u0, u1, u2 = update[r0 + 3 * n], update[r1 + 3 * n], update[r2 + 3 * n]
+        u0, u1, u2 = update[r0 + size], update[r1 + size], update[r2 + size]
         for b in range(n):
             f = node_f[nodes[b]]
             x, y = f[tb.REF] - px, f[tb.REF + 1] - py
             mx, my = cos * x + sin * y - x, cos * y - sin * x - y
             if b < a:
-                q = 3 * b * ld + 3 * a
-                u0 -= update[q] * mx + update[q + ld] * my - update[q + 2 * ld] * phi
-                u1 -= update[q + 1] * mx + update[q + ld + 1] * my - update[q + 2 * ld + 1] * phi
-                u2 -= update[q + 2] * mx + update[q + ld + 2] * my - update[q + 2 * ld + 2] * phi
+                p = row_start(3 * b, size) + 3 * a
+                q = p + size - 3 * b
+                r = q + size - 3 * b - 1
+                u0 -= update[p] * mx + update[q] * my - update[r] * phi
+                u1 -= update[p + 1] * mx + update[q + 1] * my - update[r + 1] * phi
+                u2 -= update[p + 2] * mx + update[q + 2] * my - update[r + 2] * phi
             elif b == a:
                 q = 3 * a
                 u0 -= update[r0 + q] * mx + update[r0 + q + 1] * my - update[r0 + q + 2] * phi
@@ -116,8 +120,8 @@ def turned_update(update, n, nodes, node_f, phi, to):  # type: ignore[no-untyped
                 u0 -= update[r0 + q] * mx + update[r0 + q + 1] * my - update[r0 + q + 2] * phi
                 u1 -= update[r1 + q] * mx + update[r1 + q + 1] * my - update[r1 + q + 2] * phi
                 u2 -= update[r2 + q] * mx + update[r2 + q + 1] * my - update[r2 + q + 2] * phi
-        to[r0 + 3 * n], to[r1 + 3 * n] = cos * u0 - sin * u1, sin * u0 + cos * u1
-        to[r2 + 3 * n] = u2
+        to[r0 + size], to[r1 + size] = cos * u0 - sin * u1, sin * u0 + cos * u1
+        to[r2 + size] = u2
         q = 3 * a
         xx, xy, yy = update[r0 + q], update[r0 + q + 1], update[r1 + q + 1]
         xt, yt = update[r0 + q + 2], update[r1 + q + 2]
@@ -127,14 +131,12 @@ def turned_update(update, n, nodes, node_f, phi, to):  # type: ignore[no-untyped
         to[r1 + q + 1] = ss * xx + 2.0 * cs * xy + cc * yy
         to[r0 + q + 2], to[r1 + q + 2] = cos * xt - sin * yt, sin * xt + cos * yt
         to[r2 + q + 2] = update[r2 + q + 2]
-        for b in range(a + 1, n):
-            q = 3 * b
+        for q in range(3 * (a + 1), size, 3):
             for m in range(3):
                 x, y = update[r0 + q + m], update[r1 + q + m]
                 to[r0 + q + m], to[r1 + q + m] = cos * x - sin * y, sin * x + cos * y
                 to[r2 + q + m] = update[r2 + q + m]
-            for m in range(3):
-                r = r0 + m * ld
+            for r in (r0, r1, r2):
                 x, y = to[r + q], to[r + q + 1]
                 to[r + q], to[r + q + 1] = cos * x - sin * y, sin * x + cos * y
 
@@ -163,8 +165,8 @@ def interface_error2(head, c, beta, work):  # type: ignore[no-untyped-def]
     row = clique_i[c]
     n_frontal, n = row[tb.N_FRONTAL], row[tb.N_SEPARATOR]
     nodes = pool_i[row[tb.NODES] + n_frontal:row[tb.NODES] + n_frontal + n]
-    ld = 3 * n + 1
-    update = pool_f[row[tb.VALUES] + 3 * n_frontal * (3 * (n_frontal + n) + 1):]
+    size = 3 * n
+    update = pool_f[row[tb.VALUES] + triangle_size(3 * n_frontal, 3 * (n_frontal + n)):]
     phi = present_turn(head, c)
     cos, sin = math.cos(phi), math.sin(phi)
     first = node_f[nodes[0]]
@@ -179,19 +181,19 @@ def interface_error2(head, c, beta, work):  # type: ignore[no-untyped-def]
         w[3 * a], w[3 * a + 1] = versine * x - lag * y, versine * y + lag * x
         w[3 * a + 2] = 0.0
     error2 = 0.0
-    for i in range(3 * n):
-        force[i] = -update[i * ld + 3 * n]
-    for i in range(3 * n):
-        r = update[i * ld:(i + 1) * ld]
+    for i in range(size):
+        force[i] = -update[row_start(i, size) + size]
+    for i in range(size):
+        r = update[row_start(i, size):]
         error2 += w[i] * w[i] * r[i]
         force[i] += r[i] * local[i]
-        for k in range(i + 1, 3 * n):
+        for k in range(i + 1, size):
             error2 += 2.0 * w[i] * w[k] * r[k]
             force[i] += r[k] * local[k]
             force[k] += r[k] * local[i]
     turned = 0.0
-    for a in range(n):
-        stiff = update[3 * a * ld + 3 * a] + update[(3 * a + 1) * ld + 3 * a + 1]
+    for i in range(0, size, 3):
+        stiff = update[row_start(i, size) + i] + update[row_start(i + 1, size) + i + 1]
         if stiff > 0.0:
-            turned += 2.0 * (force[3 * a] ** 2 + force[3 * a + 1] ** 2) / stiff
+            turned += 2.0 * (force[i] ** 2 + force[i + 1] ** 2) / stiff
     return max(error2, 0.0) + beta * beta * turned

@@ -107,7 +107,7 @@ def gauss_newton_step(head):  # type: ignore[no-untyped-def]
             f = node_f[nodes[k]]
             x[3 * k], x[3 * k + 1], x[3 * k + 2] = f[tb.DELTA], f[tb.DELTA + 1], f[tb.DELTA + 2]
         at = row[tb.VALUES]
-        solve_rows(pool_f[at:at + 3 * n_frontal * (n + 1)], 3 * n_frontal, n, x)
+        solve_rows(pool_f[at:], 3 * n_frontal, n, x)
         for k in range(n_frontal):
             v = nodes[k]
             if node_i[v, tb.FIXED] != 0:
@@ -154,7 +154,7 @@ def chord_step(head, right):  # type: ignore[no-untyped-def]
             for m in range(3):
                 x[3 * k + m] = right[v, m]
         at = row[tb.VALUES]
-        forward_rows(pool_f[at:at + 3 * n_frontal * (n + 1)], 3 * n_frontal, n, x)
+        forward_rows(pool_f[at:], 3 * n_frontal, n, x)
         for k in range(n_all):
             v = nodes[k]
             for m in range(3):
@@ -171,7 +171,7 @@ def chord_step(head, right):  # type: ignore[no-untyped-def]
             for m in range(3):
                 x[3 * k + m] = right[v, m]
         at = row[tb.VALUES]
-        backward_rows(pool_f[at:at + rows * (n + 1)], rows, n, x)
+        backward_rows(pool_f[at:], rows, n, x)
         for k in range(n_frontal):
             v = nodes[k]
             f = node_f[v]

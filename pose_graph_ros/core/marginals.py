@@ -22,6 +22,7 @@ from typing import Any
 import numpy as np
 
 from pose_graph_ros.core import frames, tables as tb
+from pose_graph_ros.core.cholesky import row_start
 from pose_graph_ros.core.graph import Graph
 from pose_graph_ros.core.jit import kernel
 from pose_graph_ros.core.se2 import FloatArray
@@ -112,8 +113,8 @@ def newest_covariance(head, out):  # type: ignore[no-untyped-def]
         return True
     # the inverse of R, row by row, and its product with its transpose
     at = row[tb.VALUES]
-    a, d, f = pool_f[at], pool_f[at + 5], pool_f[at + 10]
-    e = -d * pool_f[at + 6] * f
+    a, d, f = pool_f[at], pool_f[at + 4], pool_f[at + 7]
+    e = -d * pool_f[at + 5] * f
     b = -a * pool_f[at + 1] * d
     c = -a * (pool_f[at + 1] * e + pool_f[at + 2] * f)
     out[0, 0], out[1, 1], out[2, 2] = a * a + b * b + c * c, d * d + e * e, f * f
@@ -204,13 +205,12 @@ def _solution(head, v, way, n_rows):  # type: ignore[no-untyped-def]
             here[1, 3 * first], here[1, 3 * first + 1] = sin, cos
             here[2, 3 * first + 2] = 1.0
             y[:, :3 * first] = 0.0
-        values = pool_f[row[tb.VALUES]:row[tb.VALUES] + rows * (n + 1)]
+        values = pool_f[row[tb.VALUES]:]
         for f in range(first, n_frontal):
             if node_i[nodes[f], tb.FIXED] != 0:
                 y[:, end + 3 * f:end + 3 * f + 3] = 0.0
             else:
-                at = 3 * f * (n + 1)
-                _solve_block(values[at:at + 3 * (n + 1)], 3 * f, here, y[:, end:])
+                _solve_block(values, 3 * f, n, here, y[:, end:])
         end += rows
         if n_separator > 0:
             parent = clique_i[row[tb.PARENT]]
@@ -241,11 +241,10 @@ def _cleared(vectors, n):  # type: ignore[no-untyped-def]
 
 
 @kernel(allocates=True, fastmath=_FAST)
-def _solve_block(three, k, rhs, y):  # type: ignore[no-untyped-def]
+def _solve_block(values, k, n, rhs, y):  # type: ignore[no-untyped-def]
     """Solve for the three rows of R from row k on, and take them off the right-hand sides."""
-    n = len(three) // 3 - 1
     for m in range(3):
-        r, row = k + m, three[m * (n + 1):m * (n + 1) + n]
+        r, row = k + m, values[row_start(k + m, n):]
         a, b, c = rhs[0, r] * row[r], rhs[1, r] * row[r], rhs[2, r] * row[r]
         y[0, r], y[1, r], y[2, r] = a, b, c
         first, second, third = rhs[0, :n], rhs[1, :n], rhs[2, :n]

@@ -17,6 +17,7 @@ import math
 import numpy as np
 
 from pose_graph_ros.core import frames, tables as tb
+from pose_graph_ros.core.cholesky import row_start
 from pose_graph_ros.core.jit import kernel
 
 _FAST = {'reassoc', 'contract', 'nsz'}
@@ -52,7 +53,10 @@ def all_covariances(head, out):  # type: ignore[no-untyped-def]
             turn = frames.present_turn(head, c)
             if turn != 0.0:
                 for m in range(row[tb.NODES], row[tb.NODES] + row[tb.N_FRONTAL]):
-                    _turn(out[pool_i[m]].reshape(9), 3, turn)
+                    block = out[pool_i[m]]
+                    _turn(block.reshape(9), 3, turn)
+                    for i, j in ((1, 0), (2, 0), (2, 1)):   # not quite, by rounding
+                        block[i, j] = block[j, i]
             child = row[tb.CHILD]
             if child < 0:
                 continue
@@ -64,11 +68,11 @@ def all_covariances(head, out):  # type: ignore[no-untyped-def]
                     longer = np.empty(2 * (end + size * size))
                     longer[:end] = blocks[:end]
                     blocks = longer
-                block = blocks[end:end + size * size]
-                _take_separator(head, child, inverse, n, block)
+                below = blocks[end:end + size * size]
+                _take_separator(head, child, inverse, n, below)
                 turn_below = frames.present_turn(head, child)
                 if turn_below != turn:
-                    _turn(block, size, turn - turn_below)
+                    _turn(below, size, turn - turn_below)
                 end += size * size
                 if depth == len(cliques):
                     more = np.empty(2 * depth, np.int32)
@@ -137,8 +141,7 @@ def _invert_clique(head, row, inverse, product, out):  # type: ignore[no-untyped
     pool_f, node_i, pool_i = tb.pool_f(head), tb.node_i(head), tb.pool_i(head)
     n_frontal = row[tb.N_FRONTAL]
     n = 3 * (n_frontal + row[tb.N_SEPARATOR])
-    rows = 3 * n_frontal
-    values = pool_f[row[tb.VALUES]:row[tb.VALUES] + rows * (n + 1)]
+    values = pool_f[row[tb.VALUES]:]
     for f in range(n_frontal - 1, -1, -1):
         v = pool_i[row[tb.NODES] + f]
         k = 3 * f
@@ -147,21 +150,20 @@ def _invert_clique(head, row, inverse, product, out):  # type: ignore[no-untyped
             for r in range(k + 3, n):
                 inverse[r * n + k] = inverse[r * n + k + 1] = inverse[r * n + k + 2] = 0.0
             continue  # `out` holds zeros
-        three = values[k * (n + 1):(k + 3) * (n + 1)]
-        _multiply(three, k, inverse, product)
-        _finish_block(three, k, inverse, product, out[v])
+        _multiply(values, k, n, inverse, product)
+        _finish_block(values, k, n, inverse, product, out[v])
 
 
 @kernel(allocates=True, fastmath=_FAST)
-def _multiply(three, k, inverse, product):  # type: ignore[no-untyped-def]
+def _multiply(values, k, n, inverse, product):  # type: ignore[no-untyped-def]
     """Set `product` to three rows of R, right of their block at k, times the inverse."""
-    n = len(three) // 3 - 1
     rest = n - k - 3
     t0, t1, t2 = product[:rest], product[rest:2 * rest], product[2 * rest:3 * rest]
     t0[:] = 0.0
     t1[:] = 0.0
     t2[:] = 0.0
-    r0, r1, r2 = three[k + 3:n], three[n + k + 4:2 * n + 1], three[2 * n + k + 5:3 * n + 2]
+    p, q, r = row_start(k, n), row_start(k + 1, n), row_start(k + 2, n)
+    r0, r1, r2 = values[p + k + 3:p + n], values[q + k + 3:q + n], values[r + k + 3:r + n]
     j = 0
     while j < rest:
         p = (k + 3 + j) * n + k + 3
@@ -193,15 +195,16 @@ def _multiply(three, k, inverse, product):  # type: ignore[no-untyped-def]
 
 
 @kernel(allocates=True, fastmath=_FAST)
-def _finish_block(three, k, inverse, product, out):  # type: ignore[no-untyped-def]
+def _finish_block(values, k, n, inverse, product, out):  # type: ignore[no-untyped-def]
     """Solve with the 3x3 block of R at k; write the rows and columns of its node, and `out`."""
-    n = len(three) // 3 - 1
     rest = n - k - 3
     # the inverse of the block of R: (a b c; 0 d e; 0 0 f)
-    a, d, f = three[k], three[n + k + 2], three[2 * n + k + 4]
-    e = -d * three[n + k + 3] * f
-    b = -a * three[k + 1] * d
-    c = -a * (three[k + 1] * e + three[k + 2] * f)
+    r0, r1, r2 = (values[row_start(k, n):], values[row_start(k + 1, n):],
+                  values[row_start(k + 2, n):])
+    a, d, f = r0[k], r1[k + 1], r2[k + 2]
+    e = -d * r1[k + 2] * f
+    b = -a * r0[k + 1] * d
+    c = -a * (r0[k + 1] * e + r0[k + 2] * f)
     t0, t1, t2 = product[:rest], product[rest:2 * rest], product[2 * rest:3 * rest]
     p = k * n + k + 3
     z0, z1, z2 = inverse[p:p + rest], inverse[p + n:p + n + rest], (
@@ -212,7 +215,8 @@ def _finish_block(three, k, inverse, product, out):  # type: ignore[no-untyped-d
         z1[q] = -(d * v + e * w)
         z2[q] = -(f * w)
     # W = (R right of the block) (inverse right of the block)^T
-    r0, r1, r2 = three[k + 3:n], three[n + k + 4:2 * n + 1], three[2 * n + k + 5:3 * n + 2]
+    p, q, r = row_start(k, n), row_start(k + 1, n), row_start(k + 2, n)
+    r0, r1, r2 = values[p + k + 3:p + n], values[q + k + 3:q + n], values[r + k + 3:r + n]
     w00 = w01 = w02 = w11 = w12 = w22 = 0.0
     w10 = w20 = w21 = 0.0
     for q in range(rest):

@@ -14,6 +14,7 @@ from typing import Final
 import numpy as np
 
 from pose_graph_ros.core import tables as tb
+from pose_graph_ros.core.cholesky import triangle_size
 from pose_graph_ros.core.jit import kernel
 
 # What an entry of the log holds.
@@ -179,7 +180,7 @@ def give_nodes(head, at, n):  # type: ignore[no-untyped-def]
 def n_values(n_frontal, n_separator):  # type: ignore[no-untyped-def]
     """Return how many numbers a clique holds: rows of R, then the update matrix."""
     rows, rest = 3 * n_frontal, 3 * n_separator
-    return rows * (rows + rest + 1) + rest * (rest + 1)
+    return triangle_size(rows, rows + rest) + triangle_size(rest, rest)
 
 
 @kernel

@@ -323,6 +323,13 @@ class Clique:
     """Update matrix in map axes, shape (3 S, 3 S)."""
 
 
+def triangle(values: FloatArray, rows: int, n: int) -> tuple[FloatArray, int]:
+    """Return the first rows of an upper triangle of n columns and one more; and their numbers."""
+    full, places = np.zeros((rows, n + 1)), np.triu_indices(rows, m=n + 1)
+    full[places] = values[:len(places[0])]
+    return full, len(places[0])
+
+
 def cliques(graph: Graph) -> dict[int, Clique]:
     """Return all cliques by their rows."""
     memory, found = graph.memory, {}
@@ -333,11 +340,10 @@ def cliques(graph: Graph) -> dict[int, Clique]:
         nodes = memory['pool_i'][row[tb.NODES]:][:n_frontal + n_separator].tolist()
         rows, rest = 3 * n_frontal, 3 * n_separator
         values = memory['pool_f'][row[tb.VALUES]:]
-        block = values[:rows * (rows + rest + 1)].reshape(rows, rows + rest + 1)
-        R = np.triu(block[:, :-1])
+        block, n_numbers = triangle(values, rows, rows + rest)
+        R = block[:, :-1]
         R[np.diag_indices(rows)] = 1.0 / R[np.diag_indices(rows)]
-        update = np.triu(
-            values[block.size:][:rest * (rest + 1)].reshape(rest, rest + 1)[:, :-1])
+        update = triangle(values[n_numbers:], rest, rest)[0][:, :-1]
         children, child = [], int(row[tb.CHILD])
         while child >= 0:
             children.append(child)

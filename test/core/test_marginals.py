@@ -190,9 +190,9 @@ def test_it_does_not_matter_in_which_frame_a_clique_holds_its_rows(seed: int, st
         triangle *= np.sign(np.diag(triangle))[:, None]
         n = len(triangle)
         triangle[np.diag_indices(n)] = 1.0 / triangle[np.diag_indices(n)]
-        at, width = memory['clique_i'][c, tb.VALUES], clique.R.shape[1] + 1
-        values = memory['pool_f'][at:at + n * width].reshape(n, width)
-        values[:, :-1] = triangle
+        values = memory['pool_f'][memory['clique_i'][c, tb.VALUES]:]
+        places = np.triu_indices(n, m=clique.R.shape[1] + 1)
+        values[:len(places[0])] = np.column_stack((triangle, clique.rhs))[places]
         memory['clique_i'][c, tb.ANCHORED] = 0
         memory['clique_f'][c, tb.TURN_ZERO] += frame_turn(graph, c) - angle
     np.testing.assert_allclose(smoother.covariances(), expected, rtol=1e-8, atol=1e-13)
