@@ -152,7 +152,7 @@ def _extend_add(head, child, front, ld):  # type: ignore[no-untyped-def]
         turned = work_f[len(front) + len(front) // ld:]
         frames.turned_update(update, n_separator, nodes, node_f, phi, turned)
         update = turned
-    index = tb.work_i(head)[head[tb.N_NODES]:]
+    index = tb.work_i(head)[head[tb.NODE_ROOM]:]
     in_order = True
     for a in range(n_separator):
         index[a] = node_i[nodes[a], tb.INDEX]

@@ -38,7 +38,7 @@ def _move(head, v, dx, dy, dth, phi, alpha):  # type: ignore[no-untyped-def]
     phi is the angle of its clique's frame.
     """
     node_f, node_i, scalars = tb.node_f(head), tb.node_i(head), tb.scalars(head)
-    work_i, n_nodes = tb.work_i(head), head[tb.N_NODES]
+    work_i, room = tb.work_i(head), head[tb.NODE_ROOM]
     f = node_f[v]
     undo.log_solution(head, v)
     f[tb.DELTA], f[tb.DELTA + 1], f[tb.DELTA + 2] = dx, dy, dth
@@ -49,14 +49,14 @@ def _move(head, v, dx, dy, dth, phi, alpha):  # type: ignore[no-untyped-def]
     if moved <= alpha and abs(turned) * f[tb.STIFF_R] <= alpha:
         return
     node_i[v, tb.CHANGED] = head[tb.ITERATION]
-    work_i[3 * n_nodes + head[tb.N_CHANGED]] = v
+    work_i[3 * room + head[tb.N_CHANGED]] = v
     head[tb.N_CHANGED] += 1
     # about the squared linearization error that the turn since the last look makes
     bent = (dth - phi - f[tb.LOOKED]) ** 2
     error2 = bent * (bent * f[tb.STIFF_R] * f[tb.STIFF_R] + USUAL_ENERGY)
     if error2 > scalars[tb.SETTING_SHARE] or moved > LOOK_AT_MOVE * alpha:
         f[tb.LOOKED] = dth - phi
-        work_i[n_nodes + head[tb.N_LOOKS]] = v
+        work_i[room + head[tb.N_LOOKS]] = v
         head[tb.N_LOOKS] += 1
 
 
@@ -125,7 +125,7 @@ def _turn(head, c, parent_turn):  # type: ignore[no-untyped-def]
     slip2 = slip * slip
     error2 = slip2 * (slip2 * f[tb.SLIP_STIFF] + USUAL_ENERGY)
     if error2 > tb.scalars(head)[tb.SETTING_SHARE]:
-        work_i[2 * head[tb.N_NODES] + head[tb.N_TURNED]] = c
+        work_i[2 * head[tb.NODE_ROOM] + head[tb.N_TURNED]] = c
         head[tb.N_TURNED] += 1
 
 
@@ -213,7 +213,7 @@ def back_substitute(head):  # type: ignore[no-untyped-def]
                         depth += 1
                     c = child
                 child = clique_i[child, tb.SIBLING]
-    changed = work_i[3 * head[tb.N_NODES]:]
+    changed = work_i[3 * head[tb.NODE_ROOM]:]
     for k in range(head[tb.N_CHANGED]):
         f = node_f[changed[k]]
         f[tb.SEEN], f[tb.SEEN + 1], f[tb.SEEN + 2] = (

@@ -201,7 +201,7 @@ def refresh(head, marked):  # type: ignore[no-untyped-def]
     need, largest = np.int64(0), np.int64(0)
     for k in range(len(marked)):
         row = clique_i[marked[k]]
-        row[tb.COUNT] = 0
+        row[tb.MARKED] = 0
         largest = max(largest, work_size(row[tb.N_FRONTAL] + row[tb.N_SEPARATOR]))
         if row[tb.VALUES_BORN] != head[tb.UPDATE]:
             need += undo.rounded(undo.n_values(row[tb.N_FRONTAL], row[tb.N_SEPARATOR]))
@@ -212,12 +212,12 @@ def refresh(head, marked):  # type: ignore[no-untyped-def]
     for k in range(len(marked)):
         parent = clique_i[marked[k], tb.PARENT]
         if parent >= 0:
-            clique_i[parent, tb.COUNT] += 1
+            clique_i[parent, tb.MARKED] += 1
     # children first: those without a marked child, then whoever has no other left
     n_ready = 0
     ready = work_i
     for k in range(len(marked)):
-        if clique_i[marked[k], tb.COUNT] == 0:
+        if clique_i[marked[k], tb.MARKED] == 0:
             ready[n_ready] = marked[k]
             n_ready += 1
     k = 0
@@ -232,8 +232,8 @@ def refresh(head, marked):  # type: ignore[no-untyped-def]
         clique_i[c, tb.BUILT] = head[tb.ITERATION]
         parent = clique_i[c, tb.PARENT]
         if parent >= 0:
-            clique_i[parent, tb.COUNT] -= 1
-            if clique_i[parent, tb.COUNT] == 0:
+            clique_i[parent, tb.MARKED] -= 1
+            if clique_i[parent, tb.MARKED] == 0:
                 ready[n_ready] = parent
                 n_ready += 1
     _find_roots(head, marked)

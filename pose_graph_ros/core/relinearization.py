@@ -71,7 +71,7 @@ def _look(head):  # type: ignore[no-untyped-def]
     observed_i = tb.observed_i(head)
     work_i = tb.work_i(head)
     iteration = head[tb.ITERATION]
-    looks = work_i[head[tb.N_NODES]:]
+    looks = work_i[head[tb.NODE_ROOM]:]
     scalars[tb.ERROR2_SUM] = 0.0
     for n in range(head[tb.N_LOOKS]):
         v = looks[n]
@@ -94,7 +94,7 @@ def _look(head):  # type: ignore[no-untyped-def]
 def _look_at_turned(head):  # type: ignore[no-untyped-def]
     """Add what frames have turned against those of their parents to the sum; keep the worst."""
     scalars, clique_f, work_i = tb.scalars(head), tb.clique_f(head), tb.work_i(head)
-    turned = work_i[2 * head[tb.N_NODES]:]
+    turned = work_i[2 * head[tb.NODE_ROOM]:]
     kept = 0
     for k in range(head[tb.N_TURNED]):
         c = turned[k]
@@ -150,7 +150,7 @@ def _relinearize_worst(head, allowed):  # type: ignore[no-untyped-def]
         error2 = _error2(head, waiting[n])
         bins[_bin(error2 / allowed)] += error2
         left += error2
-    turned = work_i[2 * head[tb.N_NODES]:]
+    turned = work_i[2 * head[tb.NODE_ROOM]:]
     for n in range(head[tb.N_TURNED]):
         error2 = clique_f[turned[n], tb.SLIP_ERROR2]
         bins[_bin(error2 / allowed)] += error2

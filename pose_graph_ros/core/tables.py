@@ -55,16 +55,18 @@ OBS_OFFSET, OBS_TH, OBS_K, OBS_ERROR2, OBS_ENERGY, OBS_F = 10, 13, 14, 15, 16, 1
 OBS_NODE, OBS_NEXT, OBS_KIND, OBS_CHECKED, OBS_WAITS, OBS_UNDO, OBS_I = range(7)
 
 # clique_i: parent (-1: root), first child, next sibling; numbers of frontal and of separator
-# nodes; where its nodes and values lie in the pools; stamps: to be eliminated again; iteration
-# that built it; updates that took it, took its values, logged it; a counter for walks;
-# whether a node at or below it is fixed or observed
+# nodes; where its nodes and values lie in the pools; stamps: to be eliminated again (and then a
+# counter); iteration that built it; updates that took it, took its values, logged it; whether a
+# node at or below it is fixed or observed
 (PARENT, CHILD, SIBLING, N_FRONTAL, N_SEPARATOR, NODES, VALUES, MARKED, BUILT, BORN, VALUES_BORN,
- CLIQUE_UNDO, COUNT, ANCHORED, CLIQUE_I) = range(15)
+ CLIQUE_UNDO, ANCHORED, CLIQUE_I) = range(14)
 # clique_f: angle of the clique's frame that the parent was eliminated with; mean solution of the
 # headings of the separator when the clique was eliminated; squared error of the parent's model of
 # what it has turned since; how stiff the update matrix is against that, about (see `frames`); how
-# many sigmas its separator may have moved in itself since the clique was solved for
-TURN_SEEN, TURN_ZERO, SLIP_ERROR2, SLIP_STIFF, DRIFT, TURN, CLIQUE_F = range(7)
+# many sigmas its separator may have moved in itself since the clique was solved for. While the
+# solution is passed down, the angle of the frame is where that error will be.
+TURN_SEEN, TURN_ZERO, SLIP_ERROR2, SLIP_STIFF, DRIFT, CLIQUE_F = range(6)
+TURN = SLIP_ERROR2
 
 FLOAT_TABLES: Final = {'node_f': NODE_F, 'edge_f': EDGE_F, 'observed_f': OBS_F, 'pool_f': 1,
                        'log_f': 1, 'work_f': 1, 'scalars': 1, 'clique_f': CLIQUE_F}
@@ -107,7 +109,7 @@ STAMPS: Final = {
 
 # Tables of so many bytes lie on pages of their own. What they have left costs address space alone,
 # so they grow by much: seldom is a table copied.
-OWN_PAGES: Final = 2**20
+OWN_PAGES: Final = 2**18
 GROWTH: Final = 4
 
 IntHead = npt.NDArray[np.int64]

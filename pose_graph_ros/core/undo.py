@@ -198,7 +198,7 @@ def take_clique(head, n_frontal, n_separator):  # type: ignore[no-untyped-def]
     row[tb.N_FRONTAL], row[tb.N_SEPARATOR] = n_frontal, n_separator
     row[tb.NODES] = take_nodes(head, n_frontal + n_separator)
     row[tb.VALUES] = take_values(head, n_values(n_frontal, n_separator))
-    row[tb.MARKED] = row[tb.COUNT] = row[tb.ANCHORED] = 0
+    row[tb.MARKED] = row[tb.ANCHORED] = 0
     row[tb.BUILT] = head[tb.ITERATION]
     tb.clique_f(head)[c, tb.DRIFT] = 0.0
     row[tb.BORN] = row[tb.VALUES_BORN] = row[tb.CLIQUE_UNDO] = head[tb.UPDATE]
