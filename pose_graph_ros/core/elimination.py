@@ -20,7 +20,7 @@ from pose_graph_ros.core.structure import amalgamate, newest_last, structure
 # Answers of the kernels.
 DONE, MORE_MEMORY, BAD_PIVOT = range(3)
 # Cliques are joined if that stores at most so many zero blocks, up to so many frontal nodes.
-RELAXED_ZEROS = 6
+RELAXED_ZEROS = 16
 RELAXED_FRONTAL = 16
 
 
