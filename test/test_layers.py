@@ -26,7 +26,8 @@ CORE = (
     'rescue', 'incremental',
     # what drives it
     'timeline', 'trajectory', 'alignment', 'tangent_plane', 'binding', 'estimate', 'backend',
-    'prediction', 'io', 'io.g2o', 'io.tum', 'warm_up',
+    'prediction', 'io', 'io.g2o', 'io.tum', 'helper_process',
+    'warm_up',
 )
 CORE_NEEDS = {'numpy', 'scipy', 'numba', 'pyproj'}
 

@@ -64,7 +64,8 @@ def mark(head):  # type: ignore[no-untyped-def]
             clique_i[c, tb.MARKED] = stamp
             if n_marked == len(marked):
                 longer = np.empty(2 * n_marked, np.int32)
-                longer[:n_marked] = marked
+                for k in range(n_marked):
+                    longer[k] = marked[k]
                 marked = longer
             marked[n_marked] = c
             n_marked += 1

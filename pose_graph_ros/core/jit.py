@@ -25,8 +25,12 @@ from pose_graph_ros.core.kernel_cache import KernelCache
 # Arguments may be what only Numba knows, so signatures are not handed through to the type checker.
 Function = Callable[..., Any]
 
-OPTIONS = MappingProxyType({'nogil': True, 'error_model': 'numpy', 'no_cfunc_wrapper': True})
+# All of them are said: what is not, a kernel takes over from the caller that it is first compiled
+# for, and its code would depend on the order.
+OPTIONS = MappingProxyType({
+    'nogil': True, 'error_model': 'numpy', 'no_cfunc_wrapper': True, 'fastmath': False})
 # Counting references to arrays, which is what Numba's run time is for, took a fifth of the time.
+OWNS = MappingProxyType({'_nrt': True})
 BORROWS = MappingProxyType({'_nrt': False})
 
 _registered: dict[str, Dispatcher] = {}
@@ -62,7 +66,7 @@ def kernel(
 
 
 def _compiled(function: Function, allocates: bool, options: dict[str, Any]) -> Any:
-    ownership = {} if allocates else BORROWS
+    ownership = OWNS if allocates else BORROWS
     compiled = numba.njit(**{**OPTIONS, **ownership, **options})(function)
     if isinstance(compiled, Dispatcher):    # NUMBA_DISABLE_JIT=1 leaves functions as they are
         _widen_calls(compiled)
@@ -103,15 +107,28 @@ def registered() -> dict[str, Dispatcher]:
     return dict(_registered)
 
 
-def is_cached() -> bool:
+def is_cached(*kernels: Function) -> bool:
     """
-    Tell whether the code of all kernels imported so far is kept from an earlier start.
+    Tell whether the code of kernels is kept from an earlier start.
 
-    A kernel counts once the code for one of its signatures is. Takes some milliseconds, and
+    A kernel counts once the code for one of its signatures is. Takes about a millisecond each, and
     neither loads nor compiles anything.
+
+    Parameters
+    ----------
+    *kernels : kernel
+        All those imported so far if there are none.
+
     """
-    caches = [dispatcher._cache for dispatcher in _registered.values()]  # noqa: SLF001
+    caches = [kernel._cache for kernel in kernels or _registered.values()  # noqa: SLF001
+              if isinstance(kernel, Dispatcher)]
     return all(isinstance(cache, KernelCache) and cache.holds_code() for cache in caches)
+
+
+def can_be_kept() -> bool:
+    """Tell whether there are folders for the code of the kernels imported so far."""
+    return all(isinstance(dispatcher._cache, KernelCache)  # noqa: SLF001
+               for dispatcher in _registered.values())
 
 
 def compile_only(compiled: Any, signature: tuple[Any, ...]) -> None:

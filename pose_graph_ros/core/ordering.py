@@ -21,7 +21,8 @@ from pose_graph_ros.core.jit import kernel
 @kernel(allocates=True)
 def _grown(array, size):  # type: ignore[no-untyped-def]
     grown = np.empty(max(size, 2 * len(array)), np.int32)
-    grown[:len(array)] = array
+    for k in range(len(array)):
+        grown[k] = array[k]
     return grown
 
 
@@ -87,7 +88,8 @@ def minimum_degree(n, n_elements, n_last, start, adjacency):  # type: ignore[no-
     """
     iw = np.empty(start[n + n_elements] + 4 * n + 16, np.int32)
     end = np.int64(start[n + n_elements])
-    iw[:end] = adjacency[:end]
+    for k in range(end):    # to assign one array to another takes two seconds to compile
+        iw[k] = adjacency[k]
     total = n + n_elements
     # lists of nodes and elements; the element that a node becomes keeps the node's number
     begin = np.empty(total, np.int64)
@@ -302,5 +304,6 @@ def minimum_degree(n, n_elements, n_last, start, adjacency):  # type: ignore[no-
         flag += n + 1
     offset[n_cliques] = nodes_end
     # of the elements from the start, behind those of the cliques
-    parent[n_cliques:n_cliques + n_elements] = parent[n:n + n_elements]
+    for k in range(n_elements):
+        parent[n_cliques + k] = parent[n + k]
     return n_cliques, offset, n_frontal, parent, nodes

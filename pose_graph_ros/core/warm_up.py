@@ -6,22 +6,31 @@ Compile all kernels before the first measurement, or load them from the cache.
 Importing this module imports all modules that hold kernels, so that `jit.registered` is complete.
 Each step is a small job for the engine, through its own front doors: what a kernel is called with
 is then what it will be called with.
+
+To compile them all takes half a minute of computing. Where there are two processors, and a cache
+to meet at, a second process does about half of it.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+import contextlib
+import gc
+import os
 import time
 
 import numpy as np
 
-from pose_graph_ros.core import batch, gauss_newton, se2
+from pose_graph_ros.core import batch, complex_system, gauss_newton, jit, se2, symbolic
 from pose_graph_ros.core.backend import PoseGraphBackend
 from pose_graph_ros.core.config import SmootherConfig, SolverConfig
 from pose_graph_ros.core.constraints import EdgeKind, Edges, ObservedKind, ObservedNodes
-from pose_graph_ros.core.graph import GraphUpdate
+from pose_graph_ros.core.graph import Graph, GraphUpdate
+from pose_graph_ros.core.helper_process import end_with_parent, HelperProcess
 from pose_graph_ros.core.incremental import IncrementalSmoother
 from pose_graph_ros.core.measurements import GlobalPose, LoopClosure, OdometrySample, Position
 from pose_graph_ros.core.se2 import FloatArray
+from pose_graph_ros.core.sparse_inverse import all_covariances
 from pose_graph_ros.core.starts import solve_from_two_starts
+from pose_graph_ros.core.tables import Memory
 
 # Of a drive in circles, a lap in so many nodes. Odometry is a little wrong, so that there is
 # something to correct.
@@ -31,6 +40,9 @@ ERROR: FloatArray = np.array([0.02, -0.01, 0.01])
 INFORMATION: FloatArray = np.diag((400.0, 900.0, 2500.0))
 # More nodes than the first tables hold.
 N_NODES = 4 * LAP
+# What the helper process is to call.
+HELPER = (__name__, 'help_along')
+MANY_OBJECTS = 200_000
 
 
 def warm_up(stopped: Callable[[], bool] = lambda: False) -> float:
@@ -49,11 +61,43 @@ def warm_up(stopped: Callable[[], bool] = lambda: False) -> float:
 
     """
     start = time.perf_counter()
-    for step in STEPS:
-        if stopped():
-            break
-        step()
+    with _rare_collections(), contextlib.ExitStack() as stack:
+        helper = None
+        if _is_worth_a_helper() and not stopped():
+            helper = stack.enter_context(HelperProcess(*HELPER))
+        for step in STEPS:
+            if helper is not None and step in HELPED:
+                # one that takes twice as long as this process is stuck: its part is done here
+                helper.wait(time.perf_counter() - start, stopped)
+            if stopped():
+                break
+            step()
     return time.perf_counter() - start
+
+
+def help_along() -> None:
+    """Do the part of the helper process; what it has compiled is in the cache as soon as it is."""
+    end_with_parent()
+    with _rare_collections():
+        for step in HELPERS_STEPS:
+            step()
+
+
+def _is_worth_a_helper() -> bool:
+    """Tell whether there is something to compile, a cache to meet at and a processor to spare."""
+    return (len(os.sched_getaffinity(0)) > 1 and jit.can_be_kept()
+            and not jit.is_cached(*HELPERS_KERNELS))
+
+
+@contextlib.contextmanager
+def _rare_collections() -> Iterator[None]:
+    """Look for cycles seldom: the compiler makes many objects, and keeps most of them."""
+    thresholds = gc.get_threshold()
+    gc.set_threshold(MANY_OBJECTS)
+    try:
+        yield
+    finally:
+        gc.set_threshold(*thresholds)
 
 
 def _chain(config: SmootherConfig | None = None) -> IncrementalSmoother:
@@ -103,18 +147,37 @@ def _undo() -> None:
     smoother.update(GraphUpdate(edges=_closures(N_NODES - 5)))
 
 
-def _covariances() -> None:
+def _covariances_of_some() -> None:
     smoother = _chain()
     smoother.newest_covariance()
     smoother.covariance(3)
     smoother.joint_covariance(3, N_NODES - 3)
-    smoother.covariances()
+
+
+def _covariances_of_all() -> None:
+    """Ask for those of all nodes where there are none: that needs no smoother."""
+    all_covariances(Memory().head, np.zeros((0, 3, 3)))
+
+
+def _eliminate_nothing() -> None:
+    """Order and eliminate no node at all, which needs no more than empty tables."""
+    head = Memory().head
+    gauss_newton.eliminate(head, 0.0)
+    symbolic.analyse(head)
 
 
 def _optimize() -> None:
-    """Optimise a whole graph, with damping and without, from all starts."""
-    graph = _chain().graph
-    graph.apply(GraphUpdate(edges=_closures(N_NODES - 5), free=(0,)))
+    """Optimise a whole graph, with damping and without, from all starts; it needs no smoother."""
+    graph, last = Graph(), N_NODES - 1
+    kinds = [EdgeKind.ODOMETRY] * last
+    nodes, truth = np.arange(N_NODES), np.zeros((N_NODES, 3))
+    for k in range(1, N_NODES):
+        truth[k] = se2.compose(truth[k - 1], STEP)
+    graph.apply(GraphUpdate(
+        hidden=truth, fix=(0,), edges=Edges(
+            nodes[:-1], nodes[1:], np.tile(STEP + ERROR, (last, 1)),
+            np.tile(INFORMATION, (last, 1, 1)), kinds)))
+    graph.apply(GraphUpdate(edges=_closures(N_NODES - 5), observed=_pose_of(3), free=(0,)))
     batch.optimize(graph, SolverConfig(initial_damping=1.0))
     batch.optimize_from_nothing(graph, SolverConfig())
     solve_from_two_starts(graph, SolverConfig(), batch.optimize, closing=True)
@@ -145,4 +208,12 @@ def _drive() -> None:
 
 # Between two of them the warm-up can be stopped.
 STEPS: tuple[Callable[[], object], ...] = (
-    IncrementalSmoother, _chain, _update, _undo, _covariances, _optimize, _rescue, _drive)
+    IncrementalSmoother, _chain, _update, _undo, _covariances_of_some, _optimize,
+    _covariances_of_all, _rescue, _drive)
+# Those for which the helper compiles, and what it does for them: first what the smoother needs
+# too, before this process comes to it. What edits a graph this process has compiled by then.
+HELPED = (_optimize, _covariances_of_all)
+HELPERS_STEPS: tuple[Callable[[], object], ...] = (
+    _eliminate_nothing, _optimize, _covariances_of_all)
+# The largest that it compiles: they are kept only with all that they call.
+HELPERS_KERNELS = (gauss_newton.eliminate, complex_system.solve, all_covariances)

@@ -132,7 +132,7 @@ class PoseGraphNode(Node):
 
         if not is_cached():
             self.get_logger().info(
-                'compiling kernels, about a minute on the first start; what comes in waits')
+                'compiling kernels, 20 s to a minute on the first start; what comes in waits')
         seconds = warm_up(stopped)
         if not stopped():
             self.get_logger().info(f'kernels ready after {seconds:.1f} s')

@@ -1,0 +1,229 @@
+# Copyright 2026 The pose_graph_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""A second process shares the first compilation, and is gone afterwards, whatever happens."""
+
+from collections.abc import Callable
+import importlib
+import os
+from pathlib import Path
+import signal
+import subprocess
+import sys
+import time
+from types import ModuleType
+
+import numba
+import pytest
+
+from pose_graph_ros.core import jit, kernel_cache, warm_up
+from pose_graph_ros.core.helper_process import HelperProcess
+
+PACKAGE = 'helped_kernels_of_a_test'
+FILES = {
+    '__init__': '',
+    'outer': """
+from pose_graph_ros.core.jit import kernel
+
+@kernel
+def twice(x):
+    return 2.0 * x
+""",
+    'help': f"""
+import os, time
+from pathlib import Path
+from pose_graph_ros.core.helper_process import end_with_parent
+
+def along():
+    end_with_parent()
+    from {PACKAGE}.outer import twice
+    twice(1.0)
+    print('not to be seen')
+
+def die():
+    os._exit(3)
+
+def stay():
+    end_with_parent()
+    name = Path(__file__).with_name('pid')
+    name.with_suffix('.new').write_text(str(os.getpid()))
+    name.with_suffix('.new').rename(name)
+    time.sleep(60.0)
+""",
+}
+PARENT = f"""
+import time
+from pose_graph_ros.core.helper_process import HelperProcess
+with HelperProcess('{PACKAGE}.help', 'stay'):
+    time.sleep(60.0)
+"""
+
+
+@pytest.fixture
+def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """Return a package with a kernel, the only one that this process knows of."""
+    monkeypatch.setattr(jit, '_registered', {})
+    monkeypatch.syspath_prepend(tmp_path)
+    monkeypatch.delenv('NUMBA_CACHE_DIR', raising=False)
+    monkeypatch.setattr(numba.config, 'CACHE_DIR', '')
+    monkeypatch.setattr(os, 'sched_getaffinity', lambda process: {0, 1})
+    package = tmp_path / PACKAGE
+    package.mkdir()
+    for name, text in FILES.items():
+        (package / f'{name}.py').write_text(text)
+    return package
+
+
+@pytest.fixture
+def started(monkeypatch: pytest.MonkeyPatch) -> list[str]:
+    """Return the names of what helpers were started for."""
+    names: list[str] = []
+
+    def start(module: str, name: str) -> HelperProcess:
+        names.append(name)
+        return HelperProcess(module, name)
+
+    monkeypatch.setattr(warm_up, 'HelperProcess', start)
+    return names
+
+
+@pytest.fixture
+def warm(
+    folder: Path, started: list[str], monkeypatch: pytest.MonkeyPatch,
+) -> Callable[..., ModuleType]:
+    """Return what does the warm-up as in a new process, helped by a function of the package."""
+    def run(
+        helper: str, before: Callable[[], object],
+        stopped: Callable[[], bool] = lambda: False,
+    ) -> ModuleType:
+        for name in [name for name in sys.modules if name.partition('.')[0] == PACKAGE]:
+            del sys.modules[name]
+        importlib.invalidate_caches()
+        module = importlib.import_module(f'{PACKAGE}.outer')
+
+        def helped() -> None:
+            module.twice(1.0)
+
+        monkeypatch.setattr(warm_up, 'STEPS', (before, helped))
+        monkeypatch.setattr(warm_up, 'HELPED', (helped,))
+        monkeypatch.setattr(warm_up, 'HELPERS_KERNELS', (module.twice,))
+        monkeypatch.setattr(warm_up, 'HELPER', (f'{PACKAGE}.help', helper))
+        warm_up.warm_up(stopped)
+        return module
+
+    return run
+
+
+def pid(folder: Path) -> int:
+    """Wait until the helper has said who it is."""
+    deadline = time.monotonic() + 20.0
+    while not (folder / 'pid').exists():
+        assert time.monotonic() < deadline
+        time.sleep(0.01)
+    return int((folder / 'pid').read_text())
+
+
+def is_alive(process: int) -> bool:
+    try:
+        # an orphan that nobody waits for is as good as gone
+        state = Path(f'/proc/{process}/stat').read_text().rpartition(')')[2].split()[0]
+    except FileNotFoundError:
+        return False
+    return state not in 'ZX'
+
+
+def until_kept(folder: Path) -> Callable[[], None]:
+    def wait() -> None:
+        deadline = time.monotonic() + 20.0
+        while not list((folder / '__pycache__').glob('*.nbi')):
+            assert time.monotonic() < deadline
+            time.sleep(0.01)
+    return wait
+
+
+def test_what_the_helper_has_compiled_is_loaded(
+    folder: Path, warm: Callable[..., ModuleType], started: list[str],
+    capfd: pytest.CaptureFixture[str],
+) -> None:
+    first = warm('along', until_kept(folder))
+    assert first.twice.stats.cache_misses.total() == 0
+    assert started == ['along']
+    again = warm('along', lambda: None)
+    assert again is not first
+    assert again.twice.stats.cache_misses.total() == 0
+    assert started == ['along']     # all is there
+    assert capfd.readouterr() == ('', '')
+
+
+@pytest.mark.parametrize('helper', ['die', 'there is no such function'])
+def test_without_its_helper_a_process_compiles_all(
+    warm: Callable[..., ModuleType], started: list[str], helper: str,
+) -> None:
+    module = warm(helper, lambda: time.sleep(0.5))
+    assert started == [helper]
+    assert module.twice.stats.cache_misses.total() == 1
+
+
+def test_a_helper_that_is_stuck_is_not_waited_for(
+    folder: Path, warm: Callable[..., ModuleType],
+) -> None:
+    start = time.monotonic()
+    module = warm('stay', lambda: pid(folder))
+    assert module.twice.signatures
+    assert time.monotonic() - start < 30.0
+    assert not Path(f'/proc/{pid(folder)}').exists()    # not even as a zombie
+
+
+def test_with_the_warm_up_the_helper_is_stopped(
+    folder: Path, warm: Callable[..., ModuleType],
+) -> None:
+    module = warm('stay', lambda: pid(folder), (folder / 'pid').exists)
+    assert module.twice.signatures == []
+    assert not Path(f'/proc/{pid(folder)}').exists()
+
+
+def test_an_exception_ends_the_helper(folder: Path, warm: Callable[..., ModuleType]) -> None:
+    def interrupted() -> None:
+        pid(folder)
+        raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        warm('stay', interrupted)
+    assert not Path(f'/proc/{pid(folder)}').exists()
+
+
+def test_a_helper_ends_with_a_process_that_is_killed(folder: Path) -> None:
+    path = os.pathsep.join(map(os.path.abspath, sys.path))
+    parent = subprocess.Popen([sys.executable, '-c', PARENT], env={**os.environ,
+                                                                   'PYTHONPATH': path})
+    helper = pid(folder)
+    assert is_alive(helper)
+    parent.send_signal(signal.SIGKILL)
+    parent.wait()
+    deadline = time.monotonic() + 10.0
+    while is_alive(helper):
+        assert time.monotonic() < deadline
+        time.sleep(0.01)
+
+
+def test_no_helper_on_one_processor(
+    warm: Callable[..., ModuleType], started: list[str], monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr(os, 'sched_getaffinity', lambda process: {0})
+    assert warm('along', lambda: None).twice.signatures
+    assert started == []
+
+
+def test_no_helper_without_a_folder_to_meet_at(
+    warm: Callable[..., ModuleType], started: list[str], monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr(kernel_cache, '_candidates', lambda source: iter(()))
+    assert warm('along', lambda: None).twice.signatures
+    assert started == []
+
+
+@pytest.mark.parametrize('executable', ['', None, '/nowhere/python'])
+def test_no_helper_where_there_is_no_interpreter_to_start(
+    warm: Callable[..., ModuleType], monkeypatch: pytest.MonkeyPatch, executable: str | None,
+) -> None:
+    monkeypatch.setattr(sys, 'executable', executable)
+    assert warm('along', lambda: None).twice.signatures
