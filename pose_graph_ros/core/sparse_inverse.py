@@ -66,7 +66,8 @@ def all_covariances(head, out):  # type: ignore[no-untyped-def]
                 size = 3 * clique_i[child, tb.N_SEPARATOR]
                 if end + size * size > len(blocks):
                     longer = np.empty(2 * (end + size * size))
-                    longer[:end] = blocks[:end]
+                    for m in range(end):
+                        longer[m] = blocks[m]
                     blocks = longer
                 below = blocks[end:end + size * size]
                 _take_separator(head, child, inverse, n, below)
@@ -76,7 +77,8 @@ def all_covariances(head, out):  # type: ignore[no-untyped-def]
                 end += size * size
                 if depth == len(cliques):
                     more = np.empty(2 * depth, np.int32)
-                    more[:depth] = cliques
+                    for m in range(depth):
+                        more[m] = cliques[m]
                     cliques = more
                 cliques[depth] = child
                 depth += 1
