@@ -16,6 +16,8 @@ import time
 from typing import Any
 
 import numpy as np
+from scipy import sparse
+from scipy.sparse import linalg
 
 from benchmark.runs import Plan, quiet, Run
 from benchmark.worlds import chain, laps, World
@@ -201,18 +203,30 @@ def chordal_start(world: World) -> FloatArray:
 
 
 def oracle_covariances(graph: Graph, nodes: list[int]) -> FloatArray:
-    """Return covariances, shape (len(nodes), 3, 3), from the dense inverse: slow, sure."""
-    edges, observed, n = graph.edges, graph.observed, graph.n_nodes
-    H = np.zeros((n, n, 3, 3))
+    """Return covariances, shape (len(nodes), 3, 3), from the plain sparse system: slow, sure."""
+    edges, observed, size = graph.edges, graph.observed, 3 * graph.n_nodes
+    blocks = []
     _, A, B = linearize.linearize_edges(graph.poses, edges)
-    for (rows, left), (columns, right) in itertools.product(
-            ((edges.i, A), (edges.j, B)), repeat=2):
-        np.add.at(H, (rows, columns), np.swapaxes(left, 1, 2) @ edges.weighted_information @ right)
+    for (i, left), (j, right) in itertools.product(((edges.i, A), (edges.j, B)), repeat=2):
+        blocks.append((i, j, np.swapaxes(left, 1, 2) @ edges.weighted_information @ right))
     _, A = linearize.linearize_observed(graph.poses, observed)
-    np.add.at(H, (observed.node, observed.node),
-              np.swapaxes(A, 1, 2) @ observed.weighted_information @ A)
-    free = np.flatnonzero(~graph.fixed)
-    size = 3 * len(free)
-    inverse = np.linalg.inv(H[np.ix_(free, free)].transpose(0, 2, 1, 3).reshape(size, size))
-    blocks = 3 * np.searchsorted(free, nodes)
-    return np.array([inverse[b:b + 3, b:b + 3] for b in blocks])
+    blocks.append((observed.node, observed.node,
+                   np.swapaxes(A, 1, 2) @ observed.weighted_information @ A))
+    three = np.arange(3)
+    rows = [np.broadcast_to(3 * i[:, None, None] + three[:, None], block.shape)
+            for i, _, block in blocks]
+    columns = [np.broadcast_to(3 * j[:, None, None] + three, block.shape)
+               for _, j, block in blocks]
+    H = sparse.csc_array(
+        (np.concatenate([block.ravel() for *_, block in blocks]),
+         (np.concatenate([row.ravel() for row in rows]),
+          np.concatenate([column.ravel() for column in columns]))), (size, size))
+    free = np.flatnonzero(~np.repeat(graph.fixed, 3))
+    factor = linalg.splu(H[free][:, free].tocsc())
+    found = []
+    for node in nodes:
+        at = np.searchsorted(free, 3 * node) + three
+        unit = np.zeros((len(free), 3))
+        unit[at, three] = 1.0
+        found.append(factor.solve(unit)[at])
+    return np.array(found)

@@ -111,6 +111,8 @@ STAMPS: Final = {
 # so they grow by much: seldom is a table copied.
 OWN_PAGES: Final = 2**18
 GROWTH: Final = 4
+# What is not written to is not there, so a small graph never grows out of its first tables.
+FIRST_ROWS: Final = 1024
 
 IntHead = npt.NDArray[np.int64]
 
@@ -186,7 +188,9 @@ class Memory:
         self.head[FREE_F:] = -1
         self._tables: dict[str, npt.NDArray[Any]] = {}
         for name in NAMES:
-            self.ensure(name, 16)
+            self.ensure(name, FIRST_ROWS)
+        self.ensure('pool_f', 32 * FIRST_ROWS)
+        self.ensure('pool_i', 4 * FIRST_ROWS)
         self.ensure('work_f', 256)  # whatever the fronts take, the chain and the bins take this
 
     def __getitem__(self, name: str) -> npt.NDArray[Any]:
@@ -214,7 +218,7 @@ class Memory:
             return
         columns = FLOAT_TABLES.get(name, 0) or INT_TABLES[name]
         dtype = np.float64 if name in FLOAT_TABLES else np.int32
-        capacity = max(rows, 16, GROWTH * int(self.head[at + 1]))
+        capacity = max(rows, GROWTH * int(self.head[at + 1]))
         grown = _pages(capacity if columns == 1 else (capacity, columns), dtype)
         if keep > 0:
             grown[:keep] = self._tables[name][:keep]

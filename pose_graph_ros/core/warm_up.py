@@ -38,7 +38,7 @@ LAP = 12
 STEP: FloatArray = np.array([1.0, 0.0, 2.0 * np.pi / LAP])
 ERROR: FloatArray = np.array([0.02, -0.01, 0.01])
 INFORMATION: FloatArray = np.diag((400.0, 900.0, 2500.0))
-# More nodes than the first tables hold.
+# So many laps that there are old nodes and new ones.
 N_NODES = 4 * LAP
 # What the helper process is to call.
 HELPER = (__name__, 'help_along')
