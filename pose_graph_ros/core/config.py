@@ -131,7 +131,7 @@ class SmootherConfig:
 
     alpha: float = 0.02
     """A node that has moved by less than this many sigmas moves no other node."""
-    budget: float = 0.002
+    budget: float = 0.001
     """Squared linearization error [sigma^2] that a step may leave in all that it has moved ..."""
     budget_share: float = 6e-6
     """... and for each node that it has moved: the smaller of both counts."""
