@@ -32,9 +32,7 @@ def _write_node(head, v, last, mean):  # type: ignore[no-untyped-def]
     f[tb.POSE] = p[tb.POSE] + c * mean[0] - s * mean[1]
     f[tb.POSE + 1] = p[tb.POSE + 1] + s * mean[0] + c * mean[1]
     f[tb.POSE + 2] = factors.wrap(p[tb.POSE + 2] + mean[2])
-    for k in range(3):
-        f[tb.REF + k] = f[tb.POSE + k]
-        f[tb.DELTA + k] = f[tb.SEEN + k] = f[tb.LOOKED] = 0.0
+    factors.refer_to_pose(f)
     f[tb.STIFF_T] = f[tb.STIFF_R] = 0.0
     i[:] = 0
     i[tb.CLIQUE] = i[tb.EDGE_LIST] = i[tb.OBSERVED_LIST] = -1

@@ -24,9 +24,7 @@ def start_nodes(head, first, last):  # type: ignore[no-untyped-def]
     node_f, node_i = tb.node_f(head), tb.node_i(head)
     for v in range(first, last):
         f, i = node_f[v], node_i[v]
-        for k in range(3):
-            f[tb.REF + k] = f[tb.POSE + k]
-            f[tb.DELTA + k] = f[tb.SEEN + k] = f[tb.LOOKED] = 0.0
+        factors.refer_to_pose(f)
         f[tb.STIFF_T] = f[tb.STIFF_R] = 0.0
         i[:] = 0
         i[tb.CLIQUE] = i[tb.EDGE_LIST] = i[tb.OBSERVED_LIST] = -1
@@ -270,10 +268,7 @@ def restart(head):  # type: ignore[no-untyped-def]
     scalars[tb.CHI2] = 0.0
     head[tb.STRUCTURE] = 1
     for v in range(head[tb.N_NODES]):
-        f = node_f[v]
-        for k in range(3):
-            f[tb.REF + k] = f[tb.POSE + k]
-            f[tb.DELTA + k] = f[tb.SEEN + k] = f[tb.LOOKED] = 0.0
+        factors.refer_to_pose(node_f[v])
         node_i[v, tb.CLIQUE] = -1
         node_i[v, tb.SEEDED] = 0
         add_seed(head, v)

@@ -45,6 +45,15 @@ def wrap(angle):  # type: ignore[no-untyped-def]
 
 
 @kernel
+def refer_to_pose(f):  # type: ignore[no-untyped-def]
+    """Make the pose of a node, given as its row, the reference of its unknown."""
+    for k in range(3):
+        f[tb.REF + k] = f[tb.POSE + k]
+        f[tb.DELTA + k] = f[tb.SEEN + k] = 0.0
+    f[tb.LOOKED] = 0.0
+
+
+@kernel
 def linearize_edge(head, e):  # type: ignore[no-untyped-def]
     """Linearize an edge at the present estimate; the caller has logged it."""
     node_f, edge_f, edge_i = tb.node_f(head), tb.edge_f(head), tb.edge_i(head)

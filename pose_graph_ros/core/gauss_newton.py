@@ -49,10 +49,7 @@ def refer_to_poses(head):  # type: ignore[no-untyped-def]
     """Make the poses the references of the unknowns."""
     node_f = tb.node_f(head)
     for v in range(head[tb.N_NODES]):
-        f = node_f[v]
-        for k in range(3):
-            f[tb.REF + k] = f[tb.POSE + k]
-            f[tb.DELTA + k] = f[tb.SEEN + k] = f[tb.LOOKED] = 0.0
+        factors.refer_to_pose(node_f[v])
 
 
 @kernel
