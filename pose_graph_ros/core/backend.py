@@ -282,11 +282,9 @@ class PoseGraphBackend:
 
     def _step(self, update: GraphUpdate) -> UpdateResult:
         """Have the smoother make an update, whole or, whatever happens, not at all."""
-        self.graph.begin()
         try:
             return self._smoother.update(update)
         except Exception as error:
-            self.graph.undo()
             reason = f'{type(error).__name__}: {error}'
             return UpdateResult(Status.FAILED, reason, 0, 0, 0, 0, math.nan)
 

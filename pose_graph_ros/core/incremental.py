@@ -23,7 +23,6 @@ from pose_graph_ros.core import (
     se2,
     step,
     tables as tb,
-    undo,
 )
 from pose_graph_ros.core.batch import Status
 from pose_graph_ros.core.config import SmootherConfig
@@ -108,12 +107,17 @@ class IncrementalSmoother:
         Raises
         ------
         GraphUpdateError
-            If a part of the update does not fit the graph; nothing has changed then.
+            If a part of the update does not fit the graph; as with any other exception, nothing
+            has changed then.
 
         """
         self.graph.begin()
-        self.graph.apply(update)
-        result = self._step(step.FIRST)
+        try:
+            self.graph.apply(update)
+            result = self._step(step.FIRST)
+        except BaseException:
+            self.graph.undo()
+            raise
         return result._replace(chi2=self.chi2()) if chi2 else result
 
     def extend(
@@ -194,7 +198,11 @@ class IncrementalSmoother:
 
     def _solve_extended(self) -> UpdateResult:
         """Solve after a chain was extended by an observed node, which stays in any case."""
-        result = self._step(step.EXTENDED)
+        try:
+            result = self._step(step.EXTENDED)
+        except BaseException:
+            self.graph.undo()
+            raise
         return result._replace(status=Status.MAX_ITERATIONS) if result.reason else result
 
     def _extend_in_general(
@@ -239,17 +247,19 @@ class IncrementalSmoother:
         memory.ensure('work_f', work)
 
     def _rescue(self) -> UpdateResult:
-        """Take the poses that the batch optimiser finds; the whole graph is eliminated anew."""
-        graph, head = self.graph, self._memory.head
-        poses = np.empty((graph.n_nodes, 3))
-        undo.poses_before(head, poses)
-        found = rescue.optimized_poses(graph, poses)
-        if found is None:
-            graph.undo()
-            return UpdateResult(
-                Status.FAILED, 'the iterations do not converge, and there is no batch solution',
-                0, 0, 0, 0, NAN)
-        undo.commit(head)
-        graph.set_poses(found)
-        graph.begin()
-        return self._step(step.RESCUED)
+        """
+        Start over from the poses that the batch optimiser finds, everything eliminated anew.
+
+        That is done on a copy, which takes the place of this graph if it has worked.
+        """
+        other = IncrementalSmoother(self._config)
+        if rescue.optimize_copy(self.graph, other.graph):
+            other.graph.begin()
+            result = other._step(step.RESCUED)
+            if result.status is not Status.FAILED:
+                self.graph.memory = self._memory = other.graph.memory
+                return result
+        self.graph.undo()
+        return UpdateResult(
+            Status.FAILED, 'the iterations do not converge, and there is no batch solution',
+            0, 0, 0, 0, NAN)

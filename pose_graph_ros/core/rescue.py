@@ -9,34 +9,40 @@ damped for it: what the batch optimiser finds, from the poses before the step an
 better than any damped step, and costs as much as a few of them.
 """
 
-from pose_graph_ros.core import batch
+import numpy as np
+
+from pose_graph_ros.core import batch, undo
 from pose_graph_ros.core.batch import Status
 from pose_graph_ros.core.config import SolverConfig
 from pose_graph_ros.core.graph import Graph, GraphUpdate
-from pose_graph_ros.core.se2 import FloatArray
 
 _CONFIG = SolverConfig(max_iterations=50, step_tolerance=1e-6)
 
 
-def optimized_poses(graph: Graph, poses: FloatArray) -> FloatArray | None:
+def optimize_copy(graph: Graph, copy: Graph) -> bool:
     """
-    Return the best poses that the batch optimiser finds for a graph, which stays as it is.
+    Copy a graph whose iterations lead nowhere into an empty one, and optimise that.
 
     Parameters
     ----------
     graph : Graph
-    poses : ndarray, shape (N, 3)
-        Where to start if the linear start leads to something worse.
+        In the middle of an update; stays as it is.
+    copy : Graph
+        Everything in it will be eliminated anew at the next step.
 
     Returns
     -------
-    ndarray, shape (N, 3)
-        None if there is no solution.
+    bool
+        Whether there is a solution.
 
     """
-    copy = Graph()
+    poses = np.empty((graph.n_nodes, 3))
+    # where to start if the linear start leads to something worse
+    undo.poses_before(graph.memory.head, poses)
     copy.apply(GraphUpdate(
         hidden=poses, edges=graph.edges, observed=graph.observed,
         fix=[int(node) for node in graph.fixed.nonzero()[0]]))
-    result = batch.optimize_from_nothing(copy, _CONFIG)
-    return None if result.status is Status.FAILED else copy.poses
+    if batch.optimize_from_nothing(copy, _CONFIG).status is Status.FAILED:
+        return False
+    copy.set_poses(copy.poses)
+    return True

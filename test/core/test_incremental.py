@@ -324,6 +324,35 @@ def test_a_failure_in_any_iteration_leaves_no_trace(
         assert smoother.poses.tobytes() == spared.poses.tobytes()
 
 
+@pytest.mark.parametrize('raises', [False, True])
+def test_a_rescue_that_fails_leaves_no_trace(
+    raises: bool, monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """The batch optimiser may find poses at which the elimination has a bad pivot after all."""
+    smoother, slow = street(60)
+    before, entered = state(smoother.graph), []
+
+    def failing(head: object, _: int, how: int) -> int:
+        entered.append(how)
+        if how != step.RESCUED:
+            return step.ASTRAY
+        if raises:
+            raise MemoryError
+        return step.BAD_PIVOT
+
+    update = GraphUpdate(edges=link(0, 50, slow.poses[50] + 0.1), weigh_edges={3: 0.5})
+    with monkeypatch.context() as patch:
+        patch.setattr(step, 'run', failing)
+        if raises:
+            with pytest.raises(MemoryError):
+                smoother.update(update)
+        else:
+            assert smoother.update(update).status is Status.FAILED
+    assert entered == [step.FIRST, step.RESCUED]
+    assert differences(before, state(smoother.graph)) == []
+    assert smoother.update(update).reason == ''
+
+
 def test_a_bad_update_does_not_forget_what_was_left_over() -> None:
     config = replace(EXACT, max_iterations=1)
     poses = []
