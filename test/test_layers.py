@@ -16,8 +16,8 @@ MODULES = sorted(path.relative_to(PACKAGE) for path in PACKAGE.rglob('*.py'))
 
 # A module of core may import those before it, and no others.
 CORE = (
-    'kernel_cache', 'jit', 'exceptions', 'arrays', 'config', 'se2', 'covariance', 'measurements',
-    'constraints', 'linearize',
+    'kernel_cache', 'jit', 'exceptions', 'arrays', 'sources', 'config', 'se2', 'motion', 'covariance',
+    'measurements', 'admission', 'constraints', 'linearize', 'robust',
     # the engine
     'tables', 'vectors', 'cholesky', 'factors', 'undo', 'rows', 'ordering', 'frames', 'fronts',
     'structure', 'assembly', 'elimination', 'editing', 'graph', 'symbolic', 'complex_system',
@@ -25,8 +25,8 @@ CORE = (
     'gauss_newton', 'descent', 'batch', 'starts', 'chain', 'sparse_inverse', 'marginals',
     'rescue', 'incremental',
     # what drives it
-    'timeline', 'trajectory', 'alignment', 'tangent_plane', 'binding', 'estimate', 'backend',
-    'prediction', 'io', 'io.g2o', 'io.tum', 'helper_process',
+    'timeline', 'odometry_stream', 'trajectory', 'alignment', 'tangent_plane', 'binding',
+    'hidden_nodes', 'pending', 'reweighing', 'closing', 'estimate', 'backend', 'prediction', 'io', 'io.g2o', 'io.tum', 'helper_process',
     'warm_up',
 )
 CORE_NEEDS = {'numpy', 'scipy', 'numba', 'pyproj'}

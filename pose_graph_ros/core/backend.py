@@ -13,20 +13,18 @@ full optimisation. Stamps are integer nanoseconds; there is no clock in here.
 
 from collections import Counter
 from dataclasses import dataclass, field, replace
-import heapq
-import itertools
 import math
-from typing import cast
 
 import numpy as np
 
-from pose_graph_ros.core import alignment, batch, binding, covariance, se2, tables as tb
-from pose_graph_ros.core.arrays import GrowingArray
+from pose_graph_ros.core import alignment, batch, binding, closing, covariance, se2
+from pose_graph_ros.core.admission import admit
 from pose_graph_ros.core.batch import Status
 from pose_graph_ros.core.config import BackendConfig
 from pose_graph_ros.core.constraints import Edges, ObservedNodes
 from pose_graph_ros.core.estimate import AlignmentState, Estimate, UpdateReport
 from pose_graph_ros.core.graph import Energies, Graph, GraphUpdate
+from pose_graph_ros.core.hidden_nodes import HiddenNodes
 from pose_graph_ros.core.incremental import IncrementalSmoother, UpdateResult
 from pose_graph_ros.core.measurements import (
     ACCEPTED,
@@ -34,29 +32,33 @@ from pose_graph_ros.core.measurements import (
     LoopClosure,
     Measurement,
     OdometrySample,
-    Position,
     rejected,
-    value_defect,
     Verdict,
 )
+from pose_graph_ros.core.pending import MAX_PENDING, Pending, Seen
+from pose_graph_ros.core.reweighing import Reweighing
 from pose_graph_ros.core.se2 import FloatArray, IntArray
-from pose_graph_ros.core.starts import Solve, solve_from_two_starts
-from pose_graph_ros.core.timeline import OdometryTimeline
+from pose_graph_ros.core.sources import LOOP_CLOSURES, MeasurementSource, OdometrySource
+from pose_graph_ros.core.starts import Solve
 from pose_graph_ros.core.trajectory import Trajectory
 
-# Measurements that wait for odometry; a sender whose clock is ahead must not fill the memory.
-MAX_PENDING = 10_000
+# So often the weights of robust losses follow the estimate within one update.
+REWEIGHINGS = 3
 
 
 @dataclass(slots=True)
 class _Queue:
     """Constraints that are bound and join the graph at the next update, with their sources."""
 
-    edges: list[Edges] = field(default_factory=list)
-    observed: list[ObservedNodes] = field(default_factory=list)
+    edges: list[tuple[str, Edges]] = field(default_factory=list)
+    observed: list[tuple[str, ObservedNodes]] = field(default_factory=list)
 
     def __len__(self) -> int:
         return len(self.edges) + len(self.observed)
+
+    def all_observed(self) -> ObservedNodes:
+        """Return the observed nodes as one table."""
+        return ObservedNodes.joined([table for _, table in self.observed])
 
 
 class PoseGraphBackend:
@@ -81,17 +83,14 @@ class PoseGraphBackend:
         self._solve = solve
         self._smoother = (
             IncrementalSmoother(self._config.smoother) if smoother is None else smoother)
-        self._timeline = OdometryTimeline()
-        self._node_stamps = GrowingArray((), np.int64)
-        self._node_odometry = np.zeros(3)
-        """Odometry at the newest hidden node."""
+        self._nodes = HiddenNodes(self._config, self._make_node)
         self._newest_node_covariance = np.zeros((3, 3))
         """In map axes."""
-        self._pending: list[tuple[int, int, str, Measurement]] = []
-        self._arrival = itertools.count()
+        self._pending = Pending()
+        self._seen = Seen()
         self._queue = _Queue()
         self._quarantine = _Queue()
-        self._seen: set[tuple[str, int, str]] = set()
+        self._reweighing = Reweighing()
         self._settled = True
         self._alignment = AlignmentState.LOCAL
         self._alignment_sigma = np.inf
@@ -107,12 +106,7 @@ class PoseGraphBackend:
     @property
     def node_stamps_ns(self) -> IntArray:
         """Stamps of the hidden nodes [ns], a read-only view."""
-        return cast('IntArray', self._node_stamps.read_only)
-
-    @property
-    def odometry(self) -> Trajectory:
-        """All odometry that came in, in the odometry frame."""
-        return Trajectory(self._timeline.stamps_ns, self._timeline.poses)
+        return self._nodes.stamps_ns
 
     @property
     def n_pending(self) -> int:
@@ -124,61 +118,56 @@ class PoseGraphBackend:
         """Number of constraints that were set aside after a failed solve."""
         return len(self._quarantine)
 
+    @property
+    def revision(self) -> int:
+        """Changes whenever odometry jumps, or another one leads: the estimate is then stale."""
+        streams = self._nodes.streams
+        return (sum(stream.n_jumps for stream in streams.values())
+                + 1_000_000 * list(streams).index(self._nodes.lead) if self._nodes.lead else -1)
+
     def energies(self) -> Energies:
         """Return the energy of every constraint in the graph."""
         return self.graph.energies()
 
     def add_odometry(self, sample: OdometrySample, source: str = 'odom') -> Answer:
         """Take an odometry sample; make a hidden node and its edge if the policy says so."""
-        return self._count(source, self._add_odometry(sample))
+        jumps = self._n_jumps(source)
+        answer = self._count(source, self._nodes.take(sample, source))
+        if self._n_jumps(source) > jumps:
+            self.counts[source, 'jump'] += 1
+        self._queue.edges += self._nodes.edges
+        self._nodes.edges.clear()
+        self._bind_due()
+        return answer
 
-    def _add_odometry(self, sample: OdometrySample) -> Answer:
-        if sample.stamp_ns <= 0:
-            return rejected('zero_stamp', 'odometry without a stamp')
-        broken = value_defect(sample.pose)
-        if broken is not None:
-            return rejected(broken, f'odometry pose {sample.pose.tolist()}')
-        if len(self._timeline) > 0 and sample.stamp_ns <= self._timeline.stamps_ns[-1]:
-            newest = int(self._timeline.stamps_ns[-1])
-            return rejected(
-                'duplicate_stamp' if sample.stamp_ns == newest else 'out_of_order',
-                f'odometry at {sample.stamp_ns} after {newest}')
-        pose = se2.wrapped(sample.pose)
-        self._timeline.append(sample.stamp_ns, pose)
-        if self.graph.n_nodes == 0:
-            self._smoother.update(GraphUpdate(hidden=pose[None], fix=(0,)))
-            self._node_stamps.append_one(sample.stamp_ns)
-            self._node_odometry = pose
-        else:
-            self._extend(sample.stamp_ns, pose)
-        while len(self._pending) > 0 and self._pending[0][0] <= sample.stamp_ns:
-            _, _, waiting, measurement = heapq.heappop(self._pending)
-            self._count(waiting, self._bind(measurement))
-        return ACCEPTED
+    def _n_jumps(self, source: str) -> int:
+        stream = self._nodes.streams.get(source)
+        return 0 if stream is None else stream.n_jumps
 
-    def _extend(self, stamp_ns: int, pose: FloatArray) -> None:
-        """Make a hidden node at the newest odometry, tied by an edge, if one is due."""
-        last_ns = int(self.node_stamps_ns[-1])
-        difference = pose - self._node_odometry
-        if not self._config.nodes.due(
-                math.hypot(difference[0], difference[1]), abs(float(se2.wrap(difference[2]))),
-                (stamp_ns - last_ns) * 1e-9):
-            return
-        motion = self._timeline.motion(last_ns, stamp_ns)
-        noise = covariance.odometry_covariance(self._config.odometry_noise, *motion)
-        result = self._smoother.extend(motion.increment, covariance.information(noise))
+    def _make_node(self, mean: FloatArray, information: FloatArray | None, source: str) -> int:
+        """Append a hidden node to the graph; return its row, or -1 if that failed."""
+        if information is None:
+            self._smoother.update(GraphUpdate(hidden=mean[None], fix=(0,)))
+            return 0
+        result = self._smoother.extend(mean, information)
         if result.status is Status.FAILED:
             # the next sample makes the node, at the end of a longer motion
             self.counts['solver', 'failed'] += 1
-            return
+            return -1
         self._settled = self._settled and result.status is Status.CONVERGED
         self._newest_node_covariance = self._smoother.newest_covariance()
-        self._node_stamps.append_one(stamp_ns)
-        self._node_odometry = pose
+        settings = self._config.odometry.get(source, OdometrySource())
+        self._reweighing.add_edge(
+            self.graph.n_edges - 1, settings.loss, settings.rejection_threshold)
+        return self.graph.n_nodes - 1
+
+    def _bind_due(self) -> None:
+        for source, measurement in self._pending.pop_due(self._nodes.covered_ns):
+            self._count(source, self._bind(measurement, source))
 
     def add_measurement(self, measurement: Measurement, source: str) -> Answer:
         """
-        Take a global pose, a position or a loop closure, in any order of stamps.
+        Take a global pose, a position, a heading or a loop closure, in any order of stamps.
 
         The answer is pending if odometry has not reached its stamp yet; what becomes of it later
         is in `counts`.
@@ -186,65 +175,70 @@ class PoseGraphBackend:
         return self._count(source, self._add_measurement(measurement, source))
 
     def _add_measurement(self, measurement: Measurement, source: str) -> Answer:
-        if not np.any(measurement.covariance) and not isinstance(measurement, LoopClosure):
-            measurement = binding.with_default_covariance(measurement, self._config)
-            self.counts[source, 'default_covariance'] += 1
-        checked = binding.repaired(measurement, self._config)
-        if isinstance(checked, Answer):
-            return checked
-        due_ns, reference = checked.stamp_ns, ''
+        closure = isinstance(measurement, LoopClosure)
+        admitted = admit(measurement, self._settings(source, closure=closure).covariance)
+        if isinstance(admitted, Answer):
+            return admitted
+        checked, key = admitted.measurement, source
+        due_ns = checked.stamp_ns
         if isinstance(checked, LoopClosure):
-            reference = f'{checked.reference_ns} {checked.reference_node}'
+            key = f'{source} {checked.reference_ns} {checked.reference_node}'
             due_ns = max(due_ns, checked.reference_ns or 0)
-        key = (source, checked.stamp_ns, reference)
-        if key in self._seen:
+        if self._seen.has(key, checked.stamp_ns):
             return rejected('duplicate_stamp', f'{source} at {checked.stamp_ns} came before')
-        waits = len(self._timeline) == 0 or due_ns > self._timeline.stamps_ns[-1]
-        if waits and len(self._pending) >= MAX_PENDING:
-            return rejected('too_many_pending', f'{MAX_PENDING} measurements wait for odometry')
-        if not waits:
-            answer = self._bind(checked)
-            if answer.verdict is Verdict.ACCEPTED:
-                self._seen.add(key)
-            return answer
-        self._seen.add(key)
-        heapq.heappush(self._pending, (due_ns, next(self._arrival), source, checked))
-        return Answer(Verdict.PENDING, 'pending', 'waits for odometry to reach its stamp')
-
-    def _bind(self, measurement: Measurement) -> Answer:
-        """Turn a measurement that odometry has reached into a constraint for the next update."""
-        first_ns = int(self.node_stamps_ns[0])
-        if measurement.stamp_ns < first_ns:
-            return rejected('before_odometry',
-                            f'stamp {measurement.stamp_ns}, odometry begins at {first_ns}')
-        anchor = self._anchor(measurement.stamp_ns)
-        if isinstance(measurement, LoopClosure):
-            reference = self._reference(measurement)
-            if isinstance(reference, Answer):
-                return reference
-            if reference.node == anchor.node:
-                return rejected('same_node', f'both ends fall to hidden node {anchor.node}')
-            self._queue.edges.append(
-                binding.loop_closure_constraint(measurement, reference, anchor))
-        elif isinstance(measurement, Position):
-            self._queue.observed.append(binding.position_constraint(measurement, anchor))
+        if due_ns <= self._nodes.covered_ns:
+            answer = self._bind(checked, source)
+        elif self._pending.full:
+            answer = rejected(
+                'too_many_pending', f'{MAX_PENDING} measurements wait for odometry')
         else:
-            self._queue.observed.append(binding.global_pose_constraint(measurement, anchor))
+            self._pending.push(due_ns, source, checked)
+            answer = Answer(Verdict.PENDING, 'pending', 'waits for odometry to reach its stamp')
+        if answer.verdict is not Verdict.REJECTED:
+            self._seen.add(key, checked.stamp_ns)
+            for repair in admitted.repairs:
+                self.counts[source, repair] += 1
+        return answer
+
+    def _settings(self, source: str, *, closure: bool = False) -> MeasurementSource:
+        default = LOOP_CLOSURES if closure else MeasurementSource()
+        return self._config.measurements.get(source, default)
+
+    def _bind(self, measurement: Measurement, source: str) -> Answer:
+        """Turn a measurement that odometry has reached into a constraint for the next update."""
+        anchor = self._anchor(measurement.stamp_ns)
+        if isinstance(anchor, Answer):
+            return anchor
+        if not isinstance(measurement, LoopClosure):
+            self._queue.observed.append((source, binding.absolute_constraint(measurement, anchor)))
+            return ACCEPTED
+        reference = self._reference(measurement)
+        if isinstance(reference, Answer):
+            return reference
+        if reference.node == anchor.node:
+            return rejected('same_node', f'both ends fall to hidden node {anchor.node}')
+        self._queue.edges.append(
+            (source, binding.loop_closure_constraint(measurement, reference, anchor)))
         return ACCEPTED
 
-    def _anchor(self, stamp_ns: int) -> binding.Anchor:
-        return binding.anchored(stamp_ns, self.node_stamps_ns, self._timeline, self._config)
+    def _anchor(self, stamp_ns: int) -> binding.Anchor | Answer:
+        first_ns = int(self.node_stamps_ns[0])
+        if stamp_ns < first_ns:
+            return rejected('before_odometry',
+                            f'stamp {stamp_ns}, odometry begins at {first_ns}')
+        anchor = self._nodes.anchor(stamp_ns)
+        if anchor is None:
+            return rejected('no_odometry', f'no odometry tells of the motion up to {stamp_ns}')
+        return anchor
 
     def _reference(self, closure: LoopClosure) -> binding.Anchor | Answer:
         """Return the earlier end of a loop closure, named by stamp or by hidden node."""
         if closure.reference_ns is not None:
-            if closure.reference_ns < self.node_stamps_ns[0]:
-                return rejected('before_odometry', f'reference stamp {closure.reference_ns}')
             return self._anchor(closure.reference_ns)
         node = closure.reference_node
-        if node is None or not 0 <= node < self.graph.n_nodes:
+        if node is None or not 0 <= node < len(self._nodes):
             return rejected('unknown_node', f'there is no hidden node {node}')
-        return binding.Anchor(node, np.zeros(3), np.zeros((3, 3)))
+        return binding.Anchor(int(self._nodes.rows[node]), np.zeros(3), np.zeros((3, 3)))
 
     def update(self) -> UpdateReport:
         """Add what has come in to the graph and improve the estimate; for a timer."""
@@ -259,8 +253,10 @@ class PoseGraphBackend:
         if T_map_graph is not None:
             before = self.graph.poses.copy()
             self.graph.set_poses(se2.compose(T_map_graph, before))
+        sizes = self.graph.n_edges, self.graph.n_observed
         result = self._step(GraphUpdate(
-            edges=Edges.joined(joining.edges), observed=ObservedNodes.joined(joining.observed),
+            edges=Edges.joined([table for _, table in joining.edges]),
+            observed=joining.all_observed(),
             # from here on the map holds the graph, not its first node
             free=() if T_map_graph is None else (0,)))
         if result.status is Status.FAILED:
@@ -272,7 +268,8 @@ class PoseGraphBackend:
             self._quarantine.observed += joining.observed
             self.counts['solver', 'failed'] += 1
             return UpdateReport(Status.FAILED, result.reason, 0, 0, self._chi2)
-        self._settled = result.status is Status.CONVERGED
+        self._enlist(joining, *sizes)
+        result = self._reweighed(result)
         # the only thing here in proportion to the graph: 0.03 ms for 1000 nodes
         self._chi2 = self._smoother.chi2()
         self._newest_node_covariance = self._smoother.newest_covariance()
@@ -288,6 +285,32 @@ class PoseGraphBackend:
             reason = f'{type(error).__name__}: {error}'
             return UpdateResult(Status.FAILED, reason, 0, 0, 0, 0, math.nan)
 
+    def _enlist(self, joined: _Queue, edge: int, observed: int) -> None:
+        """Remember the losses of what has joined the graph, from these rows on."""
+        for number, (source, table) in enumerate(joined.edges):
+            settings = self._config.odometry.get(source) or self._settings(source, closure=True)
+            assert len(table) == 1
+            self._reweighing.add_edge(
+                edge + number, settings.loss, settings.rejection_threshold)
+        for number, (source, _) in enumerate(joined.observed):
+            settings = self._settings(source)
+            self._reweighing.add_observed(
+                observed + number, settings.loss, settings.rejection_threshold)
+
+    def _reweighed(self, result: UpdateResult) -> UpdateResult:
+        """Let the weights of robust losses follow the estimate that an update has led to."""
+        self._settled = result.status is Status.CONVERGED
+        for _ in range(REWEIGHINGS if len(self._reweighing) > 0 else 0):
+            edges, observed = self._reweighing.changes(self.graph)
+            if len(edges) + len(observed) == 0:
+                return result
+            self._settled = False
+            again = self._step(GraphUpdate(weigh_edges=edges, weigh_observed=observed))
+            if again.status is Status.FAILED:
+                return result
+            result = again
+        return result
+
     def _joining(self) -> _Queue:
         """Take what can join the graph out of the queue; observed nodes wait for alignment."""
         joining = _Queue(edges=self._queue.edges)
@@ -301,7 +324,7 @@ class PoseGraphBackend:
         if self._alignment is AlignmentState.ALIGNED or len(self._queue.observed) == 0:
             return None
         turn = alignment.find_turn(
-            self.graph.poses, ObservedNodes.joined(self._queue.observed), self._config.alignment)
+            self.graph.poses, self._queue.all_observed(), self._config.alignment)
         self._alignment = (AlignmentState.UNALIGNED if turn.T_map_graph is None
                            else AlignmentState.ALIGNED)
         self._alignment_sigma = turn.sigma
@@ -309,6 +332,10 @@ class PoseGraphBackend:
 
     def optimize(self) -> UpdateReport:
         """Optimise fully, once more with what had been set aside: the end of a stream."""
+        self._nodes.finish()
+        self._bind_due()
+        self._queue.edges += self._nodes.edges
+        self._nodes.edges.clear()
         report = self.update()
         if len(self._quarantine) > 0:
             self._queue.edges += self._quarantine.edges
@@ -321,54 +348,42 @@ class PoseGraphBackend:
         return report.after(self._solve_whole())
 
     def _solve_whole(self) -> UpdateReport:
-        """Optimise the whole graph from two starts; if that fails all poses are as before."""
-        before = self.graph.poses.copy()
-        try:
-            result = solve_from_two_starts(
-                self.graph, self._config.closing, self._solve, closing=True)
-            status, reason = result.status, result.reason
-        except Exception as error:
-            # whatever it is: no pose must stay on its way
-            status, reason = Status.FAILED, f'{type(error).__name__}: {error}'
-        if status is Status.FAILED:
-            self.graph.set_poses(before)
+        """Optimise the whole graph; if that fails all poses and weights are as before."""
+        result = closing.optimize(
+            self._smoother, self._reweighing, self._config.closing, self._solve)
+        if result.status is Status.FAILED:
             self._settled = False
             self.counts['solver', 'failed'] += 1
-            return UpdateReport(Status.FAILED, reason, 0, 0, self._chi2)
-        if self.graph.memory.head[tb.N_SEEDS] > 0:
-            # the solver has left the elimination to the smoother
-            self._smoother.update(GraphUpdate())
-        self._settled = status is not Status.MAX_ITERATIONS
+            return UpdateReport(Status.FAILED, result.reason, 0, 0, self._chi2)
+        self._settled = result.status is not Status.MAX_ITERATIONS
         self._chi2 = result.chi2
         self._newest_node_covariance = self._smoother.newest_covariance()
-        return UpdateReport(status, '', 0, result.iterations, result.chi2)
+        return UpdateReport(result.status, '', 0, result.iterations, result.chi2)
 
     def estimate(self) -> Estimate | None:
         """Return the present estimate; None before the first odometry."""
         graph = self.graph
         if graph.n_nodes == 0:
             return None
-        poses, stamps = graph.poses, self.node_stamps_ns
-        newest_ns = int(self._timeline.stamps_ns[-1])
-        motion = self._timeline.motion(int(stamps[-1]), newest_ns)
-        newest = se2.compose(poses[-1], motion.increment)
-        noise = covariance.odometry_covariance(
-            self._config.odometry_noise, *motion, floor=False)
+        poses, stamps = graph.poses[self._nodes.rows], self.node_stamps_ns
+        motion, noise, odometry = self._nodes.newest()
+        newest_ns, newest = self._nodes.newest_ns, se2.compose(poses[-1], motion.increment)
         cov = covariance.propagated(
             poses[-1], self._newest_node_covariance, motion.increment, noise)
         if self._alignment is AlignmentState.UNALIGNED:
             # those that turned the graph in an update that failed are set aside
-            shift, cov = alignment.guess(poses, newest, ObservedNodes.joined(
-                self._queue.observed + self._quarantine.observed))
+            shift, cov = alignment.guess(graph.poses, newest, ObservedNodes.joined(
+                [table for _, table in self._queue.observed + self._quarantine.observed]))
             poses, newest = poses + shift, newest + shift
         if newest_ns > stamps[-1]:
             stamps, poses = np.append(stamps, newest_ns), np.vstack((poses, newest))
-        odometry = self._timeline.pose(newest_ns)
+        lead = self._nodes.lead
         return Estimate(
             path=Trajectory(stamps, poses), T_odom_base=odometry, T_map_base=newest,
             T_map_odom=se2.compose(newest, se2.inverse(odometry)), covariance=cov,
             alignment=self._alignment, alignment_sigma=self._alignment_sigma, chi2=self._chi2,
-            n_hidden=graph.n_nodes, n_edges=graph.n_edges, n_observed=graph.n_observed)
+            n_hidden=len(self._nodes), n_edges=graph.n_edges, n_observed=graph.n_observed,
+            lead=lead, noise=self._config.odometry.get(lead, OdometrySource()).noise)
 
     def _count(self, source: str, answer: Answer) -> Answer:
         if answer.verdict is Verdict.ACCEPTED:

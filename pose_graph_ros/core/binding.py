@@ -8,24 +8,20 @@ between, whose noise is added to the measurement's own. No node is made for a me
 nothing here depends on when it arrived or on the present estimate.
 """
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 
 from pose_graph_ros.core import covariance, se2
-from pose_graph_ros.core.config import BackendConfig
 from pose_graph_ros.core.constraints import EdgeKind, Edges, ObservedKind, ObservedNodes
 from pose_graph_ros.core.measurements import (
-    Answer,
+    Absolute,
     GlobalPose,
+    HeadingOnly,
     LoopClosure,
-    Measurement,
     Position,
-    rejected,
-    value_defect,
 )
-from pose_graph_ros.core.se2 import FloatArray, IntArray
-from pose_graph_ros.core.timeline import OdometryTimeline
+from pose_graph_ros.core.se2 import FloatArray
 
 
 @dataclass(frozen=True, slots=True)
@@ -39,67 +35,23 @@ class Anchor:
     """Covariance of the motion in the frame at the stamp, shape (3, 3)."""
 
 
-def repaired(measurement: Measurement, config: BackendConfig) -> Measurement | Answer:
-    """
-    Return the measurement with its covariance floored, or why it cannot be used.
-
-    A global pose whose heading is less certain than a flat guess becomes a position.
-    """
-    if isinstance(measurement, GlobalPose) and not _heading_known(measurement.covariance):
-        measurement = Position(measurement.stamp_ns, measurement.pose[:2],
-                               measurement.covariance[:2, :2], np.zeros(2))
-    kind = type(measurement).__name__
-    value = (np.concatenate((measurement.position, measurement.lever_arm))
-             if isinstance(measurement, Position) else measurement.pose)
-    broken = value_defect(value)
-    if broken is not None:
-        return rejected(broken, f'{kind}: {value.tolist()}')
-    if measurement.stamp_ns <= 0:
-        return rejected('zero_stamp', f'{kind} without a stamp')
-    cov = measurement.covariance
-    defect = covariance.defect(cov)
-    if defect is not None:
-        return rejected(f'covariance_{defect}', f'{kind}: {cov.tolist()}')
-    floors = np.array([config.position_sigma_floor, config.position_sigma_floor,
-                       config.heading_sigma_floor])[:len(cov)] ** 2
-    return replace(measurement, covariance=covariance.floored(cov, floors))
+def absolute_constraint(measurement: Absolute, anchor: Anchor) -> ObservedNodes:
+    """Return the observed node on the anchor's node, offset by the motion since."""
+    if isinstance(measurement, Position):
+        return _position_constraint(measurement, anchor)
+    if isinstance(measurement, HeadingOnly):
+        return _heading_constraint(measurement, anchor)
+    return _global_pose_constraint(measurement, anchor)
 
 
-def with_default_covariance(
-    measurement: GlobalPose | Position, config: BackendConfig,
-) -> Position:
-    """Return what is left where all covariances are zero, which is how ROS says unknown."""
-    position = measurement.position if isinstance(measurement, Position) else measurement.pose[:2]
-    lever_arm = measurement.lever_arm if isinstance(measurement, Position) else np.zeros(2)
-    return Position(measurement.stamp_ns, position, config.default_position_sigma**2 * np.eye(2),
-                    lever_arm)
-
-
-def _heading_known(cov: FloatArray) -> bool:
-    """Tell whether a variance is neither infinite, nor huge, nor zero, nor below."""
-    return bool(0.0 < cov[2, 2] < covariance.UNKNOWN_HEADING_VARIANCE)
-
-
-def anchored(
-    stamp_ns: int, node_stamps_ns: IntArray, timeline: OdometryTimeline,
-    config: BackendConfig,
-) -> Anchor:
-    """Return a covered stamp as seen from the last hidden node before it."""
-    node = int(np.searchsorted(node_stamps_ns, stamp_ns, side='right')) - 1
-    motion = timeline.motion(int(node_stamps_ns[node]), stamp_ns)
-    noise = covariance.odometry_covariance(
-        config.odometry_noise, *motion, floor=False)
-    return Anchor(node, motion.increment, noise)
-
-
-def global_pose_constraint(measurement: GlobalPose, anchor: Anchor) -> ObservedNodes:
+def _global_pose_constraint(measurement: GlobalPose, anchor: Anchor) -> ObservedNodes:
     """Return the constraint (3.51)-(3.53) on the anchor's node, offset by the motion since."""
     cov = covariance.turned(measurement.covariance, float(measurement.pose[2])) + anchor.noise
     return ObservedNodes([anchor.node], [anchor.motion], [measurement.pose],
                          [covariance.information(cov)], [ObservedKind.GLOBAL_POSE])
 
 
-def position_constraint(measurement: Position, anchor: Anchor) -> ObservedNodes:
+def _position_constraint(measurement: Position, anchor: Anchor) -> ObservedNodes:
     """
     Return the constraint of a position: no information on the heading, error in map axes.
 
@@ -116,6 +68,14 @@ def position_constraint(measurement: Position, anchor: Anchor) -> ObservedNodes:
                          [information], [ObservedKind.POSITION])
 
 
+def _heading_constraint(measurement: HeadingOnly, anchor: Anchor) -> ObservedNodes:
+    """Return the constraint of a heading: no information on the position."""
+    information = np.zeros((3, 3))
+    information[2, 2] = 1.0 / (measurement.variance + anchor.noise[2, 2])
+    return ObservedNodes([anchor.node], [anchor.motion], [(0.0, 0.0, measurement.heading)],
+                         [information], [ObservedKind.HEADING])
+
+
 def loop_closure_constraint(
     measurement: LoopClosure, reference: Anchor, anchor: Anchor,
 ) -> Edges:
@@ -124,14 +84,20 @@ def loop_closure_constraint(
 
     With T_i and T_j the motions from the nodes to the stamps, z' = T_i z T_j^-1. A small error at
     the end of z shows at the end of z' through the adjoint of T_j; one at its start through that
-    of T_j z^-1.
+    of T_j z^-1. With infinite variances of x and y it ties the headings alone.
     """
     z = measurement.pose
+    mean = se2.compose(se2.compose(reference.motion, z), se2.inverse(anchor.motion))
+    if not np.isfinite(measurement.covariance[0, 0]):
+        information = np.zeros((3, 3))
+        information[2, 2] = 1.0 / float(
+            measurement.covariance[2, 2] + anchor.noise[2, 2] + reference.noise[2, 2])
+        return Edges([reference.node], [anchor.node], [mean], [information],
+                     [EdgeKind.LOOP_CLOSURE])
     cov = covariance.turned(measurement.covariance, float(z[2])) + anchor.noise
     back = se2.adjoint(se2.inverse(z))
     cov = cov + back @ reference.noise @ back.T
     out = se2.adjoint(anchor.motion)
     cov = out @ cov @ out.T
-    mean = se2.compose(se2.compose(reference.motion, z), se2.inverse(anchor.motion))
     return Edges([reference.node], [anchor.node], [mean], [covariance.information(cov)],
                  [EdgeKind.LOOP_CLOSURE])

@@ -6,20 +6,11 @@ All settings of the engine and their defaults, in one place.
 The ROS parameters, the yaml file and the README's table take their defaults from here.
 """
 
+from collections.abc import Mapping
 from dataclasses import dataclass, field
-import math
 
 from pose_graph_ros.core.exceptions import ConfigError
-
-
-def _require(settings: object, *names: str, positive: bool = False) -> None:
-    """Raise ConfigError unless the named settings are finite and not negative (or positive)."""
-    for name in names:
-        value = getattr(settings, name)
-        if not math.isfinite(value) or value < 0.0 or (positive and value == 0.0):
-            expected = 'a positive number' if positive else 'a number that is not negative'
-            raise ConfigError(
-                f'{type(settings).__name__}.{name}: expected {expected}, got {value!r}')
+from pose_graph_ros.core.sources import MeasurementSource, OdometrySource, require
 
 
 # Motion since the last hidden node below these is standing still: odometry jitters [m, rad].
@@ -43,8 +34,8 @@ class NodePolicy:
     """A hidden node at the latest after this time, even when standing still [s]."""
 
     def __post_init__(self) -> None:
-        _require(self, 'minimum_travel_distance', 'minimum_travel_heading', 'minimum_interval')
-        _require(self, 'moving_interval', 'heartbeat', positive=True)
+        require(self, 'minimum_travel_distance', 'minimum_travel_heading', 'minimum_interval')
+        require(self, 'moving_interval', 'heartbeat', positive=True)
 
     def due(self, distance: float, turned: float, elapsed: float) -> bool:
         """
@@ -63,35 +54,6 @@ class NodePolicy:
 
 
 @dataclass(frozen=True, slots=True)
-class OdometryNoise:
-    """
-    Random-walk noise of odometry: variances grow with the path length and the turn.
-
-    Composable by construction: the noise of a long increment is that of its parts added up, so
-    that, but for the small floors, the spacing of the hidden nodes does not change the estimate's
-    uncertainty.
-    """
-
-    sigma_distance: float = 0.05
-    """Along the direction of travel [m per sqrt(m) travelled]."""
-    sigma_lateral: float = 0.03
-    """Across the direction of travel [m per sqrt(m) travelled]."""
-    sigma_heading_distance: float = 0.01
-    """Heading [rad per sqrt(m) travelled]."""
-    sigma_heading_turn: float = 0.05
-    """Heading [rad per sqrt(rad) turned]."""
-    sigma_floor_position: float = 0.002
-    """Position, once per increment [m]; keeps the information finite when standing still."""
-    sigma_floor_heading: float = 0.0005
-    """Heading, once per increment [rad]."""
-
-    def __post_init__(self) -> None:
-        _require(self, 'sigma_distance', 'sigma_lateral', 'sigma_heading_distance',
-                 'sigma_heading_turn')
-        _require(self, 'sigma_floor_position', 'sigma_floor_heading', positive=True)
-
-
-@dataclass(frozen=True, slots=True)
 class AlignmentPolicy:
     """When the angle between odometry and map counts as known from positions alone."""
 
@@ -103,7 +65,7 @@ class AlignmentPolicy:
     """... and at least this many sigmas of a position."""
 
     def __post_init__(self) -> None:
-        _require(self, 'sigma_heading', 'minimum_baseline', 'baseline_in_sigmas', positive=True)
+        require(self, 'sigma_heading', 'minimum_baseline', 'baseline_in_sigmas', positive=True)
 
 
 @dataclass(frozen=True, slots=True)
@@ -121,8 +83,8 @@ class SolverConfig:
         if self.max_iterations < 1:
             raise ConfigError(f'SolverConfig.max_iterations: expected >= 1, '
                               f'got {self.max_iterations!r}')
-        _require(self, 'step_tolerance', positive=True)
-        _require(self, 'initial_damping')
+        require(self, 'step_tolerance', positive=True)
+        require(self, 'initial_damping')
 
 
 @dataclass(frozen=True, slots=True)
@@ -139,7 +101,7 @@ class SmootherConfig:
     """Iterations of one update at the most; what is left over is done in the next."""
 
     def __post_init__(self) -> None:
-        _require(self, 'alpha', 'budget', 'budget_share')
+        require(self, 'alpha', 'budget', 'budget_share')
         if self.max_iterations < 1:
             raise ConfigError(f'SmootherConfig.max_iterations: expected >= 1, '
                               f'got {self.max_iterations!r}')
@@ -150,20 +112,18 @@ class BackendConfig:
     """Settings of `PoseGraphBackend`."""
 
     nodes: NodePolicy = field(default_factory=NodePolicy)
-    odometry_noise: OdometryNoise = field(default_factory=OdometryNoise)
     alignment: AlignmentPolicy = field(default_factory=AlignmentPolicy)
     smoother: SmootherConfig = field(default_factory=SmootherConfig)
     """For the timer: what is left over is done at the next update."""
     closing: SolverConfig = field(
         default_factory=lambda: SolverConfig(max_iterations=400, step_tolerance=1e-10))
     """For the full optimisation at the end of a stream; an outage can make it converge slowly."""
-    position_sigma_floor: float = 0.01
-    """No position or pose is believed to be better than this [m]."""
-    heading_sigma_floor: float = 0.001
-    """No heading is believed to be better than this [rad]."""
-    default_position_sigma: float = 5.0
-    """Taken for a position whose sender says that its covariance is unknown [m]."""
+    odometry: Mapping[str, OdometrySource] = field(default_factory=dict)
+    """Sources of odometry by name, the preferred one first; defaults for others."""
+    measurements: Mapping[str, MeasurementSource] = field(default_factory=dict)
+    """Other sources by name; defaults for those that are not named."""
+    odometry_patience: float = 2.0
+    """Another odometry makes the hidden nodes when the one that did is so much behind [s]."""
 
     def __post_init__(self) -> None:
-        _require(self, 'position_sigma_floor', 'heading_sigma_floor', 'default_position_sigma',
-                 positive=True)
+        require(self, 'odometry_patience', positive=True)

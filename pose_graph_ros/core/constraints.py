@@ -6,7 +6,8 @@ The two kinds of constraints, as struct of arrays: edges and observed nodes.
 An *edge* is directed from hidden node i to hidden node j and carries the measured pose of j in i.
 An *observed node* is a pose measured from outside; its constraint ties it to one hidden node. A
 position is an observed node whose information on the heading is zero, and whose mean heading is
-zero, so that its error lies in the axes of the map.
+zero, so that its error lies in the axes of the map; a heading is one whose information on the
+position is zero.
 """
 
 from collections.abc import Sequence
@@ -39,6 +40,7 @@ class ObservedKind(IntEnum):
 
     GLOBAL_POSE = 0
     POSITION = 1
+    HEADING = 2
 
 
 @dataclass(frozen=True, slots=True)

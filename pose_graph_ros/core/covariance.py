@@ -10,8 +10,9 @@ has the order (x, y, theta); docs/conventions.md says in which axes.
 import numpy as np
 
 from pose_graph_ros.core import se2
-from pose_graph_ros.core.config import OdometryNoise
+from pose_graph_ros.core.motion import Motion
 from pose_graph_ros.core.se2 import FloatArray
+from pose_graph_ros.core.sources import OdometryNoise
 
 # A heading that is uniform on the circle has the variance pi^2 / 3; what claims to be less
 # certain than a flat guess carries no heading at all.
@@ -77,11 +78,10 @@ def information(covariance: FloatArray) -> FloatArray:
 
 
 def odometry_covariance(
-    noise: OdometryNoise, increment: FloatArray, distance: float, turn: float, *,
-    floor: bool = True,
+    noise: OdometryNoise, motion: Motion, *, floor: bool = True,
 ) -> FloatArray:
     """
-    Return the covariance, shape (3, 3), of an odometry increment in the frame at its end.
+    Return the covariance, shape (3, 3), of a motion by odometry in the frame at its end.
 
     The heading is a random walk along the path. An error of the heading turns what is still to
     come of the path: with c the chord in the frame at the end, n the same turned by 90 degrees
@@ -91,24 +91,23 @@ def odometry_covariance(
     Parameters
     ----------
     noise : OdometryNoise
-    increment : ndarray, shape (3,)
-        Pose at the end in the frame at the start [m, m, rad].
-    distance, turn : float
-        Path length [m] and sum of the absolute turns [rad] of the increment.
+        Grows with the path and the turns of the motion, beside what the motion itself brings.
+    motion : Motion
     floor : bool
         Add the floors, which stand once in every increment.
 
     """
+    increment, distance, turn, variance = motion
     # no heading is less certain than a flat guess
-    q = min(noise.sigma_heading_distance**2 * distance + noise.sigma_heading_turn**2 * turn,
-            UNKNOWN_HEADING_VARIANCE)
+    q = min(noise.sigma_heading_distance**2 * distance + noise.sigma_heading_turn**2 * turn
+            + float(variance[2]), UNKNOWN_HEADING_VARIANCE)
     c, s = np.cos(increment[2]), np.sin(increment[2])
     chord_x, chord_y = c * increment[0] + s * increment[1], c * increment[1] - s * increment[0]
     sweep = np.array([-chord_y, chord_x])
     covariance = np.zeros((3, 3))
     covariance[:2, :2] = q / 3.0 * np.outer(sweep, sweep)
-    covariance[0, 0] += noise.sigma_distance**2 * distance
-    covariance[1, 1] += noise.sigma_lateral**2 * distance
+    covariance[0, 0] += noise.sigma_distance**2 * distance + variance[0]
+    covariance[1, 1] += noise.sigma_lateral**2 * distance + variance[1]
     covariance[:2, 2] = covariance[2, :2] = q / 2.0 * sweep
     covariance[2, 2] = q
     if floor:

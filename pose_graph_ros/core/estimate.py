@@ -7,6 +7,7 @@ from enum import Enum
 
 from pose_graph_ros.core.batch import Status
 from pose_graph_ros.core.se2 import FloatArray
+from pose_graph_ros.core.sources import OdometryNoise
 from pose_graph_ros.core.trajectory import Trajectory
 
 
@@ -67,6 +68,10 @@ class Estimate:
     n_hidden: int
     n_edges: int
     n_observed: int
+    lead: str
+    """Source of the odometry in `T_odom_base`."""
+    noise: OdometryNoise
+    """Of that odometry."""
 
     def __post_init__(self) -> None:
         for array in (self.T_odom_base, self.T_map_base, self.T_map_odom, self.covariance):

@@ -111,8 +111,11 @@ class Graph:
     @property
     def edges(self) -> Edges:
         """All edges, with their weights."""
-        numbers = self.memory['edge_f'][:self.n_edges]
-        integers = self.memory['edge_i'][:self.n_edges]
+        return self.edges_at(slice(self.n_edges))
+
+    def edges_at(self, rows: IntArray | slice) -> Edges:
+        """Return some edges, by their numbers."""
+        numbers, integers = self.memory['edge_f'][rows], self.memory['edge_i'][rows]
         return Edges(
             integers[:, tb.END_I], integers[:, tb.END_J], numbers[:, tb.MEAN:tb.MEAN + 3].copy(),
             _unpacked(numbers[:, tb.INFO:tb.INFO + 6]), integers[:, tb.EDGE_KIND],
@@ -121,8 +124,11 @@ class Graph:
     @property
     def observed(self) -> ObservedNodes:
         """All observed nodes, with their weights."""
-        numbers = self.memory['observed_f'][:self.n_observed]
-        integers = self.memory['observed_i'][:self.n_observed]
+        return self.observed_at(slice(self.n_observed))
+
+    def observed_at(self, rows: IntArray | slice) -> ObservedNodes:
+        """Return some observed nodes, by their numbers."""
+        numbers, integers = self.memory['observed_f'][rows], self.memory['observed_i'][rows]
         return ObservedNodes(
             integers[:, tb.OBS_NODE], numbers[:, tb.OBS_OFFSET:tb.OBS_OFFSET + 3].copy(),
             numbers[:, tb.MEAN:tb.MEAN + 3].copy(), _unpacked(numbers[:, tb.INFO:tb.INFO + 6]),

@@ -26,6 +26,10 @@ class OdometrySample:
     stamp_ns: int
     pose: FloatArray
     """`T_odom_base`, shape (3,) [m, m, rad]."""
+    speed: float = 0.0
+    """By the twist that came with it, if one did [m/s]."""
+    twist_variance: FloatArray | None = None
+    """Of the twist (v_x, v_y, yaw rate) in the robot's frame, shape (3,); None if unknown."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -53,6 +57,17 @@ class Position:
 
 
 @dataclass(frozen=True, slots=True)
+class HeadingOnly:
+    """Which way the robot points in the map."""
+
+    stamp_ns: int
+    heading: float
+    """[rad]"""
+    variance: float
+    """[rad^2]"""
+
+
+@dataclass(frozen=True, slots=True)
 class LoopClosure:
     """Where the robot is, seen from where it was at another instant (or at a hidden node)."""
 
@@ -60,14 +75,19 @@ class LoopClosure:
     pose: FloatArray
     """`T_reference_base`, shape (3,) [m, m, rad]."""
     covariance: FloatArray
-    """Of (x, y, theta) in the axes of the reference pose, shape (3, 3)."""
+    """
+    Of (x, y, theta) in the axes of the reference pose, shape (3, 3); infinite variances of x and
+    y make it a statement on the two headings alone, such as that two walls are perpendicular.
+    """
     reference_ns: int | None = None
     """Instant of the reference pose ..."""
     reference_node: int | None = None
     """... or its hidden node; exactly one of the two is given."""
 
 
-Measurement = GlobalPose | Position | LoopClosure
+Absolute = GlobalPose | Position | HeadingOnly
+"""What tells of the robot in the map."""
+Measurement = Absolute | LoopClosure
 
 
 class Verdict(Enum):

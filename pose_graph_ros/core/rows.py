@@ -120,7 +120,7 @@ def write_all_observed(  # type: ignore[no-untyped-def]
     """Write observed nodes behind the last row; return whether all are plainly sound."""
     sound = True
     for k in range(len(node)):
-        inside = 0 <= node[k] < n_nodes and kind[k] <= 1
+        inside = 0 <= node[k] < n_nodes and kind[k] <= 2
         if not (write_observed(head, head[tb.N_OBSERVED] + k, node[k], offset[k], mean[k],
                                information[k], kind[k], weight[k]) and inside):
             sound = False

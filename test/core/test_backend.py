@@ -16,7 +16,6 @@ from pose_graph_ros.core.batch import BatchResult, Status
 from pose_graph_ros.core.config import (
     BackendConfig,
     NodePolicy,
-    OdometryNoise,
     SmootherConfig,
     SolverConfig,
 )
@@ -34,6 +33,7 @@ from pose_graph_ros.core.measurements import (
     Verdict,
 )
 from pose_graph_ros.core.se2 import FloatArray
+from pose_graph_ros.core.sources import OdometryNoise, OdometrySource
 
 SECOND = 1_000_000_000
 # The promise: the same measurements give the same path, whatever their order [m, rad].

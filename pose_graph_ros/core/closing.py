@@ -1,0 +1,96 @@
+# Copyright 2026 The pose_graph_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""
+The full optimisation at the end of a stream.
+
+Its result must not depend on what the updates before it did. So the graph is solved from two
+starts, and where sources have a robust loss, their weights begin at those of plain least squares.
+"""
+
+from dataclasses import replace
+from typing import Any
+
+from pose_graph_ros.core import tables as tb
+from pose_graph_ros.core.batch import BatchResult, Status
+from pose_graph_ros.core.config import SolverConfig
+from pose_graph_ros.core.graph import Graph, GraphUpdate
+from pose_graph_ros.core.incremental import IncrementalSmoother
+from pose_graph_ros.core.reweighing import Reweighing
+from pose_graph_ros.core.starts import SAME_MINIMUM, Solve, solve_from_two_starts
+
+# So often the weights of robust losses follow the estimate at the most ...
+REWEIGHINGS = 200
+# ... and they are settled when none changes by more than this.
+SAME_WEIGHT = 1e-12
+
+
+def optimize(
+    smoother: IncrementalSmoother, reweighing: Reweighing, config: SolverConfig, solve: Solve,
+) -> BatchResult:
+    """
+    Optimise the whole graph of a smoother in place; chi2 of the result has the robust weights.
+
+    If that fails, whatever happens, all poses and weights are as before.
+    """
+    graph = smoother.graph
+    poses, edges, observed = graph.poses.copy(), graph.edges.weight, graph.observed.weight
+    try:
+        if len(reweighing) == 0:
+            result = solve_from_two_starts(graph, config, solve, closing=True)
+        else:
+            result = _optimize_robustly(graph, reweighing, config, solve)
+    except Exception as error:
+        # whatever it is: no pose must stay on its way
+        reason = f'{type(error).__name__}: {error}'
+        result = BatchResult(Status.FAILED, reason, 0, float('nan'), float('nan'))
+    if result.status is Status.FAILED:
+        if len(reweighing) > 0:
+            _weigh(graph, dict(enumerate(edges.tolist())), dict(enumerate(observed.tolist())))
+        graph.set_poses(poses)
+    elif graph.memory.head[tb.N_SEEDS] > 0:
+        # the solver has left the elimination to the smoother
+        smoother.update(GraphUpdate())
+    return result
+
+
+def _optimize_robustly(
+    graph: Graph, reweighing: Reweighing, config: SolverConfig, solve: Solve,
+) -> BatchResult:
+    """Reweigh from plain least squares on, and from the present estimate; keep the lower cost."""
+    result = _reweighed(graph, reweighing, config, solve)
+    own, poses, weights = result, graph.poses.copy(), (graph.edges.weight, graph.observed.weight)
+    _weigh(graph, *reweighing.ones())
+    result = solve_from_two_starts(graph, config, solve, closing=True)
+    if result.status is not Status.FAILED:
+        result = _reweighed(graph, reweighing, config, solve)
+    if own.status is not Status.FAILED and (
+            result.status is Status.FAILED or own.chi2 < result.chi2 * (1.0 - SAME_MINIMUM)):
+        _weigh(graph, *(dict(enumerate(weight.tolist())) for weight in weights))
+        graph.set_poses(poses)
+        result = own
+    return result
+
+
+def _reweighed(
+    graph: Graph, reweighing: Reweighing, config: SolverConfig, solve: Solve,
+) -> BatchResult:
+    """Solve and reweigh in turn until the weights stay; chi2 of the result is the robust cost."""
+    iterations = 0
+    for _ in range(REWEIGHINGS):
+        edges, observed = reweighing.all_changes(graph)
+        before = graph.edges.weight, graph.observed.weight
+        largest = max((abs(weight - table[row]) for table, changes in zip(
+            before, (edges, observed), strict=True) for row, weight in changes.items()),
+            default=0.0)
+        _weigh(graph, edges, observed)
+        result = solve(graph, config)
+        iterations += result.iterations
+        if result.status is Status.FAILED or largest < SAME_WEIGHT:
+            break
+    if result.status is Status.FAILED:
+        return result
+    return replace(result, iterations=iterations, chi2=result.chi2 + reweighing.cost(graph))
+
+
+def _weigh(graph: Graph, edges: Any, observed: Any) -> None:
+    graph.apply(GraphUpdate(weigh_edges=edges, weigh_observed=observed))
