@@ -30,7 +30,18 @@ COLUMNS = 3
 VERSIONS = ('gtsam', 'numpy', 'scipy', 'numba')
 
 
-def write(sections: list[Section], folder: Path, command: str) -> Path:
+AGAINST_GTSAM = (
+    'Times of steps are in microseconds. Ours is all that a caller from Python pays, an '
+    'up-to-date estimate included; of GTSAM only `ISAM2.update` is counted. Runs of the '
+    'tools are interleaved in one process, figures are medians over the runs. A ratio is '
+    "GTSAM's time divided by ours. Excess is half of chi2 above the batch optimum of the "
+    'graph so far, each tool under its own error model.')
+
+
+def write(
+    sections: list[Section], folder: Path, command: str, *,
+    title: str = 'Benchmark: pose_graph_ros against GTSAM', remarks: str = AGAINST_GTSAM,
+) -> Path:
     """
     Write the report.
 
@@ -42,15 +53,15 @@ def write(sections: list[Section], folder: Path, command: str) -> Path:
     """
     folder.mkdir(parents=True, exist_ok=True)
     curves = [curve for section in sections for curve in section.curves]
-    parts = ['# Benchmark: pose_graph_ros against GTSAM', '', *_environment(command), '',
+    parts = [f'# {title}', '', *_environment(command), '', remarks, '',
              '## Requirements', '', *_verdicts(sections)]
-    for name, title, draw in (
+    for name, heading, draw in (
             ('step_time', 'Time of a step against the size of the graph', _draw_step_time),
             ('excess', 'Excess along the run', _draw_excess)):
         chosen = [curve for curve in curves if curve.picture == name.replace('_', ' ')]
         if len(chosen) > 0:
             draw(chosen, folder / f'{name}.png')
-            parts += [f'## {title}', '', f'![{title}]({name}.png)', '']
+            parts += [f'## {heading}', '', f'![{heading}]({name}.png)', '']
     for section in sections:
         parts += [f'## {section.title}', '', section.about, '']
         for table in section.tables:
@@ -76,12 +87,7 @@ def _environment(command: str) -> list[str]:
             versions.append(f'without {name}')
     return [f'{date.today().isoformat()}, {_processor()}, {os.cpu_count()} cores, '
             f'{platform.system()} {platform.machine()}, Python {platform.python_version()}, '
-            f'{", ".join(versions)}.', '', 'Made by', '', f'    {command}', '',
-            'Times of steps are in microseconds. Ours is all that a caller from Python pays, an '
-            'up-to-date estimate included; of GTSAM only `ISAM2.update` is counted. Runs of the '
-            'tools are interleaved in one process, figures are medians over the runs. A ratio is '
-            "GTSAM's time divided by ours. Excess is half of chi2 above the batch optimum of the "
-            'graph so far, each tool under its own error model.']
+            f'{", ".join(versions)}.', '', 'Made by', '', f'    {command}']
 
 
 def _processor() -> str:

@@ -12,7 +12,7 @@ full optimisation. Stamps are integer nanoseconds; there is no clock in here.
 """
 
 from collections import Counter
-from dataclasses import dataclass, field, replace
+from dataclasses import replace
 import math
 
 import numpy as np
@@ -21,11 +21,11 @@ from pose_graph_ros.core import alignment, batch, binding, closing, covariance, 
 from pose_graph_ros.core.admission import admit
 from pose_graph_ros.core.batch import Status
 from pose_graph_ros.core.config import BackendConfig
-from pose_graph_ros.core.constraints import Edges, ObservedNodes
 from pose_graph_ros.core.estimate import AlignmentState, Estimate, UpdateReport
 from pose_graph_ros.core.graph import Energies, Graph, GraphUpdate
 from pose_graph_ros.core.hidden_nodes import HiddenNodes
 from pose_graph_ros.core.incremental import IncrementalSmoother, UpdateResult
+from pose_graph_ros.core.joining import Bound, Joining, Queue, SourceReport
 from pose_graph_ros.core.measurements import (
     ACCEPTED,
     Answer,
@@ -38,27 +38,12 @@ from pose_graph_ros.core.measurements import (
 from pose_graph_ros.core.pending import MAX_PENDING, Pending, Seen
 from pose_graph_ros.core.reweighing import Reweighing
 from pose_graph_ros.core.se2 import FloatArray, IntArray
-from pose_graph_ros.core.sources import LOOP_CLOSURES, MeasurementSource, OdometrySource
+from pose_graph_ros.core.sources import OdometrySource
 from pose_graph_ros.core.starts import Solve
 from pose_graph_ros.core.trajectory import Trajectory
 
 # So often the weights of robust losses follow the estimate within one update.
 REWEIGHINGS = 3
-
-
-@dataclass(slots=True)
-class _Queue:
-    """Constraints that are bound and join the graph at the next update, with their sources."""
-
-    edges: list[tuple[str, Edges]] = field(default_factory=list)
-    observed: list[tuple[str, ObservedNodes]] = field(default_factory=list)
-
-    def __len__(self) -> int:
-        return len(self.edges) + len(self.observed)
-
-    def all_observed(self) -> ObservedNodes:
-        """Return the observed nodes as one table."""
-        return ObservedNodes.joined([table for _, table in self.observed])
 
 
 class PoseGraphBackend:
@@ -88,9 +73,10 @@ class PoseGraphBackend:
         """In map axes."""
         self._pending = Pending()
         self._seen = Seen()
-        self._queue = _Queue()
-        self._quarantine = _Queue()
+        self._queue = Queue()
+        self._quarantine = Queue()
         self._reweighing = Reweighing()
+        self._joins = Joining(self._config, self._reweighing)
         self._settled = True
         self._alignment = AlignmentState.LOCAL
         self._alignment_sigma = np.inf
@@ -124,6 +110,10 @@ class PoseGraphBackend:
         streams = self._nodes.streams
         return (sum(stream.n_jumps for stream in streams.values())
                 + 1_000_000 * list(streams).index(self._nodes.lead) if self._nodes.lead else -1)
+
+    def reports(self) -> dict[str, SourceReport]:
+        """Return how well the measurements of each source fit the estimate."""
+        return self._joins.reports(self.graph)
 
     def energies(self) -> Energies:
         """Return the energy of every constraint in the graph."""
@@ -159,7 +149,7 @@ class PoseGraphBackend:
         settings = self._config.odometry.get(source, OdometrySource())
         self._reweighing.add_edge(
             self.graph.n_edges - 1, settings.loss, settings.rejection_threshold)
-        return self.graph.n_nodes - 1
+        return self.graph.newest_pose
 
     def _bind_due(self) -> None:
         for source, measurement in self._pending.pop_due(self._nodes.covered_ns):
@@ -176,7 +166,7 @@ class PoseGraphBackend:
 
     def _add_measurement(self, measurement: Measurement, source: str) -> Answer:
         closure = isinstance(measurement, LoopClosure)
-        admitted = admit(measurement, self._settings(source, closure=closure).covariance)
+        admitted = admit(measurement, self._joins.settings(source, closure=closure).covariance)
         if isinstance(admitted, Answer):
             return admitted
         checked, key = admitted.measurement, source
@@ -200,17 +190,14 @@ class PoseGraphBackend:
                 self.counts[source, repair] += 1
         return answer
 
-    def _settings(self, source: str, *, closure: bool = False) -> MeasurementSource:
-        default = LOOP_CLOSURES if closure else MeasurementSource()
-        return self._config.measurements.get(source, default)
-
     def _bind(self, measurement: Measurement, source: str) -> Answer:
         """Turn a measurement that odometry has reached into a constraint for the next update."""
         anchor = self._anchor(measurement.stamp_ns)
         if isinstance(anchor, Answer):
             return anchor
         if not isinstance(measurement, LoopClosure):
-            self._queue.observed.append((source, binding.absolute_constraint(measurement, anchor)))
+            self._queue.observed.append(Bound(
+                source, binding.absolute_constraint(measurement, anchor), measurement, anchor))
             return ACCEPTED
         reference = self._reference(measurement)
         if isinstance(reference, Answer):
@@ -253,13 +240,11 @@ class PoseGraphBackend:
         if T_map_graph is not None:
             before = self.graph.poses.copy()
             self.graph.set_poses(se2.compose(T_map_graph, before))
-        sizes = self.graph.n_edges, self.graph.n_observed
-        result = self._step(GraphUpdate(
-            edges=Edges.joined([table for _, table in joining.edges]),
-            observed=joining.all_observed(),
-            # from here on the map holds the graph, not its first node
-            free=() if T_map_graph is None else (0,)))
+        change = self._joins.begin(joining, self.graph)
+        # from here on the map holds the graph, not its first node
+        result = self._step(change if T_map_graph is None else change._replace(free=(0,)))
         if result.status is Status.FAILED:
+            self._joins.undo()
             if before is not None:
                 self.graph.set_poses(before)
                 self._settled = False
@@ -268,7 +253,7 @@ class PoseGraphBackend:
             self._quarantine.observed += joining.observed
             self.counts['solver', 'failed'] += 1
             return UpdateReport(Status.FAILED, result.reason, 0, 0, self._chi2)
-        self._enlist(joining, *sizes)
+        self._joins.finish()
         result = self._reweighed(result)
         # the only thing here in proportion to the graph: 0.03 ms for 1000 nodes
         self._chi2 = self._smoother.chi2()
@@ -285,18 +270,6 @@ class PoseGraphBackend:
             reason = f'{type(error).__name__}: {error}'
             return UpdateResult(Status.FAILED, reason, 0, 0, 0, 0, math.nan)
 
-    def _enlist(self, joined: _Queue, edge: int, observed: int) -> None:
-        """Remember the losses of what has joined the graph, from these rows on."""
-        for number, (source, table) in enumerate(joined.edges):
-            settings = self._config.odometry.get(source) or self._settings(source, closure=True)
-            assert len(table) == 1
-            self._reweighing.add_edge(
-                edge + number, settings.loss, settings.rejection_threshold)
-        for number, (source, _) in enumerate(joined.observed):
-            settings = self._settings(source)
-            self._reweighing.add_observed(
-                observed + number, settings.loss, settings.rejection_threshold)
-
     def _reweighed(self, result: UpdateResult) -> UpdateResult:
         """Let the weights of robust losses follow the estimate that an update has led to."""
         self._settled = result.status is Status.CONVERGED
@@ -311,9 +284,9 @@ class PoseGraphBackend:
             result = again
         return result
 
-    def _joining(self) -> _Queue:
+    def _joining(self) -> Queue:
         """Take what can join the graph out of the queue; observed nodes wait for alignment."""
-        joining = _Queue(edges=self._queue.edges)
+        joining = Queue(edges=self._queue.edges)
         self._queue.edges = []
         if self._alignment is AlignmentState.ALIGNED:
             joining.observed, self._queue.observed = self._queue.observed, []
@@ -330,17 +303,21 @@ class PoseGraphBackend:
         self._alignment_sigma = turn.sigma
         return turn.T_map_graph
 
-    def optimize(self) -> UpdateReport:
-        """Optimise fully, once more with what had been set aside: the end of a stream."""
+    def finish(self) -> None:
+        """Wait for no older odometry any more: the newest samples count at the next update."""
         self._nodes.finish()
-        self._bind_due()
         self._queue.edges += self._nodes.edges
         self._nodes.edges.clear()
+        self._bind_due()
+
+    def optimize(self) -> UpdateReport:
+        """Optimise fully, once more with what had been set aside: the end of a stream."""
+        self.finish()
         report = self.update()
         if len(self._quarantine) > 0:
             self._queue.edges += self._quarantine.edges
             self._queue.observed += self._quarantine.observed
-            self._quarantine = _Queue()
+            self._quarantine = Queue()
             again = self.update()
             report = replace(again, new_constraints=report.new_constraints + again.new_constraints)
         if self.graph.n_nodes == 0:
@@ -372,8 +349,8 @@ class PoseGraphBackend:
             poses[-1], self._newest_node_covariance, motion.increment, noise)
         if self._alignment is AlignmentState.UNALIGNED:
             # those that turned the graph in an update that failed are set aside
-            shift, cov = alignment.guess(graph.poses, newest, ObservedNodes.joined(
-                [table for _, table in self._queue.observed + self._quarantine.observed]))
+            shift, cov = alignment.guess(graph.poses, newest, Queue(
+                observed=self._queue.observed + self._quarantine.observed).all_observed())
             poses, newest = poses + shift, newest + shift
         if newest_ns > stamps[-1]:
             stamps, poses = np.append(stamps, newest_ns), np.vstack((poses, newest))

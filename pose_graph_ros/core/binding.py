@@ -52,20 +52,25 @@ def _global_pose_constraint(measurement: GlobalPose, anchor: Anchor) -> Observed
 
 
 def _position_constraint(measurement: Position, anchor: Anchor) -> ObservedNodes:
-    """
-    Return the constraint of a position: no information on the heading, error in map axes.
-
-    The noise of the motion since the node, with what its heading does at the end of the lever
-    arm, lies in axes of an unknown heading: its largest variance is taken for all directions.
-    """
-    jacobian = np.eye(2, 3)
-    jacobian[:, 2] = -measurement.lever_arm[1], measurement.lever_arm[0]
-    variance = float(np.linalg.eigvalsh(jacobian @ anchor.noise @ jacobian.T)[-1])
+    """Return the constraint of a position: no information on the heading, error in map axes."""
     information = np.zeros((3, 3))
-    information[:2, :2] = covariance.information(measurement.covariance + variance * np.eye(2))
+    information[:2, :2] = covariance.information(
+        measurement.covariance + swept_variance(measurement, anchor) * np.eye(2))
     offset = se2.compose(anchor.motion, np.append(measurement.lever_arm, 0.0))
     return ObservedNodes([anchor.node], [offset], [np.append(measurement.position, 0.0)],
                          [information], [ObservedKind.POSITION])
+
+
+def swept_variance(measurement: Position, anchor: Anchor) -> float:
+    """
+    Return the variance that a position has by the motion since the node [m^2].
+
+    The noise of the motion, with what its heading does at the end of the lever arm, lies in axes
+    of an unknown heading: its largest variance is taken for all directions.
+    """
+    jacobian = np.eye(2, 3)
+    jacobian[:, 2] = -measurement.lever_arm[1], measurement.lever_arm[0]
+    return float(np.linalg.eigvalsh(jacobian @ anchor.noise @ jacobian.T)[-1])
 
 
 def _heading_constraint(measurement: HeadingOnly, anchor: Anchor) -> ObservedNodes:

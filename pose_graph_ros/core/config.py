@@ -12,7 +12,6 @@ from dataclasses import dataclass, field
 from pose_graph_ros.core.exceptions import ConfigError
 from pose_graph_ros.core.sources import MeasurementSource, OdometrySource, require
 
-
 # Motion since the last hidden node below these is standing still: odometry jitters [m, rad].
 REST_DISTANCE = 0.05
 REST_HEADING = 0.05

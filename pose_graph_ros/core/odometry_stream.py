@@ -17,7 +17,13 @@ from typing import NamedTuple
 import numpy as np
 
 from pose_graph_ros.core import covariance, se2
-from pose_graph_ros.core.measurements import ACCEPTED, Answer, OdometrySample, rejected, value_defect
+from pose_graph_ros.core.measurements import (
+    ACCEPTED,
+    Answer,
+    OdometrySample,
+    rejected,
+    value_defect,
+)
 from pose_graph_ros.core.motion import Motion
 from pose_graph_ros.core.se2 import FloatArray
 from pose_graph_ros.core.sources import NoiseFrom, OdometrySource

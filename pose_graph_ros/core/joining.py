@@ -1,0 +1,199 @@
+# Copyright 2026 The pose_graph_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""
+From bound measurements to one update of the graph, each as its source's settings want it.
+
+White errors make observed nodes; errors that live on make edges to the states of the error, or
+observed nodes with shares of a weight. What has a robust loss is enlisted for reweighing, and of
+every source it is remembered which constraints are its own.
+"""
+
+from dataclasses import dataclass, field
+from typing import NamedTuple
+
+import numpy as np
+
+from pose_graph_ros.core import autocorrelation, linearize, se2
+from pose_graph_ros.core.arrays import GrowingArray
+from pose_graph_ros.core.binding import Anchor
+from pose_graph_ros.core.config import BackendConfig
+from pose_graph_ros.core.constraints import Edges, ObservedNodes
+from pose_graph_ros.core.correlated import Additions, BiasChain, GraphSizes, Shares
+from pose_graph_ros.core.graph import Graph, GraphUpdate
+from pose_graph_ros.core.measurements import Absolute
+from pose_graph_ros.core.reweighing import Reweighing
+from pose_graph_ros.core.se2 import FloatArray, IntArray
+from pose_graph_ros.core.sources import (
+    Correlation,
+    LOOP_CLOSURES,
+    MeasurementSource,
+    OdometrySource,
+)
+
+# So many of the newest residuals of a source are looked at, anew when there are so many more.
+MOST_RESIDUALS = 5000
+MORE_RESIDUALS = 1.05
+
+
+class Bound(NamedTuple):
+    """A measurement that is bound to a hidden node."""
+
+    source: str
+    observed: ObservedNodes
+    """Its constraint, if its error is white."""
+    measurement: Absolute
+    anchor: Anchor
+
+
+@dataclass(slots=True)
+class Queue:
+    """Constraints that are bound and join the graph at the next update, with their sources."""
+
+    edges: list[tuple[str, Edges]] = field(default_factory=list)
+    observed: list[Bound] = field(default_factory=list)
+
+    def __len__(self) -> int:
+        return len(self.edges) + len(self.observed)
+
+    def all_observed(self) -> ObservedNodes:
+        """Return the observed nodes as one table."""
+        return ObservedNodes.joined([bound.observed for bound in self.observed])
+
+
+class SourceReport(NamedTuple):
+    """How well the measurements of a source fit."""
+
+    n: int
+    """Measurements in the graph."""
+    energy: float
+    """Mean squared residual of a coordinate in units of the sigmas that it came with."""
+    errors: autocorrelation.Autocorrelation
+    """Of the newest residuals [m]."""
+
+
+class _Own:
+    """The constraints of one source."""
+
+    def __init__(self) -> None:
+        self.rows = GrowingArray((2,), np.int64)
+        """Stamp and row in the graph."""
+        self.report: SourceReport | None = None
+        """The newest."""
+
+
+class Joining:
+    """
+    Turns queues into updates of the graph.
+
+    Parameters
+    ----------
+    config : BackendConfig
+    reweighing : Reweighing
+
+    """
+
+    def __init__(self, config: BackendConfig, reweighing: Reweighing) -> None:
+        self._config = config
+        self._reweighing = reweighing
+        self._correlated: dict[str, BiasChain | Shares] = {}
+        self._own: dict[str, _Own] = {}
+        self._enlisted: list[tuple[bool, int, str, int]] = []
+
+    def settings(self, source: str, *, closure: bool = False) -> MeasurementSource:
+        """Return the settings of a source of measurements."""
+        default = LOOP_CLOSURES if closure else MeasurementSource()
+        return self._config.measurements.get(source, default)
+
+    def begin(self, queue: Queue, graph: Graph) -> GraphUpdate:
+        """Return the update that adds all of a queue; `finish` or `undo` comes next."""
+        additions = Additions(GraphSizes(graph.n_nodes, graph.n_edges, graph.n_observed))
+        self._enlisted.clear()
+        for chain in self._correlated.values():
+            chain.begin()
+        for source, edge in queue.edges:
+            self._enlisted.append((True, additions.add_edge(edge), source, -1))
+        for bound in sorted(queue.observed, key=lambda bound: bound.measurement.stamp_ns):
+            stamp_ns, chain = bound.measurement.stamp_ns, self._chain(bound.source)
+            if isinstance(chain, BiasChain):
+                row = chain.add(bound.measurement, bound.anchor, additions)
+            elif isinstance(chain, Shares):
+                row = chain.add(stamp_ns, bound.observed, additions)
+            else:
+                row = additions.add_observed(bound.observed)
+            self._enlisted.append((isinstance(chain, BiasChain), row, bound.source, stamp_ns))
+        return GraphUpdate(
+            biases=np.array(additions.biases).reshape(-1, 3),
+            edges=Edges.joined(additions.edges), observed=ObservedNodes.joined(additions.observed),
+            remove_edges=additions.remove_edges, remove_observed=additions.remove_observed,
+            weigh_observed=additions.weigh_observed)
+
+    def _chain(self, source: str) -> BiasChain | Shares | None:
+        settings = self.settings(source)
+        if settings.correlation_time == 0.0:
+            return None
+        if source not in self._correlated:
+            inflate = settings.correlation is Correlation.INFLATE
+            self._correlated[source] = (Shares if inflate else BiasChain)(settings)
+        return self._correlated[source]
+
+    def undo(self) -> None:
+        """Forget the update that was begun: it has failed."""
+        for chain in self._correlated.values():
+            chain.undo()
+
+    def finish(self) -> None:
+        """Remember what the update that was begun has added."""
+        for is_edge, row, source, stamp_ns in self._enlisted:
+            settings: MeasurementSource | OdometrySource | None = (
+                self._config.odometry.get(source) if stamp_ns < 0 else None)
+            settings = settings or self.settings(source, closure=stamp_ns < 0)
+            enlist = self._reweighing.add_edge if is_edge else self._reweighing.add_observed
+            enlist(row, settings.loss, settings.rejection_threshold)
+            if stamp_ns >= 0:
+                self._own.setdefault(source, _Own()).rows.append_one((stamp_ns, row))
+
+    def reports(self, graph: Graph) -> dict[str, SourceReport]:
+        """Return how well each source fits, by its newest measurements."""
+        for source, own in self._own.items():
+            if own.report is None or len(own.rows) > MORE_RESIDUALS * own.report.n:
+                own.report = self._report(graph, source, own)
+        return {source: own.report for source, own in self._own.items()
+                if own.report is not None}
+
+    def _report(self, graph: Graph, source: str, own: _Own) -> SourceReport:
+        newest = own.rows.values[-MOST_RESIDUALS:].astype(np.int64)
+        newest = newest[np.argsort(newest[:, 0], kind='stable')]
+        newest = newest[np.append(True, np.diff(newest[:, 0]) > 0)]
+        stamps, rows = newest[:, 0], newest[:, 1]
+        if isinstance(self._correlated.get(source), BiasChain):
+            residuals, information = _biased_residuals(graph, graph.edges_at(rows))
+        else:
+            residuals, information = _residuals(graph, graph.observed_at(rows))
+        energy = np.einsum('ki,kij,kj->k', residuals, information, residuals)
+        return SourceReport(len(own.rows), float(np.mean(energy)) / 2.0,
+                            autocorrelation.estimate(stamps, residuals))
+
+
+def _residuals(graph: Graph, observed: ObservedNodes) -> tuple[FloatArray, FloatArray]:
+    """Return residuals of the positions in map axes, shape (K, 2), and their information."""
+    errors = linearize.observed_errors(graph.poses, observed)
+    turn = se2.rotation(observed.mean[:, 2])
+    back = np.einsum('kij,kj->ki', turn, errors[:, :2])
+    information = turn @ observed.information[:, :2, :2] @ np.swapaxes(turn, 1, 2)
+    return back, information
+
+
+def _biased_residuals(graph: Graph, edges: Edges) -> tuple[FloatArray, FloatArray]:
+    """Return the same where the state of the error is a part of the residual."""
+    poses = graph.poses
+    errors = linearize.edge_errors(poses, edges)[:, :2]
+    factor = edges.bias[:, 2]
+    total = errors - factor[:, None] * poses[edges.j, :2]
+    variance = factor**2 + 1.0 / (0.5 * np.trace(
+        edges.information[:, :2, :2], axis1=1, axis2=2) + 1e-12)
+    return total, np.eye(2) / variance[:, None, None]
+
+
+def stamps_of(queue: Queue) -> IntArray:
+    """Return the stamps of the observed nodes of a queue [ns]."""
+    return np.array([bound.measurement.stamp_ns for bound in queue.observed], dtype=np.int64)
