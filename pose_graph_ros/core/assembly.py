@@ -69,6 +69,8 @@ def eliminate_clique(head, c, afresh):  # type: ignore[no-untyped-def]
                         undo.log_edge(head, e)
                         factors.linearize_edge(head, e)
                     edge_i[e, tb.OWNER] = c
+                    if edge_i[e, tb.EDGE_KIND] == factors.BIAS:
+                        anchored = 1    # it feels a common motion of its ends
                     if side == 0:
                         factors.add_edge(head, e, 3 * k, at, front, ld)
                     else:

@@ -3,7 +3,7 @@
 """
 The step along a chain: a new node behind the newest one, in constant time.
 
-The newest node is alone in the root clique. Its rows of R give back its equations, `R^T R` and
+The newest pose is alone in the root clique. Its rows of R give back its equations, `R^T R` and
 `R^T d`; with the new edge they make a front of two nodes. The old root is eliminated from it, the
 new node becomes the root. Where nothing was measured but the odometry the solution is known: the
 new node lies where odometry puts it, and nothing else moves.
@@ -106,7 +106,7 @@ def extend(  # type: ignore[no-untyped-def]
     head, mean, information, observed_mean, observed_information, with_observed,
 ):
     """
-    Append a node behind the newest one, with an edge and perhaps an observed node on it.
+    Append a node behind the newest pose, with an edge and perhaps an observed node on it.
 
     Returns
     -------
@@ -137,8 +137,8 @@ def extend(  # type: ignore[no-untyped-def]
     if (len(mean) != 3 or information.shape != (3, 3) or len(observed_mean) != 3
             or observed_information.shape != (3, 3)):
         return NOT_A_CHAIN
-    last = v - 1
-    if (v == 0 or head[tb.N_SEEDS] > 0 or head[tb.UPDATE] > tb.LAST_STAMP
+    last = head[tb.NEWEST]
+    if (last < 0 or head[tb.N_SEEDS] > 0 or head[tb.UPDATE] > tb.LAST_STAMP
             or node_i[last, tb.CLIQUE] < 0):
         return NOT_A_CHAIN
     c = node_i[last, tb.CLIQUE]
@@ -205,7 +205,7 @@ def extend(  # type: ignore[no-untyped-def]
     node_i[v, tb.CLIQUE] = r
     edge_i[e, tb.NEXT_I], node_i[last, tb.EDGE_LIST] = node_i[last, tb.EDGE_LIST], 2 * e
     edge_i[e, tb.NEXT_J], node_i[v, tb.EDGE_LIST] = -1, 2 * e + 1
-    head[tb.N_NODES], head[tb.N_EDGES] = v + 1, e + 1
+    head[tb.N_NODES], head[tb.N_EDGES], head[tb.NEWEST] = v + 1, e + 1, v
     if with_observed:
         observed_i[k, tb.OBS_NEXT], node_i[v, tb.OBSERVED_LIST] = -1, k
         observed_i[k, tb.OBS_CHECKED] = observed_i[k, tb.OBS_WAITS] = 0

@@ -8,6 +8,9 @@ An *observed node* is a pose measured from outside; its constraint ties it to on
 position is an observed node whose information on the heading is zero, and whose mean heading is
 zero, so that its error lies in the axes of the map; a heading is one whose information on the
 position is zero.
+
+A *bias* is a hidden node that is no pose but what a source of measurements is off for a while, in
+units of its sigma. Edges of a kind of their own lead to it.
 """
 
 from collections.abc import Sequence
@@ -33,6 +36,11 @@ class EdgeKind(IntEnum):
 
     ODOMETRY = 0
     LOOP_CLOSURE = 1
+    BIAS = 2
+    """
+    Leads to a bias j, from the pose i that was measured with it, or from the next bias i: the
+    error is `F x_j + mean - x_i * offset` in map axes, F = diag(f_t, f_t, f_th).
+    """
 
 
 class ObservedKind(IntEnum):
@@ -111,18 +119,27 @@ class Edges(_Table):
     j: IntArray
     """Node that it leads to, shape (M,)."""
     mean: FloatArray
-    """Measured pose of j in i, shape (M, 3) [m, m, rad]."""
+    """Measured pose of j in i, shape (M, 3) [m, m, rad]; to a bias: that of i in the map."""
     information: FloatArray
-    """Inverse covariance of the error (3.48), in the frame of the measured pose, (M, 3, 3)."""
+    """
+    Inverse covariance of the error (3.48), in the frame of the measured pose, (M, 3, 3); to a
+    bias: in map axes.
+    """
     kind: KindArray
     """`EdgeKind`, shape (M,)."""
     weight: FloatArray
     """Factor on the information, shape (M,); 0 for an edge that has been removed."""
+    bias: FloatArray
+    """
+    Offset in i that was measured, and factors of the bias, `(o_x, o_y, f_t, f_th)`, shape (M, 4)
+    [m, m, m, rad]; means nothing but for edges to a bias.
+    """
 
     def __init__(  # noqa: PLR0917  the columns
         self, i: npt.ArrayLike = (), j: npt.ArrayLike = (),
         mean: npt.ArrayLike | None = None, information: npt.ArrayLike | None = None,
         kind: npt.ArrayLike = (), weight: npt.ArrayLike | None = None,
+        bias: npt.ArrayLike | None = None,
     ) -> None:
         i = _integers(i, _INT)
         _set(self, 'i', i)
@@ -131,6 +148,7 @@ class Edges(_Table):
         _set(self, 'information', _numbers(_empty(3, 3) if information is None else information))
         _set(self, 'kind', _integers(kind, _KIND))
         _set(self, 'weight', _weights(weight, len(i)))
+        _set(self, 'bias', np.zeros((len(i), 4)) if bias is None else _numbers(bias))
 
     def __len__(self) -> int:
         return len(self.i)
@@ -138,7 +156,7 @@ class Edges(_Table):
     @property
     def columns(self) -> tuple[npt.NDArray[Any], ...]:
         """All columns, in their order."""
-        return self.i, self.j, self.mean, self.information, self.kind, self.weight
+        return self.i, self.j, self.mean, self.information, self.kind, self.weight, self.bias
 
 
 @dataclass(frozen=True, slots=True)
@@ -183,7 +201,8 @@ class ObservedNodes(_Table):
         return self.node, self.offset, self.mean, self.information, self.kind, self.weight
 
 
-_TAILS: dict[str, tuple[int, ...]] = {'mean': (3,), 'offset': (3,), 'information': (3, 3)}
+_TAILS: dict[str, tuple[int, ...]] = {
+    'mean': (3,), 'offset': (3,), 'information': (3, 3), 'bias': (4,)}
 _COLUMNS = {table: [(item.name, _TAILS.get(item.name, ())) for item in fields(table)]
             for table in (Edges, ObservedNodes)}
 
@@ -198,20 +217,27 @@ def _check_shapes(table: Edges | ObservedNodes) -> None:
                 f'{type(table).__name__}.{name}: expected shape {(size, *tail)}, got {shape}')
 
 
-def check(table: Edges | ObservedNodes, n_nodes: int) -> None:
+def check(table: Edges | ObservedNodes, is_bias: npt.NDArray[np.bool_]) -> None:
     """
-    Raise unless the rows are sound constraints between hidden nodes 0 to n_nodes - 1.
+    Raise unless the rows are sound constraints.
+
+    Parameters
+    ----------
+    table : Edges or ObservedNodes
+    is_bias : ndarray of bool, shape (N,)
+        Which of the hidden nodes, which may be the ends, are biases.
 
     Raises
     ------
     GraphUpdateError
         Says which row, what was expected and what came: shapes, node indices, an edge from a
-        node to itself, numbers that are not finite, an information matrix that is not symmetric
-        or not positive semidefinite.
+        node to itself, an edge to a bias that is not of that kind, or the other way round,
+        numbers that are not finite, an information matrix that is not symmetric or not positive
+        semidefinite.
 
     """
     _check_shapes(table)
-    name = type(table).__name__
+    name, n_nodes = type(table).__name__, len(is_bias)
     for item in fields(table):
         column = getattr(table, item.name)
         _refuse_rows(~np.isfinite(column), f'{name}.{item.name} is not finite', column)
@@ -224,6 +250,12 @@ def check(table: Edges | ObservedNodes, n_nodes: int) -> None:
     _refuse_rows(table.weight < 0.0, f'{name}.weight is negative', table.weight)
     if isinstance(table, Edges):
         _refuse_rows(table.i == table.j, f'{name}: an edge leads from a node to itself', table.i)
+        to_bias = table.kind == EdgeKind.BIAS
+        _refuse_rows(to_bias & ~is_bias[table.j],
+                     f'{name}: expected an edge of kind BIAS to lead to a bias', table.j)
+        _refuse_rows(~to_bias & (is_bias[table.i] | is_bias[table.j]),
+                     f'{name}: an edge of another kind than BIAS has a bias for an end',
+                     np.column_stack((table.i, table.j)))
     _check_information(f'{name}.information', table.information)
 
 

@@ -19,8 +19,8 @@ WEIGH_EDGE, WEIGH_OBSERVED, FIX = range(3)
 
 
 @kernel
-def start_nodes(head, first, last):  # type: ignore[no-untyped-def]
-    """Make the new nodes, rows first to last - 1 with their poses, nodes without a clique."""
+def start_nodes(head, first, first_bias, last):  # type: ignore[no-untyped-def]
+    """Make new rows with their poses, and biases from a row on, nodes without a clique."""
     node_f, node_i = tb.node_f(head), tb.node_i(head)
     for v in range(first, last):
         f, i = node_f[v], node_i[v]
@@ -29,8 +29,11 @@ def start_nodes(head, first, last):  # type: ignore[no-untyped-def]
         i[:] = 0
         i[tb.CLIQUE] = i[tb.EDGE_LIST] = i[tb.OBSERVED_LIST] = -1
         i[tb.NODE_UNDO] = head[tb.UPDATE]
+        i[tb.IS_BIAS] = 1 if v >= first_bias else 0
         add_seed(head, v)
         head[tb.STRUCTURE] = 1
+    if first_bias > first:
+        head[tb.NEWEST] = first_bias - 1
 
 
 @kernel
@@ -49,8 +52,12 @@ def stiffen_by_edge(head, e, weight):  # type: ignore[no-untyped-def]
     f = edge_f[e]
     position = 0.5 * weight * (f[tb.INFO] + f[tb.INFO + 3])
     heading = weight * f[tb.INFO + 5]
-    arm2 = f[tb.MEAN] * f[tb.MEAN] + f[tb.MEAN + 1] * f[tb.MEAN + 1]
+    # of an edge to a bias these are its offset
+    arm2 = f[tb.OWN_T] * f[tb.OWN_T] + f[tb.OWN_T + 1] * f[tb.OWN_T + 1]
     _stiffen(head, edge_i[e, tb.END_I], position, heading + position * arm2)
+    if edge_i[e, tb.EDGE_KIND] == factors.BIAS:
+        position *= f[tb.FACTOR_T] * f[tb.FACTOR_T]
+        heading *= f[tb.FACTOR_TH] * f[tb.FACTOR_TH]
     _stiffen(head, edge_i[e, tb.END_J], position, heading)
 
 
@@ -104,9 +111,10 @@ def start_edges(head, first, last):  # type: ignore[no-untyped-def]
     edge_i = tb.edge_i(head)
     for e in range(first, last):
         f, row = edge_f[e], edge_i[e]
-        c, s = math.cos(f[tb.MEAN + 2]), math.sin(f[tb.MEAN + 2])
-        f[tb.OWN_T] = c * f[tb.MEAN] + s * f[tb.MEAN + 1]
-        f[tb.OWN_T + 1] = c * f[tb.MEAN + 1] - s * f[tb.MEAN]
+        if row[tb.EDGE_KIND] != factors.BIAS:
+            c, s = math.cos(f[tb.MEAN + 2]), math.sin(f[tb.MEAN + 2])
+            f[tb.OWN_T] = c * f[tb.MEAN] + s * f[tb.MEAN + 1]
+            f[tb.OWN_T + 1] = c * f[tb.MEAN + 1] - s * f[tb.MEAN]
         row[tb.EDGE_CHECKED] = row[tb.EDGE_WAITS] = 0
         row[tb.EDGE_UNDO] = head[tb.UPDATE]
         _touch_edge(head, e)
@@ -200,16 +208,17 @@ def _lengths_agree(n, mean, information, kind, weight):  # type: ignore[no-untyp
 
 @kernel
 def add_rows(  # type: ignore[no-untyped-def]
-    head, hidden, i, j, mean, information, kind, weight, node, offset, observed_mean,
-    observed_information, observed_kind, observed_weight, checked,
+    head, hidden, biases, i, j, mean, information, kind, weight, bias, node, offset,
+    observed_mean, observed_information, observed_kind, observed_weight, checked,
 ):
     """
     Add hidden nodes, edges and observed nodes, all of them or none.
 
     Parameters
     ----------
-    hidden : ndarray, shape (N, 3)
-    i, j, mean, information, kind, weight : ndarray
+    hidden, biases : ndarray, shapes (N, 3) and (S, 3)
+        Poses of new hidden nodes, then values of new biases.
+    i, j, mean, information, kind, weight, bias : ndarray
         Columns of `Edges`.
     node, offset, observed_mean, observed_information, observed_kind, observed_weight : ndarray
         Columns of `ObservedNodes`.
@@ -222,11 +231,14 @@ def add_rows(  # type: ignore[no-untyped-def]
         ADDED; NO_ROOM: a table is full; UNSOUND: not plainly sound, and not checked either.
 
     """
-    n_nodes = head[tb.N_NODES] + len(hidden)
+    first = head[tb.N_NODES]
+    first_bias = first + len(hidden)
+    n_nodes = first_bias + len(biases)
     n_edges = head[tb.N_EDGES] + len(i)
     n_observed = head[tb.N_OBSERVED] + len(node)
-    if (hidden.shape[1] != 3 or len(j) != len(i)
+    if (hidden.shape[1] != 3 or biases.shape[1] != 3 or len(j) != len(i)
             or not _lengths_agree(len(i), mean, information, kind, weight)
+            or bias.shape != (len(i), 4)
             or offset.shape != (len(node), 3)
             or not _lengths_agree(len(node), observed_mean, observed_information, observed_kind,
                                   observed_weight)):
@@ -235,15 +247,17 @@ def add_rows(  # type: ignore[no-untyped-def]
             or n_observed > head[tb.OBSERVED_ROOM]):
         return NO_ROOM
     # rows behind the ends count for nothing yet
-    sound = rows.write_nodes(head, hidden)
-    sound = rows.write_edges(head, n_nodes, i, j, mean, information, kind, weight) and sound
+    sound = rows.write_nodes(head, first, hidden)
+    sound = rows.write_nodes(head, first_bias, biases) and sound
+    sound = rows.write_edges(head, n_nodes, first_bias, i, j, mean, information, kind, weight,
+                             bias) and sound
     sound = rows.write_all_observed(
         head, n_nodes, node, offset, observed_mean, observed_information, observed_kind,
         observed_weight) and sound
     if not sound and not checked:
         return UNSOUND
-    first, head[tb.N_NODES] = head[tb.N_NODES], n_nodes
-    start_nodes(head, first, n_nodes)
+    head[tb.N_NODES] = n_nodes
+    start_nodes(head, first, first_bias, n_nodes)
     first, head[tb.N_EDGES] = head[tb.N_EDGES], n_edges
     start_edges(head, first, n_edges)
     first, head[tb.N_OBSERVED] = head[tb.N_OBSERVED], n_observed

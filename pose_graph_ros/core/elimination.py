@@ -104,7 +104,7 @@ def rebuild(head, marked, affected):  # type: ignore[no-untyped-def]
     node_i = tb.node_i(head)
     clique_i = tb.clique_i(head)
     pool_i = tb.pool_i(head)
-    n_last = newest_last(affected)
+    n_last = newest_last(affected, head[tb.NEWEST])
     orphans, start, adjacency = structure(head, marked, affected)
     n_cliques, offset, n_frontal, parent, nodes = minimum_degree(
         len(affected), len(orphans), n_last, start, adjacency)

@@ -24,12 +24,23 @@ along a direction that has turned, which is worth the fraction of e by which it 
 `r^T W r + change^2 e^T W e`, the squared linearization error in units of sigma, say what is to be
 linearized again (a whitened version of fluid relinearization, M. Kaess et al., "iSAM2", IJRR
 2012). Its sum over all constraints is about what chi2 lies above its minimum.
+
+An edge to a bias m_j, `e = F m_j + z - x_i * o` with F = diag(f_t, f_t, f_th), has the same form
+in map axes, where its error lies anyway: with the arm a = R_i t_o in the place of d,
+
+    e' = h + F delta_j - T delta_i
+    h_t = f_t m_ref_j + t_z - x_ref_i - a_bar + S a_bar delta_bar_th,   h_th constant
+
+Only its arm bends it. A rigid motion of its nodes does change it, so it anchors its clique.
 """
 
 import math
 
 from pose_graph_ros.core import tables as tb
+from pose_graph_ros.core.constraints import EdgeKind
 from pose_graph_ros.core.jit import kernel
+
+BIAS = int(EdgeKind.BIAS)
 
 # Square of the fraction from which on a change of the arm counts by itself.
 MUCH_LONGER = 1e-4
@@ -59,6 +70,9 @@ def linearize_edge(head, e):  # type: ignore[no-untyped-def]
     node_f, edge_f, edge_i = tb.node_f(head), tb.edge_f(head), tb.edge_i(head)
     f = edge_f[e]
     start, end = node_f[edge_i[e, tb.END_I]], node_f[edge_i[e, tb.END_J]]
+    if edge_i[e, tb.EDGE_KIND] == BIAS:
+        _linearize_to_bias(f, start, end)
+        return
     phi = start[tb.POSE + 2] + f[tb.MEAN + 2]
     f[tb.LIN_D] = end[tb.POSE] - start[tb.POSE]
     f[tb.LIN_D + 1] = end[tb.POSE + 1] - start[tb.POSE + 1]
@@ -78,6 +92,9 @@ def check_edge(head, e, phi):  # type: ignore[no-untyped-def]
     node_f, edge_f, edge_i = tb.node_f(head), tb.edge_f(head), tb.edge_i(head)
     f = edge_f[e]
     start, end = node_f[edge_i[e, tb.END_I]], node_f[edge_i[e, tb.END_J]]
+    if edge_i[e, tb.EDGE_KIND] == BIAS:
+        _check_to_bias(f, start, end)   # its clique is anchored, so phi is zero
+        return
     dx, dy = end[tb.POSE] - start[tb.POSE], end[tb.POSE + 1] - start[tb.POSE + 1]
     if phi != 0.0:
         c, s = math.cos(phi), math.sin(phi)
@@ -112,6 +129,46 @@ def check_edge(head, e, phi):  # type: ignore[no-untyped-def]
     longer *= iso / (f[tb.INFO + 5] + iso * (gx * gx + gy * gy) + 1e-300)
     f[tb.ERROR2] = w * _form(f, rx, ry, rth) + (turn * turn + longer) * energy + (
         longer if longer > MUCH_LONGER else 0.0)
+    f[tb.ENERGY] = energy
+
+
+@kernel
+def error_to_bias(f, start, end):  # type: ignore[no-untyped-def]
+    """Return the error of an edge to a bias and its arm in map axes, all given as rows."""
+    ax = ay = 0.0
+    ox, oy = f[tb.BIAS_OFFSET], f[tb.BIAS_OFFSET + 1]
+    if ox != 0.0 or oy != 0.0:
+        c, s = math.cos(start[tb.POSE + 2]), math.sin(start[tb.POSE + 2])
+        ax, ay = c * ox - s * oy, s * ox + c * oy
+    ft, fth = f[tb.FACTOR_T], f[tb.FACTOR_TH]
+    return (ft * end[tb.POSE] + (f[tb.MEAN] - start[tb.POSE] - ax),
+            ft * end[tb.POSE + 1] + (f[tb.MEAN + 1] - start[tb.POSE + 1] - ay),
+            wrap(fth * end[tb.POSE + 2] + f[tb.MEAN + 2] - start[tb.POSE + 2]), ax, ay)
+
+
+@kernel
+def _linearize_to_bias(f, start, end):  # type: ignore[no-untyped-def]
+    """Linearize an edge to a bias; it and its ends are given as rows."""
+    _, _, eth, f[tb.BIAS_ARM], f[tb.BIAS_ARM + 1] = error_to_bias(f, start, end)
+    f[tb.LIN_TH] = start[tb.DELTA + 2]
+    f[tb.LIN_K] = eth - (f[tb.FACTOR_TH] * end[tb.DELTA + 2] - start[tb.DELTA + 2])
+
+
+@kernel
+def _check_to_bias(f, start, end):  # type: ignore[no-untyped-def]
+    """Set the squared linearization error and the energy of an edge to a bias."""
+    ex, ey, eth, ax, ay = error_to_bias(f, start, end)
+    turn = start[tb.DELTA + 2] - f[tb.LIN_TH]
+    bx, by = f[tb.BIAS_ARM], f[tb.BIAS_ARM + 1]
+    linear = f[tb.LIN_K] + f[tb.FACTOR_TH] * end[tb.DELTA + 2] - start[tb.DELTA + 2]
+    rx, ry, rth = bx - by * turn - ax, by + bx * turn - ay, eth - linear
+    if abs(rth) < 1.0:
+        rth = 0.0
+    w = f[tb.WEIGHT]
+    energy = w * _form(f, ex, ey, eth)
+    f[tb.ERROR2] = w * _form(f, rx, ry, rth)
+    if ax != 0.0 or ay != 0.0:
+        f[tb.ERROR2] += turn * turn * energy
     f[tb.ENERGY] = energy
 
 
@@ -151,42 +208,51 @@ def add_edge(head, e, a, b, front, ld):  # type: ignore[no-untyped-def]
     node_f, edge_f, edge_i = tb.node_f(head), tb.edge_f(head), tb.edge_i(head)
     f = edge_f[e]
     start, end = node_f[edge_i[e, tb.END_I]], node_f[edge_i[e, tb.END_J]]
-    c, s = f[tb.LIN_COS], f[tb.LIN_SIN]
-    xx, xy, xt, yy, yt, tt = _turned(f, c, s)
     px, py = -f[tb.LIN_D + 1], f[tb.LIN_D]  # S d
-    ux, uy = f[tb.OWN_T], f[tb.OWN_T + 1]
-    hx = end[tb.REF] - start[tb.REF] - (c * ux - s * uy) + px * f[tb.LIN_TH]
-    hy = end[tb.REF + 1] - start[tb.REF + 1] - (s * ux + c * uy) + py * f[tb.LIN_TH]
-    hth = f[tb.LIN_K]
+    if edge_i[e, tb.EDGE_KIND] == BIAS:
+        ft, fth = f[tb.FACTOR_T], f[tb.FACTOR_TH]
+        xx, xy, xt, yy, yt, tt = _turned(f, 1.0, 0.0)
+        hx = ft * end[tb.REF] + (f[tb.MEAN] - start[tb.REF] - f[tb.BIAS_ARM])
+        hy = ft * end[tb.REF + 1] + (f[tb.MEAN + 1] - start[tb.REF + 1] - f[tb.BIAS_ARM + 1])
+    else:
+        ft = fth = 1.0
+        c, s = f[tb.LIN_COS], f[tb.LIN_SIN]
+        xx, xy, xt, yy, yt, tt = _turned(f, c, s)
+        ux, uy = f[tb.OWN_T], f[tb.OWN_T + 1]
+        hx = end[tb.REF] - start[tb.REF] - (c * ux - s * uy)
+        hy = end[tb.REF + 1] - start[tb.REF + 1] - (s * ux + c * uy)
+    hx, hy, hth = hx + px * f[tb.LIN_TH], hy + py * f[tb.LIN_TH], f[tb.LIN_K]
     # W T: the third column is W (S d, 1)
     wx, wy, wt = xx * px + xy * py + xt, xy * px + yy * py + yt, xt * px + yt * py + tt
-    # T^T W T
-    tt_i = px * wx + py * wy + wt
     gx = xx * hx + xy * hy + xt * hth
     gy = xy * hx + yy * hy + yt * hth
     gth = xt * hx + yt * hy + tt * hth
+    # block ii is T^T W T
     r = a * ld + a
     front[r] += xx
     front[r + 1] += xy
     front[r + 2] += wx
     front[r + ld + 1] += yy
     front[r + ld + 2] += wy
-    front[r + 2 * ld + 2] += tt_i
-    r = b * ld + b
-    front[r] += xx
-    front[r + 1] += xy
-    front[r + 2] += xt
-    front[r + ld + 1] += yy
-    front[r + ld + 2] += yt
-    front[r + 2 * ld + 2] += tt
+    front[r + 2 * ld + 2] += px * wx + py * wy + wt
     right = ld - 1
     front[a * ld + right] += gx
     front[(a + 1) * ld + right] += gy
     front[(a + 2) * ld + right] += px * gx + py * gy + gth
-    front[b * ld + right] -= gx
-    front[(b + 1) * ld + right] -= gy
-    front[(b + 2) * ld + right] -= gth
-    # block ij is -T^T W, block ji its transpose
+    front[b * ld + right] -= ft * gx
+    front[(b + 1) * ld + right] -= ft * gy
+    front[(b + 2) * ld + right] -= fth * gth
+    # from here on what the blocks of j have of it, columns times F
+    xx, xy, xt, yy, yt = ft * xx, ft * xy, fth * xt, ft * yy, fth * yt
+    wx, wy, wt = ft * wx, ft * wy, fth * wt
+    r = b * ld + b
+    front[r] += ft * xx
+    front[r + 1] += ft * xy
+    front[r + 2] += ft * xt
+    front[r + ld + 1] += ft * yy
+    front[r + ld + 2] += ft * yt
+    front[r + 2 * ld + 2] += fth * fth * tt
+    # block ij is -T^T W F, block ji its transpose
     if a < b:
         r = a * ld + b
         front[r] -= xx

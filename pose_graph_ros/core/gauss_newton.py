@@ -219,6 +219,18 @@ def evaluate(head, right):  # type: ignore[no-untyped-def]
         if w > 0.0:
             i, j = edge_i[e, tb.END_I], edge_i[e, tb.END_J]
             start, end = node_f[i], node_f[j]
+            if edge_i[e, tb.EDGE_KIND] == factors.BIAS:
+                ex, ey, eth, dx, dy = factors.error_to_bias(f, start, end)
+                gx, gy, gth, energy = _pull(f, ex, ey, eth)
+                chi2 += energy
+                pulls += abs(gx) + abs(gy)
+                right[i, 0] += gx
+                right[i, 1] += gy
+                right[i, 2] += dx * gy - dy * gx + gth
+                right[j, 0] -= f[tb.FACTOR_T] * gx
+                right[j, 1] -= f[tb.FACTOR_T] * gy
+                right[j, 2] -= f[tb.FACTOR_TH] * gth
+                continue
             phi = start[tb.POSE + 2] + f[tb.MEAN + 2]
             c, s = math.cos(phi), math.sin(phi)
             dx, dy = end[tb.POSE] - start[tb.POSE], end[tb.POSE + 1] - start[tb.POSE + 1]

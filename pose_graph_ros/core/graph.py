@@ -16,7 +16,7 @@ import numpy as np
 import numpy.typing as npt
 
 from pose_graph_ros.core import editing, linearize, se2, tables as tb, undo
-from pose_graph_ros.core.constraints import check, Edges, ObservedNodes
+from pose_graph_ros.core.constraints import check, EdgeKind, Edges, ObservedNodes
 from pose_graph_ros.core.exceptions import GraphUpdateError
 from pose_graph_ros.core.jit import compile_only
 from pose_graph_ros.core.se2 import FloatArray, IntArray
@@ -34,8 +34,10 @@ _NUMBERS, _INTEGERS, _POSES, _MATRICES, _KINDS = (
     types.float64[::1], types.int64[::1], types.float64[:, ::1], types.float64[:, :, ::1],
     types.uint8[::1])
 _ADD_ROWS = (
-    _INTEGERS, _POSES, _INTEGERS, _INTEGERS, _POSES, _MATRICES, _KINDS, _NUMBERS,
+    _INTEGERS, _POSES, _POSES, _INTEGERS, _INTEGERS, _POSES, _MATRICES, _KINDS, _NUMBERS, _POSES,
     _INTEGERS, _POSES, _POSES, _MATRICES, _KINDS, _NUMBERS, types.boolean)
+# Where the tables keep the column `Edges.bias`.
+_BIAS_COLUMNS = [tb.BIAS_OFFSET, tb.BIAS_OFFSET + 1, tb.FACTOR_T, tb.FACTOR_TH]
 
 
 class GraphUpdate(NamedTuple):
@@ -59,6 +61,11 @@ class GraphUpdate(NamedTuple):
     """New weights (factors on the information) of edges; a removed one comes back by it."""
     weigh_observed: Mapping[int, float] = NO_WEIGHTS
     """New weights of observed nodes."""
+    biases: FloatArray = NO_POSES
+    """
+    Initial values of new biases, shape (S, 3) [sigma, sigma, rad]: hidden nodes too, numbered
+    after those of `hidden`.
+    """
 
 
 class Energies(NamedTuple):
@@ -83,8 +90,13 @@ class Graph:
 
     @property
     def n_nodes(self) -> int:
-        """Number of hidden nodes."""
+        """Number of hidden nodes, biases included."""
         return int(self.memory.head[tb.N_NODES])
+
+    @property
+    def newest_pose(self) -> int:
+        """The newest hidden node that is no bias, or -1."""
+        return int(self.memory.head[tb.NEWEST])
 
     @property
     def n_edges(self) -> int:
@@ -98,7 +110,7 @@ class Graph:
 
     @property
     def poses(self) -> FloatArray:
-        """Estimates of the hidden nodes in the map, shape (N, 3), a read-only view."""
+        """Estimates of all hidden nodes in the map, shape (N, 3), a read-only view."""
         view = self.memory['node_f'][:self.n_nodes, tb.POSE:tb.POSE + 3]
         view.flags.writeable = False
         return view
@@ -109,6 +121,11 @@ class Graph:
         return self.memory['node_i'][:self.n_nodes, tb.FIXED] != 0
 
     @property
+    def is_bias(self) -> BoolArray:
+        """Hidden nodes that are biases and no poses, shape (N,)."""
+        return self.memory['node_i'][:self.n_nodes, tb.IS_BIAS] != 0
+
+    @property
     def edges(self) -> Edges:
         """All edges, with their weights."""
         return self.edges_at(slice(self.n_edges))
@@ -116,10 +133,12 @@ class Graph:
     def edges_at(self, rows: IntArray | slice) -> Edges:
         """Return some edges, by their numbers."""
         numbers, integers = self.memory['edge_f'][rows], self.memory['edge_i'][rows]
+        kind, bias = integers[:, tb.EDGE_KIND], np.zeros((len(integers), 4))
+        to_bias = np.flatnonzero(kind == EdgeKind.BIAS)
+        bias[to_bias] = numbers[to_bias[:, None], _BIAS_COLUMNS]
         return Edges(
             integers[:, tb.END_I], integers[:, tb.END_J], numbers[:, tb.MEAN:tb.MEAN + 3].copy(),
-            _unpacked(numbers[:, tb.INFO:tb.INFO + 6]), integers[:, tb.EDGE_KIND],
-            numbers[:, tb.WEIGHT].copy())
+            _unpacked(numbers[:, tb.INFO:tb.INFO + 6]), kind, numbers[:, tb.WEIGHT].copy(), bias)
 
     @property
     def observed(self) -> ObservedNodes:
@@ -144,11 +163,11 @@ class Graph:
             If any part does not fit, saying which; the graph is unchanged then.
 
         """
-        hidden, edges, observed, *by_number = update
+        hidden, edges, observed, *by_number, biases = update
         edits = any(map(len, by_number))
         if edits:
             self._check_edits(update)
-        columns, checked = (hidden, *edges.columns, *observed.columns), False
+        columns, checked = (hidden, biases, *edges.columns, *observed.columns), False
         try:
             code = editing.add_rows(self.memory.head, *columns, checked)
         except (TypeError, ValueError):
@@ -164,8 +183,8 @@ class Graph:
 
     def _sizes_after(self, update: GraphUpdate) -> tuple[int, int, int]:
         """Return how many hidden nodes, edges and observed nodes there will be."""
-        return (self.n_nodes + len(update.hidden), self.n_edges + len(update.edges),
-                self.n_observed + len(update.observed))
+        return (self.n_nodes + len(update.hidden) + len(update.biases),
+                self.n_edges + len(update.edges), self.n_observed + len(update.observed))
 
     def _check_edits(self, update: GraphUpdate) -> None:
         """Refuse numbers and weights that do not fit the graph with its new rows."""
@@ -191,15 +210,18 @@ class Graph:
 
     def _checked_columns(self, update: GraphUpdate) -> tuple[npt.NDArray[Any], ...]:
         """Refuse rows that are not sound; return them as the kernel wants them."""
-        hidden, edges, observed = _checked_hidden(update.hidden), update.edges, update.observed
-        n_nodes = self.n_nodes + len(hidden)
+        hidden, biases = (
+            _checked_poses(name, getattr(update, name)) for name in ('hidden', 'biases'))
+        edges, observed = update.edges, update.observed
+        is_bias = np.concatenate((
+            self.is_bias, np.zeros(len(hidden), dtype=bool), np.ones(len(biases), dtype=bool)))
         for table in (edges, observed):
             if len(table) > 0:
-                check(table, n_nodes)
+                check(table, is_bias)
         edges = edges if len(edges) > 0 else NO_EDGES
         observed = observed if len(observed) > 0 else NOTHING_OBSERVED
         return tuple(np.array(column, order='C')
-                     for column in (hidden, *edges.columns, *observed.columns))
+                     for column in (hidden, biases, *edges.columns, *observed.columns))
 
     def ensure(self, n_nodes: int, n_edges: int, n_observed: int) -> None:
         """Make all tables hold a graph of such a size, and one update of all of it."""
@@ -242,6 +264,15 @@ class Graph:
         rows[:, tb.POSE:tb.POSE + 3] = se2.wrapped(poses)
         editing.restart(self.memory.head)
 
+    def take_over(self, other: 'Graph', poses: FloatArray) -> None:
+        """Copy all rows of another graph into this empty one, with poses (N, 3) of their own."""
+        self.apply(GraphUpdate(hidden=poses))
+        memory, head = self.memory, self.memory.head
+        memory['node_i'][:len(poses), tb.IS_BIAS] = other.is_bias
+        head[tb.NEWEST] = other.newest_pose
+        self.apply(GraphUpdate(
+            edges=other.edges, observed=other.observed, fix=np.flatnonzero(other.fixed).tolist()))
+
     def energies(self, poses: FloatArray | None = None) -> Energies:
         """Return the energies of all constraints, at other poses (N, 3) if given."""
         poses = self.poses if poses is None else poses
@@ -269,16 +300,16 @@ def _unpacked(upper: FloatArray) -> FloatArray:
     return upper[:, _FULL].reshape(-1, 3, 3)
 
 
-def _checked_hidden(poses: FloatArray) -> FloatArray:
-    hidden = np.asarray(poses, dtype=np.float64)
-    if hidden.ndim != 2 or hidden.shape[1:] != (3,):
+def _checked_poses(name: str, poses: FloatArray) -> FloatArray:
+    array = np.asarray(poses, dtype=np.float64)
+    if array.ndim != 2 or array.shape[1:] != (3,):
         raise GraphUpdateError(
-            f'hidden: expected finite poses, shape (N, 3), got shape {hidden.shape}')
-    if not np.all(np.isfinite(hidden)):
+            f'{name}: expected finite poses, shape (N, 3), got shape {array.shape}')
+    if not np.all(np.isfinite(array)):
         raise GraphUpdateError(
-            f'hidden: expected finite poses, shape (N, 3), got shape {hidden.shape} '
+            f'{name}: expected finite poses, shape (N, 3), got shape {array.shape} '
             f'with numbers that are not finite')
-    return hidden
+    return array
 
 
 def _check_numbers(name: str, numbers: Iterable[int], what: str, size: int) -> None:

@@ -125,7 +125,7 @@ class IncrementalSmoother:
         observed_mean: FloatArray | None = None, observed_information: FloatArray | None = None,
     ) -> UpdateResult:
         """
-        Append a hidden node behind the newest one, tied by odometry: the step along a chain.
+        Append a hidden node behind the newest pose, tied by odometry: the step along a chain.
 
         The same as an update with one hidden node, where odometry puts it, one edge and perhaps
         one observed node, at a fraction of the cost.
@@ -172,11 +172,11 @@ class IncrementalSmoother:
         return self._extend_in_general(arguments, with_observed=with_observed)
 
     def newest_covariance(self) -> FloatArray:
-        """Return the covariance of the newest hidden node in map axes, shape (3, 3)."""
+        """Return the covariance of the newest pose in map axes, shape (3, 3)."""
         covariance = np.empty((3, 3))
         if not marginals.newest_covariance(self._memory.head, covariance):
             # it says what is missing
-            return marginals.covariance(self.graph, self.graph.n_nodes - 1)
+            return marginals.covariance(self.graph, self.graph.newest_pose)
         return covariance
 
     def covariance(self, node: int) -> FloatArray:
@@ -209,16 +209,16 @@ class IncrementalSmoother:
         self, arguments: tuple[FloatArray, ...], *, with_observed: bool,
     ) -> UpdateResult:
         mean, information, observed_mean, observed_information = arguments
-        node = self.graph.n_nodes
-        if node == 0:
+        node, last = self.graph.n_nodes, self.graph.newest_pose
+        if last < 0:
             raise GraphUpdateError('extend: expected a graph with a hidden node to go on from')
         observed = ObservedNodes()
         if with_observed:
             observed = ObservedNodes([node], None, observed_mean[None], observed_information[None],
                                      [ObservedKind.GLOBAL_POSE])
         return self.update(GraphUpdate(
-            hidden=se2.compose(self.graph.poses[node - 1], mean)[None],
-            edges=Edges([node - 1], [node], mean[None], information[None], [EdgeKind.ODOMETRY]),
+            hidden=se2.compose(self.graph.poses[last], mean)[None],
+            edges=Edges([last], [node], mean[None], information[None], [EdgeKind.ODOMETRY]),
             observed=observed))
 
     def _step(self, entered: int) -> UpdateResult:

@@ -24,6 +24,7 @@ import scipy.sparse.linalg
 
 from pose_graph_ros.core import complex_system, se2, symbolic, tables as tb
 from pose_graph_ros.core.complex_system import Terms
+from pose_graph_ros.core.constraints import EdgeKind, Edges, ObservedKind, ObservedNodes
 from pose_graph_ros.core.exceptions import LinearSolveError
 from pose_graph_ros.core.factors import wrap
 from pose_graph_ros.core.graph import Graph
@@ -43,7 +44,8 @@ def chordal(graph: Graph) -> FloatArray:
     Raises
     ------
     LinearSolveError
-        If headings or positions are not determined, as where only positions are observed.
+        If headings or positions are not determined, as where only positions are observed; or if
+        there are biases.
 
     """
     head = graph.memory.head
@@ -52,6 +54,8 @@ def chordal(graph: Graph) -> FloatArray:
 
 def chordal_poses(head: tb.IntHead, cliques: symbolic.Cliques) -> FloatArray:
     """Do what `chordal` does, where the cliques of the whole graph are known."""
+    if _n_biases(head) > 0:
+        raise LinearSolveError('chordal start: a bias has no heading')
     u, bad = complex_system.solve(head, cliques, _rotation_terms(head))
     length = np.hypot(u[:, 0], u[:, 1])
     if bad >= 0:
@@ -65,6 +69,14 @@ def chordal_poses(head: tb.IntHead, cliques: symbolic.Cliques) -> FloatArray:
         raise LinearSolveError(
             f'chordal start: the position of hidden node {bad} is not determined')
     return np.asarray(_poses(head, u, t))
+
+
+@kernel
+def _n_biases(head):  # type: ignore[no-untyped-def]
+    node_i, n = tb.node_i(head), 0
+    for v in range(head[tb.N_NODES]):
+        n += node_i[v, tb.IS_BIAS]
+    return n
 
 
 @kernel(allocates=True)
@@ -138,13 +150,16 @@ def joint(graph: Graph) -> FloatArray:
     was observed is spread over that part the short way round, which Gauss-Newton from the drifted
     poses does not find. Only fixed nodes keep their pose.
 
+    Biases start at zero; what was measured with one is an observed node, less certain by it.
+
     Raises
     ------
     LinearSolveError
         If the poses are not determined.
 
     """
-    edges, observed, n = graph.edges, graph.observed, graph.n_nodes
+    n, is_bias, fixed = graph.n_nodes, graph.is_bias, graph.fixed
+    edges, observed = _of_poses(graph.edges, graph.observed, is_bias)
     edge_rows, observed_rows = np.arange(len(edges)), np.arange(len(observed))
     root_t = np.sqrt(_isotropic(edges.weighted_information))
     root_u = np.sqrt(edges.weighted_information[:, 2, 2])
@@ -169,10 +184,33 @@ def joint(graph: Graph) -> FloatArray:
         np.zeros(2 * len(edges)), seen_t * _complex(observed.mean),
         seen_u * np.exp(1j * (observed.mean[:, 2] - observed.offset[:, 2]))))
     known = np.concatenate((_complex(graph.poses), np.exp(1j * graph.poses[:, 2])))
-    solution = _least_squares(matrix, right, known, np.tile(graph.fixed, 2))
+    solution = _least_squares(matrix, right, known, np.tile(fixed | is_bias, 2))
     t, u = solution[:n], solution[n:]
-    theta = np.where(graph.fixed, graph.poses[:, 2], se2.wrap(np.angle(u)))
-    return np.column_stack((t.real, t.imag, theta))
+    theta = np.where(fixed, graph.poses[:, 2], se2.wrap(np.angle(u)))
+    poses = np.column_stack((t.real, t.imag, theta))
+    poses[is_bias & ~fixed] = 0.0
+    return poses
+
+
+def _of_poses(
+    edges: Edges, observed: ObservedNodes, is_bias: npt.NDArray[np.bool_],
+) -> tuple[Edges, ObservedNodes]:
+    """Return the constraints of poses alone, as if the noise of biases were white."""
+    to_bias = edges.kind == EdgeKind.BIAS
+    observed = observed.rows(~is_bias[observed.node])
+    measured = edges.rows(to_bias & ~is_bias[edges.i])
+    if len(measured) > 0:
+        offset, information = np.zeros((len(measured), 3)), np.zeros((len(measured), 3, 3))
+        offset[:, :2] = measured.bias[:, :2]
+        weighted = measured.weighted_information
+        of_t, of_th = _isotropic(weighted), weighted[:, 2, 2]
+        of_t = of_t / (1.0 + of_t * measured.bias[:, 2]**2)
+        information[:, 0, 0] = information[:, 1, 1] = of_t
+        information[:, 2, 2] = of_th / (1.0 + of_th * measured.bias[:, 3]**2)
+        observed = ObservedNodes.joined([observed, ObservedNodes(
+            measured.i, offset, measured.mean, information,
+            [ObservedKind.GLOBAL_POSE] * len(measured))])
+    return edges.rows(~to_bias), observed
 
 
 def _complex(pose: FloatArray) -> ComplexArray:

@@ -17,6 +17,10 @@ in the frame of the measured pose. Observed node with offset o = (t_o, th_o) fro
 
     e = (R_z^T (t_i + R_i t_o - t_z), wrap(th_i + th_o - th_z))
 
+Edge to a bias m_j, in map axes, with an offset t_o from node i and factors f_t, f_th of the bias:
+
+    e = (f_t m_t + t_z - (t_i + R_i t_o), wrap(f_th m_th + th_z - th_i))
+
 The energy of a constraint is `e^T information e`, without a factor 1/2; chi2 is their sum.
 """
 
@@ -25,8 +29,8 @@ from typing import NamedTuple
 import numpy as np
 
 from pose_graph_ros.core import se2
-from pose_graph_ros.core.constraints import Edges, ObservedNodes
-from pose_graph_ros.core.se2 import FloatArray
+from pose_graph_ros.core.constraints import EdgeKind, Edges, ObservedNodes
+from pose_graph_ros.core.se2 import FloatArray, IntArray
 
 
 class EdgeLinearization(NamedTuple):
@@ -57,14 +61,21 @@ def edge_errors(poses: FloatArray, edges: Edges) -> FloatArray:
     Returns
     -------
     ndarray, shape (M, 3)
-        In the frames of the measured poses [m, m, rad], theta in [-pi, pi).
+        In the frames of the measured poses, those of edges to a bias in map axes [m, m, rad];
+        theta in [-pi, pi).
 
     """
     start, end, mean = poses[edges.i], poses[edges.j], edges.mean
     moved = _unrotate(start[:, 2], end[:, :2] - start[:, :2])
     translation = _unrotate(mean[:, 2], moved - mean[:, :2])
     theta = se2.wrap(end[:, 2] - start[:, 2] - mean[:, 2])
-    return np.column_stack((translation, theta))
+    error = np.column_stack((translation, theta))
+    rows = np.flatnonzero(edges.kind == EdgeKind.BIAS)
+    if len(rows) > 0:
+        error[rows] = _factors(edges, rows) * end[rows] + mean[rows] - start[rows]
+        error[rows, :2] -= _arms(start, edges, rows)
+        error[rows, 2] = se2.wrap(error[rows, 2])
+    return error
 
 
 def linearize_edges(poses: FloatArray, edges: Edges) -> EdgeLinearization:
@@ -86,7 +97,24 @@ def linearize_edges(poses: FloatArray, edges: Edges) -> EdgeLinearization:
     # d(R_i^T)/dth_i v = (R_i^T v) turned by -90 degrees, and turns commute
     jacobian_i[:, 0, 2] = difference[:, 1]
     jacobian_i[:, 1, 2] = -difference[:, 0]
+    rows = np.flatnonzero(edges.kind == EdgeKind.BIAS)
+    if len(rows) > 0:
+        jacobian_i[rows], jacobian_j[rows] = -np.eye(3), 0.0
+        arm = _arms(start, edges, rows)
+        jacobian_i[rows, 0, 2], jacobian_i[rows, 1, 2] = arm[:, 1], -arm[:, 0]
+        for k in range(3):
+            jacobian_j[rows, k, k] = _factors(edges, rows)[:, k]
     return EdgeLinearization(error, jacobian_i, jacobian_j)
+
+
+def _factors(edges: Edges, rows: IntArray) -> FloatArray:
+    """Return the diagonals of F of edges to a bias, shape (M, 3)."""
+    return edges.bias[rows[:, None], [2, 2, 3]]
+
+
+def _arms(start: FloatArray, edges: Edges, rows: IntArray) -> FloatArray:
+    """Return the offsets of edges to a bias in map axes, shape (M, 2)."""
+    return _unrotate(-start[rows, 2], edges.bias[rows, :2])
 
 
 def observed_errors(poses: FloatArray, observed: ObservedNodes) -> FloatArray:

@@ -92,7 +92,7 @@ def _require_node(graph: Graph, node: Any) -> None:
 @kernel(allocates=True)
 def newest_covariance(head, out):  # type: ignore[no-untyped-def]
     """
-    Write the covariance of the newest node, shape (3, 3): at once where it is alone in a root.
+    Write the covariance of the newest pose, shape (3, 3): at once where it is alone in a root.
 
     Returns
     -------
@@ -100,7 +100,7 @@ def newest_covariance(head, out):  # type: ignore[no-untyped-def]
         Whether there is a node, and no edit waits for the next step.
 
     """
-    v = head[tb.N_NODES] - 1
+    v = head[tb.NEWEST]
     if v < 0 or head[tb.N_SEEDS] > 0:
         return False
     pool_f, node_i, clique_i = tb.pool_f(head), tb.node_i(head), tb.clique_i(head)

@@ -14,7 +14,7 @@ import numpy as np
 from pose_graph_ros.core import batch, undo
 from pose_graph_ros.core.batch import Status
 from pose_graph_ros.core.config import SolverConfig
-from pose_graph_ros.core.graph import Graph, GraphUpdate
+from pose_graph_ros.core.graph import Graph
 
 _CONFIG = SolverConfig(max_iterations=50, step_tolerance=1e-6)
 
@@ -39,9 +39,7 @@ def optimize_copy(graph: Graph, copy: Graph) -> bool:
     poses = np.empty((graph.n_nodes, 3))
     # where to start if the linear start leads to something worse
     undo.poses_before(graph.memory.head, poses)
-    copy.apply(GraphUpdate(
-        hidden=poses, edges=graph.edges, observed=graph.observed,
-        fix=[int(node) for node in graph.fixed.nonzero()[0]]))
+    copy.take_over(graph, poses)
     if batch.optimize_from_nothing(copy, _CONFIG).status is Status.FAILED:
         return False
     copy.set_poses(copy.poses)

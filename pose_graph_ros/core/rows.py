@@ -87,12 +87,12 @@ def write_observed(  # type: ignore[no-untyped-def]
 
 
 @kernel
-def write_nodes(head, poses):  # type: ignore[no-untyped-def]
-    """Write hidden nodes behind the last row, headings wrapped; tell if all are plainly finite."""
+def write_nodes(head, first, poses):  # type: ignore[no-untyped-def]
+    """Write hidden nodes from a row on, headings wrapped; tell if all are plainly finite."""
     node_f = tb.node_f(head)
     sound = True
     for k in range(len(poses)):
-        f = node_f[head[tb.N_NODES] + k]
+        f = node_f[first + k]
         if not _copy_pose(f, tb.POSE, poses[k]):
             sound = False
         f[tb.POSE + 2] = factors.wrap(f[tb.POSE + 2])
@@ -100,16 +100,34 @@ def write_nodes(head, poses):  # type: ignore[no-untyped-def]
 
 
 @kernel
+def _is_bias(head, v, first_bias):  # type: ignore[no-untyped-def]
+    """Tell whether a node, perhaps a new one, is a bias; the new ones begin at `first_bias`."""
+    if v < head[tb.N_NODES]:
+        return tb.node_i(head)[v, tb.IS_BIAS] != 0
+    return v >= first_bias
+
+
+@kernel
 def write_edges(  # type: ignore[no-untyped-def]
-    head, n_nodes, i, j, mean, information, kind, weight,
+    head, n_nodes, first_bias, i, j, mean, information, kind, weight, bias,
 ):
     """Write edges behind the last row; return whether all are plainly sound."""
+    edge_f = tb.edge_f(head)
     sound = True
     for k in range(len(i)):
-        inside = 0 <= i[k] < n_nodes and 0 <= j[k] < n_nodes and kind[k] <= 1
-        if not (write_edge(head, head[tb.N_EDGES] + k, i[k], j[k], mean[k], information[k],
-                           kind[k], weight[k]) and inside):
-            sound = False
+        e = head[tb.N_EDGES] + k
+        inside = 0 <= i[k] < n_nodes and 0 <= j[k] < n_nodes and kind[k] <= factors.BIAS
+        sound = write_edge(
+            head, e, i[k], j[k], mean[k], information[k], kind[k], weight[k]) and inside and sound
+        if kind[k] == factors.BIAS:
+            f = edge_f[e]
+            f[tb.BIAS_OFFSET], f[tb.BIAS_OFFSET + 1] = bias[k, 0], bias[k, 1]
+            f[tb.FACTOR_T], f[tb.FACTOR_TH] = bias[k, 2], bias[k, 3]
+            for m in range(4):
+                sound = is_finite(bias[k, m]) and sound
+            sound = sound and _is_bias(head, j[k], first_bias)
+        elif sound:
+            sound = not (_is_bias(head, i[k], first_bias) or _is_bias(head, j[k], first_bias))
     return sound
 
 

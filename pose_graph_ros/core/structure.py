@@ -12,14 +12,20 @@ NEWEST_LAST = 10
 
 
 @kernel
-def newest_last(affected):  # type: ignore[no-untyped-def]
-    """Move the newest of the affected nodes to the end, in order; return how many."""
+def newest_last(affected, newest):  # type: ignore[no-untyped-def]
+    """
+    Move the newest of the affected nodes to the end, in order; return how many.
+
+    The last of all is the newest pose, if it is there: biases may have come after it, but the next
+    edge will lead from it.
+    """
     n = len(affected)
     n_last = min(NEWEST_LAST, n)
     for k in range(n_last):
         best = 0
         for i in range(1, n - k):
-            if affected[i] > affected[best]:
+            if affected[best] != newest and (
+                    affected[i] > affected[best] or affected[i] == newest):
                 best = i
         last = n - k - 1
         affected[best], affected[last] = affected[last], affected[best]

@@ -18,7 +18,7 @@ from pose_graph_ros.core import tables as tb, undo
 from pose_graph_ros.core.assembly import work_size
 from pose_graph_ros.core.jit import kernel
 from pose_graph_ros.core.ordering import minimum_degree
-from pose_graph_ros.core.structure import amalgamate, NEWEST_LAST, structure
+from pose_graph_ros.core.structure import amalgamate, newest_last, structure
 
 # Cliques are joined if that stores at most so many zero blocks, up to so many frontal nodes: more
 # than while driving, as here every clique is met in every iteration.
@@ -49,25 +49,26 @@ class Analysis(NamedTuple):
 
 def analyse(head: tb.IntHead) -> Analysis:
     """Order all nodes and return the cliques; no table is changed."""
-    n = int(head[tb.N_NODES])
-    start, adjacency = _adjacency(head)
-    eliminated = minimum_degree(n, 0, min(NEWEST_LAST, n), start, adjacency)
-    cliques = _arranged(n, eliminated)
+    order = np.arange(int(head[tb.N_NODES])).astype(np.int32)
+    n_last = newest_last(order, int(head[tb.NEWEST]))
+    start, adjacency = _adjacency(head, order)
+    cliques = _arranged(order, minimum_degree(len(order), 0, n_last, start, adjacency))
     return Analysis(cliques, *_needs(cliques))
 
 
 @kernel(allocates=True)
-def _adjacency(head):  # type: ignore[no-untyped-def]
-    """Return the graph of all nodes as `minimum_degree` takes it."""
-    _, start, adjacency = structure(
-        head, np.empty(0, np.int32), np.arange(head[tb.N_NODES]).astype(np.int32))
+def _adjacency(head, order):  # type: ignore[no-untyped-def]
+    """Return the graph of all nodes, in this order, as `minimum_degree` takes it."""
+    _, start, adjacency = structure(head, np.empty(0, np.int32), order)
     return start, adjacency
 
 
 @kernel(allocates=True)
-def _arranged(n, eliminated):  # type: ignore[no-untyped-def]
+def _arranged(order, eliminated):  # type: ignore[no-untyped-def]
     """Return the cliques that `minimum_degree` has found, joined where that is of use."""
     n_raw, offset, raw_frontal, raw_parent, raw_nodes = eliminated
+    for m in range(offset[n_raw]):
+        raw_nodes[m] = order[raw_nodes[m]]
     into, _ = amalgamate(
         n_raw, raw_frontal, offset, raw_parent, RELAXED_ZEROS, RELAXED_FRONTAL)
     raw_order = _postorder(n_raw, into, raw_parent)
@@ -98,7 +99,7 @@ def _arranged(n, eliminated):  # type: ignore[no-untyped-def]
         for m in range(offset[q], offset[q] + raw_frontal[q]):
             nodes[filled[k]] = raw_nodes[m]
             filled[k] += 1
-    _put_separators(cliques, separators, raw_nodes, n)
+    _put_separators(cliques, separators, raw_nodes, len(order))
     return cliques
 
 

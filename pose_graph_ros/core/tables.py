@@ -33,15 +33,19 @@ POSE, DELTA, SEEN, LOOKED, STIFF_T, STIFF_R, REF, NODE_F = 0, 3, 6, 9, 10, 11, 1
 # node_i: clique that it is frontal in; heads of the lists of edges (2 * edge + side) and of
 # observed nodes; whether it is fixed; whether it is a seed of the next elimination; index in a
 # front and the stamp that makes it valid; stamp of the last change that matters; undo log of the
-# row and of the solution alone
+# row and of the solution alone; whether it is a bias and no pose
 (CLIQUE, EDGE_LIST, OBSERVED_LIST, FIXED, SEEDED, INDEX, FRONT, CHANGED, NODE_UNDO, SOLUTION_UNDO,
- NODE_I) = range(11)
+ IS_BIAS, NODE_I) = range(12)
 
 # edge_f: mean, information (xx, xy, xt, yy, yt, tt), weight; translation of the mean in its own
 # axes; linearization: t_j - t_i, cos and sin of the direction of the measured frame, solution of
 # the heading of i, constant of the heading error; squared linearization error, energy
 (MEAN, INFO, WEIGHT, OWN_T, LIN_D, LIN_COS, LIN_SIN, LIN_TH, LIN_K, ERROR2, ENERGY, EDGE_F) = (
     0, 3, 9, 10, 12, 14, 15, 16, 17, 18, 19, 20)
+# An edge to a bias keeps other things in the same places: the offset, which is an arm of i; the
+# arm in map axes at the linearization; the factors of the bias. Its error lies in map axes, so
+# there is no direction to keep.
+BIAS_OFFSET, BIAS_ARM, FACTOR_T, FACTOR_TH = OWN_T, LIN_D, LIN_COS, LIN_SIN
 # edge_i: ends; next entries of the lists of both ends; `EdgeKind`; stamp of the last check;
 # whether it waits to be relinearized; undo log of the row and of error, energy and waiting alone;
 # the clique that it was assembled in
@@ -57,7 +61,7 @@ OBS_NODE, OBS_NEXT, OBS_KIND, OBS_CHECKED, OBS_WAITS, OBS_UNDO, OBS_I = range(7)
 # clique_i: parent (-1: root), first child, next sibling; numbers of frontal and of separator
 # nodes; where its nodes and values lie in the pools; stamps: to be eliminated again (and then a
 # counter); iteration that built it; updates that took it, took its values, logged it; whether a
-# node at or below it is fixed or observed
+# node at or below it is fixed, observed or tied to a bias
 (PARENT, CHILD, SIBLING, N_FRONTAL, N_SEPARATOR, NODES, VALUES, MARKED, BUILT, BORN, VALUES_BORN,
  CLIQUE_UNDO, ANCHORED, CLIQUE_I) = range(14)
 # clique_f: angle of the clique's frame that the parent was eliminated with; mean solution of the
@@ -77,11 +81,12 @@ NAMES: Final = (*FLOAT_TABLES, *INT_TABLES)
 
 # --- the head: addresses and capacities first, then counters ------------------------------------
 
+# NEWEST is the newest node that is a pose, or -1
 (N_NODES, N_EDGES, N_OBSERVED, N_CLIQUES, FREE_CLIQUE, POOL_F_END, POOL_I_END, N_SEEDS, N_FREED,
  N_WAITING, LOG_F_END, LOG_I_END, UPDATE, ITERATION, FRONT_SERIAL, STRUCTURE, NEED_F,
  NEED_I, NEED_WORK, BAD_NODE, N_RELINEARIZED, N_ELIMINATED, N_VISITED, N_ITERATIONS, N_ROOTS,
- N_LOOKS, N_CHANGED, N_TURNED, NODE_ROOM, EDGE_ROOM, OBSERVED_ROOM, COUNTERS_END) = range(
-     2 * len(NAMES), 2 * len(NAMES) + 32)
+ N_LOOKS, N_CHANGED, N_TURNED, NODE_ROOM, EDGE_ROOM, OBSERVED_ROOM, NEWEST, COUNTERS_END) = range(
+     2 * len(NAMES), 2 * len(NAMES) + 33)
 # heads of the free lists of the pools, one for each size class
 SIZES: Final = [*range(65)]
 while SIZES[-1] < 2**31:
@@ -184,7 +189,7 @@ class Memory:
 
     def __init__(self) -> None:
         self.head: IntHead = np.zeros(HEAD_SIZE, dtype=np.int64)
-        self.head[FREE_CLIQUE] = -1
+        self.head[FREE_CLIQUE] = self.head[NEWEST] = -1
         self.head[FREE_F:] = -1
         self._tables: dict[str, npt.NDArray[Any]] = {}
         for name in NAMES:

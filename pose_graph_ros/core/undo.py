@@ -20,7 +20,8 @@ from pose_graph_ros.core.jit import kernel
 # What an entry of the log holds.
 NODE, EDGE, OBSERVED, CLIQUE, TAKEN_CLIQUE, SOLUTION, EDGE_ENERGY, START = range(8)
 # Counters that the first entry brings back.
-STARTED_WITH = (tb.N_NODES, tb.N_EDGES, tb.N_OBSERVED, tb.STRUCTURE, tb.N_SEEDS, tb.N_WAITING)
+STARTED_WITH = (
+    tb.N_NODES, tb.N_EDGES, tb.N_OBSERVED, tb.STRUCTURE, tb.N_SEEDS, tb.N_WAITING, tb.NEWEST)
 
 _SIZES: Final = np.array(tb.SIZES, dtype=np.int64)
 

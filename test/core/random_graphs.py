@@ -46,11 +46,15 @@ def random_observed(
     return ObservedNodes(node, offsets, mean, information, kind)
 
 
-def random_graph(
+def random_graph(  # noqa: PLR0917
     seed: int, n_nodes: int = 7, n_edges: int = 12, n_observed: int = 5,
-    fix: tuple[int, ...] = (),
+    fix: tuple[int, ...] = (), n_biases: int = 0,
 ) -> Graph:
-    """Return a connected graph with duplicate and reversed edges and large errors."""
+    """
+    Return a connected graph with duplicate and reversed edges and large errors.
+
+    The biases are the last nodes, a chain of them that hangs on an observed node and on poses.
+    """
     rng = np.random.default_rng(seed)
     i, j = list(range(n_nodes - 1)), list(range(1, n_nodes))
     for _ in range(n_edges - len(i)):
@@ -61,7 +65,23 @@ def random_graph(
     graph.apply(GraphUpdate(
         hidden=random_poses(rng, n_nodes), edges=random_edges(rng, i, j),
         observed=random_observed(rng, rng.integers(0, n_nodes, n_observed).tolist()), fix=fix))
+    if n_biases > 0:
+        biases = np.arange(n_nodes, n_nodes + n_biases)
+        graph.apply(GraphUpdate(
+            biases=random_poses(rng, n_biases), observed=random_observed(rng, [0, n_nodes]).rows(
+                slice(1, 2)), edges=Edges.joined([
+                    random_edges_to_biases(rng, biases[1:], biases[:-1]),
+                    random_edges_to_biases(rng, rng.integers(0, n_nodes, 3 * n_biases),
+                                           rng.choice(biases, 3 * n_biases))])))
     return graph
+
+
+def random_edges_to_biases(rng: np.random.Generator, i: FloatArray, j: FloatArray) -> Edges:
+    """Return edges to biases with large errors; every third tells nothing of the heading."""
+    edges, n = random_edges(rng, i, j), len(i)
+    edges.information[::3, 2, :] = edges.information[::3, :, 2] = 0.0
+    bias = np.column_stack((random_poses(rng, n, 2.0)[:, :2], rng.uniform(0.3, 1.5, (n, 2))))
+    return Edges(i, j, edges.mean, edges.information, [EdgeKind.BIAS] * n, bias=bias)
 
 
 def consistent_graph(seed: int, noise: float = 0.0, n_nodes: int = 8) -> Graph:
@@ -124,6 +144,19 @@ def slow_edge(
     return error, A, B
 
 
+def slow_to_bias(
+    x_i: FloatArray, m_j: FloatArray, z: FloatArray, bias: FloatArray,
+) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Return the error of one edge to a bias and its Jacobians."""
+    F = np.diag(bias[[2, 2, 3]])
+    error = F @ m_j + z - (matrix(x_i) @ matrix(np.append(bias[:2], 0.0)))[[0, 1, 2], 2]
+    error[2] = np.arctan2(*(f(F[2, 2] * m_j[2] + z[2] - x_i[2]) for f in (np.sin, np.cos)))
+    c, s = np.cos(x_i[2]), np.sin(x_i[2])
+    A = -np.eye(3)
+    A[:2, 2] = -np.array([[-s, -c], [c, -s]]) @ bias[:2]
+    return error, A, F
+
+
 def slow_observed(
     x: FloatArray, offset: FloatArray, z: FloatArray,
 ) -> tuple[FloatArray, FloatArray]:
@@ -143,7 +176,9 @@ def dense_system(graph: Graph) -> tuple[FloatArray, FloatArray]:
     H, b = np.zeros((3 * graph.n_nodes,) * 2), np.zeros(3 * graph.n_nodes)
     edges, observed = graph.edges, graph.observed
     for k, (i, j) in enumerate(zip(edges.i, edges.j, strict=True)):
-        e, A, B = slow_edge(graph.poses[i], graph.poses[j], edges.mean[k])
+        ends = graph.poses[i], graph.poses[j], edges.mean[k]
+        e, A, B = (slow_to_bias(*ends, edges.bias[k]) if edges.kind[k] == EdgeKind.BIAS
+                   else slow_edge(*ends))
         for row, J_row in ((i, A), (j, B)):
             b[3 * row:3 * row + 3] += J_row.T @ edges.information[k] @ e
             for column, J_column in ((i, A), (j, B)):

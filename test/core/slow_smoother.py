@@ -33,8 +33,8 @@ class SlowGraph:
     observed: ObservedNodes = field(default_factory=ObservedNodes)
 
     def edited(self, update: GraphUpdate) -> 'SlowGraph':
-        poses = np.vstack((self.poses, se2.wrapped(update.hidden)))
-        fixed = np.append(self.fixed, np.zeros(len(update.hidden), dtype=bool))
+        poses = np.vstack((self.poses, se2.wrapped(update.hidden), se2.wrapped(update.biases)))
+        fixed = np.append(self.fixed, np.zeros(len(poses) - len(self.poses), dtype=bool))
         fixed[list(update.fix)] = True
         fixed[list(update.free)] = False
         return SlowGraph(
@@ -153,11 +153,18 @@ def information(graph: Graph, nodes: list[int] | None = None) -> FloatArray:
     # what a clique holds turns with its frame
     turn = np.array([frame_turn(graph, c) for c in graph.memory['edge_i'][:m, tb.OWNER]])
     ends[:m, 2] = (np.arctan2(rows[:, tb.LIN_SIN], rows[:, tb.LIN_COS]) - edges.mean[:, 2] + turn)
+    # that of an edge to a bias stands in its arm
+    to_bias = edges.kind == EdgeKind.BIAS
+    assert np.all(turn[to_bias & (edges.weight > 0.0)] == 0.0)
+    ends[:m][to_bias, 2] = (
+        np.arctan2(rows[to_bias, tb.BIAS_ARM + 1], rows[to_bias, tb.BIAS_ARM])
+        - np.arctan2(edges.bias[to_bias, 1], edges.bias[to_bias, 0]))
     difference = rows[:, tb.LIN_D:tb.LIN_D + 2]
     ends[m:, :2] = np.einsum('mij,mj->mi', se2.rotation(turn), difference)
     hidden[:, 2] = graph.memory['node_f'][observed.node, tb.REF + 2] + unary[:, tb.OBS_TH]
     edge = linearize.linearize_edges(ends, Edges(
-        np.arange(m), m + np.arange(m), edges.mean, edges.information, edges.kind))
+        np.arange(m), m + np.arange(m), edges.mean, edges.information, edges.kind,
+        bias=edges.bias))
     single = linearize.linearize_observed(hidden, ObservedNodes(
         np.arange(k), observed.offset, observed.mean, observed.information, observed.kind))
     return _normal_equations(graph.n_nodes, (
@@ -192,6 +199,13 @@ class World:
     """Of the poses that new nodes come with."""
     weight: Callable[[np.random.Generator], float] | None = None
     """Factor on the information of each measurement."""
+    biases: set[int] = field(default_factory=set)
+    """Nodes that are biases."""
+
+    @property
+    def poses(self) -> list[int]:
+        """Nodes that are poses."""
+        return [node for node in range(len(self.truth)) if node not in self.biases]
 
     def informative(self) -> FloatArray:
         root = self.rng.normal(size=(3, 3))
@@ -202,6 +216,7 @@ class World:
         """Put a node somewhere in front of another; return the guess of its pose."""
         move = self.rng.normal((self.stride, 0.0, 0.0),
                                (0.3 * self.stride, 0.3 * self.stride, self.turn))
+        self.biases.discard(len(self.truth))    # an update that failed may have left it
         self.truth.append(se2.compose(self.truth[start], move))
         return self.disturbed(self.truth[-1], self.guess)
 
@@ -233,9 +248,9 @@ class World:
         """Return nodes that branch off somewhere, with edges in both directions."""
         hidden, pairs = [], []
         for _ in range(count):
-            node = len(self.truth)
-            start = int(self.rng.integers(max(0, node - 4) if self.rng.random() < 0.8 else 0,
-                                          node))
+            node, poses = len(self.truth), self.poses
+            n = len(poses)
+            start = poses[self.rng.integers(max(0, n - 4) if self.rng.random() < 0.8 else 0, n)]
             hidden.append(self.drive(start))
             pairs.append((start, node) if self.rng.random() < 0.7 else (node, start))
         return GraphUpdate(hidden=np.reshape(hidden, (-1, 3)), edges=self.edges(pairs))
@@ -243,7 +258,7 @@ class World:
     def new_part(self, anchor: str) -> GraphUpdate:
         """Return a node that nothing ties to the others, held by itself or not at all."""
         node = len(self.truth)
-        hidden = self.drive(node - 1)[None]
+        hidden = self.drive(self.poses[-1])[None]
         if anchor == 'fixed':
             return GraphUpdate(hidden=hidden, fix=[node])
         if anchor == 'pose':
@@ -258,11 +273,50 @@ class World:
 
     def pairs(self, count: int) -> list[tuple[int, int]]:
         """Return so many pairs of different nodes, now and then one twice."""
-        if len(self.truth) < 2:
+        if len(self.poses) < 2:
             return []
-        pairs = [tuple(self.rng.choice(len(self.truth), 2, replace=False).tolist())
+        pairs = [tuple(self.rng.choice(self.poses, 2, replace=False).tolist())
                  for _ in range(count)]
         return pairs + pairs[:1] if self.rng.random() < 0.2 else pairs
+
+    def new_biases(self, count: int, measurements: int) -> GraphUpdate:
+        """Return biases, each with a prior or a link to an older one, and what is measured."""
+        rng, values, edges, priors = self.rng, [], [], []
+        spread = np.array([1.0, 1.0, 0.2])
+        for _ in range(count):
+            node = len(self.truth)
+            older = sorted(bias for bias in self.biases if bias < node)
+            if len(older) > 0 and rng.random() < 0.8:
+                before, phi = older[-1 - int(rng.integers(min(len(older), 3)))], rng.uniform(
+                    0.3, 0.98)
+                left = np.sqrt(1.0 - phi * phi) * spread
+                truth = phi * self.truth[before] + left * rng.normal(size=3)
+                edges.append(Edges([node], [before], np.zeros((1, 3)), [np.diag(left**-2.0)],
+                                   [EdgeKind.BIAS], bias=[[0.0, 0.0, phi, phi]]))
+            else:
+                truth = spread * rng.normal(size=3)
+                priors.append(ObservedNodes([node], None, np.zeros((1, 3)),
+                                            [np.diag(spread**-2.0)], [ObservedKind.GLOBAL_POSE]))
+            self.biases.add(node)
+            self.truth.append(truth)
+            values.append(truth + 0.3 * spread * rng.normal(size=3))
+        biases = sorted(bias for bias in self.biases if bias < len(self.truth))
+        edges += [self.biased(int(rng.choice(self.poses)), int(rng.choice(biases[-3:])))
+                  for _ in range(measurements if len(biases) > 0 else 0)]
+        return GraphUpdate(biases=np.reshape(values, (-1, 3)), edges=Edges.joined(edges),
+                           observed=ObservedNodes.joined(priors))
+
+    def biased(self, node: int, bias: int) -> Edges:
+        """Return a measured position or pose with a bias."""
+        offset, factors = self.rng.normal(size=2) * (self.rng.random() < 0.6), self.rng.uniform(
+            0.2, 1.0, 2)
+        mean = np.append(se2.transform(self.truth[node], offset), self.truth[node][2])
+        mean = self.disturbed(mean - factors[[0, 0, 1]] * self.truth[bias], self.noise)
+        information = self.informative()
+        if self.rng.random() < 0.5:
+            information[2] = information[:, 2] = 0.0
+        return Edges([node], [bias], [mean], [information], [EdgeKind.BIAS],
+                     bias=[[*offset, *factors]])
 
     def joined(self, first: GraphUpdate, **more: Any) -> GraphUpdate:
         """Add to an update; constraints come on top of its own."""
@@ -275,8 +329,12 @@ class World:
         """Return an update of any size that does everything at once."""
         rng = self.rng
         update = self.new_nodes(int(rng.integers(0, 4)))
-        n = len(self.truth)
-        nodes = rng.integers(0, n, int(rng.integers(0, 3))).tolist()
+        if rng.random() < 0.4:
+            more = self.new_biases(int(rng.integers(0, 3)), int(rng.integers(0, 3)))
+            update = self.joined(
+                update, biases=more.biases, edges=more.edges, observed=more.observed)
+        n, poses = len(self.truth), self.poses
+        nodes = [poses[k] for k in rng.integers(0, len(poses), int(rng.integers(0, 3)))]
         update = self.joined(
             update, edges=self.edges(self.pairs(int(rng.integers(0, 3)))),
             observed=self.observed(nodes, position=bool(rng.random() < 0.4),
@@ -373,6 +431,7 @@ def state(graph: Graph) -> dict[str, bytes]:
         np.array([row, c.parent, -1, *c.children, -1, *c.frontal, -1, *c.separator]).tobytes()
         + c.R.tobytes() + c.rhs.tobytes() + c.update.tobytes()
         for row, c in cliques(graph).items())
+    parts['newest'] = memory.head[tb.NEWEST].tobytes()
     parts['structure'] = bytes([int(memory.head[tb.STRUCTURE]) != 0])
     return parts
 

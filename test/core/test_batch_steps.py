@@ -23,9 +23,12 @@ seeds = st.integers(0, 2**32 - 1)
 def weighted_graph(seed: int, n_nodes: int = 12) -> Graph:
     """Return a graph with weights of all kinds, none of which loosens a part of it."""
     rng = np.random.default_rng(seed)
-    graph = random_graph(seed, n_nodes, 2 * n_nodes, 6, fix=(int(rng.integers(n_nodes)),))
-    chain = n_nodes - 1
-    weights = {int(e): float(rng.choice([0.0, 0.3, 2.5])) for e in range(chain, graph.n_edges)}
+    n_biases = int(rng.integers(0, 4))
+    graph = random_graph(
+        seed, n_nodes, 2 * n_nodes, 6, fix=(int(rng.integers(n_nodes)),), n_biases=n_biases)
+    loose = range(n_nodes - 1, graph.n_edges - 4 * n_biases)
+    weights = {int(e): float(rng.choice([0.0, 0.3, 2.5])) for e in loose}
+    weights |= {e: float(rng.choice([0.3, 2.5])) for e in range(loose.stop, graph.n_edges)}
     graph.apply(GraphUpdate(weigh_edges=weights, weigh_observed={0: 0.0, 1: 0.5}))
     return graph
 
@@ -89,10 +92,11 @@ def test_cliques_cover_the_graph_in_postorder(seed: int, n_nodes: int, extra: in
         assert {i, j} <= set(lists[first])
 
 
-def test_the_newest_node_is_alone_in_its_clique() -> None:
-    graph = random_graph(seed=1, n_nodes=30, n_edges=60)
+@pytest.mark.parametrize('n_biases', [0, 5])
+def test_the_newest_pose_is_alone_in_its_clique(n_biases: int) -> None:
+    graph = random_graph(seed=1, n_nodes=30, n_edges=60, n_biases=n_biases)
     cliques = symbolic.analyse(graph.memory.head).cliques
-    assert cliques.nodes[-1] == graph.n_nodes - 1
+    assert cliques.nodes[-1] == graph.newest_pose == 29
     assert cliques.n_frontal[-1] == 1
 
 

@@ -160,7 +160,7 @@ def test_nodes_know_how_stiff_their_constraints_are_now(seed: int, steps: int) -
     smoother = driven(seed, steps)
     graph, columns = smoother.graph, [tb.STIFF_T, tb.STIFF_R]
     other = Graph()
-    other.apply(GraphUpdate(hidden=graph.poses, edges=graph.edges, observed=graph.observed))
+    other.take_over(graph, graph.poses)
     actual, expected = (
         each.memory['node_f'][:each.n_nodes, columns] for each in (graph, other))
     # squares, which differences of large numbers leave

@@ -11,6 +11,7 @@ import pytest
 from random_graphs import (
     dense_system,
     random_edges,
+    random_edges_to_biases,
     random_graph,
     random_observed,
     random_poses,
@@ -38,6 +39,11 @@ def edge(
     information: object = (np.eye(3),), kind: object = (EdgeKind.ODOMETRY,),
 ) -> GraphUpdate:
     return GraphUpdate(edges=Edges(i, j, mean, information, kind))
+
+
+def edge_to_bias(bias: object) -> GraphUpdate:
+    return GraphUpdate(biases=np.zeros((1, 3)), edges=Edges(
+        [0], [N_NODES], np.zeros((1, 3)), [np.eye(3)], [EdgeKind.BIAS], bias=bias))
 
 
 def observed(
@@ -82,6 +88,16 @@ BAD_UPDATES = {
     'edge_information_zero': (
         lambda: edge(information=[np.zeros((3, 3))]), r'Edges\.information.*row 0'),
     'edge_kind_missing': (lambda: edge(kind=()), r'Edges\.kind.*\(1,\).*\(0,\)'),
+    'edge_to_a_pose_as_a_bias': (
+        lambda: edge(kind=[EdgeKind.BIAS]), r'kind BIAS to lead to a bias; row 0: 1'),
+    'edge_to_a_bias_of_another_kind': (
+        lambda: edge(j=[7])._replace(biases=np.zeros((1, 3))), r'other kind than BIAS.*\[0, 7\]'),
+    'edge_bias_shape': (
+        lambda: edge_to_bias([[1.0, 1.0]]), r'Edges\.bias.*\(1, 4\).*\(1, 2\)'),
+    'edge_bias_inf': (
+        lambda: edge_to_bias([[0.0, 0.0, np.inf, 1.0]]), r'Edges\.bias.*finite.*inf'),
+    'biases_shape': (lambda: GraphUpdate(biases=np.zeros((2, 2))), r'biases.*\(N, 3\).*\(2, 2\)'),
+    'biases_nan': (lambda: GraphUpdate(biases=np.full((1, 3), np.nan)), 'biases.*finite'),
     'edge_second_row': (
         lambda: edge([0, 2], [1, 9], np.zeros((2, 3)), [np.eye(3)] * 2, [0, 0]), 'row 1: 9'),
     'observed_outside': (lambda: observed(node=[7]), r'ObservedNodes.*0\.\.6.*row 0: 7'),
@@ -225,10 +241,12 @@ def test_writing_to_what_leaves_the_graph_does_not_change_it() -> None:
 
 def grow(graph: Graph, rng: np.random.Generator, n: int) -> None:
     first = graph.n_nodes
+    before = [graph.newest_pose, *range(first, first + n - 1)]
     graph.apply(GraphUpdate(
-        hidden=random_poses(rng, n),
-        edges=random_edges(rng, list(range(first - 1, first + n - 1)),
-                           list(range(first, first + n))),
+        hidden=random_poses(rng, n), edges=Edges.joined([
+            random_edges(rng, before, list(range(first, first + n))),
+            random_edges_to_biases(rng, [first, first], [first + n, first + n])]),
+        biases=random_poses(rng, 1),
         observed=random_observed(rng, list(range(first, first + n))), fix=(first,), free=(0,)))
 
 
@@ -237,7 +255,7 @@ def test_undoing_an_update_undoes_every_edit_bit_for_bit(
     seed: int, sizes: list[int],
 ) -> None:
     rng = np.random.default_rng(seed)
-    graph = random_graph(seed, fix=(0,))
+    graph = random_graph(seed, fix=(0,), n_biases=2)
     before = snapshot(graph)
     graph.begin()
     for size in sizes:
@@ -249,7 +267,7 @@ def test_undoing_an_update_undoes_every_edit_bit_for_bit(
     graph.undo()
     assert snapshot(graph) == before
     # and the graph grows on as if nothing had been
-    other = random_graph(seed, fix=(0,))
+    other = random_graph(seed, fix=(0,), n_biases=2)
     grow(graph, np.random.default_rng(seed), 5)
     grow(other, np.random.default_rng(seed), 5)
     assert snapshot(graph) == snapshot(other)

@@ -81,9 +81,14 @@ class Edits(RuleBasedStateMachine):
     @rule(seed=seeds, position=st.booleans(), offset=st.booleans())
     def observe(self, seed: int, position: bool, offset: bool) -> None:
         self.world.rng = np.random.default_rng(seed)
-        nodes = self.world.rng.integers(0, len(self.slow.poses), 2).tolist()
+        nodes = self.world.rng.choice(self.world.poses, 2).tolist()
         self.update(GraphUpdate(
             observed=self.world.observed(nodes, position=position, offset=offset)))
+
+    @rule(seed=seeds, count=st.integers(0, 2), measurements=st.integers(0, 3))
+    def measure_with_biases(self, seed: int, count: int, measurements: int) -> None:
+        self.world.rng = np.random.default_rng(seed)
+        self.update(self.world.new_biases(count, measurements))
 
     @rule(seed=seeds, weight=st.sampled_from([0.0, 0.1, 1.0, 7.0]), of_edge=st.booleans())
     def weigh(self, seed: int, weight: float, of_edge: bool) -> None:
@@ -187,8 +192,7 @@ def test_the_batch_solver_finds_nothing_better(seed: int) -> None:
             slow = slow.edited(update).at(smoother.poses)
         del here.truth[len(slow.poses):]
     other = Graph()
-    other.apply(GraphUpdate(hidden=slow.poses, edges=slow.edges, observed=slow.observed,
-                            fix=np.flatnonzero(slow.fixed).tolist()))
+    other.take_over(smoother.graph, slow.poses)
     before = smoother.chi2()
     batch.optimize(other, SolverConfig(max_iterations=50, step_tolerance=1e-12))
     np.testing.assert_allclose(other.poses, smoother.poses, atol=CLOSE)

@@ -38,16 +38,16 @@ def blocks_that_are_not_zero(H: FloatArray) -> npt.NDArray[np.bool_]:
 
 
 @given(seeds, st.integers(2, 9), st.integers(0, 8), st.integers(1, 6),
-       st.sets(st.integers(0, 8), max_size=3))
-def test_h_and_b_are_those_of_dense_loops(
-    seed: int, n_nodes: int, extra: int, n_observed: int, fixed: set[int],
+       st.sets(st.integers(0, 8), max_size=3), st.integers(0, 3))
+def test_h_and_b_are_those_of_dense_loops(  # noqa: PLR0917
+    seed: int, n_nodes: int, extra: int, n_observed: int, fixed: set[int], n_biases: int,
 ) -> None:
     fix = tuple(node for node in fixed if node < n_nodes)
-    graph = random_graph(seed, n_nodes, n_nodes - 1 + extra, n_observed, fix)
+    graph = random_graph(seed, n_nodes, n_nodes - 1 + extra, n_observed, fix, n_biases)
     system = LinearSystem(graph)
     H, b = system.assemble(graph.poses)
     H_dense, b_dense = free_part(graph, *dense_system(graph))
-    assert system.size == 3 * (n_nodes - len(fix)) == H.shape[0]
+    assert system.size == 3 * (n_nodes - len(fix) + n_biases) == H.shape[0]
     np.testing.assert_allclose(H.toarray(), H_dense, atol=ROUNDING)
     np.testing.assert_allclose(b, b_dense, atol=ROUNDING)
     np.testing.assert_array_equal(system.pattern(), blocks_that_are_not_zero(H_dense))

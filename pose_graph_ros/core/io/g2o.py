@@ -15,6 +15,9 @@ Tags that are read and written, one a line:
 The last is this project's own, as g2o has no tag for an observed node with an offset; other
 programs pass over it with a warning rather than misread it.
 
+There is no tag for a bias either, nor for what was measured with one: they are left out, and a
+comment says how many.
+
 A file does not keep the order of observed nodes with different tags, nor which edges are loop
 closures: those are taken to be the ones between ids that do not follow each other. Of a matrix
 the upper triangle is written.
@@ -310,10 +313,14 @@ def write_g2o(graph: Graph, path: Path, ids: IntArray | None = None) -> None:
 
     """
     names = (np.arange(graph.n_nodes) if ids is None else ids).tolist()
-    lines = [f'VERTEX_SE2 {name} {_text(pose)}'
-             for name, pose in zip(names, graph.poses, strict=True)]
-    lines += [f'FIX {names[node]}' for node in np.flatnonzero(graph.fixed)]
-    edges, observed = graph.edges, graph.observed
+    edges, observed, poses, is_pose = graph.edges, graph.observed, graph.poses, ~graph.is_bias
+    lines = [f'VERTEX_SE2 {names[node]} {_text(poses[node])}' for node in np.flatnonzero(is_pose)]
+    if not np.all(is_pose):
+        edges = edges.rows(edges.kind != EdgeKind.BIAS)
+        observed = observed.rows(is_pose[observed.node])
+        lines.insert(0, f'# left out: {np.sum(~is_pose)} biases, {graph.n_edges - len(edges)} '
+                        f'edges to them and {graph.n_observed - len(observed)} observed ones')
+    lines += [f'FIX {names[node]}' for node in np.flatnonzero(graph.fixed & is_pose)]
     for k in range(len(edges)):
         lines.append(f'EDGE_SE2 {names[edges.i[k]]} {names[edges.j[k]]} '
                      f'{_text(edges.mean[k])} {_upper(edges.information[k])}')
