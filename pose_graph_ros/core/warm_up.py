@@ -121,12 +121,22 @@ def _pose_of(node: int) -> ObservedNodes:
         [node], [STEP], np.zeros((1, 3)), INFORMATION[None], [ObservedKind.GLOBAL_POSE])
 
 
+def _with_a_bias(node: int) -> GraphUpdate:
+    """Return a bias, the node after this one, and an old node that was measured with it."""
+    return GraphUpdate(
+        biases=np.zeros((1, 3)), observed=ObservedNodes(
+            [node + 1], None, np.zeros((1, 3)), INFORMATION[None], [ObservedKind.GLOBAL_POSE]),
+        edges=Edges([3], [node + 1], STEP[None], INFORMATION[None], [EdgeKind.BIAS],
+                    bias=[[0.3, 0.1, 1.0, 0.1]]))
+
+
 def _update() -> None:
     """Tie far nodes together, observe an old one, weigh, remove, fix and free."""
     # with hardly any budget, so that something is linearized again
     smoother = _chain(SmootherConfig(alpha=1e-6, budget=1e-12, budget_share=1e-12))
     for update in (
             GraphUpdate(edges=_closures(N_NODES - 5)), GraphUpdate(observed=_pose_of(3)),
+            _with_a_bias(N_NODES - 1),
             GraphUpdate(weigh_edges={N_NODES - 1: 0.5}, weigh_observed={0: 0.5}),
             GraphUpdate(remove_edges=(N_NODES,), remove_observed=(1,)),
             GraphUpdate(fix=(5,)), GraphUpdate(free=(0, 5)), GraphUpdate()):
