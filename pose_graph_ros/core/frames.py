@@ -8,7 +8,7 @@ every linear model in it, made in map axes before the swing, is wrong after it. 
 a frame of its own, which is the map when the clique is eliminated and turns with its separator
 afterwards: its rows of R, and its update matrix, are equations in that frame. This is exact as
 long as the constraints below are relative ones, which a rigid motion does not change: a clique
-below which a node is fixed or observed is *anchored*, and its frame stays the map.
+below which a node is fixed, observed or tied to a bias is *anchored*, and its frame stays the map.
 
 With phi the angle of the frame and P a point in it, local coordinates are an affine function of
 the map's, and so of the unknowns delta:
