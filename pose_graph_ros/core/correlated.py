@@ -3,8 +3,8 @@
 """
 Sources whose errors live on from one measurement to the next, such as GNSS.
 
-The error of a measurement at t is `f m(t)` plus a white part: f^2 is the correlated share of the
-variance, and m a first-order Gauss-Markov process of variance 1 and time constant tau in each
+The error of a measurement at t is `f m(t)` plus a small white part: f^2 is the variance that the
+sender gives, and m a first-order Gauss-Markov process of variance 1 and time constant tau in each
 coordinate. m is estimated, as a *bias*: time is cut into bins of a small part of tau, each bin
 with measurements has one hidden state, and consecutive ones are tied by
 
@@ -34,6 +34,10 @@ from pose_graph_ros.core.sources import MeasurementSource
 
 # Bins in a time constant.
 BINS = 16
+# The third number of a state is wrapped as a heading is, so it is kept small: in units of so many
+# sigmas. Its variance is 1 / STRETCH^2.
+STRETCH = 10.0
+_INFORMATION = np.diag((1.0, 1.0, STRETCH**2))
 
 
 class GraphSizes(NamedTuple):
@@ -148,11 +152,11 @@ class BiasChain:
         """Tie a state to the one before; the first one has its variance alone."""
         if before is None:
             return additions.add_observed(ObservedNodes(
-                [row], None, np.zeros((1, 3)), np.eye(3)[None], [ObservedKind.GLOBAL_POSE]))
+                [row], None, np.zeros((1, 3)), _INFORMATION[None], [ObservedKind.GLOBAL_POSE]))
         phi = self._phi((number - before) * self._width_ns)
         return additions.add_edge(Edges(
             [row], [self._bins[before].row], np.zeros((1, 3)),
-            np.eye(3)[None] / (1.0 - phi * phi), [EdgeKind.BIAS],
+            _INFORMATION[None] / (1.0 - phi * phi), [EdgeKind.BIAS],
             bias=np.array([(0.0, 0.0, phi, phi)])))
 
 
@@ -209,20 +213,20 @@ def _biased_constraint(
     axes = np.eye(3)
     if isinstance(measurement, HeadingOnly):
         variance = measurement.variance
-        factors[1], rest = _split(variance, phi, white_share)
+        factors[1], rest = _split(variance, phi)
         mean[2] = measurement.heading - offset[2]
         information[2, 2] = 1.0 / (white_share * variance + rest + anchor.noise[2, 2])
     elif isinstance(measurement, Position):
         cov = measurement.covariance
-        factors[0], rest = _split(0.5 * float(np.trace(cov)), phi, white_share)
+        factors[0], rest = _split(0.5 * float(np.trace(cov)), phi)
         mean[:2] = measurement.position
         offset = se2.compose(anchor.motion, np.append(measurement.lever_arm, 0.0))
         information[:2, :2] = covariance.information(
             white_share * cov + (rest + swept_variance(measurement, anchor)) * np.eye(2))
     else:
         cov = measurement.covariance
-        factors[0], rest = _split(0.5 * float(np.trace(cov[:2, :2])), phi, white_share)
-        factors[1], rest_heading = _split(float(cov[2, 2]), phi, white_share)
+        factors[0], rest = _split(0.5 * float(np.trace(cov[:2, :2])), phi)
+        factors[1], rest_heading = _split(float(cov[2, 2]), phi)
         mean = measurement.pose - (0.0, 0.0, offset[2])
         axes[:2, :2] = se2.rotation(float(measurement.pose[2]))
         information = covariance.information(
@@ -230,10 +234,9 @@ def _biased_constraint(
             + axes @ anchor.noise @ axes.T)
     mean[2] = se2.wrap(mean[2])
     return Edges([anchor.node], [bias], [mean], [information], [EdgeKind.BIAS],
-                 bias=[(offset[0], offset[1], *(phi * factors))])
+                 bias=[(offset[0], offset[1], phi * factors[0], STRETCH * phi * factors[1])])
 
 
-def _split(variance: float, phi: float, white_share: float) -> tuple[float, float]:
-    """Return f of the correlated part, and the variance of what leaves its state within a bin."""
-    correlated = (1.0 - white_share) * variance
-    return math.sqrt(correlated), correlated * (1.0 - phi * phi)
+def _split(variance: float, phi: float) -> tuple[float, float]:
+    """Return f, and the variance of what leaves the state of the error within a bin."""
+    return math.sqrt(variance), variance * (1.0 - phi * phi)

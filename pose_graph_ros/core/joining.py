@@ -22,7 +22,7 @@ from pose_graph_ros.core.correlated import Additions, BiasChain, GraphSizes, Sha
 from pose_graph_ros.core.graph import Graph, GraphUpdate
 from pose_graph_ros.core.measurements import Absolute
 from pose_graph_ros.core.reweighing import Reweighing
-from pose_graph_ros.core.se2 import FloatArray, IntArray
+from pose_graph_ros.core.se2 import FloatArray
 from pose_graph_ros.core.sources import (
     Correlation,
     LOOP_CLOSURES,
@@ -108,12 +108,13 @@ class Joining:
         """Return the update that adds all of a queue; `finish` or `undo` comes next."""
         additions = Additions(GraphSizes(graph.n_nodes, graph.n_edges, graph.n_observed))
         self._enlisted.clear()
-        for chain in self._correlated.values():
-            chain.begin()
+        for old in self._correlated.values():
+            old.begin()
         for source, edge in queue.edges:
             self._enlisted.append((True, additions.add_edge(edge), source, -1))
         for bound in sorted(queue.observed, key=lambda bound: bound.measurement.stamp_ns):
-            stamp_ns, chain = bound.measurement.stamp_ns, self._chain(bound.source)
+            stamp_ns = bound.measurement.stamp_ns
+            chain = self._chain(bound.source)
             if isinstance(chain, BiasChain):
                 row = chain.add(bound.measurement, bound.anchor, additions)
             elif isinstance(chain, Shares):
@@ -133,7 +134,7 @@ class Joining:
             return None
         if source not in self._correlated:
             inflate = settings.correlation is Correlation.INFLATE
-            self._correlated[source] = (Shares if inflate else BiasChain)(settings)
+            self._correlated[source] = Shares(settings) if inflate else BiasChain(settings)
         return self._correlated[source]
 
     def undo(self) -> None:
@@ -192,8 +193,3 @@ def _biased_residuals(graph: Graph, edges: Edges) -> tuple[FloatArray, FloatArra
     variance = factor**2 + 1.0 / (0.5 * np.trace(
         edges.information[:, :2, :2], axis1=1, axis2=2) + 1e-12)
     return total, np.eye(2) / variance[:, None, None]
-
-
-def stamps_of(queue: Queue) -> IntArray:
-    """Return the stamps of the observed nodes of a queue [ns]."""
-    return np.array([bound.measurement.stamp_ns for bound in queue.observed], dtype=np.int64)

@@ -151,7 +151,7 @@ class MeasurementSource:
     """How long an error lives, its time constant [s]; 0 for white noise."""
     correlation: Correlation = Correlation.BIAS
     white_share: float = 0.05
-    """Part of the variance that is white all the same, in [0.001, 1]."""
+    """Variance of what is white beside that, in parts of the variance, in [0.001, 1]."""
 
     def __post_init__(self) -> None:
         require(self, 'rejection_threshold', positive=True)
