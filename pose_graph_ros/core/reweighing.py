@@ -22,7 +22,7 @@ from pose_graph_ros.core.sources import Loss
 # So many of the newest constraints are weighed at each update, and as many of the others.
 WINDOW = 200
 # A smaller change of a weight is left for later, between updates.
-LEAST_CHANGE = 0.02
+LEAST_CHANGE = 0.005
 
 _LOSSES = tuple(Loss)
 
