@@ -25,8 +25,9 @@ CORE = (
     'gauss_newton', 'descent', 'batch', 'starts', 'chain', 'sparse_inverse', 'marginals',
     'rescue', 'incremental',
     # what drives it
-    'timeline', 'odometry_stream', 'trajectory', 'alignment', 'tangent_plane', 'binding',
-    'hidden_nodes', 'pending', 'reweighing', 'closing', 'estimate', 'backend', 'prediction', 'io', 'io.g2o', 'io.tum', 'helper_process',
+    'timeline', 'odometry_stream', 'trajectory', 'consensus', 'alignment', 'tangent_plane',
+    'binding', 'hidden_nodes', 'pending', 'reweighing', 'closing', 'autocorrelation',
+    'correlated', 'joining', 'estimate', 'aligning', 'backend', 'prediction', 'io', 'io.g2o', 'io.tum', 'helper_process',
     'warm_up',
 )
 CORE_NEEDS = {'numpy', 'scipy', 'numba', 'pyproj'}
