@@ -16,8 +16,8 @@ MODULES = sorted(path.relative_to(PACKAGE) for path in PACKAGE.rglob('*.py'))
 
 # A module of core may import those before it, and no others.
 CORE = (
-    'kernel_cache', 'jit', 'exceptions', 'arrays', 'sources', 'config', 'se2', 'motion', 'covariance',
-    'measurements', 'admission', 'constraints', 'linearize', 'robust',
+    'kernel_cache', 'jit', 'exceptions', 'arrays', 'sources', 'config', 'se2', 'motion',
+    'covariance', 'measurements', 'admission', 'constraints', 'linearize', 'robust',
     # the engine
     'tables', 'vectors', 'cholesky', 'factors', 'undo', 'rows', 'ordering', 'frames', 'fronts',
     'structure', 'assembly', 'elimination', 'editing', 'graph', 'symbolic', 'complex_system',
@@ -27,8 +27,8 @@ CORE = (
     # what drives it
     'timeline', 'odometry_stream', 'trajectory', 'consensus', 'alignment', 'tangent_plane',
     'binding', 'hidden_nodes', 'pending', 'reweighing', 'closing', 'autocorrelation',
-    'correlated', 'joining', 'estimate', 'aligning', 'backend', 'prediction', 'io', 'io.g2o', 'io.tum', 'helper_process',
-    'warm_up',
+    'correlated', 'joining', 'estimate', 'aligning', 'backend', 'prediction', 'io', 'io.g2o',
+    'io.tum', 'helper_process', 'warm_up',
 )
 CORE_NEEDS = {'numpy', 'scipy', 'numba', 'pyproj'}
 

@@ -15,13 +15,13 @@ from typing import NamedTuple
 import numpy as np
 
 from pose_graph_ros.core import se2
-from pose_graph_ros.core.config import AlignmentPolicy, OdometryNoise
+from pose_graph_ros.core.config import AlignmentPolicy
 from pose_graph_ros.core.consensus import (
     Consensus,
     consensus,
-    Correlation,
     LARGEST_SCALE,
     LEAST_SHARE,
+    Lifetime,
     mirrored,
     Positions,
     positions_along,
@@ -30,6 +30,7 @@ from pose_graph_ros.core.constraints import ObservedKind, ObservedNodes
 from pose_graph_ros.core.covariance import UNKNOWN_HEADING_VARIANCE
 from pose_graph_ros.core.linearize import observed_errors
 from pose_graph_ros.core.se2 import FloatArray
+from pose_graph_ros.core.sources import OdometryNoise
 
 # A global pose tells the angle at once if its heading is at least this certain [rad].
 ALIGNING_SIGMA = 0.5
@@ -109,7 +110,7 @@ class Turn(NamedTuple):
 
 def find_turn(
     poses: FloatArray, observed: ObservedNodes, policy: AlignmentPolicy,
-    noise: OdometryNoise | None = None, correlation: Correlation | None = None,
+    noise: OdometryNoise | None = None, correlation: Lifetime | None = None,
 ) -> Turn:
     """
     Find the rigid motion that takes a graph into the map.
@@ -123,7 +124,7 @@ def find_turn(
     policy : AlignmentPolicy
     noise : OdometryNoise, optional
         Of the odometry that led from node to node.
-    correlation : Correlation, optional
+    correlation : Lifetime, optional
         Of the errors of the positions; None for white noise.
 
     """
@@ -142,7 +143,7 @@ def find_turn(
 
 def judge_again(
     solved: FloatArray, odometry: FloatArray, observed: ObservedNodes, policy: AlignmentPolicy,
-    noise: OdometryNoise | None = None, *, correlation: Correlation | None = None,
+    noise: OdometryNoise | None = None, *, correlation: Lifetime | None = None,
     sigma: float = 0.0,
 ) -> Turn | None:
     """

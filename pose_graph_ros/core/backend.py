@@ -19,6 +19,7 @@ import numpy as np
 
 from pose_graph_ros.core import alignment, batch, binding, closing, covariance, se2
 from pose_graph_ros.core.admission import admit
+from pose_graph_ros.core.aligning import Aligning, placed
 from pose_graph_ros.core.batch import Status
 from pose_graph_ros.core.config import BackendConfig
 from pose_graph_ros.core.estimate import AlignmentState, Estimate, UpdateReport
@@ -78,8 +79,7 @@ class PoseGraphBackend:
         self._reweighing = Reweighing()
         self._joins = Joining(self._config, self._reweighing)
         self._settled = True
-        self._alignment = AlignmentState.LOCAL
-        self._alignment_sigma = np.inf
+        self._aligning = Aligning(self._config)
         self._chi2 = 0.0
         self.counts: Counter[tuple[str, str]] = Counter()
         """How often each source got each answer: (source, 'accepted' or the reason)."""
@@ -231,8 +231,9 @@ class PoseGraphBackend:
         """Add what has come in to the graph and improve the estimate; for a timer."""
         if self.graph.n_nodes == 0:
             return UpdateReport(Status.CONVERGED, '', 0, 0, 0.0)
-        state = self._alignment, self._alignment_sigma
-        T_map_graph = self._align()
+        state = self._aligning.copy()
+        T_map_graph = self._aligning.find(
+            self.graph.poses, self._queue.observed, self._nodes.lead)
         joining = self._joining()
         if len(joining) == 0 and self._settled:
             return UpdateReport(Status.CONVERGED, '', 0, 0, self._chi2)
@@ -248,12 +249,14 @@ class PoseGraphBackend:
             if before is not None:
                 self.graph.set_poses(before)
                 self._settled = False
-            self._alignment, self._alignment_sigma = state
+            self._aligning.restore(state)
             self._quarantine.edges += joining.edges
             self._quarantine.observed += joining.observed
             self.counts['solver', 'failed'] += 1
             return UpdateReport(Status.FAILED, result.reason, 0, 0, self._chi2)
         self._joins.finish()
+        self._aligning.hear(joining.observed)
+        self._realign()
         result = self._reweighed(result)
         # the only thing here in proportion to the graph: 0.03 ms for 1000 nodes
         self._chi2 = self._smoother.chi2()
@@ -288,20 +291,21 @@ class PoseGraphBackend:
         """Take what can join the graph out of the queue; observed nodes wait for alignment."""
         joining = Queue(edges=self._queue.edges)
         self._queue.edges = []
-        if self._alignment is AlignmentState.ALIGNED:
+        if self._aligning.state is AlignmentState.ALIGNED:
             joining.observed, self._queue.observed = self._queue.observed, []
         return joining
 
-    def _align(self) -> FloatArray | None:
-        """Return the motion of the graph into the map, once the observed nodes tell it."""
-        if self._alignment is AlignmentState.ALIGNED or len(self._queue.observed) == 0:
-            return None
-        turn = alignment.find_turn(
-            self.graph.poses, self._queue.all_observed(), self._config.alignment)
-        self._alignment = (AlignmentState.UNALIGNED if turn.T_map_graph is None
-                           else AlignmentState.ALIGNED)
-        self._alignment_sigma = turn.sigma
-        return turn.T_map_graph
+    def _realign(self) -> None:
+        """Begin anew with another angle between odometry and map if the one in use is wrong."""
+        T_map_odom = self._aligning.judge_again(self.graph.poses, self._nodes)
+        if T_map_odom is None:
+            return
+        self.counts['alignment', 'done_over'] += 1
+        poses = self.graph.poses.copy()
+        poses[self._nodes.rows] = se2.compose(T_map_odom, self._nodes.odometry)
+        poses[self.graph.is_bias] = 0.0
+        self.graph.set_poses(poses)
+        self._solve_whole()
 
     def finish(self) -> None:
         """Wait for no older odometry any more: the newest samples count at the next update."""
@@ -347,10 +351,11 @@ class PoseGraphBackend:
         newest_ns, newest = self._nodes.newest_ns, se2.compose(poses[-1], motion.increment)
         cov = covariance.propagated(
             poses[-1], self._newest_node_covariance, motion.increment, noise)
-        if self._alignment is AlignmentState.UNALIGNED:
+        state, sigma = self._aligning.copy()
+        if state is AlignmentState.UNALIGNED:
             # those that turned the graph in an update that failed are set aside
-            shift, cov = alignment.guess(graph.poses, newest, Queue(
-                observed=self._queue.observed + self._quarantine.observed).all_observed())
+            shift, cov = alignment.guess(graph.poses, newest, Queue(observed=placed(
+                self._queue.observed + self._quarantine.observed)).all_observed())
             poses, newest = poses + shift, newest + shift
         if newest_ns > stamps[-1]:
             stamps, poses = np.append(stamps, newest_ns), np.vstack((poses, newest))
@@ -358,7 +363,8 @@ class PoseGraphBackend:
         return Estimate(
             path=Trajectory(stamps, poses), T_odom_base=odometry, T_map_base=newest,
             T_map_odom=se2.compose(newest, se2.inverse(odometry)), covariance=cov,
-            alignment=self._alignment, alignment_sigma=self._alignment_sigma, chi2=self._chi2,
+            alignment=state, chi2=self._chi2, alignment_sigma=(
+                math.sqrt(cov[2, 2]) if state is AlignmentState.ALIGNED else sigma),
             n_hidden=len(self._nodes), n_edges=graph.n_edges, n_observed=graph.n_observed,
             lead=lead, noise=self._config.odometry.get(lead, OdometrySource()).noise)
 

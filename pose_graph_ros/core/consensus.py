@@ -21,9 +21,9 @@ import numpy as np
 import numpy.typing as npt
 
 from pose_graph_ros.core import se2
-from pose_graph_ros.core.config import OdometryNoise
 from pose_graph_ros.core.constraints import ObservedKind, ObservedNodes
 from pose_graph_ros.core.se2 import FloatArray, IntArray
+from pose_graph_ros.core.sources import OdometryNoise
 
 BoolArray = npt.NDArray[np.bool_]
 ComplexArray = npt.NDArray[np.complex128]
@@ -96,7 +96,7 @@ class Positions:
                          | (rank * PER_PLACE // n != (rank - 1) * PER_PLACE // n))
 
 
-class Correlation(NamedTuple):
+class Lifetime(NamedTuple):
     """How long the errors of K positions live: they decay as exp(-t / time)."""
 
     stamps: FloatArray
@@ -110,7 +110,7 @@ class Correlation(NamedTuple):
 
 def positions_along(
     poses: FloatArray, observed: ObservedNodes, noise: OdometryNoise,
-    correlation: Correlation | None,
+    correlation: Lifetime | None,
 ) -> Positions:
     """
     Sort the observed nodes along the drive, and say how far odometry had come.
@@ -122,7 +122,7 @@ def positions_along(
     observed : ObservedNodes
         K >= 1; of a global pose the position counts.
     noise : OdometryNoise
-    correlation : Correlation, optional
+    correlation : Lifetime, optional
         Of their errors; None for white noise.
 
     """

@@ -63,7 +63,7 @@ class Estimate:
     """Of `T_map_base`, in map axes, shape (3, 3)."""
     alignment: AlignmentState
     alignment_sigma: float
-    """Of the heading between odometry and map when it was found [rad]; infinite before."""
+    """Of the heading between odometry and map [rad], infinite before anything is known of it."""
     chi2: float
     n_hidden: int
     n_edges: int

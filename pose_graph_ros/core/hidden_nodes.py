@@ -53,6 +53,7 @@ class HiddenNodes:
         self._stamps = GrowingArray((), np.int64)
         self._rows = GrowingArray((), np.int64)
         self._drivers = GrowingArray((), np.int64)
+        self._odometry = GrowingArray((3,), np.float64)
         self.streams: dict[str, OdometryStream] = {}
         """By the name of the source."""
         self.lead = ''
@@ -76,6 +77,11 @@ class HiddenNodes:
     def rows(self) -> IntArray:
         """Their rows in the graph, a read-only view."""
         return cast('IntArray', self._rows.read_only)
+
+    @property
+    def odometry(self) -> FloatArray:
+        """Where odometry alone puts the nodes, shape (N, 3), a read-only view."""
+        return cast('FloatArray', self._odometry.read_only)
 
     @property
     def covered_ns(self) -> int:
@@ -137,7 +143,7 @@ class HiddenNodes:
         self.lead, timeline = source, self.streams[source].timeline
         first_ns = int(timeline.stamps_ns[0])
         pose = timeline.pose(first_ns)
-        self._append(first_ns, self._make_node(pose, None, source), pose)
+        self._append(first_ns, self._make_node(pose, None, source), pose, pose)
         self._catch_up()
 
     def _catch_up(self) -> None:
@@ -146,7 +152,10 @@ class HiddenNodes:
         for stamp_ns in stamps[np.searchsorted(stamps, self.stamps_ns[-1], side='right'):]:
             self._extend(int(stamp_ns))
 
-    def _append(self, stamp_ns: int, row: int, base: FloatArray) -> None:
+    def _append(
+        self, stamp_ns: int, row: int, base: FloatArray, odometry: FloatArray,
+    ) -> None:
+        self._odometry.append_one(odometry)
         self._stamps.append_one(stamp_ns)
         self._rows.append_one(row)
         self._drivers.append_one(list(self.streams).index(self.lead))
@@ -171,7 +180,7 @@ class HiddenNodes:
     ) -> None:
         row = self._make_node(mean, covariance.information(noise), self.lead)
         if row >= 0:
-            self._append(stamp_ns, row, base)
+            self._append(stamp_ns, row, base, se2.compose(self.odometry[-1], mean))
 
     def _follow(self, source: str) -> None:
         """Let another source lead: the one that did is silent."""

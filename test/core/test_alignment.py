@@ -11,8 +11,9 @@ from scipy.optimize import least_squares
 
 from pose_graph_ros.core import se2
 from pose_graph_ros.core.alignment import align, certain, find_turn, judge_again, Turn
-from pose_graph_ros.core.config import AlignmentPolicy, OdometryNoise
-from pose_graph_ros.core.consensus import Consensus, Correlation, positions_along
+from pose_graph_ros.core.config import AlignmentPolicy
+from pose_graph_ros.core.sources import OdometryNoise
+from pose_graph_ros.core.consensus import Consensus, Lifetime, positions_along
 from pose_graph_ros.core.constraints import ObservedKind, ObservedNodes
 from pose_graph_ros.core.se2 import FloatArray, IntArray
 
@@ -218,10 +219,10 @@ def test_the_order_of_the_rows_changes_nothing(seed: int, n: int, share: float) 
     bad = rng.permutation(n)[:int(share * n)]
     some = some.moved(bad, 40.0 * rng.standard_normal((len(bad), 2)))
     order = rng.permutation(n)
-    times = Correlation(some.stamp, 30.0)
+    times = Lifetime(some.stamp, 30.0)
     turn = found(some, correlation=times)
     other = find_turn(some.odometry, some.observed.rows(order), POLICY, NOISE,
-                      Correlation(times.stamps[order], 30.0))
+                      Lifetime(times.stamps[order], 30.0))
     assert (turn.sigma, turn.node) == (other.sigma, other.node)
     np.testing.assert_array_equal(turn.T_map_graph, other.T_map_graph)
 
@@ -250,7 +251,7 @@ def normalised_errors(n: int, gap: float, *, told: bool = False, **arguments: fl
     squares = []
     for seed in range(300):
         some = drive(seed, n, gap, **arguments)
-        times = Correlation(some.stamp, arguments['time']) if told else None
+        times = Lifetime(some.stamp, arguments['time']) if told else None
         turn = found(some, correlation=times)
         if turn.T_map_graph is not None:
             squares.append((some.error(turn) / turn.sigma)**2)
@@ -280,12 +281,12 @@ def test_the_sigma_is_no_smaller_than_the_errors_where_they_live_for_a_minute(
 def test_errors_that_live_long_are_worth_less() -> None:
     some = drive(0, 300, 1.0)
     white = found(some).sigma
-    assert found(some, correlation=Correlation(some.stamp, 0.0)).sigma == white
-    assert found(some, correlation=Correlation(some.stamp, 30.0)).sigma > white
+    assert found(some, correlation=Lifetime(some.stamp, 0.0)).sigma == white
+    assert found(some, correlation=Lifetime(some.stamp, 30.0)).sigma > white
     # those of different receivers do not add up: it is as if each were known to be better
     times = np.where(np.arange(300) % 2 == 0, 30.0, 30.1)
-    both = found(some, correlation=Correlation(some.stamp, times)).sigma
-    assert white < both < found(some, correlation=Correlation(some.stamp, 30.0)).sigma
+    both = found(some, correlation=Lifetime(some.stamp, times)).sigma
+    assert white < both < found(some, correlation=Lifetime(some.stamp, 30.0)).sigma
 
 
 def test_covariances_that_are_too_small_are_seen_from_the_residuals() -> None:
