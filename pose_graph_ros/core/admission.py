@@ -15,10 +15,10 @@ import numpy as np
 
 from pose_graph_ros.core import covariance
 from pose_graph_ros.core.measurements import (
-    Absolute,
     Answer,
     GlobalPose,
     HeadingOnly,
+    LARGEST_STAMP,
     LoopClosure,
     Measurement,
     Position,
@@ -51,21 +51,18 @@ def admit(measurement: Measurement, policy: CovariancePolicy) -> Admitted | Answ
     broken = value_defect(_numbers(measurement))
     if broken is not None:
         return rejected(broken, f'{kind}: {_numbers(measurement).tolist()}')
-    if measurement.stamp_ns <= 0:
-        return rejected('zero_stamp', f'{kind} without a stamp')
+    stamps = _stamps(measurement)
+    if stamps[0] <= 0 or any(abs(stamp) > LARGEST_STAMP for stamp in stamps):
+        return rejected('zero_stamp' if stamps[0] <= 0 else 'no_stamp', f'{kind}: {stamps}')
     if isinstance(measurement, HeadingOnly):
         return _admit_heading(measurement, policy)
     cov, repairs = np.array(measurement.covariance, dtype=np.float64), []
-    unknown = not np.any(cov)
-    if len(policy.override) > 0:
-        sigmas = np.append(np.repeat(policy.override[0], 2), policy.override[1:])
-        if isinstance(measurement, GlobalPose) and len(sigmas) == 2:
-            sigmas = np.append(sigmas, np.sqrt(cov[2, 2]) if _known(cov[2, 2]) else np.inf)
-        cov = np.diag(sigmas[:len(cov)]**2)
-    elif _says_nothing(cov[0, 0]) and _says_nothing(cov[1, 1]) and len(cov) == 3:
+    if len(cov) == 3 and _says_nothing(cov[0, 0]) and _says_nothing(cov[1, 1]):
         return _without_position(measurement, cov, policy)
-    elif unknown and policy.repair:
-        cov = np.diag(_defaults(policy))[:len(cov), :len(cov)].copy()
+    if len(policy.override) > 0:
+        cov = _overridden(cov, policy)
+    elif not np.any(cov) and policy.repair:
+        cov = np.diag(_defaults(policy)[:len(cov)])
         repairs.append('default_covariance')
         if isinstance(measurement, GlobalPose) and policy.heading is not Heading.ALWAYS:
             cov[2, 2] = np.inf  # who does not know the covariance knows no heading either
@@ -119,34 +116,56 @@ def _numbers(measurement: Measurement) -> FloatArray:
     return measurement.pose
 
 
+def _overridden(cov: FloatArray, policy: CovariancePolicy) -> FloatArray:
+    """Return the covariance, shape (d, d), with the sigmas that are taken instead."""
+    variances = np.diagonal(cov).copy()
+    variances[:2] = policy.override[0]**2
+    if len(policy.override) == 2:
+        variances[2:] = policy.override[1]**2
+    return np.diag(variances)
+
+
+def _stamps(measurement: Measurement) -> tuple[int, ...]:
+    if isinstance(measurement, LoopClosure):
+        return (measurement.stamp_ns, measurement.reference_ns or 0,
+                measurement.reference_node or 0)
+    return (measurement.stamp_ns,)
+
+
 def _admit_heading(measurement: HeadingOnly, policy: CovariancePolicy) -> Admitted | Answer:
     variance, repairs = measurement.variance, []
     if len(policy.override) == 2:
         variance = policy.override[1]**2
-    elif not 0.0 < variance < np.inf:
+    elif not variance > 0.0:
         if not policy.repair:
             return rejected('covariance_not_positive', f'variance of a heading: {variance}')
         variance = policy.default_heading**2
         repairs.append('default_covariance')
     if not _known(variance):
         return rejected('no_information', f'variance of a heading: {variance}')
-    variance = max(policy.scale * variance, policy.heading_floor**2)
-    return Admitted(replace(measurement, variance=variance), tuple(repairs))
+    return Admitted(
+        replace(measurement, variance=_heading_variance(variance, policy)), tuple(repairs))
 
 
 def _without_position(
-    measurement: Absolute | LoopClosure, cov: FloatArray, policy: CovariancePolicy,
+    measurement: GlobalPose | LoopClosure | Position, cov: FloatArray, policy: CovariancePolicy,
 ) -> Admitted | Answer:
     """Admit a pose, or a relative pose, whose heading alone means something."""
-    if isinstance(measurement, Position) or not _known(cov[2, 2]):
+    variance = float(cov[2, 2]) if len(policy.override) < 2 else policy.override[1]**2
+    never = isinstance(measurement, GlobalPose) and policy.heading is Heading.NEVER
+    if isinstance(measurement, Position) or never or not _known(variance):
         return rejected('no_information', f'{type(measurement).__name__}: {cov.tolist()}')
-    variance = max(policy.scale * float(cov[2, 2]), policy.heading_floor**2)
+    variance = _heading_variance(variance, policy)
     if isinstance(measurement, LoopClosure):
         return Admitted(replace(measurement, covariance=np.diag((np.inf, np.inf, variance))), ())
-    if policy.heading is Heading.NEVER:
-        return rejected('no_information', f'{type(measurement).__name__}: {cov.tolist()}')
     return Admitted(
         HeadingOnly(measurement.stamp_ns, float(measurement.pose[2]), variance), ())
+
+
+def _heading_variance(variance: float, policy: CovariancePolicy) -> float:
+    """Return a known variance of a heading alone, with the factor, the floor and the ceiling."""
+    return min(max(policy.scale * variance, policy.heading_floor**2),
+               covariance.UNKNOWN_HEADING_VARIANCE)
 
 
 def _with_heading_judged(

@@ -36,7 +36,7 @@ from pose_graph_ros.core.measurements import (
     rejected,
     Verdict,
 )
-from pose_graph_ros.core.pending import MAX_PENDING, Pending, Seen
+from pose_graph_ros.core.pending import due_ns, MAX_PENDING, Pending, Seen
 from pose_graph_ros.core.reweighing import Reweighing
 from pose_graph_ros.core.se2 import FloatArray, IntArray
 from pose_graph_ros.core.sources import OdometrySource
@@ -107,9 +107,8 @@ class PoseGraphBackend:
     @property
     def revision(self) -> int:
         """Changes whenever odometry jumps, or another one leads: the estimate is then stale."""
-        streams = self._nodes.streams
-        return (sum(stream.n_jumps for stream in streams.values())
-                + 1_000_000 * list(streams).index(self._nodes.lead) if self._nodes.lead else -1)
+        jumps = sum(stream.n_jumps_seen for stream in self._nodes.streams.values())
+        return jumps + 1_000_000_000 * self._nodes.n_leads
 
     def reports(self) -> dict[str, SourceReport]:
         """Return how well the measurements of each source fit the estimate."""
@@ -121,18 +120,20 @@ class PoseGraphBackend:
 
     def add_odometry(self, sample: OdometrySample, source: str = 'odom') -> Answer:
         """Take an odometry sample; make a hidden node and its edge if the policy says so."""
-        jumps = self._n_jumps(source)
         answer = self._count(source, self._nodes.take(sample, source))
-        if self._n_jumps(source) > jumps:
-            self.counts[source, 'jump'] += 1
-        self._queue.edges += self._nodes.edges
-        self._nodes.edges.clear()
-        self._bind_due()
+        self._collect()
         return answer
 
-    def _n_jumps(self, source: str) -> int:
-        stream = self._nodes.streams.get(source)
-        return 0 if stream is None else stream.n_jumps
+    def _collect(self) -> None:
+        """Take what odometry has led to: edges, counts, and measurements that are due."""
+        self._queue.edges += self._nodes.edges
+        self._nodes.edges.clear()
+        for source, stream in self._nodes.streams.items():
+            if stream.n_jumps > 0:
+                self.counts[source, 'jump'] = stream.n_jumps
+            if stream.n_dropped > 0:
+                self.counts[source, 'stamp_ahead'] = stream.n_dropped
+        self._bind_due()
 
     def _make_node(self, mean: FloatArray, information: FloatArray | None, source: str) -> int:
         """Append a hidden node to the graph; return its row, or -1 if that failed."""
@@ -152,8 +153,10 @@ class PoseGraphBackend:
         return self.graph.newest_pose
 
     def _bind_due(self) -> None:
-        for source, measurement in self._pending.pop_due(self._nodes.covered_ns):
-            self._count(source, self._bind(measurement, source))
+        if len(self._pending) == 0:
+            return
+        for waiting in self._pending.pop_due(self._nodes.covered_ns):
+            self._count(waiting.source, self._bind(waiting.measurement, waiting.source))
 
     def add_measurement(self, measurement: Measurement, source: str) -> Answer:
         """
@@ -169,26 +172,29 @@ class PoseGraphBackend:
         admitted = admit(measurement, self._joins.settings(source, closure=closure).covariance)
         if isinstance(admitted, Answer):
             return admitted
-        checked, key = admitted.measurement, source
-        due_ns = checked.stamp_ns
-        if isinstance(checked, LoopClosure):
-            key = f'{source} {checked.reference_ns} {checked.reference_node}'
-            due_ns = max(due_ns, checked.reference_ns or 0)
-        if self._seen.has(key, checked.stamp_ns):
+        checked = admitted.measurement
+        if self._seen.has(source, checked):
             return rejected('duplicate_stamp', f'{source} at {checked.stamp_ns} came before')
-        if due_ns <= self._nodes.covered_ns:
+        if due_ns(checked) <= self._nodes.covered_ns:
             answer = self._bind(checked, source)
-        elif self._pending.full:
-            answer = rejected(
-                'too_many_pending', f'{MAX_PENDING} measurements wait for odometry')
         else:
-            self._pending.push(due_ns, source, checked)
-            answer = Answer(Verdict.PENDING, 'pending', 'waits for odometry to reach its stamp')
+            answer = self._let_wait(checked, source)
         if answer.verdict is not Verdict.REJECTED:
-            self._seen.add(key, checked.stamp_ns)
+            self._seen.add(source, checked)
             for repair in admitted.repairs:
                 self.counts[source, repair] += 1
         return answer
+
+    def _let_wait(self, measurement: Measurement, source: str) -> Answer:
+        """Let a measurement wait for odometry, in the place of the one that waits longest."""
+        excess = self._pending.push(source, measurement)
+        if excess is not None:
+            answer = rejected('too_many_pending', f'{MAX_PENDING} measurements wait for odometry')
+            if excess.measurement is measurement:
+                return answer
+            self._count(excess.source, answer)
+            self._seen.remove(excess.source, excess.measurement)
+        return Answer(Verdict.PENDING, 'pending', 'waits for odometry to reach its stamp')
 
     def _bind(self, measurement: Measurement, source: str) -> Answer:
         """Turn a measurement that odometry has reached into a constraint for the next update."""
@@ -310,9 +316,7 @@ class PoseGraphBackend:
     def finish(self) -> None:
         """Wait for no older odometry any more: the newest samples count at the next update."""
         self._nodes.finish()
-        self._queue.edges += self._nodes.edges
-        self._nodes.edges.clear()
-        self._bind_due()
+        self._collect()
 
     def optimize(self) -> UpdateReport:
         """Optimise fully, once more with what had been set aside: the end of a stream."""
@@ -348,9 +352,8 @@ class PoseGraphBackend:
             return None
         poses, stamps = graph.poses[self._nodes.rows], self.node_stamps_ns
         motion, noise, odometry = self._nodes.newest()
-        newest_ns, newest = self._nodes.newest_ns, se2.compose(poses[-1], motion.increment)
-        cov = covariance.propagated(
-            poses[-1], self._newest_node_covariance, motion.increment, noise)
+        newest_ns, newest = self._nodes.newest_ns, se2.compose(poses[-1], motion)
+        cov = covariance.propagated(poses[-1], self._newest_node_covariance, motion, noise)
         state, sigma = self._aligning.copy()
         if state is AlignmentState.UNALIGNED:
             # those that turned the graph in an update that failed are set aside

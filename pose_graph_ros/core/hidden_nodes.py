@@ -4,12 +4,16 @@
 Hidden nodes: when odometry makes them, and what every source of odometry says of them.
 
 One source of odometry leads: the samples at which a node is due are its samples, and its motion
-ties each node to the one before. If it falls so far behind another one that it must be silent,
-that one leads from there on. Every other source ties the nodes too, at whose stamps its own
-samples are interpolated; a source without samples there ties the next nodes on both sides.
+ties each node to the one before. If it is silent for longer than the patience, another one leads
+from its last sample on. Every other source ties the nodes too, at whose stamps its own samples
+are interpolated; a source without samples there ties the next nodes on both sides.
+
+Who leads from when on follows from the stamps alone, as long as the samples of all sources come
+in the order of their stamps but for the reorder window: at an instant that a source has settled
+all that was before it is there.
 """
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable
 import math
 from typing import cast
 
@@ -21,16 +25,17 @@ from pose_graph_ros.core.binding import Anchor
 from pose_graph_ros.core.config import BackendConfig
 from pose_graph_ros.core.constraints import EdgeKind, Edges
 from pose_graph_ros.core.measurements import Answer, OdometrySample
-from pose_graph_ros.core.motion import Motion
-from pose_graph_ros.core.odometry_stream import LOOSE, OdometryStream
+from pose_graph_ros.core.motion import Pose, wrap_one
+from pose_graph_ros.core.odometry_stream import LOOSE, MEMORY_TIME, OdometryStream
 from pose_graph_ros.core.se2 import FloatArray, IntArray
 from pose_graph_ros.core.sources import OdometrySource
-
-# A source says nothing of an instant between two samples that are further apart [ns].
-LARGEST_GAP_NS = 1_000_000_000
+from pose_graph_ros.core.timeline import OdometryTimeline
 
 MakeNode = Callable[[FloatArray, FloatArray | None, str], int]
 """Takes the pose of the first node, or pose and information of an edge; returns the row or -1."""
+
+# The speed of a robot is looked at over so long [ns].
+SPEED_TIME_NS = 500_000_000
 
 
 class HiddenNodes:
@@ -49,17 +54,21 @@ class HiddenNodes:
 
     def __init__(self, config: BackendConfig, make_node: MakeNode) -> None:
         self._config = config
+        self._patience_ns = round(config.odometry_patience * 1e9)
         self._make_node = make_node
         self._stamps = GrowingArray((), np.int64)
         self._rows = GrowingArray((), np.int64)
-        self._drivers = GrowingArray((), np.int64)
         self._odometry = GrowingArray((3,), np.float64)
         self.streams: dict[str, OdometryStream] = {}
         """By the name of the source."""
-        self.lead = ''
-        """Source that makes the nodes; empty before the first odometry."""
-        self._base = np.zeros(3)
-        """Its pose at the newest node."""
+        self._leads: list[tuple[int, str]] = []
+        """Who leads, each with the stamp after which it does."""
+        self._lead_ns = -1
+        """Stamp of the newest sample at which the leading source may have made a node."""
+        self._base_ns, self._base = -1, (0.0, 0.0, 0.0)
+        """From there, by its pose, it says how far it is to the next node: the newest node ..."""
+        self._bridge: tuple[FloatArray, FloatArray] | None = None
+        """... or what was known of the motion from there when it began to lead, (3,), (3, 3)."""
         self._tied: dict[str, tuple[int, int]] = {}
         """For each source the newest node that it ties (-1: none), and the next to look at."""
         self.edges: list[tuple[str, Edges]] = []
@@ -84,14 +93,24 @@ class HiddenNodes:
         return cast('FloatArray', self._odometry.read_only)
 
     @property
+    def lead(self) -> str:
+        """Source that makes the nodes; empty before the first one."""
+        return self._leads[-1][1] if self._leads else ''
+
+    @property
+    def n_leads(self) -> int:
+        """How often a source began to lead."""
+        return len(self._leads)
+
+    @property
     def covered_ns(self) -> int:
         """Up to which stamp [ns] everything is settled; -1 before the first odometry."""
-        return self.streams[self.lead].settled_ns if self.lead != '' else -1
+        return self._lead_ns
 
     @property
     def newest_ns(self) -> int:
         """Stamp of the newest sample of the leading source [ns]."""
-        return self.streams[self.lead].newest_ns if self.lead != '' else -1
+        return self.streams[self.lead].newest_ns if self._leads else -1
 
     def take(self, sample: OdometrySample, source: str) -> Answer:
         """Take an odometry sample, and make what nodes and edges are due."""
@@ -101,118 +120,178 @@ class HiddenNodes:
             self.streams[source] = stream
             self._tied[source] = -1, 0
         answer = stream.add(sample)
-        self._grow(source, stream.settle())
+        self._go_on(source, stream.settle())
         return answer
 
     def finish(self) -> None:
         """Settle all samples: no older ones are expected any more."""
-        for source, stream in self.streams.items():
-            self._grow(source, stream.settle(everything=True))
-        ready = [name for name in self._preferred()
-                 if name in self.streams and self.streams[name].settled_ns >= 0]
-        if self.lead == '' and len(ready) > 0:
+        for source, stream in list(self.streams.items()):
+            self._go_on(source, stream.settle(stream.newest_ns))
+        ready = [name for name in self._preferred() if self._began(name) is not None]
+        if not self._leads and len(ready) > 0:
             self._begin(ready[0])
             self._tie()
 
-    def _grow(self, source: str, settled: Iterator[int]) -> None:
-        for stamp_ns in settled:
-            if source == self.lead:
-                self._extend(stamp_ns)
-        stream = self.streams[source]
-        patience_ns = round(self._config.odometry_patience * 1e9)
-        if stream.settled_ns < 0:
-            return
-        if self.lead == '':
-            # the preferred source may be a little later than others
-            if source == self._preferred()[0] or (
-                    stream.settled_ns - stream.timeline.stamps_ns[0] >= patience_ns):
-                self._begin(source)
-        elif source != self.lead and stream.settled_ns > self.newest_ns + patience_ns:
-            self._follow(source)
+    def _go_on(self, source: str, settled: Iterable[tuple[int, Pose]]) -> None:
+        """Do what follows from the settled samples of a source."""
+        for stamp_ns, pose in settled:
+            if not self._leads:
+                self._choose(stamp_ns)
+            elif stamp_ns - self._lead_ns > self._patience_ns:
+                self._look_for_silence(source, stamp_ns)
+            if self._leads and source == self.lead and stamp_ns > self._lead_ns:
+                self._extend(stamp_ns, pose)
         self._tie()
 
     def _preferred(self) -> list[str]:
         """Return the sources in the order in which they are to lead."""
         named = [name for name in self._config.odometry if name in self.streams]
-        others = [name for name in self.streams if name not in named]
-        first = [name for name in self._config.odometry if name not in self.streams][:1]
-        return sorted(named + first, key=list(self._config.odometry).index) + others
+        return named + [name for name in self.streams if name not in named]
+
+    def _began(self, source: str) -> int | None:
+        return self.streams[source].first_after(-1)
+
+    def _choose(self, settled_ns: int) -> None:
+        """
+        Let a source begin to lead, as all is known up to an instant.
+
+        The preferred one begins at once; it may be later than others, but no more than their
+        patience.
+        """
+        preferred = self._preferred()
+        first = next(iter(self._config.odometry), preferred[0])
+        instants = []
+        for name in preferred:
+            begin_ns = self._began(name)
+            if begin_ns is not None and name != first:
+                begin_ns = self.streams[name].first_after(begin_ns + self._patience_ns - 1)
+            if begin_ns is not None and begin_ns <= settled_ns:
+                instants.append(begin_ns)
+        if len(instants) > 0:
+            until_ns = min(instants)
+            self._begin(next(name for name in preferred
+                             if (self._began(name) or until_ns + 1) <= until_ns))
 
     def _begin(self, source: str) -> None:
-        """Make the first node; a source begins to lead."""
-        self.lead, timeline = source, self.streams[source].timeline
-        first_ns = int(timeline.stamps_ns[0])
-        pose = timeline.pose(first_ns)
-        self._append(first_ns, self._make_node(pose, None, source), pose, pose)
+        """Make the first node."""
+        stream = self.streams[source]
+        first_ns = self._began(source)
+        assert first_ns is not None
+        for _ in stream.settle(first_ns):
+            pass
+        pose = stream.timeline.poses[0]
+        self._leads.append((-1, source))
+        self._lead_ns = self._base_ns = first_ns
+        x, y, theta = pose.tolist()
+        self._append(
+            first_ns, self._make_node(pose.copy(), None, source), (x, y, theta), pose.copy())
+        self._catch_up()
+
+    def _look_for_silence(self, source: str, settled_ns: int) -> None:
+        """Let another source lead if the one that does was silent before a settled sample."""
+        lead, last_ns = self.lead, self._lead_ns
+        others = [name for name in self._preferred() if name != lead]
+        while True:
+            # its next sample, before which it is silent
+            next_ns = settled_ns if source == lead else self.streams[lead].first_after(last_ns)
+            until_ns = settled_ns + 1 if next_ns is None else min(next_ns, settled_ns + 1)
+            after = (self.streams[name].first_after(last_ns + self._patience_ns)
+                     for name in others)
+            there = [instant_ns for instant_ns in after
+                     if instant_ns is not None and instant_ns < until_ns]
+            if len(there) > 0:
+                self._follow(last_ns, min(there))
+                return
+            if next_ns is None or next_ns >= settled_ns:
+                return
+            last_ns = next_ns
+
+    def _follow(self, last_ns: int, instant_ns: int) -> None:
+        """Let another source lead after the last sample of the one that does, now silent."""
+        old = self.streams[self.lead]
+        for stamp_ns, pose in old.settle(last_ns):
+            self._extend(stamp_ns, pose)
+        source = next(
+            name for name in self._preferred() if name != self.lead
+            and (self.streams[name].first_after(last_ns) or instant_ns + 1) <= instant_ns)
+        stream = self.streams[source]
+        for _ in stream.settle(instant_ns):
+            pass
+        self._tie()
+        timeline, node_ns = stream.timeline, int(self.stamps_ns[-1])
+        self._leads.append((last_ns, source))
+        if self._bridge is None and timeline.covers(node_ns):
+            self._base_ns = node_ns
+        else:
+            # it began later than the newest node
+            begin_ns = int(timeline.stamps_ns[0])
+            self._bridge = self._moved(old, min(begin_ns, last_ns))
+            self._base_ns = begin_ns
+            if begin_ns > last_ns:
+                self._bridge = self._bridged(*_blind(old.timeline, last_ns, begin_ns))
+        x, y, theta = timeline.pose(self._base_ns).tolist()
+        self._base, self._lead_ns = (x, y, theta), last_ns
         self._catch_up()
 
     def _catch_up(self) -> None:
-        """Make the nodes that are due at settled samples after the newest node."""
-        stamps = self.streams[self.lead].timeline.stamps_ns.copy()
-        for stamp_ns in stamps[np.searchsorted(stamps, self.stamps_ns[-1], side='right'):]:
-            self._extend(int(stamp_ns))
+        """Make the nodes that are due at settled samples of a source that has begun to lead."""
+        source = self.lead
+        timeline = self.streams[source].timeline
+        begin = int(np.searchsorted(timeline.stamps_ns, self._lead_ns, side='right'))
+        samples = zip(timeline.stamps_ns[begin:].tolist(), timeline.poses[begin:].tolist(),
+                      strict=True)
+        for stamp_ns, (x, y, theta) in list(samples):
+            if stamp_ns - self._lead_ns > self._patience_ns:
+                self._look_for_silence(source, stamp_ns)
+            if self.lead != source:
+                return  # the one that leads now has caught up
+            self._extend(stamp_ns, (x, y, theta))
 
-    def _append(
-        self, stamp_ns: int, row: int, base: FloatArray, odometry: FloatArray,
-    ) -> None:
+    def _append(self, stamp_ns: int, row: int, base: Pose, odometry: FloatArray) -> None:
         self._odometry.append_one(odometry)
         self._stamps.append_one(stamp_ns)
         self._rows.append_one(row)
-        self._drivers.append_one(list(self.streams).index(self.lead))
-        self._base = base
+        self._base_ns, self._base, self._bridge = stamp_ns, base, None
         node = len(self) - 1
         self._tied[self.lead] = node, node + 1
 
-    def _extend(self, stamp_ns: int) -> None:
+    def _extend(self, stamp_ns: int, pose: Pose) -> None:
         """Make a node at a settled sample of the leading source, if one is due."""
-        stream = self.streams[self.lead]
-        pose, last_ns = stream.timeline.pose(stamp_ns), int(self.stamps_ns[-1])
-        difference = pose - self._base
-        if not self._config.nodes.due(
-                math.hypot(difference[0], difference[1]), abs(float(se2.wrap(difference[2]))),
-                (stamp_ns - last_ns) * 1e-9):
+        self._lead_ns, base = stamp_ns, self._base
+        if self._bridge is None and not self._config.nodes.due(
+                math.hypot(pose[0] - base[0], pose[1] - base[1]),
+                abs(wrap_one(pose[2] - base[2])), (stamp_ns - self._base_ns) * 1e-9):
             return
-        motion = stream.timeline.motion(last_ns, stamp_ns)
-        self._make(stamp_ns, motion.increment, stream.covariance(motion), pose)
-
-    def _make(
-        self, stamp_ns: int, mean: FloatArray, noise: FloatArray, base: FloatArray,
-    ) -> None:
+        mean, noise = self._moved(self.streams[self.lead], stamp_ns)
         row = self._make_node(mean, covariance.information(noise), self.lead)
         if row >= 0:
-            self._append(stamp_ns, row, base, se2.compose(self.odometry[-1], mean))
+            self._append(stamp_ns, row, pose, se2.compose(self.odometry[-1], mean))
 
-    def _follow(self, source: str) -> None:
-        """Let another source lead: the one that did is silent."""
-        old = self.streams[self.lead]
-        for stamp_ns in old.settle(everything=True):
-            self._extend(stamp_ns)
-        self._tie()
-        self.lead, timeline = source, self.streams[source].timeline
-        last_ns = int(self.stamps_ns[-1])
-        if timeline.covers(last_ns):
-            self._base = timeline.pose(last_ns)
-        else:
-            # it began later: what was in between is not known
-            begin_ns = int(timeline.stamps_ns[0])
-            motion = old.timeline.motion(last_ns, old.settled_ns)
-            time = (begin_ns - old.settled_ns) * 1e-9
-            loose = np.array((LOOSE[0] + time, LOOSE[0] + time, LOOSE[1] + 0.1 * time))
-            self._make(begin_ns, motion.increment, old.covariance(motion) + np.diag(loose**2),
-                       timeline.pose(begin_ns))
-        self._catch_up()
+    def _moved(
+        self, stream: OdometryStream, stamp_ns: int, *, floor: bool = True,
+    ) -> tuple[FloatArray, FloatArray]:
+        """Return the motion since the newest node and its covariance."""
+        motion = stream.timeline.motion(self._base_ns, stamp_ns)
+        return self._bridged(motion.increment, stream.covariance(motion, floor=floor))
+
+    def _bridged(self, mean: FloatArray, noise: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Put the motion up to where the leading source began to lead before its own."""
+        if self._bridge is None:
+            return mean, noise
+        carry = se2.adjoint(se2.inverse(mean))
+        return (se2.compose(self._bridge[0], mean), carry @ self._bridge[1] @ carry.T + noise)
 
     def _tie(self) -> None:
         """Add the edges of the sources that do not lead."""
-        if len(self.streams) == 1:
+        if len(self.streams) == 1 or not self._leads:
             return
-        stamps = self.stamps_ns
+        stamps, lead = self.stamps_ns, self.lead
         for source, stream in self.streams.items():
-            if source == self.lead:
+            if source == lead:
                 continue
             last, node = self._tied[source]
             while node < len(stamps) and stamps[node] <= stream.settled_ns:
-                if stream.timeline.covers(int(stamps[node]), LARGEST_GAP_NS):
+                if stream.timeline.covers(int(stamps[node]), closely=True):
                     if last >= 0:
                         motion = stream.timeline.motion(int(stamps[last]), int(stamps[node]))
                         self.edges.append((source, Edges(
@@ -227,24 +306,34 @@ class HiddenNodes:
         """
         Return a stamp as seen from the last hidden node before it; None if no odometry tells.
 
-        The stamp is not before the first node and not after `covered_ns`.
+        The stamp is not before the first node and not after `covered_ns`. The source that led at
+        that instant tells, whatever has come since.
         """
         node = int(np.searchsorted(self.stamps_ns, stamp_ns, side='right')) - 1
         node_ns, row = int(self.stamps_ns[node]), int(self.rows[node])
-        names = list(self.streams)
-        # who made the next node knows the motion to it; after the newest node it is who leads
-        candidates = [self.lead if node + 1 == len(self)
-                      else names[self._drivers.values[node + 1]]]
-        candidates += [name for name in names if name not in candidates]
-        for name in candidates:
-            stream = self.streams[name]
-            if stream.timeline.covers(node_ns) and stream.timeline.covers(stamp_ns):
-                motion = stream.timeline.motion(node_ns, stamp_ns)
-                return Anchor(row, motion.increment, stream.covariance(motion, floor=False))
-        return None
+        source = next(name for after_ns, name in reversed(self._leads) if after_ns < stamp_ns)
+        stream = self.streams[source]
+        if not (stream.timeline.covers(node_ns) and stream.timeline.covers(stamp_ns)):
+            return None
+        motion = stream.timeline.motion(node_ns, stamp_ns)
+        return Anchor(row, motion.increment, stream.covariance(motion, floor=False))
 
-    def newest(self) -> tuple[Motion, FloatArray, FloatArray]:
+    def newest(self) -> tuple[FloatArray, FloatArray, FloatArray]:
         """Return motion since the newest node, its covariance, and odometry as it came."""
         stream = self.streams[self.lead]
-        motion, raw = stream.newest(int(self.stamps_ns[-1]))
-        return motion, stream.covariance(motion, floor=False), raw
+        motion, raw = stream.newest(self._base_ns)
+        return *self._bridged(motion.increment, stream.covariance(motion, floor=False)), raw
+
+
+def _blind(
+    timeline: OdometryTimeline, last_ns: int, until_ns: int,
+) -> tuple[FloatArray, FloatArray]:
+    """Guess the motion after the last sample before a silence, and its covariance."""
+    begin_ns = max(int(timeline.stamps_ns[0]), last_ns - SPEED_TIME_NS)
+    motion, time = timeline.motion(begin_ns, last_ns), (last_ns - begin_ns) * 1e-9
+    elapsed = (until_ns - last_ns) * 1e-9
+    share = elapsed / time if time > 0.0 else 0.0
+    sigma = np.array((LOOSE[0] + motion.distance * share, LOOSE[0] + motion.distance * share,
+                      LOOSE[1] + motion.turn * share))
+    mean = motion.increment * min(share, MEMORY_TIME / time if time > 0.0 else 0.0)
+    return se2.wrapped(mean), np.diag(sigma**2)

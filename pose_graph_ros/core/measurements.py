@@ -17,6 +17,8 @@ from pose_graph_ros.core.se2 import FloatArray
 # No coordinate of a map or of odometry is larger [m, rad]; numbers beyond are broken ones, and
 # their squares would not fit.
 LARGEST_COORDINATE = 1e9
+# No stamp is later than the year 2116 [ns].
+LARGEST_STAMP = 2**62
 
 
 @dataclass(frozen=True, slots=True)

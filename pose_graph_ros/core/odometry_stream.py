@@ -16,18 +16,20 @@ from typing import NamedTuple
 
 import numpy as np
 
-from pose_graph_ros.core import covariance, se2
+from pose_graph_ros.core import covariance
 from pose_graph_ros.core.measurements import (
     ACCEPTED,
     Answer,
+    LARGEST_COORDINATE,
+    LARGEST_STAMP,
     OdometrySample,
     rejected,
     value_defect,
 )
-from pose_graph_ros.core.motion import Motion
+from pose_graph_ros.core.motion import between_one, compose_one, Motion, Pose, wrap_one
 from pose_graph_ros.core.se2 import FloatArray
 from pose_graph_ros.core.sources import NoiseFrom, OdometrySource
-from pose_graph_ros.core.timeline import OdometryTimeline
+from pose_graph_ros.core.timeline import next_row, NOTHING, OdometryTimeline, Row, Variances
 
 # A motion within the first of these is no jump, whatever the time [m, rad].
 SLACK = (0.25, 0.5)
@@ -41,24 +43,54 @@ LEAST_TIME = 0.05
 MEMORY_TIME = 2.0
 # Standard deviations of the motion at a jump: at least, and of the speed before [m, rad].
 LOOSE = (0.5, 0.1)
-# A motion of less than this between two samples is none [m or rad].
-NO_STEP = 1e-6
+# A variance of a twist beyond this, or one of zero, says nothing [m^2/s^2, rad^2/s^2].
+LARGEST_TWIST_VARIANCE = 1e4
+# A sample whose stamp lies so far ahead of this many that come after it is a mistake [ns].
+FAR_AHEAD_NS = 10_000_000_000
+MANY_BEHIND = 5
+
+
+class _Sample(NamedTuple):
+    """An odometry sample as it came."""
+
+    stamp_ns: int
+    pose: Pose
+    speed: float
+    variance: Variances | None
+
+
+class _Rate(NamedTuple):
+    """How fast the robot moves by odometry: [m/s] and [rad/s]."""
+
+    velocity: Pose
+    """In the robot's frame, and turn rate."""
+    recent: tuple[float, float]
+    """Greatest speed and turn rate of late; infinite before the first are known."""
+    ever: tuple[float, float]
+    """Greatest speed and turn rate so far; likewise."""
+
+
+_UNKNOWN = _Rate((0.0, 0.0, 0.0), (math.inf, math.inf), (math.inf, math.inf))
 
 
 class _Instant(NamedTuple):
     """The state of a source at a sample."""
 
-    stamp_ns: int
-    raw: FloatArray
+    raw: Pose
     """As it came."""
-    pose: FloatArray
-    """In a frame without jumps."""
-    velocity: FloatArray
-    """In the robot's frame, shape (3,)."""
-    recent: FloatArray
-    """Greatest speed and turn rate of late, shape (2,); infinite at the first sample."""
-    ever: FloatArray
-    """Greatest speed and turn rate so far, shape (2,); likewise."""
+    row: Row
+    """In a frame without jumps, with what has been counted."""
+    offset: Pose | None
+    """Pose of the odometry's own frame in that one; None before the first jump."""
+    rate: _Rate
+    since_ns: int
+    """The rate is taken anew over the time from here on ..."""
+    since: Pose
+    """... the pose there ..."""
+    way: tuple[float, float]
+    """... and the path length and turns since."""
+    jumped: bool
+    """Whether odometry jumped to here."""
 
 
 class OdometryStream:
@@ -76,6 +108,8 @@ class OdometryStream:
         """Samples that are settled, in a frame without jumps."""
         self.n_jumps = 0
         """Jumps among the settled samples."""
+        self.n_dropped = 0
+        """Samples that were taken, but whose stamps turned out to be far ahead of their time."""
         self._source = source
         self._noise = source.noise
         if source.noise_from is NoiseFrom.TWIST:
@@ -83,9 +117,13 @@ class OdometryStream:
             self._noise = replace(source.noise, sigma_distance=0.0, sigma_lateral=0.0,
                                   sigma_heading_distance=0.0, sigma_heading_turn=0.0)
         self._window_ns = round(source.reorder_window * 1e9)
-        self._waiting: list[OdometrySample] = []
+        self._waiting: list[_Sample] = []
         """By stamp, all newer than what is settled."""
+        self._ahead: list[_Instant] = []
+        """The states at the first of them, as far as they have been worked out."""
         self._last: _Instant | None = None
+        self._n_behind = 0
+        """How many have come since that are far behind the newest."""
 
     @property
     def newest_ns(self) -> int:
@@ -95,40 +133,87 @@ class OdometryStream:
     @property
     def settled_ns(self) -> int:
         """Stamp of the newest settled sample [ns]; -1 before the first."""
-        return -1 if self._last is None else self._last.stamp_ns
+        return -1 if self._last is None else self._last.row.stamp_ns
+
+    @property
+    def n_jumps_seen(self) -> int:
+        """Jumps among all samples, settled or not."""
+        self._look_ahead()
+        return self.n_jumps + sum(instant.jumped for instant in self._ahead)
 
     def add(self, sample: OdometrySample) -> Answer:
         """Take a sample, or say why it cannot be used."""
-        if sample.stamp_ns <= 0:
-            return rejected('zero_stamp', 'odometry without a stamp')
-        broken = value_defect(sample.pose)
-        if broken is not None:
-            return rejected(broken, f'odometry pose {sample.pose.tolist()}')
+        if not 0 < sample.stamp_ns <= LARGEST_STAMP:
+            return rejected('zero_stamp' if sample.stamp_ns <= 0 else 'no_stamp',
+                            f'odometry at {sample.stamp_ns}')
+        x, y, theta = sample.pose.tolist()
+        if not (abs(x) <= LARGEST_COORDINATE and abs(y) <= LARGEST_COORDINATE
+                and abs(theta) <= LARGEST_COORDINATE):
+            return rejected(value_defect(sample.pose) or '', f'odometry pose {[x, y, theta]}')
         if sample.stamp_ns <= self.settled_ns:
             return rejected(*self._late(sample.stamp_ns))
-        at = bisect.bisect_left(self._waiting, sample.stamp_ns, key=_stamp)
-        if at < len(self._waiting) and self._waiting[at].stamp_ns == sample.stamp_ns:
-            return rejected('duplicate_stamp', f'odometry at {sample.stamp_ns} came before')
-        self._waiting.insert(at, replace(sample, pose=se2.wrapped(sample.pose)))
+        at = len(self._waiting)
+        if at > 0 and sample.stamp_ns <= self._waiting[-1].stamp_ns:
+            at = bisect.bisect_left(self._waiting, sample.stamp_ns, key=_stamp)
+            if self._waiting[at].stamp_ns == sample.stamp_ns:
+                return rejected('duplicate_stamp', f'odometry at {sample.stamp_ns} came before')
+            del self._ahead[at:]
+        variance = sample.twist_variance
+        self._waiting.insert(at, _Sample(
+            sample.stamp_ns, (x, y, wrap_one(theta)), sample.speed,
+            None if variance is None else tuple(variance.tolist())))
+        behind = self._waiting[-1].stamp_ns - sample.stamp_ns > FAR_AHEAD_NS + self._window_ns
+        self._n_behind = self._n_behind + 1 if behind else 0
+        if self._n_behind >= MANY_BEHIND:
+            self._drop_far_ahead(sample.stamp_ns)
         return ACCEPTED
+
+    def _drop_far_ahead(self, now_ns: int) -> None:
+        """Forget the samples that are far ahead of the others."""
+        kept = bisect.bisect_right(
+            self._waiting, now_ns + FAR_AHEAD_NS + self._window_ns, key=_stamp)
+        self.n_dropped += len(self._waiting) - kept
+        del self._waiting[kept:], self._ahead[kept:]
+        self._n_behind = 0
 
     def _late(self, stamp_ns: int) -> tuple[str, str]:
         stamps = self.timeline.stamps_ns
         at = int(np.searchsorted(stamps, stamp_ns))
-        came = at < len(stamps) and stamps[at] == stamp_ns
+        came = at < len(stamps) and (stamps[at] == stamp_ns or self.timeline.dense(at))
         return ('duplicate_stamp' if came else 'out_of_order',
                 f'odometry at {stamp_ns} after {self.settled_ns}')
 
-    def settle(self, *, everything: bool = False) -> Iterator[int]:
-        """Settle what nothing older can be expected for; yield the stamps [ns], one by one."""
-        until = self.newest_ns - (0 if everything else self._window_ns)
-        while self._waiting and self._waiting[0].stamp_ns <= until:
-            sample = self._waiting.pop(0)
-            before = self._last
-            self._last, variance, jumped = self._carried(before, sample)
-            self.n_jumps += jumped
-            self.timeline.append(sample.stamp_ns, self._last.pose, variance)
-            yield sample.stamp_ns
+    def settle(self, until_ns: int | None = None) -> Iterator[tuple[int, Pose]]:
+        """
+        Settle samples up to a stamp, or what nothing older can be expected for.
+
+        Yields
+        ------
+        stamp_ns : int
+        pose : tuple
+            In a frame without jumps. The sample is in the timeline by then, the next one is not.
+
+        """
+        if until_ns is None:
+            until_ns = self.newest_ns - self._window_ns
+        while self._waiting and self._waiting[0].stamp_ns <= until_ns:
+            if not self._ahead:
+                self._ahead.append(self._carried(self._last, self._waiting[0]))
+            del self._waiting[0]
+            self._last = self._ahead.pop(0)
+            self.n_jumps += self._last.jumped
+            self.timeline.append_row(self._last.row)
+            yield self._last.row.stamp_ns, self._last.row.pose
+
+    def first_after(self, stamp_ns: int) -> int | None:
+        """Return the stamp of the first sample after an instant [ns], settled or not."""
+        if self.settled_ns > stamp_ns:
+            stamps = self.timeline.stamps_ns
+            at = int(np.searchsorted(stamps, stamp_ns, side='right'))
+            # one that was left out lies somewhere in between
+            return stamp_ns + 1 if self.timeline.dense(at) and at > 0 else int(stamps[at])
+        at = bisect.bisect_right(self._waiting, stamp_ns, key=_stamp)
+        return self._waiting[at].stamp_ns if at < len(self._waiting) else None
 
     def covariance(self, motion: Motion, *, floor: bool = True) -> FloatArray:
         """Return the covariance, shape (3, 3), of a motion by this odometry, at its end."""
@@ -137,77 +222,96 @@ class OdometryStream:
 
     def newest(self, since_ns: int) -> tuple[Motion, FloatArray]:
         """Return the motion from a settled instant to the newest sample, and that, as it came."""
-        last = self._last
+        self._look_ahead()
+        last = self._ahead[-1] if self._ahead else self._last
         if last is None:
-            raise ValueError('there is no settled odometry')
-        motion = self.timeline.motion(since_ns, last.stamp_ns)
-        distance, turn, variance = motion.distance, motion.turn, motion.variance.copy()
-        start = last.pose
-        for sample in self._waiting:
-            before = last
-            last, more, _ = self._carried(before, sample)
-            distance += math.hypot(*(last.pose - before.pose)[:2])
-            turn += abs(float(se2.wrap(last.pose[2] - before.pose[2])))
-            variance += more
-        increment = se2.compose(motion.increment, se2.between(start, last.pose))
-        return Motion(increment, distance, turn, variance), last.raw
+            raise ValueError('there is no odometry')
+        return self.timeline.motion_to(since_ns, last.row), np.array(last.raw)
 
-    def _carried(
-        self, before: _Instant | None, sample: OdometrySample,
-    ) -> tuple[_Instant, FloatArray, bool]:
-        """Return the state at a sample, the variance of the motion to it, if it was a jump."""
+    def _look_ahead(self) -> None:
+        """Work out the states at all samples that wait."""
+        for sample in self._waiting[len(self._ahead):]:
+            self._ahead.append(self._carried(
+                self._ahead[-1] if self._ahead else self._last, sample))
+
+    def _carried(self, before: _Instant | None, sample: _Sample) -> _Instant:
+        """Return the state at a sample."""
+        stamp_ns, raw = sample.stamp_ns, sample.pose
         if before is None:
-            unknown = np.full(2, np.inf)
-            return (_Instant(sample.stamp_ns, sample.pose, sample.pose, np.zeros(3), unknown,
-                             unknown), np.zeros(3), False)
-        step = se2.between(before.raw, sample.pose)
-        elapsed = (sample.stamp_ns - before.stamp_ns) * 1e-9
-        if self._is_jump(before, sample.stamp_ns, step, sample.speed):
-            guessed = se2.compose(before.pose, before.velocity * min(elapsed, MEMORY_TIME))
-            speed = np.where(np.isfinite(before.recent), before.recent, 0.0) * elapsed
-            loose = np.array((LOOSE[0] + speed[0], LOOSE[0] + speed[0], LOOSE[1] + speed[1]))
-            return before._replace(
-                stamp_ns=sample.stamp_ns, raw=sample.pose, pose=guessed), loose**2, True
-        time = max(elapsed, LEAST_TIME)
-        measure = np.array((math.hypot(step[0], step[1]), abs(step[2])))
-        rate = measure / time
-        recent = ever = rate
-        if math.isfinite(before.ever[0]):
-            recent = np.maximum(rate, math.exp(-elapsed / MEMORY_TIME) * before.recent)
-            ever = np.maximum(rate, before.ever)
-        after = _Instant(sample.stamp_ns, sample.pose, se2.compose(before.pose, step),
-                         step / time, recent, ever)
-        return after, self._step_variance(sample, measure, elapsed), False
+            return _Instant(raw, next_row(None, stamp_ns, raw), None, _UNKNOWN, stamp_ns,
+                            raw, (0.0, 0.0), jumped=False)
+        step = between_one(before.raw, raw)
+        elapsed = (stamp_ns - before.row.stamp_ns) * 1e-9
+        moved = math.hypot(step[0], step[1]), abs(step[2])
+        if self._is_jump(before.rate, moved, elapsed, sample.speed):
+            return _after_jump(before, stamp_ns, raw, elapsed)
+        offset, rate = before.offset, before.rate
+        pose = raw if offset is None else compose_one(offset, raw)
+        row = next_row(before.row, stamp_ns, pose, self._step_variance(sample, moved, elapsed))
+        way = before.way[0] + moved[0], before.way[1] + moved[1]
+        time = (stamp_ns - before.since_ns) * 1e-9
+        if time < LEAST_TIME:
+            return _Instant(
+                raw, row, offset, rate, before.since_ns, before.since, way, jumped=False)
+        speed = way[0] / time, way[1] / time
+        x, y, theta = between_one(before.since, pose)
+        velocity = x / time, y / time, theta / time
+        if rate is _UNKNOWN:
+            rate = _Rate(velocity, speed, speed)
+        else:
+            decay = math.exp(-time / MEMORY_TIME)
+            rate = _Rate(
+                velocity,
+                (max(speed[0], decay * rate.recent[0]), max(speed[1], decay * rate.recent[1])),
+                (max(speed[0], rate.ever[0]), max(speed[1], rate.ever[1])))
+        return _Instant(raw, row, offset, rate, stamp_ns, pose, (0.0, 0.0), jumped=False)
 
     def _is_jump(
-        self, before: _Instant, stamp_ns: int, step: FloatArray, speed: float = 0.0,
+        self, rate: _Rate, moved: tuple[float, float], elapsed: float, speed: float,
     ) -> bool:
         """Tell whether a step is farther than the robot can have moved in the time."""
-        time = max((stamp_ns - before.stamp_ns) * 1e-9, LEAST_TIME)
-        moved = math.hypot(step[0], step[1]), abs(float(step[2]))
-        recent = max(float(before.recent[0]), abs(speed)), float(before.recent[1])
-        for k, most in ((0, self._source.maximum_speed), (1, math.inf)):
-            ever = max(float(before.ever[k]), recent[k])
-            allowed = min(2.0 * recent[k] + ACCELERATION[k] * max(time, 0.1),
+        if moved[0] <= SLACK[0] and moved[1] <= SLACK[1]:
+            return False
+        time = max(elapsed, LEAST_TIME)
+        stated = abs(speed) if math.isfinite(speed) else 0.0
+        for k, stated_k, most in ((0, stated, self._source.maximum_speed), (1, 0.0, math.inf)):
+            recent, ever = max(rate.recent[k], stated_k), max(rate.ever[k], stated_k)
+            allowed = min(2.0 * recent + ACCELERATION[k] * max(time, 0.1),
                           2.0 * ever + MORE_SPEED[k], most)
             if moved[k] > SLACK[k] + allowed * time:
                 return True
         return False
 
     def _step_variance(
-        self, sample: OdometrySample, measure: FloatArray, elapsed: float,
-    ) -> FloatArray:
+        self, sample: _Sample, moved: tuple[float, float], elapsed: float,
+    ) -> Variances:
         """Return the variance of (x, y, theta) of a step, where it is taken from the twist."""
-        if self._source.noise_from is not NoiseFrom.TWIST or np.max(measure) < NO_STEP:
-            return np.zeros(3)  # at rest nothing is measured that could be wrong
-        if sample.twist_variance is not None:
-            return np.asarray(sample.twist_variance * elapsed)
+        if self._source.noise_from is not NoiseFrom.TWIST:
+            return NOTHING
         noise = self._source.noise
-        return np.array((
-            noise.sigma_distance**2 * measure[0], noise.sigma_lateral**2 * measure[0],
-            noise.sigma_heading_distance**2 * measure[0]
-            + noise.sigma_heading_turn**2 * measure[1]))
+        by_model = (
+            noise.sigma_distance**2 * moved[0], noise.sigma_lateral**2 * moved[0],
+            noise.sigma_heading_distance**2 * moved[0] + noise.sigma_heading_turn**2 * moved[1])
+        if sample.variance is None:
+            return by_model
+        x, y, theta = (
+            variance * elapsed if 0.0 < variance <= LARGEST_TWIST_VARIANCE else instead
+            for variance, instead in zip(sample.variance, by_model, strict=True))
+        return x, y, theta
 
 
-def _stamp(sample: OdometrySample) -> int:
+def _after_jump(before: _Instant, stamp_ns: int, raw: Pose, elapsed: float) -> _Instant:
+    """Return the state at a sample to which odometry has jumped."""
+    time = min(elapsed, MEMORY_TIME)
+    x, y, theta = before.rate.velocity
+    pose = compose_one(before.row.pose, (x * time, y * time, wrap_one(theta * time)))
+    way, turn = (rate * elapsed if math.isfinite(rate) else 0.0 for rate in before.rate.recent)
+    position, heading = (LOOSE[0] + way)**2, (LOOSE[1] + turn)**2
+    row = next_row(before.row, stamp_ns, pose, loose=(position, position, heading))
+    offset = compose_one(pose, between_one(raw, (0.0, 0.0, 0.0)))
+    return before._replace(raw=raw, row=row, offset=offset, since_ns=stamp_ns, since=pose,
+                           way=(0.0, 0.0), jumped=True)
+
+
+def _stamp(sample: _Sample) -> int:
     return sample.stamp_ns

@@ -4,56 +4,109 @@
 
 from array import array
 import bisect
-from collections.abc import Iterator
-import heapq
 import itertools
+from typing import NamedTuple
 
-from pose_graph_ros.core.measurements import Measurement
+from pose_graph_ros.core.measurements import LoopClosure, Measurement
 
 # A sender whose clock is ahead must not fill the memory.
 MAX_PENDING = 10_000
+
+
+class Waiting(NamedTuple):
+    """A measurement that waits."""
+
+    due_ns: int
+    arrival: int
+    """So many came before it."""
+    source: str
+    measurement: Measurement
 
 
 class Pending:
     """Measurements by the stamp at which they are due."""
 
     def __init__(self) -> None:
-        self._heap: list[tuple[int, int, str, Measurement]] = []
+        self._waiting: list[Waiting] = []
+        """The one that is due last first."""
         self._arrival = itertools.count()
 
     def __len__(self) -> int:
-        return len(self._heap)
+        return len(self._waiting)
 
-    @property
-    def full(self) -> bool:
-        """Whether no more can wait."""
-        return len(self) >= MAX_PENDING
+    def push(self, source: str, measurement: Measurement) -> Waiting | None:
+        """
+        Let a measurement wait.
 
-    def push(self, due_ns: int, source: str, measurement: Measurement) -> None:
-        """Let a measurement wait."""
-        heapq.heappush(self._heap, (due_ns, next(self._arrival), source, measurement))
+        Returns
+        -------
+        Waiting or None
+            Where there are too many, that which would have to wait longest: a sender whose clock
+            is ahead does not keep out the others.
 
-    def pop_due(self, covered_ns: int) -> Iterator[tuple[str, Measurement]]:
+        """
+        waiting = Waiting(due_ns(measurement), next(self._arrival), source, measurement)
+        bisect.insort(self._waiting, waiting, key=_last_first)
+        return self._waiting.pop(0) if len(self) > MAX_PENDING else None
+
+    def pop_due(self, covered_ns: int) -> list[Waiting]:
         """Hand out what is due, the oldest first."""
-        while self._heap and self._heap[0][0] <= covered_ns:
-            _, _, source, measurement = heapq.heappop(self._heap)
-            yield source, measurement
+        at = bisect.bisect_left(self._waiting, (-covered_ns, -next(self._arrival)),
+                                key=_last_first)
+        due = self._waiting[at:]
+        del self._waiting[at:]
+        return due[::-1]
+
+
+def _last_first(waiting: Waiting) -> tuple[int, int]:
+    return -waiting.due_ns, -waiting.arrival
 
 
 class Seen:
-    """Stamps that have come before, by source: 8 bytes each."""
+    """Which measurements have come before, by source and stamps: 16 bytes each."""
 
     def __init__(self) -> None:
         self._stamps: dict[str, array[int]] = {}
+        self._references: dict[str, array[int]] = {}
 
-    def has(self, key: str, stamp_ns: int) -> bool:
-        """Tell whether a stamp has been added under a key."""
-        stamps = self._stamps.get(key)
+    def has(self, source: str, measurement: Measurement) -> bool:
+        """Tell whether there was one with the same stamp, and the same reference."""
+        return self._find(source, measurement) >= 0
+
+    def add(self, source: str, measurement: Measurement) -> None:
+        """Add a measurement; in order it costs nothing."""
+        stamps = self._stamps.setdefault(source, array('q'))
+        at = bisect.bisect_right(stamps, measurement.stamp_ns)
+        stamps.insert(at, measurement.stamp_ns)
+        self._references.setdefault(source, array('q')).insert(at, _reference(measurement))
+
+    def remove(self, source: str, measurement: Measurement) -> None:
+        """Forget a measurement that has been added."""
+        at = self._find(source, measurement)
+        if at >= 0:
+            del self._stamps[source][at], self._references[source][at]
+
+    def _find(self, source: str, measurement: Measurement) -> int:
+        stamps = self._stamps.get(source)
         if stamps is None:
-            return False
-        at = bisect.bisect_left(stamps, stamp_ns)
-        return at < len(stamps) and stamps[at] == stamp_ns
+            return -1
+        begin = bisect.bisect_left(stamps, measurement.stamp_ns)
+        end = bisect.bisect_right(stamps, measurement.stamp_ns)
+        reference, references = _reference(measurement), self._references[source]
+        return next((at for at in range(begin, end) if references[at] == reference), -1)
 
-    def add(self, key: str, stamp_ns: int) -> None:
-        """Add a stamp; in order it costs nothing."""
-        bisect.insort(self._stamps.setdefault(key, array('q')), stamp_ns)
+
+def due_ns(measurement: Measurement) -> int:
+    """Return the stamp [ns] that odometry must have reached."""
+    if isinstance(measurement, LoopClosure) and measurement.reference_ns is not None:
+        return max(measurement.stamp_ns, measurement.reference_ns)
+    return measurement.stamp_ns
+
+
+def _reference(measurement: Measurement) -> int:
+    """Return what tells a measurement from others at its stamp."""
+    if not isinstance(measurement, LoopClosure):
+        return 0
+    if measurement.reference_ns is not None:
+        return measurement.reference_ns
+    return -1 if measurement.reference_node is None else -2 - measurement.reference_node

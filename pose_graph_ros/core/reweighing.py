@@ -10,6 +10,7 @@ again and again, from a start that does not depend on what was before.
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
+from typing import cast
 
 import numpy as np
 
@@ -35,6 +36,11 @@ class _Rows:
     losses: GrowingArray = field(default_factory=lambda: GrowingArray((2,), np.float64))
     """Index of the loss, and its threshold."""
     cursor: int = 0
+
+    @property
+    def numbers(self) -> IntArray:
+        """Their numbers in the graph."""
+        return cast('IntArray', self.rows.values)
 
     def add(self, row: int, loss: Loss, threshold: float) -> None:
         self.rows.append_one(row)
@@ -94,7 +100,7 @@ class Reweighing:
             index = np.arange(len(table.rows))
             if len(index) == 0:
                 continue
-            energy, weight = _energies(graph, table.rows.values, edges=edges)
+            energy, weight = _energies(graph, table.numbers[index], edges=edges)
             for loss, threshold, chosen in _groups(table, index):
                 total += float(np.sum(robust.costs(loss, energy[chosen], threshold)
                                       - weight[chosen] * energy[chosen]))
@@ -105,7 +111,7 @@ class Reweighing:
     ) -> Mapping[int, float]:
         if len(index) == 0:
             return {}
-        rows = table.rows.values[index]
+        rows = table.numbers[index]
         energy, weight = _energies(graph, rows, edges=edges)
         wanted = np.empty(len(index))
         for loss, threshold, chosen in _groups(table, index):

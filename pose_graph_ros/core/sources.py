@@ -8,6 +8,9 @@ import math
 
 from pose_graph_ros.core.exceptions import ConfigError
 
+# Sigma of a heading that is uniform on the circle [rad].
+FLAT_GUESS = math.pi / math.sqrt(3.0)
+
 
 def require(settings: object, *names: str, positive: bool = False) -> None:
     """Raise ConfigError unless the named settings are finite and not negative (or positive)."""
@@ -130,13 +133,17 @@ class CovariancePolicy:
     def __post_init__(self) -> None:
         require(self, 'scale', 'position_floor', 'heading_floor', 'position_ceiling',
                 'default_position', 'default_heading', positive=True)
-        if len(self.override) not in (0, 1, 2) or not all(s > 0.0 for s in self.override):
+        if len(self.override) not in (0, 1, 2) or not all(
+                0.0 < sigma < math.inf for sigma in self.override):
             raise ConfigError('CovariancePolicy.override: expected no, one or two positive '
                               f'sigmas, got {list(self.override)}')
         if self.position_ceiling < self.position_floor:
             raise ConfigError(
                 'CovariancePolicy.position_ceiling: expected at least the floor '
                 f'{self.position_floor}, got {self.position_ceiling}')
+        if self.heading_floor > FLAT_GUESS:
+            raise ConfigError('CovariancePolicy.heading_floor: expected less than that of a flat '
+                              f'guess {FLAT_GUESS:.2f}, got {self.heading_floor}')
 
 
 @dataclass(frozen=True, slots=True)

@@ -26,6 +26,7 @@ from pose_graph_ros.core.incremental import IncrementalSmoother, UpdateResult
 from pose_graph_ros.core.measurements import (
     Answer,
     GlobalPose,
+    HeadingOnly,
     LoopClosure,
     Measurement,
     OdometrySample,
@@ -33,7 +34,12 @@ from pose_graph_ros.core.measurements import (
     Verdict,
 )
 from pose_graph_ros.core.se2 import FloatArray
-from pose_graph_ros.core.sources import OdometryNoise, OdometrySource
+from pose_graph_ros.core.sources import (
+    CovariancePolicy,
+    MeasurementSource,
+    OdometryNoise,
+    OdometrySource,
+)
 
 SECOND = 1_000_000_000
 # The promise: the same measurements give the same path, whatever their order [m, rad].
@@ -42,6 +48,12 @@ SAME_PATH = 1e-9
 T_MAP_ODOM = np.array([40.0, -25.0, np.deg2rad(122.0)])
 
 Event = OdometrySample | Measurement
+# Odometry here comes in order: each sample counts at once.
+PROMPT = {'odom': OdometrySource(reorder_window=0.0)}
+
+
+def prompt(**settings_: object) -> BackendConfig:
+    return BackendConfig(odometry=PROMPT, **settings_)
 
 
 @dataclass(frozen=True)
@@ -149,7 +161,7 @@ def test_hidden_nodes_come_from_odometry_alone() -> None:
 
 
 def test_a_robot_that_stands_still_makes_nodes_by_the_heartbeat_alone() -> None:
-    config = BackendConfig(nodes=NodePolicy(heartbeat=10.0))
+    config = prompt(nodes=NodePolicy(heartbeat=10.0))
     backend = PoseGraphBackend(config)
     for k in range(501):     # 100 s
         backend.add_odometry(OdometrySample(SECOND + k * SECOND // 5, np.zeros(3)))
@@ -157,7 +169,7 @@ def test_a_robot_that_stands_still_makes_nodes_by_the_heartbeat_alone() -> None:
 
 
 def test_a_quick_robot_makes_no_more_nodes_than_the_interval_allows() -> None:
-    backend = PoseGraphBackend(BackendConfig(nodes=NodePolicy(minimum_interval=1.0)))
+    backend = PoseGraphBackend(prompt(nodes=NodePolicy(minimum_interval=1.0)))
     for k in range(101):     # 10 s at 20 m/s
         backend.add_odometry(OdometrySample(SECOND + k * SECOND // 10, np.array([2.0 * k, 0, 0])))
     assert backend.graph.n_nodes == 11
@@ -238,7 +250,7 @@ def test_the_path_is_near_the_truth_and_exact_without_noise() -> None:
 # --- Answers ---------------------------------------------------------------------------------
 
 def test_a_measurement_is_pending_until_odometry_reaches_its_stamp() -> None:
-    backend = PoseGraphBackend()
+    backend = PoseGraphBackend(prompt())
     for sample in DRIVE.odometry[:50]:
         backend.add_odometry(sample)
     late = next(p for p in DRIVE.positions if p.stamp_ns > DRIVE.odometry[50].stamp_ns)
@@ -257,7 +269,7 @@ def test_a_measurement_is_pending_until_odometry_reaches_its_stamp() -> None:
 
 
 def test_a_loop_closure_waits_for_the_later_of_its_two_stamps() -> None:
-    backend = PoseGraphBackend()
+    backend = PoseGraphBackend(prompt())
     for sample in DRIVE.odometry[:50]:
         backend.add_odometry(sample)
     early, late = DRIVE.odometry[10].stamp_ns, DRIVE.odometry[60].stamp_ns
@@ -270,7 +282,7 @@ def test_a_loop_closure_waits_for_the_later_of_its_two_stamps() -> None:
 
 
 def test_measurements_before_any_odometry_wait() -> None:
-    backend = PoseGraphBackend()
+    backend = PoseGraphBackend(prompt())
     assert backend.estimate() is None
     assert backend.update().status is Status.CONVERGED
     assert backend.optimize().status is Status.CONVERGED
@@ -281,7 +293,10 @@ def test_measurements_before_any_odometry_wait() -> None:
 @pytest.mark.parametrize(('sample', 'reason'), [
     (OdometrySample(0, np.zeros(3)), 'zero_stamp'),
     (OdometrySample(DRIVE.odometry[-1].stamp_ns, np.zeros(3)), 'duplicate_stamp'),
-    (OdometrySample(DRIVE.odometry[3].stamp_ns, np.zeros(3)), 'out_of_order'),
+    (OdometrySample(DRIVE.odometry[3].stamp_ns, np.zeros(3)), 'duplicate_stamp'),
+    (OdometrySample(DRIVE.odometry[3].stamp_ns + 1, np.zeros(3)), 'out_of_order'),
+    (OdometrySample(-7, np.zeros(3)), 'zero_stamp'),
+    (OdometrySample(2**64, np.zeros(3)), 'no_stamp'),
     (OdometrySample(100 * SECOND, np.array([0.0, np.nan, 0.0])), 'not_finite'),
     (OdometrySample(100 * SECOND, np.array([0.0, 0.0, np.inf])), 'not_finite'),
     (OdometrySample(100 * SECOND, np.array([1e200, 0.0, 0.0])), 'too_large'),
@@ -303,12 +318,14 @@ BAD_MEASUREMENTS = [
     (GlobalPose(0, np.zeros(3), np.eye(3)), 'zero_stamp'),
     (GlobalPose(-5, np.zeros(3), np.eye(3)), 'zero_stamp'),
     (GlobalPose(GOOD, np.array([np.nan, 0.0, 0.0]), np.eye(3)), 'not_finite'),
-    (GlobalPose(GOOD, np.zeros(3), np.diag([-1.0, 1.0, 1.0])), 'covariance_not_positive'),
+    (GlobalPose(2**64, np.zeros(3), np.eye(3)), 'no_stamp'),
+    (GlobalPose(GOOD, np.zeros(3), np.diag([np.inf, np.inf, 4.0])), 'no_information'),
+    (HeadingOnly(GOOD, np.nan, 0.1), 'not_finite'),
+    (HeadingOnly(GOOD, 1.0, np.inf), 'no_information'),
     (GlobalPose(SECOND, np.zeros(3), np.eye(3)), 'before_odometry'),
     (Position(GOOD, np.array([0.0, np.inf]), np.eye(2), np.zeros(2)), 'not_finite'),
     (Position(GOOD, np.array([1e200, 0.0]), np.eye(2), np.zeros(2)), 'too_large'),
     (LoopClosure(GOOD, np.array([0.0, -1e200, 0.0]), np.eye(3), reference_node=0), 'too_large'),
-    (Position(GOOD, np.zeros(2), np.full((2, 2), np.nan), np.zeros(2)), 'covariance_not_finite'),
     (Position(GOOD, np.zeros(2), np.diag([1e-300, 1e-300]), np.zeros(2)), None),
     (LoopClosure(GOOD, np.zeros(3), np.zeros((3, 3)), reference_node=0),
      'covariance_not_positive'),
@@ -319,6 +336,8 @@ BAD_MEASUREMENTS = [
     (LoopClosure(GOOD, np.zeros(3), np.eye(3), reference_node=10_000), 'unknown_node'),
     (LoopClosure(GOOD, np.zeros(3), np.eye(3), reference_node=-2), 'unknown_node'),
     (LoopClosure(GOOD, np.zeros(3), np.eye(3)), 'unknown_node'),
+    (LoopClosure(GOOD, np.zeros(3), np.eye(3), reference_node=2**70), 'no_stamp'),
+    (LoopClosure(GOOD, np.zeros(3), np.eye(3), reference_ns=-2**70), 'no_stamp'),
 ]
 
 
@@ -336,6 +355,24 @@ def test_bad_measurements_are_rejected_and_counted(
     assert answer.reason == reason
     assert answer.detail != ''
     assert backend.counts['source', reason] == 1
+    assert backend.update().new_constraints == 0
+    assert snapshot(backend.graph) == before
+
+
+@pytest.mark.parametrize(('measurement', 'repair'), [
+    (GlobalPose(GOOD, np.array([5.0, 6.0, 1.0]), np.diag([-1.0, 1.0, 1.0])), 'not_positive'),
+    (Position(GOOD, np.array([5.0, 6.0]), np.full((2, 2), np.nan), np.zeros(2)), 'not_finite'),
+])
+def test_broken_covariances_are_repaired_and_counted_or_refused(
+    measurement: Measurement, repair: str,
+) -> None:
+    backend = run(DRIVE.odometry)
+    assert backend.add_measurement(measurement, 'source').verdict is Verdict.ACCEPTED
+    assert backend.counts['source', f'repaired_covariance_{repair}'] == 1
+    strict = MeasurementSource(covariance=CovariancePolicy(repair=False))
+    backend = run(DRIVE.odometry, config=BackendConfig(measurements={'source': strict}))
+    before = snapshot(backend.graph)
+    assert backend.add_measurement(measurement, 'source').reason == f'covariance_{repair}'
     assert backend.update().new_constraints == 0
     assert snapshot(backend.graph) == before
 
@@ -383,7 +420,7 @@ def test_without_anything_in_the_map_the_map_is_the_odometry_frame() -> None:
 
 
 def test_positions_align_once_they_tell_the_angle_and_the_estimate_says_so() -> None:
-    backend, states = PoseGraphBackend(), []
+    backend, states = PoseGraphBackend(prompt()), []
     positions_sigma = np.sqrt(DRIVE.positions[0].covariance[0, 0])
     for event in in_order(DRIVE.odometry, DRIVE.positions):
         feed(backend, event)
@@ -413,7 +450,7 @@ def test_positions_align_once_they_tell_the_angle_and_the_estimate_says_so() -> 
 
 
 def test_the_unaligned_estimate_passes_through_the_first_position() -> None:
-    backend = PoseGraphBackend()
+    backend = PoseGraphBackend(prompt())
     for sample in DRIVE.odometry[:9]:
         backend.add_odometry(sample)
     first = DRIVE.positions[0]
@@ -430,7 +467,7 @@ def test_the_unaligned_estimate_passes_through_the_first_position() -> None:
 
 
 def test_a_global_pose_aligns_at_once() -> None:
-    backend = PoseGraphBackend()
+    backend = PoseGraphBackend(prompt())
     for event in in_order(DRIVE.odometry[:10], DRIVE.global_poses[:1]):
         feed(backend, event)
     report = backend.update()
@@ -483,6 +520,7 @@ class FlakySolver:
         return BatchResult(Status.FAILED, 'broken on purpose', 0, 1.0, 1.0)
 
 
+FAR = {'GlobalPose': MeasurementSource(covariance=CovariancePolicy(position_ceiling=1e6))}
 # It tells the angle to the map, but is too uncertain of the place to hold the graph anywhere.
 NOWHERE = GlobalPose(
     DRIVE.odometry[3].stamp_ns + 7, DRIVE.global_poses[0].pose, np.diag([1e10, 1e10, 1e-6]))
@@ -491,7 +529,7 @@ NOWHERE = GlobalPose(
 @pytest.mark.parametrize('known', [20, 100])
 def test_a_failing_update_leaves_the_graph_bit_equal_and_the_engine_recovers(known: int) -> None:
     smoother = Flaky()
-    backend = PoseGraphBackend(smoother=smoother)
+    backend = PoseGraphBackend(prompt(), smoother=smoother)
     for event in ALL[:known]:
         feed(backend, event)
     backend.update()
@@ -524,7 +562,7 @@ def test_a_failing_update_leaves_the_graph_bit_equal_and_the_engine_recovers(kno
 
 def test_an_alignment_whose_update_fails_is_undone() -> None:
     smoother = Flaky()
-    backend = PoseGraphBackend(smoother=smoother)
+    backend = PoseGraphBackend(prompt(), smoother=smoother)
     events = in_order(DRIVE.odometry, DRIVE.positions)
     for event in events[:6]:
         feed(backend, event)
@@ -546,7 +584,7 @@ def test_an_alignment_whose_update_fails_is_undone() -> None:
 
 
 def test_an_update_that_raises_is_undone_and_set_aside(monkeypatch: pytest.MonkeyPatch) -> None:
-    backend = PoseGraphBackend()
+    backend = PoseGraphBackend(prompt())
     for event in in_order(DRIVE.odometry, DRIVE.global_poses):
         feed(backend, event)
     before = backend.graph.poses.copy()
@@ -568,7 +606,7 @@ def test_an_update_that_raises_is_undone_and_set_aside(monkeypatch: pytest.Monke
 
 
 def test_a_constraint_that_cannot_be_solved_for_is_set_aside_and_the_engine_goes_on() -> None:
-    backend = PoseGraphBackend()
+    backend = PoseGraphBackend(prompt(measurements=FAR))
     events = in_order(DRIVE.odometry, DRIVE.global_poses, DRIVE.positions[1:], DRIVE.closures)
     for event in events:
         if event is DRIVE.odometry[5]:
@@ -597,7 +635,7 @@ def test_a_constraint_that_cannot_be_solved_for_is_set_aside_and_the_engine_goes
 
 
 def test_a_constraint_that_fails_at_the_end_too_does_not_take_others_with_it() -> None:
-    backend = run(DRIVE.odometry)
+    backend = run(DRIVE.odometry, config=BackendConfig(measurements=FAR))
     feed(backend, NOWHERE)
     report = backend.optimize()
     assert report.status is Status.FAILED
@@ -615,7 +653,7 @@ def test_a_constraint_that_fails_at_the_end_too_does_not_take_others_with_it() -
 def test_a_full_optimisation_that_fails_leaves_all_poses_bit_equal(way: str) -> None:
     solve = FlakySolver()
     solve.broken = way
-    backend = PoseGraphBackend(solve=solve)
+    backend = PoseGraphBackend(prompt(), solve=solve)
     for event in ALL[:-20]:
         feed(backend, event)
         backend.update()
@@ -673,7 +711,7 @@ def long_drive(backend: PoseGraphBackend, n: int, *, closures: bool) -> list[Upd
 def test_the_work_of_an_update_does_not_grow_with_the_graph(
     closures: bool, growth: float,
 ) -> None:
-    backend = PoseGraphBackend()
+    backend = PoseGraphBackend(prompt())
     reports = long_drive(backend, 5_000, closures=closures)
     assert backend.graph.n_nodes == 5_000
     assert all(report.status is not Status.FAILED for report in reports)
@@ -684,7 +722,7 @@ def test_the_work_of_an_update_does_not_grow_with_the_graph(
 
 
 def test_the_path_is_current_after_every_update() -> None:
-    backend = PoseGraphBackend()
+    backend = PoseGraphBackend(prompt())
     late = [*DRIVE.positions[::2], *DRIVE.global_poses[1:], *DRIVE.closures]
     events = in_order(DRIVE.odometry, DRIVE.global_poses[:1], DRIVE.positions[1::2])
     for k, event in enumerate(events):
@@ -700,7 +738,8 @@ def test_the_path_is_current_after_every_update() -> None:
         assert report.new_constraints == n_waiting
         np.testing.assert_array_equal(
             estimate.path.poses[:backend.graph.n_nodes], backend.graph.poses)
-        assert estimate.path.stamps_ns[-1] == backend.odometry.stamps_ns[-1]
+        assert estimate.path.stamps_ns[-1] == max(
+            event.stamp_ns for event in events[:k + 1] if isinstance(event, OdometrySample))
         assert estimate.chi2 == pytest.approx(backend.energies().chi2, rel=1e-2, abs=0.05)
         other = Graph()
         edges, observed = backend.graph.edges, backend.graph.observed
@@ -715,7 +754,7 @@ def test_the_path_is_current_after_every_update() -> None:
 
 
 def test_what_an_update_leaves_over_is_done_in_the_next() -> None:
-    backend = PoseGraphBackend(BackendConfig(
+    backend = PoseGraphBackend(prompt(
         smoother=SmootherConfig(alpha=1e-4, budget=1e-8, budget_share=1e-8, max_iterations=1)))
     left_over = 0
     for event in ALL:
@@ -735,7 +774,7 @@ def test_what_an_update_leaves_over_is_done_in_the_next() -> None:
 # --- The estimate ----------------------------------------------------------------------------
 
 def test_snapshots_do_not_change_afterwards() -> None:
-    backend = PoseGraphBackend()
+    backend = PoseGraphBackend(prompt())
     for event in ALL[:80]:
         feed(backend, event)
     backend.update()
@@ -778,7 +817,7 @@ def test_the_covariance_of_the_newest_node_is_the_block_of_the_dense_inverse() -
 
 def test_the_covariance_is_that_of_the_solved_system_where_steps_were_damped() -> None:
     damped = SolverConfig(max_iterations=2, initial_damping=1.0)
-    backend = PoseGraphBackend(BackendConfig(closing=damped))
+    backend = PoseGraphBackend(prompt(closing=damped))
     for event in in_order(DRIVE.odometry[:10], DRIVE.global_poses[:1]):
         feed(backend, event)
     backend.optimize()
@@ -790,8 +829,8 @@ def test_the_covariance_is_that_of_the_solved_system_where_steps_were_damped() -
 
 
 def test_too_many_waiting_measurements_are_rejected(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr('pose_graph_ros.core.backend.MAX_PENDING', 3)
-    backend = PoseGraphBackend()
+    monkeypatch.setattr('pose_graph_ros.core.pending.MAX_PENDING', 3)
+    backend = PoseGraphBackend(prompt())
     answers = [feed(backend, position) for position in DRIVE.positions[:5]]
     assert [answer.verdict for answer in answers] == [Verdict.PENDING] * 3 + [Verdict.REJECTED] * 2
     assert backend.counts['Position', 'too_many_pending'] == 2
@@ -799,11 +838,20 @@ def test_too_many_waiting_measurements_are_rejected(monkeypatch: pytest.MonkeyPa
     for sample in DRIVE.odometry:
         backend.add_odometry(sample)
     assert feed(backend, DRIVE.positions[4]).verdict is Verdict.ACCEPTED
-    np.testing.assert_array_equal(backend.odometry.poses, [s.pose for s in DRIVE.odometry])
+    np.testing.assert_array_equal(
+        backend._nodes.streams['odom'].timeline.poses, [s.pose for s in DRIVE.odometry])
+    # a sender whose clock is ahead does not keep out the others
+    backend = PoseGraphBackend(prompt())
+    for k in range(9):
+        ahead = GOOD + 3600 * SECOND + k
+        backend.add_measurement(replace(DRIVE.positions[0], stamp_ns=ahead), 'x')
+    assert feed(backend, DRIVE.positions[0]).verdict is Verdict.PENDING
+    assert backend.n_pending == 3
+    assert backend.counts['x', 'too_many_pending'] == 7
 
 
 def test_the_covariance_grows_along_odometry_and_shrinks_with_a_measurement() -> None:
-    backend, traces = PoseGraphBackend(), []
+    backend, traces = PoseGraphBackend(prompt()), []
     for sample in DRIVE.odometry[:60]:
         backend.add_odometry(sample)
         traces.append(np.trace(backend.estimate().covariance[:2, :2]))
@@ -845,7 +893,7 @@ def covariances(draw: st.DrawFn) -> FloatArray:
 def test_no_numbers_bring_the_backend_down(
     events: list[tuple[FloatArray, FloatArray, int, int]],
 ) -> None:
-    backend = PoseGraphBackend()
+    backend = PoseGraphBackend(prompt())
     for sample in DRIVE.odometry[:20]:
         backend.add_odometry(sample)
     with np.errstate(all='ignore'):
@@ -906,7 +954,7 @@ def drive_with_outage(
 def test_a_heading_that_drifts_far_in_a_long_outage_is_wound_the_right_way(
     drift: float, seed: int,
 ) -> None:
-    backend = PoseGraphBackend()
+    backend = PoseGraphBackend(prompt())
     truth = drive_with_outage(backend, drift, seed, update_every=1)
     assert backend.optimize().status is Status.CONVERGED
     found = backend.energies().chi2
@@ -919,7 +967,7 @@ def test_a_heading_that_drifts_far_in_a_long_outage_is_wound_the_right_way(
 def test_updates_alone_wind_a_heading_that_has_drifted_far_the_right_way(
     drift: float, seed: int, update_every: int,
 ) -> None:
-    backend = PoseGraphBackend()
+    backend = PoseGraphBackend(prompt())
     drive_with_outage(backend, drift, seed, update_every)
     found = backend.energies().chi2
     backend.optimize()
@@ -927,7 +975,7 @@ def test_updates_alone_wind_a_heading_that_has_drifted_far_the_right_way(
 
 
 def test_outliers_do_not_bring_the_engine_down() -> None:
-    backend = PoseGraphBackend()
+    backend = PoseGraphBackend(prompt())
     for k, event in enumerate(in_order(DRIVE.odometry, DRIVE.positions, DRIVE.global_poses)):
         off = isinstance(event, Position) and k > 40 and k % 3 == 0
         feed(backend, replace(event, position=event.position + 30.0 * (-1.0)**k) if off else event)
@@ -951,7 +999,7 @@ def test_a_loop_closure_that_came_too_early_can_be_sent_again() -> None:
 
 def test_one_poor_position_does_not_delay_the_alignment() -> None:
     def updates(poor: bool) -> int:
-        backend = PoseGraphBackend()
+        backend = PoseGraphBackend(prompt())
         for k, event in enumerate(in_order(DRIVE.odometry, DRIVE.positions)):
             if poor and isinstance(event, Position):
                 poor = False

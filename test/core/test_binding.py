@@ -8,18 +8,18 @@ import pytest
 
 from pose_graph_ros.core import binding, linearize, se2
 from pose_graph_ros.core.binding import Anchor
-from pose_graph_ros.core.config import BackendConfig, OdometryNoise
+from pose_graph_ros.core.config import BackendConfig, NodePolicy
 from pose_graph_ros.core.constraints import EdgeKind, Edges, ObservedKind, ObservedNodes
+from pose_graph_ros.core.hidden_nodes import HiddenNodes
 from pose_graph_ros.core.measurements import (
-    Answer,
     GlobalPose,
+    HeadingOnly,
     LoopClosure,
-    Measurement,
+    OdometrySample,
     Position,
-    Verdict,
 )
 from pose_graph_ros.core.se2 import FloatArray
-from pose_graph_ros.core.timeline import OdometryTimeline
+from pose_graph_ros.core.sources import OdometryNoise, OdometrySource
 
 SECOND = 1_000_000_000
 # Compositions of poses of some 50 m.
@@ -28,7 +28,6 @@ ROUNDING = 1e-12
 N_SAMPLES = 200_000
 SAMPLING = 0.03
 
-CONFIG = BackendConfig()
 T_MAP_ODOM = np.array([30.0, -12.0, 2.1])
 # A curved drive, a hidden node every fourth sample.
 ODOMETRY = np.zeros((21, 3))
@@ -41,22 +40,31 @@ NODES = se2.compose(T_MAP_ODOM, ODOMETRY[::4])
 covered = st.integers(int(STAMPS[0]), int(STAMPS[-1]))
 
 
-def timeline() -> OdometryTimeline:
-    filled = OdometryTimeline()
+def hidden_nodes(noise: OdometryNoise) -> HiddenNodes:
+    """Make a node at every fourth sample."""
+    config = BackendConfig(
+        nodes=NodePolicy(minimum_travel_distance=1e3, minimum_travel_heading=3.0,
+                         moving_interval=0.4, minimum_interval=0.0),
+        odometry={'odom': OdometrySource(noise=noise)})
+    nodes = HiddenNodes(config, lambda *_: len(nodes))
     for stamp, pose in zip(STAMPS.tolist(), ODOMETRY, strict=True):
-        filled.append(stamp, pose)
-    return filled
+        nodes.take(OdometrySample(stamp, pose), 'odom')
+    nodes.finish()
+    np.testing.assert_array_equal(nodes.stamps_ns, NODE_STAMPS)
+    return nodes
 
 
-TIMELINE = timeline()
+PLAIN = hidden_nodes(OdometryNoise())
 
 
-def anchored(stamp: int, config: BackendConfig = CONFIG) -> Anchor:
-    return binding.anchored(stamp, NODE_STAMPS, TIMELINE, config)
+def anchored(stamp: int, nodes: HiddenNodes = PLAIN) -> Anchor:
+    anchor = nodes.anchor(stamp)
+    assert anchor is not None
+    return anchor
 
 
 def truth(stamp: int) -> FloatArray:
-    return se2.compose(T_MAP_ODOM, TIMELINE.pose(stamp))
+    return se2.compose(T_MAP_ODOM, PLAIN.streams['odom'].timeline.pose(stamp))
 
 
 def covariance_of(constraint: Edges | ObservedNodes) -> FloatArray:
@@ -92,7 +100,7 @@ def test_at_a_hidden_node_there_is_no_motion_and_no_noise() -> None:
 
 @given(covered)
 def test_a_true_global_pose_has_no_error_at_the_true_nodes(stamp: int) -> None:
-    constraint = binding.global_pose_constraint(
+    constraint = binding.absolute_constraint(
         GlobalPose(stamp, truth(stamp), np.eye(3)), anchored(stamp))
     assert constraint.kind[0] == ObservedKind.GLOBAL_POSE
     np.testing.assert_allclose(linearize.observed_errors(NODES, constraint), 0.0, atol=ROUNDING)
@@ -101,7 +109,7 @@ def test_a_true_global_pose_has_no_error_at_the_true_nodes(stamp: int) -> None:
 @given(covered, st.floats(-2.0, 2.0), st.floats(-2.0, 2.0))
 def test_a_true_position_has_no_error_at_the_true_nodes(stamp: int, x: float, y: float) -> None:
     lever_arm = np.array([x, y])
-    constraint = binding.position_constraint(
+    constraint = binding.absolute_constraint(
         Position(stamp, se2.transform(truth(stamp), lever_arm), np.eye(2), lever_arm),
         anchored(stamp))
     assert constraint.kind[0] == ObservedKind.POSITION
@@ -128,7 +136,7 @@ def test_a_true_loop_closure_has_no_error_at_the_true_nodes(stamp: int, other: i
 # constraint that is made of the means.
 
 # Large enough to matter beside the measurement's, small enough for first order.
-NOISY = BackendConfig(odometry_noise=OdometryNoise(
+NOISY = hidden_nodes(OdometryNoise(
     sigma_distance=0.02, sigma_lateral=0.01, sigma_heading_distance=0.02,
     sigma_heading_turn=0.02))
 STAMP, OTHER = int(STAMPS[7]) + SECOND // 40, int(STAMPS[14]) + SECOND // 30
@@ -153,7 +161,7 @@ def test_the_noise_of_a_global_pose_is_that_of_samples() -> None:
     measured = pose + draws(MAP_COVARIANCE, rng)
     moved = se2.compose(tiled(NODES[anchor.node]), noisy_motions(anchor, rng))
     errors = se2.between(measured, moved)     # (3.52) through the offset
-    constraint = binding.global_pose_constraint(
+    constraint = binding.absolute_constraint(
         GlobalPose(STAMP, pose, MAP_COVARIANCE), anchor)
     assert_agree(np.cov(errors.T), covariance_of(constraint))
 
@@ -166,7 +174,7 @@ def test_the_noise_of_a_position_is_at_least_that_of_samples() -> None:
     measured = where + draws(covariance, rng)
     moved = se2.compose(tiled(NODES[anchor.node]), noisy_motions(anchor, rng))
     errors = se2.transform(moved, lever_arm) - measured     # in map axes
-    constraint = binding.position_constraint(
+    constraint = binding.absolute_constraint(
         Position(STAMP, where, covariance, lever_arm), anchor)
     claimed = np.linalg.inv(constraint.information[0, :2, :2])
     sampled = np.cov(errors.T)
@@ -176,7 +184,7 @@ def test_the_noise_of_a_position_is_at_least_that_of_samples() -> None:
 
 
 def test_the_noise_of_a_position_at_a_node_is_its_own() -> None:
-    constraint = binding.position_constraint(
+    constraint = binding.absolute_constraint(
         Position(int(NODE_STAMPS[2]), np.zeros(2), MAP_COVARIANCE[:2, :2], np.zeros(2)),
         anchored(int(NODE_STAMPS[2])))
     np.testing.assert_allclose(
@@ -199,87 +207,41 @@ def test_the_noise_of_a_loop_closure_is_that_of_samples(stamp: int, other: int) 
     assert_agree(np.cov(errors.T), covariance_of(constraint))
 
 
-# --- bad covariances -------------------------------------------------------------------------
 
-NAN, INF, LARGEST = np.nan, np.inf, np.finfo(float).max     # 1.8e308 itself reads as inf
-GOOD = np.diag([0.04, 0.09, 0.01])
-UPPER = np.triu(np.full((3, 3), 0.01), 1)
-# Covariance, then what is said of a global pose, a position and a loop closure with it: the
-# reason of the rejection, None if it is taken, 'position' if that is what is left of it.
-VERDICTS = {
-    'good': (GOOD, None, None, None),
-    'zeros': (np.zeros((3, 3)), *3 * ('covariance_not_positive',)),
-    'nan': (np.full((3, 3), NAN), *3 * ('covariance_not_finite',)),
-    'inf': (np.diag([INF] * 3), *3 * ('covariance_not_finite',)),
-    'largest': (np.diag([LARGEST] * 3), *3 * ('covariance_too_large',)),
-    'minus_one': (np.diag([-1.0, 0.09, 0.01]), *3 * ('covariance_not_positive',)),
-    'asymmetric': (GOOD + UPPER, *3 * ('covariance_not_symmetric',)),
-    'not_definite': (GOOD + 0.1 * (UPPER + UPPER.T) / 0.01,
-                     *3 * ('covariance_not_positive_definite',)),
-    'heading_nan': (np.diag([0.04, 0.09, NAN]), 'position', None, 'covariance_not_finite'),
-    'heading_inf': (np.diag([0.04, 0.09, INF]), 'position', None, 'covariance_not_finite'),
-    'heading_largest': (np.diag([0.04, 0.09, LARGEST]), 'position', None, 'covariance_too_large'),
-    'heading_zero': (np.diag([0.04, 0.09, 0.0]), 'position', None, 'covariance_not_positive'),
-    'heading_minus_one': (
-        np.diag([0.04, 0.09, -1.0]), 'position', None, 'covariance_not_positive'),
-    'heading_flat': (np.diag([0.04, 0.09, np.pi**2 / 3.0]), 'position', None, None),
-    'tiny': (np.diag([1e-300, 1e-300, 1e-300]), None, None, None),
-}
+def test_the_noise_of_a_heading_is_that_of_samples() -> None:
+    rng = np.random.default_rng(4)
+    anchor, heading = anchored(STAMP, NOISY), float(truth(STAMP)[2])
+    moved = se2.compose(tiled(NODES[anchor.node]), noisy_motions(anchor, rng))
+    errors = se2.wrap(moved[:, 2] - heading - 0.01 * rng.standard_normal(N_SAMPLES))
+    constraint = binding.absolute_constraint(HeadingOnly(STAMP, heading, 1e-4), anchor)
+    assert constraint.kind[0] == ObservedKind.HEADING
+    assert np.var(errors) == pytest.approx(1.0 / constraint.information[0, 2, 2], rel=SAMPLING)
+    np.testing.assert_array_equal(constraint.information[0, :2], 0.0)
+    np.testing.assert_array_equal(constraint.information[0, :, :2], 0.0)
 
 
-def measurements(covariance: FloatArray) -> tuple[Measurement, ...]:
-    return (GlobalPose(SECOND, np.array([1.0, 2.0, 3.0]), covariance),
-            Position(SECOND, np.array([1.0, 2.0]), covariance[:2, :2], np.zeros(2)),
-            LoopClosure(SECOND, np.array([1.0, 2.0, 3.0]), covariance, reference_node=0))
+@given(covered, st.floats(-3.1, 3.1))
+def test_a_true_heading_has_no_error_at_the_true_nodes(stamp: int, off: float) -> None:
+    constraint = binding.absolute_constraint(
+        HeadingOnly(stamp, float(truth(stamp)[2]) + off, 1.0), anchored(stamp))
+    error = linearize.observed_errors(NODES, constraint)
+    assert error[0, 2] == pytest.approx(-off, abs=ROUNDING)
 
 
-@pytest.mark.parametrize('name', VERDICTS)
-def test_every_bad_covariance_gets_its_verdict(name: str) -> None:
-    covariance, *verdicts = VERDICTS[name]
-    with np.errstate(all='raise', under='ignore'):
-        answers = [binding.repaired(one, CONFIG) for one in measurements(covariance)]
-    for given_, answer, verdict in zip(measurements(covariance), answers, verdicts, strict=True):
-        if verdict is None:
-            assert type(answer) is type(given_)
-            assert np.min(np.diagonal(answer.covariance)[:2]) >= 0.99e-4     # 1 cm squared
-            assert np.all(np.linalg.eigvalsh(answer.covariance) > 0.0)
-        elif verdict == 'position':
-            assert isinstance(answer, Position)
-            np.testing.assert_array_equal(answer.position, [1.0, 2.0])
-            np.testing.assert_array_equal(answer.lever_arm, 0.0)
-            np.testing.assert_array_equal(answer.covariance, covariance[:2, :2])
-        else:
-            assert isinstance(answer, Answer)
-            assert answer.verdict is Verdict.REJECTED
-            assert answer.reason == verdict
-
-
-def test_values_and_stamps_are_looked_at_too() -> None:
-    bad = [GlobalPose(SECOND, np.array([0.0, 0.0, NAN]), GOOD),
-           Position(SECOND, np.array([INF, 0.0]), GOOD[:2, :2], np.zeros(2)),
-           LoopClosure(SECOND, np.array([0.0, -INF, 0.0]), GOOD, reference_node=0)]
-    assert [binding.repaired(one, CONFIG).reason for one in bad] == 3 * ['not_finite']
-    late = Position(0, np.zeros(2), GOOD[:2, :2], np.zeros(2))
-    assert binding.repaired(late, CONFIG).reason == 'zero_stamp'
-
-
-def test_a_lever_arm_that_is_no_number_is_refused() -> None:
-    bad = Position(SECOND, np.zeros(2), GOOD[:2, :2], np.array([NAN, 0.0]))
-    assert isinstance(binding.repaired(bad, CONFIG), Answer)
-
-
-def test_no_measurement_is_changed_in_place() -> None:
-    covariance = np.diag([1e-9, 1e-9, 1e-9])
-    before = covariance.copy()
-    for one in measurements(covariance):
-        binding.repaired(one, CONFIG)
-    np.testing.assert_array_equal(covariance, before)
-
-
-def test_an_unknown_covariance_leaves_a_position_with_the_default() -> None:
-    pose, position, _ = measurements(np.zeros((3, 3)))
-    for one in (pose, position):
-        left = binding.with_default_covariance(one, CONFIG)
-        np.testing.assert_array_equal(left.covariance, 25.0 * np.eye(2))
-        np.testing.assert_array_equal(left.position, [1.0, 2.0])
-        assert left.stamp_ns == SECOND
+@pytest.mark.parametrize(('stamp', 'other'), [(OTHER, STAMP), (STAMP, OTHER)])
+def test_a_relative_heading_says_nothing_of_the_position(stamp: int, other: int) -> None:
+    rng = np.random.default_rng(5)
+    anchor, reference = anchored(stamp, NOISY), anchored(other, NOISY)
+    turn = float(se2.wrap(truth(stamp)[2] - truth(other)[2]))
+    # where a position stands does not matter
+    closure = LoopClosure(stamp, np.array([7.0, -9.0, turn]), np.diag([np.inf, np.inf, 1e-4]),
+                          reference_ns=other)
+    constraint = binding.loop_closure_constraint(closure, reference, anchor)
+    error = linearize.edge_errors(NODES, constraint)
+    assert error[0, 2] == pytest.approx(0.0, abs=ROUNDING)
+    information = constraint.information[0].copy()
+    expected = np.var(0.01 * rng.standard_normal(N_SAMPLES)
+                      + noisy_motions(anchor, rng)[:, 2] + noisy_motions(reference, rng)[:, 2])
+    assert 1.0 / information[2, 2] == pytest.approx(expected, rel=SAMPLING)
+    information[2, 2] = 0.0
+    np.testing.assert_array_equal(information, 0.0)

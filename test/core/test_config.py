@@ -7,21 +7,23 @@ from dataclasses import fields, FrozenInstanceError, replace
 import numpy as np
 import pytest
 
-from pose_graph_ros.core.config import (
-    AlignmentPolicy,
-    BackendConfig,
-    NodePolicy,
-    OdometryNoise,
-    SolverConfig,
-)
+from pose_graph_ros.core.config import AlignmentPolicy, BackendConfig, NodePolicy, SolverConfig
 from pose_graph_ros.core.exceptions import ConfigError
+from pose_graph_ros.core.sources import (
+    CovariancePolicy,
+    MeasurementSource,
+    OdometryNoise,
+    OdometrySource,
+)
 
 NUMBERS = [(kind, item.name)
-           for kind in (NodePolicy, OdometryNoise, AlignmentPolicy, SolverConfig, BackendConfig)
+           for kind in (NodePolicy, OdometryNoise, OdometrySource, CovariancePolicy,
+                        MeasurementSource, AlignmentPolicy, SolverConfig, BackendConfig)
            for item in fields(kind) if isinstance(getattr(kind(), item.name), float)]
 MAY_BE_ZERO = {
     'minimum_travel_distance', 'minimum_travel_heading', 'minimum_interval', 'sigma_distance',
     'sigma_lateral', 'sigma_heading_distance', 'sigma_heading_turn', 'initial_damping',
+    'reorder_window', 'correlation_time', 'white_share',
 }
 
 
@@ -50,7 +52,7 @@ def test_there_is_at_least_one_iteration(iterations: int) -> None:
 def test_a_config_error_is_a_value_error_and_settings_are_frozen() -> None:
     assert issubclass(ConfigError, ValueError)
     with pytest.raises(FrozenInstanceError):
-        BackendConfig().default_position_sigma = 3.0
+        BackendConfig().odometry_patience = 3.0
 
 
 @pytest.mark.parametrize(('distance', 'turned', 'elapsed', 'due'), [
@@ -70,3 +72,19 @@ def test_a_node_is_due_after_enough_motion_or_time(
     policy = NodePolicy(minimum_travel_distance=1.0, minimum_travel_heading=0.3,
                         minimum_interval=0.2, moving_interval=2.0, heartbeat=10.0)
     assert policy.due(distance, turned, elapsed) == due
+
+
+@pytest.mark.parametrize('override', [(0.0,), (-1.0, 1.0), (np.nan,), (1.0, np.inf),
+                                      (1.0, 1.0, 1.0)])
+def test_an_override_is_one_or_two_sigmas(override: tuple[float, ...]) -> None:
+    with pytest.raises(ConfigError, match='override: expected no, one or two positive'):
+        CovariancePolicy(override=override)
+
+
+def test_ranges_are_ranges() -> None:
+    with pytest.raises(ConfigError, match=r'position_ceiling: expected at least the floor 2.0'):
+        CovariancePolicy(position_floor=2.0, position_ceiling=1.0)
+    with pytest.raises(ConfigError, match='heading_floor: expected less than'):
+        CovariancePolicy(heading_floor=1.9)
+    with pytest.raises(ConfigError, match=r'white_share: expected a number in \[0, 1\]'):
+        MeasurementSource(white_share=1.1)

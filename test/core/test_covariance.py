@@ -8,8 +8,9 @@ import numpy as np
 import pytest
 
 from pose_graph_ros.core import covariance, se2
-from pose_graph_ros.core.config import OdometryNoise
+from pose_graph_ros.core.motion import Motion
 from pose_graph_ros.core.se2 import FloatArray
+from pose_graph_ros.core.sources import OdometryNoise
 
 ROUNDING = 1e-12
 # Sample covariances of 2e5 draws: 1 / sqrt(1e5) = 0.3 % one sigma; 2 % for the worst of six.
@@ -156,6 +157,13 @@ NOISE = OdometryNoise(sigma_distance=0.05, sigma_lateral=0.03, sigma_heading_dis
                       sigma_floor_heading=0.001)
 
 
+def odometry(
+    increment: FloatArray, distance: float, turn: float, noise: OdometryNoise = NOISE,
+    **options: bool,
+) -> FloatArray:
+    return covariance.odometry_covariance(noise, Motion(increment, distance, turn), **options)
+
+
 def composed(first: FloatArray, second: FloatArray, increment: FloatArray) -> FloatArray:
     """Return the covariance at the end of two increments, in the frame there."""
     carry = se2.adjoint(se2.inverse(increment))
@@ -167,23 +175,19 @@ def test_the_parts_of_a_straight_increment_compose_to_the_whole(
     distance: float, parts: int,
 ) -> None:
     step = distance / parts
-    part = covariance.odometry_covariance(
-        NOISE, np.array([step, 0.0, 0.0]), step, 0.0, floor=False)
+    part = odometry(np.array([step, 0.0, 0.0]), step, 0.0, floor=False)
     total = np.zeros((3, 3))
     for _ in range(parts):
         total = composed(total, part, np.array([step, 0.0, 0.0]))
-    whole = covariance.odometry_covariance(
-        NOISE, np.array([distance, 0.0, 0.0]), distance, 0.0, floor=False)
+    whole = odometry(np.array([distance, 0.0, 0.0]), distance, 0.0, floor=False)
     np.testing.assert_allclose(total, whole, rtol=1e-9, atol=1e-15)
 
 
 @given(st.floats(0.0, 3.0), st.floats(0.0, 3.0))
 def test_the_parts_of_a_turn_in_place_compose_to_the_whole(first: float, second: float) -> None:
-    parts = [covariance.odometry_covariance(
-        NOISE, np.array([0.0, 0.0, turn]), 0.0, turn, floor=False)
+    parts = [odometry(np.array([0.0, 0.0, turn]), 0.0, turn, floor=False)
              for turn in (first, second)]
-    whole = covariance.odometry_covariance(
-        NOISE, np.array([0.0, 0.0, first + second]), 0.0, first + second, floor=False)
+    whole = odometry(np.array([0.0, 0.0, first + second]), 0.0, first + second, floor=False)
     np.testing.assert_allclose(
         composed(*parts, np.array([0.0, 0.0, second])), whole, atol=ROUNDING)
 
@@ -205,8 +209,8 @@ def sampled_random_walk(distance: float) -> FloatArray:
 def heading_part(distance: float) -> FloatArray:
     noise = OdometryNoise(sigma_distance=0.0, sigma_lateral=0.0, sigma_heading_turn=0.0,
                           sigma_heading_distance=NOISE.sigma_heading_distance)
-    return covariance.odometry_covariance(
-        noise, np.array([distance, 0.0, 0.0]), abs(distance), 0.0, floor=False)
+    return odometry(
+        np.array([distance, 0.0, 0.0]), abs(distance), 0.0, noise, floor=False)
 
 
 def test_a_walking_heading_shows_across_the_path_as_it_does_in_samples() -> None:
@@ -223,11 +227,35 @@ def test_a_walking_heading_shows_across_the_path_when_reversing_too() -> None:
 @given(st.floats(0.0, 100.0), st.floats(0.0, 10.0))
 def test_odometry_that_has_a_floor_is_always_a_covariance(distance: float, turn: float) -> None:
     increment = np.array([0.6 * distance, -0.8 * distance, turn])
-    cov = covariance.odometry_covariance(NOISE, increment, distance, turn)
+    cov = odometry(increment, distance, turn)
     assert covariance.defect(cov) is None
-    bare = covariance.odometry_covariance(NOISE, increment, distance, turn, floor=False)
+    bare = odometry(increment, distance, turn, floor=False)
     np.testing.assert_allclose(cov - bare, np.diag([1e-4, 1e-4, 1e-6]), atol=1e-9)
     assert np.min(np.linalg.eigvalsh(bare)) > -ROUNDING
+
+
+VARIANCE = np.array([0.04, 0.01, 0.0025])
+
+
+def test_the_variance_that_a_motion_brings_is_added_and_its_heading_sweeps_the_end() -> None:
+    increment = np.array([3.0, 1.0, 0.7])
+    silent = OdometryNoise(sigma_distance=0.0, sigma_lateral=0.0, sigma_heading_distance=0.0,
+                           sigma_heading_turn=0.0)
+    cov = covariance.odometry_covariance(
+        silent, Motion(increment, 4.0, 0.7, VARIANCE), floor=False)
+    # the same heading noise by the model
+    by_path = OdometryNoise(sigma_distance=0.0, sigma_lateral=0.0, sigma_heading_turn=0.0,
+                            sigma_heading_distance=float(np.sqrt(VARIANCE[2] / 4.0)))
+    expected = odometry(increment, 4.0, 0.7, by_path, floor=False)
+    expected[0, 0] += VARIANCE[0]
+    expected[1, 1] += VARIANCE[1]
+    np.testing.assert_allclose(cov, expected, atol=ROUNDING)
+
+
+def test_no_heading_is_less_certain_than_a_flat_guess() -> None:
+    cov = odometry(np.array([1e6, 0.0, 0.0]), 1e6, 0.0)
+    assert cov[2, 2] <= covariance.UNKNOWN_HEADING_VARIANCE + NOISE.sigma_floor_heading**2
+    assert covariance.defect(cov) is None
 
 
 # --- propagation -----------------------------------------------------------------------------

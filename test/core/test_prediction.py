@@ -7,14 +7,13 @@ import pytest
 
 from pose_graph_ros.core import covariance, se2
 from pose_graph_ros.core.backend import PoseGraphBackend
-from pose_graph_ros.core.config import OdometryNoise
 from pose_graph_ros.core.estimate import Estimate
 from pose_graph_ros.core.measurements import GlobalPose, OdometrySample
+from pose_graph_ros.core.motion import NO_MOTION
 from pose_graph_ros.core.prediction import predict
 from pose_graph_ros.core.se2 import FloatArray
 
 SECOND = 1_000_000_000
-NOISE = OdometryNoise()
 
 
 def odometry(k: int) -> FloatArray:
@@ -40,7 +39,7 @@ def estimate_of(backend: PoseGraphBackend) -> Estimate:
 
 def test_at_the_estimate_nothing_is_added(backend: PoseGraphBackend) -> None:
     estimate = estimate_of(backend)
-    now = predict(estimate, odometry(19), NOISE)
+    now = predict(estimate, odometry(19))
     np.testing.assert_allclose(now.T_map_base, estimate.T_map_base, atol=1e-12)
     np.testing.assert_allclose(now.covariance, estimate.covariance, atol=1e-15)
 
@@ -49,7 +48,7 @@ def test_later_odometry_is_appended_as_the_next_estimate_would(
     backend: PoseGraphBackend,
 ) -> None:
     estimate = estimate_of(backend)
-    ahead = predict(estimate, odometry(22), NOISE)
+    ahead = predict(estimate, odometry(22))
     np.testing.assert_allclose(
         ahead.T_map_base, se2.compose(estimate.T_map_odom, odometry(22)), atol=1e-12)
     # more uncertain than if the odometry in between had no noise
@@ -62,6 +61,6 @@ def test_later_odometry_is_appended_as_the_next_estimate_would(
     then = estimate_of(backend)
     np.testing.assert_allclose(ahead.T_map_base, then.T_map_base, atol=1e-12)
     # the estimate's own covariance holds the floor of one increment more, at the most
-    floor = covariance.odometry_covariance(NOISE, np.zeros(3), 0.0, 0.0)
+    floor = covariance.odometry_covariance(estimate.noise, NO_MOTION)
     difference = then.covariance - ahead.covariance
     assert np.abs(difference[:2, :2]).max() <= 2.0 * floor[0, 0]
