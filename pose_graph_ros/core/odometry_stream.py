@@ -37,7 +37,7 @@ SLACK = (0.25, 0.5)
 ACCELERATION = (10.0, 20.0)
 # ... and however long that was, faster than it ever was by this and a factor of 2 [m/s, rad/s].
 MORE_SPEED = (3.0, 2.0)
-# Stamps lie unevenly; a speed is not judged over less than this [s].
+# Stamps lie unevenly, by so much: a speed is not taken over less than this [s].
 LEAST_TIME = 0.05
 # The fastest motion of late is forgotten within about this time [s].
 MEMORY_TIME = 2.0
@@ -272,7 +272,7 @@ class OdometryStream:
         """Tell whether a step is farther than the robot can have moved in the time."""
         if moved[0] <= SLACK[0] and moved[1] <= SLACK[1]:
             return False
-        time = max(elapsed, LEAST_TIME)
+        time = elapsed + LEAST_TIME
         stated = abs(speed) if math.isfinite(speed) else 0.0
         for k, stated_k, most in ((0, stated, self._source.maximum_speed), (1, 0.0, math.inf)):
             recent, ever = max(rate.recent[k], stated_k), max(rate.ever[k], stated_k)
