@@ -12,10 +12,10 @@ from scipy.optimize import least_squares
 from pose_graph_ros.core import se2
 from pose_graph_ros.core.alignment import align, certain, find_turn, judge_again, Turn
 from pose_graph_ros.core.config import AlignmentPolicy
-from pose_graph_ros.core.sources import OdometryNoise
 from pose_graph_ros.core.consensus import Consensus, Lifetime, positions_along
 from pose_graph_ros.core.constraints import ObservedKind, ObservedNodes
 from pose_graph_ros.core.se2 import FloatArray, IntArray
+from pose_graph_ros.core.sources import OdometryNoise
 
 # Weighted sums of squares of some 100 m.
 EXACT = 1e-9
