@@ -8,7 +8,7 @@ own. Without a bag a simulated drive is made first, with a known truth.
 """
 
 import argparse
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 import os
 from pathlib import Path
 import random
@@ -29,6 +29,7 @@ from pose_graph_ros.core.trajectory import Trajectory
 from pose_graph_ros.ros.bags import BagError, open_bag
 from pose_graph_ros.ros.conversions import planar_pose, stamp_ns
 from pose_graph_ros.ros.inputs import choose_inputs, Inputs
+from pose_graph_ros.ros.sources import Source, source_list
 
 SIMULATED_TOPICS = {'odom': '/odom', 'fix': '/gps/fix', 'loop_closure': '/loop_closure'}
 SIMULATED_TRUTH = '/ground_truth'
@@ -64,7 +65,7 @@ def execute(options: argparse.Namespace) -> int:
     options.out.mkdir(parents=True, exist_ok=True)
     bag_path, wanted, truth, title = _bag(options)
     with open_bag(bag_path) as bag:
-        inputs = choose_inputs(bag, wanted, options.hold_out)
+        inputs = choose_inputs(bag, source_list(values), wanted, options.hold_out)
     if bag_path.suffix == '.bag':
         raise BagError(f'{bag_path}: a ROS 1 bag cannot be played to a ROS 2 node; '
                        'pose-graph replay reads it')
@@ -74,7 +75,7 @@ def execute(options: argparse.Namespace) -> int:
 
     start = time.monotonic()
     signal.signal(signal.SIGTERM, signal.default_int_handler)  # so that no process is left behind
-    converged = _run(bag_path, inputs, options, shared.ros_arguments(options))
+    converged = _run(bag_path, inputs, source_list(values), options)
     seconds = time.monotonic() - start
     corrected = _read_path(options.out / 'corrected')
     with open_bag(bag_path) as bag:
@@ -101,8 +102,11 @@ def _bag(
     return path, wanted, options.truth or SIMULATED_TRUTH, 'Simulated drive'
 
 
-def _run(bag: Path, inputs: Inputs, options: argparse.Namespace, ros_args: list[str]) -> bool:
+def _run(
+    bag: Path, inputs: Inputs, sources: Sequence[Source], options: argparse.Namespace,
+) -> bool:
     """Start the node, play the bag to it, stop it; tell whether the optimisation converged."""
+    ros_args = shared.ros_arguments(options)
     with tempfile.TemporaryDirectory(prefix='pose_graph_') as log:
         env = isolated_environment(Path(log))
         for parameter in DEMO_PARAMETERS:
@@ -113,8 +117,10 @@ def _run(bag: Path, inputs: Inputs, options: argparse.Namespace, ros_args: list[
             player = [sys.executable, '-m', 'pose_graph_ros.ros.player', str(bag.resolve()),
                       str((options.out / 'corrected').resolve()), '--rate', str(options.rate),
                       '--hold-out', str(inputs.hold_out)]
-            for source, topic in inputs.topics.items():
-                player += [f'--{source}', topic]
+            for source in sources:
+                if source.name in inputs.topics:
+                    player += ['--input', source.name, source.kind.value, source.topic,
+                               inputs.topics[source.name]]
             processes.append(subprocess.Popen(player, env=env))
             while processes[1].poll() is None:
                 if node.poll() is not None:

@@ -9,7 +9,7 @@ import sys
 from pose_graph_ros import __version__
 from pose_graph_ros.cli import demo, replay, solve
 from pose_graph_ros.cli.simulate import simulate_drive, write_drive
-from pose_graph_ros.ros.parameters import as_markdown, as_yaml
+from pose_graph_ros.ros.parameter_texts import as_markdown, as_yaml, sources_as_markdown
 
 
 def main(args: list[str] | None = None) -> int:
@@ -48,7 +48,7 @@ def _simulate(options: argparse.Namespace) -> int:
 
 
 def _parameters(options: argparse.Namespace) -> int:
-    print(as_yaml() if options.yaml else as_markdown(), end='')
+    print(as_yaml() if options.yaml else f'{as_markdown()}\n{sources_as_markdown()}', end='')
     return 0
 
 

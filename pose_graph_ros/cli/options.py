@@ -10,6 +10,7 @@ from typing import Any
 import yaml
 
 from pose_graph_ros.core.exceptions import ConfigError
+from pose_graph_ros.ros.inputs import OPTIONS
 from pose_graph_ros.ros.parameters import checked
 
 
@@ -22,7 +23,9 @@ def add_inputs(parser: argparse.ArgumentParser) -> None:
     group.add_argument('--global-pose', metavar='TOPIC',
                        help='geometry_msgs/PoseWithCovarianceStamped in the map')
     group.add_argument('--loop-closure', metavar='TOPIC',
-                       help='geometry_msgs/PoseWithCovarianceStamped seen from an earlier pose')
+                       help='geometry_msgs/PoseWithCovarianceStamped seen from another pose')
+    group.add_argument('--imu', metavar='TOPIC',
+                       help='sensor_msgs/Imu with an absolute heading, if sources list it')
     group.add_argument('--truth', metavar='TOPIC',
                        help='Odometry or PoseStamped in the map, for comparison alone')
     parser.add_argument('--hold-out', metavar='N', type=int, default=0,
@@ -38,9 +41,8 @@ def add_parameters(parser: argparse.ArgumentParser) -> None:
 
 
 def wanted_topics(options: argparse.Namespace) -> dict[str, str | None]:
-    """Return the topics that the options name, by input."""
-    return {'odom': options.odom, 'fix': options.fix, 'global_pose': options.global_pose,
-            'loop_closure': options.loop_closure}
+    """Return the topics that the options name, by source."""
+    return {source: getattr(options, source) for source in OPTIONS}
 
 
 def parameter_values(options: argparse.Namespace) -> dict[str, Any]:

@@ -26,9 +26,9 @@ from pose_graph_ros.core.exceptions import PoseGraphError
 from pose_graph_ros.core.io.g2o import write_g2o
 from pose_graph_ros.core.measurements import Answer, OdometrySample
 from pose_graph_ros.ros.bags import BagError, BagReader, MessageError, open_bag
-from pose_graph_ros.ros.conversions import FixReader, MessageReader
-from pose_graph_ros.ros.inputs import choose_inputs, Inputs, read_inputs
-from pose_graph_ros.ros.parameters import backend_config
+from pose_graph_ros.ros.inputs import choose_inputs, Inputs, read_inputs, read_static_frames
+from pose_graph_ros.ros.reader import MessageReader
+from pose_graph_ros.ros.sources import backend_config, Kind, source_list
 
 # An update each time that so many hidden nodes have come keeps the estimate near the optimum.
 UPDATE_EVERY = 10
@@ -48,8 +48,9 @@ class Replayed:
 def run(bag: BagReader, inputs: Inputs, values: Mapping[str, Any]) -> Replayed:
     """Feed a bag's messages to a new engine and optimise fully at the end."""
     backend = PoseGraphBackend(backend_config(values))
-    reader = MessageReader(
-        values['map_frame'], FixReader(values['datum'], values['fix.lever_arm']))
+    reader = MessageReader(values)
+    for message in read_static_frames(bag):
+        reader.frames.take(message.decode())
     refused: Counter[tuple[str, str]] = Counter()
     next_update = UPDATE_EVERY
     for source, message, held_out in read_inputs(bag, inputs):
@@ -85,7 +86,8 @@ def execute(options: argparse.Namespace) -> int:
     """Run the tool; return the exit code."""
     values = shared.parameter_values(options)
     with open_bag(options.bag) as bag:
-        inputs = choose_inputs(bag, shared.wanted_topics(options), options.hold_out)
+        inputs = choose_inputs(
+            bag, source_list(values), shared.wanted_topics(options), options.hold_out)
         for source, topic in inputs.topics.items():
             print(f'{source}: {topic}')
         start = time.monotonic()
@@ -94,7 +96,8 @@ def execute(options: argparse.Namespace) -> int:
         backend, report = replayed.backend, replayed.report
         estimate = backend.estimate()
         if estimate is None:
-            raise BagError(f'{options.bag}: no usable odometry on {inputs.topics["odom"]}')
+            topics = ' or '.join(inputs.topics[name] for name in inputs.of(Kind.ODOMETRY))
+            raise BagError(f'{options.bag}: no usable odometry on {topics}')
         drive = collect_drive(bag, inputs, values, estimate.path, options.truth)
     counts = {f'{source}.{answer}': count for (source, answer), count
               in sorted((backend.counts + replayed.refused).items())}

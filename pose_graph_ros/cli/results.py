@@ -13,11 +13,19 @@ from pose_graph_ros.cli.evaluation import Drive, evaluate, format_table, summary
 from pose_graph_ros.cli.picture import draw_drive
 from pose_graph_ros.core import se2
 from pose_graph_ros.core.io.tum import write_tum
-from pose_graph_ros.core.measurements import Answer, GlobalPose, LoopClosure, Position
+from pose_graph_ros.core.measurements import (
+    Answer,
+    GlobalPose,
+    HeadingOnly,
+    LoopClosure,
+    Position,
+)
 from pose_graph_ros.core.trajectory import Trajectory
 from pose_graph_ros.ros.bags import BagError, BagReader, MessageError
-from pose_graph_ros.ros.conversions import FixReader, MessageReader, planar_pose, stamp_ns
-from pose_graph_ros.ros.inputs import Inputs, read_inputs
+from pose_graph_ros.ros.conversions import planar_pose, stamp_ns
+from pose_graph_ros.ros.inputs import Inputs, read_inputs, read_static_frames
+from pose_graph_ros.ros.reader import MessageReader
+from pose_graph_ros.ros.sources import Kind
 
 TRUTH_TYPES = ('nav_msgs/msg/Odometry', 'geometry_msgs/msg/PoseStamped',
                'geometry_msgs/msg/PoseWithCovarianceStamped')
@@ -35,15 +43,17 @@ def collect_drive(
     bag : BagReader
     inputs : Inputs
     values : mapping
-        The node's parameters: the frame of the map, datum and lever arm.
+        All parameters of the node.
     corrected : Trajectory
         The result, `T_map_base`.
     truth_topic : str, optional
         Poses in the map that are taken for the truth.
 
     """
-    fixes = FixReader(values['datum'], values['fix.lever_arm'])
-    reader = MessageReader(values['map_frame'], fixes)
+    reader = MessageReader(values)
+    for frames in read_static_frames(bag):
+        reader.frames.take(frames.decode())
+    preferred = inputs.of(Kind.ODOMETRY)[0]
     odometry: dict[int, np.ndarray] = {}
     observed: list[tuple[int, np.ndarray, np.ndarray, bool]] = []
     loops: list[tuple[int, int]] = []
@@ -53,7 +63,7 @@ def collect_drive(
         except MessageError:
             continue
         match measurement:
-            case Answer():
+            case Answer() | HeadingOnly():
                 continue
             case Position(stamp, position, _, lever_arm):
                 observed.append((stamp, position, lever_arm, held_out))
@@ -63,7 +73,7 @@ def collect_drive(
                 loops.append((reference, stamp))
             case LoopClosure():
                 continue
-            case sample:
+            case sample if source == preferred:
                 odometry.setdefault(sample.stamp_ns, sample.pose)
     stamps = np.array([row[0] for row in observed], dtype=np.int64)
     positions = np.array([row[1] for row in observed]).reshape(-1, 2)
@@ -77,7 +87,7 @@ def collect_drive(
         fix_held_out=np.array([row[3] for row in observed], dtype=bool), corrected=corrected,
         truth=None if truth_topic is None else read_truth(bag, truth_topic),
         loop_stamps_ns=np.array(loops, dtype=np.int64).reshape(-1, 2),
-        map_axes=('east', 'north') if 'fix' in inputs.topics and not any(values['datum'][2:])
+        map_axes=('east', 'north') if len(inputs.of(Kind.FIX)) > 0 and not any(values['datum'][2:])
         else ('x', 'y'))
 
 

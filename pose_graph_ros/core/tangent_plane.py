@@ -15,6 +15,10 @@ import pyproj
 from pose_graph_ros.core import se2
 from pose_graph_ros.core.se2 import FloatArray
 
+# So often a point is lifted to an altitude; each time what is missing shrinks by the angle
+# between the verticals there and at the datum, squared.
+LIFTS = 4
+
 
 class TangentPlane:
     """
@@ -59,10 +63,24 @@ class TangentPlane:
         east, north, _ = self._projection.transform(longitude, latitude, altitude)
         return se2.transform(se2.inverse(self._map), np.stack((east, north), axis=-1))
 
-    def to_geodetic(self, position: FloatArray) -> FloatArray:
-        """Return latitude, longitude [degrees] and altitude [m], shape (..., 3), of points."""
+    def to_geodetic(self, position: FloatArray, altitude: float | None = None) -> FloatArray:
+        """
+        Return latitude, longitude [degrees] and altitude [m], shape (..., 3), of points.
+
+        Parameters
+        ----------
+        position : ndarray, shape (..., 2)
+            In the map [m].
+        altitude : float, optional
+            Of the points above the ellipsoid [m]; those in the plane itself if it is not given.
+
+        """
         east_north = se2.transform(self._map, position)
         east, north = east_north[..., 0], east_north[..., 1]
-        longitude, latitude, altitude = self._projection.transform(
-            east, north, np.zeros_like(east), direction='INVERSE')
-        return np.stack((latitude, longitude, altitude), axis=-1)
+        up = np.zeros_like(east)
+        for _ in range(1 if altitude is None else LIFTS):
+            longitude, latitude, height = self._projection.transform(
+                east, north, up, direction='INVERSE')
+            if altitude is not None:
+                up = up + altitude - height
+        return np.stack((latitude, longitude, height), axis=-1)

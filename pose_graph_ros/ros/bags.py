@@ -192,6 +192,7 @@ def open_bag(path: str | Path) -> BagReader:
 
 def choose_topic(
     reader: BagReader, wanted: str | None, type_name: str, option: str,
+    *, among: Collection[str] | None = None,
 ) -> str | None:
     """
     Return the topic to read: the wanted one, or else the only one of the type.
@@ -205,6 +206,8 @@ def choose_topic(
         The message type that the topic must have, such as `nav_msgs/msg/Odometry`.
     option : str
         The user's option for this topic, such as `--odom`, for the messages.
+    among : collection of str, optional
+        Topics to choose from; all if it is not given.
 
     Returns
     -------
@@ -226,7 +229,8 @@ def choose_topic(
             raise BagError(
                 f'{reader.path}: {option} {wanted} is of type {info.type}, expected {type_name}')
         return wanted
-    candidates = [name for name, info in reader.topics.items() if info.type == type_name]
+    candidates = [name for name, info in reader.topics.items()
+                  if info.type == type_name and (among is None or name in among)]
     if len(candidates) > 1:
         choices = ' or '.join(f'{option} {name}' for name in candidates)
         raise BagError(

@@ -6,26 +6,25 @@ The inputs of the node as a bag holds them: which topic feeds which, and what is
 Player and offline replay read bags through here, so both feed the same messages. No rclpy.
 """
 
-from collections.abc import Iterator, Mapping
-from dataclasses import dataclass
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
+import logging
 from typing import NamedTuple
 
-from pose_graph_ros.ros.bags import BagError, BagMessage, BagReader, choose_topic
+from pose_graph_ros.ros.bags import (
+    BagError,
+    BagMessage,
+    BagReader,
+    choose_topic,
+    MessageError,
+)
+from pose_graph_ros.ros.sources import CLOSURES, Kind, KNOWN_SOURCES, Source
 
-POSE = 'geometry_msgs/msg/PoseWithCovarianceStamped'
-TYPES = {
-    'odom': 'nav_msgs/msg/Odometry',
-    'fix': 'sensor_msgs/msg/NavSatFix',
-    'global_pose': POSE,
-    'loop_closure': POSE,
-}
-"""Message type of each input of the node."""
-TOPICS = {
-    'odom': 'odom', 'fix': 'gps/fix', 'global_pose': 'global_pose',
-    'loop_closure': 'loop_closure'}
-"""Topic of the node for each input."""
-CLOSURES = '/loop_closure'
-"""Topic of a bag that is taken for loop closures without being asked for."""
+logger = logging.getLogger(__name__)
+
+OPTIONS = tuple(KNOWN_SOURCES)
+"""Sources whose topics in a bag the user can name, and that may be guessed."""
+STATIC_FRAMES = '/tf_static', 'tf2_msgs/msg/TFMessage'
 
 
 @dataclass(frozen=True, slots=True)
@@ -33,13 +32,19 @@ class Inputs:
     """Topics of a bag that feed the node, and how much of them is kept back."""
 
     topics: Mapping[str, str]
-    """Input, such as `fix`, to the topic in the bag."""
+    """Source, such as `fix`, to the topic in the bag."""
+    kinds: Mapping[str, Kind] = field(default_factory=dict)
+    """What each of them is."""
     hold_out: int = 0
     """Every so many-th fix (global pose, if there are no fixes) is held out; 0 for none."""
 
     def __post_init__(self) -> None:
         if self.hold_out < 0 or self.hold_out == 1:
             raise BagError(f'hold out: expected 0 or at least 2, got {self.hold_out}')
+
+    def of(self, *kinds: Kind) -> list[str]:
+        """Return the sources of some kinds."""
+        return [source for source in self.topics if self.kinds[source] in kinds]
 
 
 class InputMessage(NamedTuple):
@@ -51,12 +56,14 @@ class InputMessage(NamedTuple):
 
 
 def choose_inputs(
-    reader: BagReader, wanted: Mapping[str, str | None], hold_out: int = 0,
+    reader: BagReader, sources: Sequence[Source], wanted: Mapping[str, str | None],
+    hold_out: int = 0,
 ) -> Inputs:
     """
-    Settle which topics feed which input: those asked for, else what the bag leaves no doubt about.
+    Settle which topics feed which source.
 
-    Odometry and fixes are then the only topic of their type, loop closures are `/loop_closure`,
+    Those asked for, else those that the parameters name, else what the bag leaves no doubt about:
+    odometry and fixes are then the only topic of their type, loop closures are `/loop_closure`,
     and where there are no fixes a global pose is the only other pose. Who asks for global poses
     gets no fixes unasked, and the other way around.
 
@@ -66,32 +73,69 @@ def choose_inputs(
         If there is no odometry, or the choice is not clear; names the candidates.
 
     """
-    topics: dict[str, str] = {}
+    kinds = {source.name: source.kind for source in sources}
+    chosen = {name: topic for name, topic in wanted.items() if topic is not None}
+    asked = 'global_pose' in chosen
+    for name in sorted(set(chosen) - set(kinds)):
+        raise BagError(f'--{_option(name)} {chosen[name]}: the parameter sources has no {name}')
+    for source in sources:
+        named = '/' + source.topic.removeprefix('/')
+        if source.name not in chosen and source.topic != _usual_topic(source):
+            if named in reader.topics:
+                chosen[source.name] = named
+            else:
+                logger.warning('%s: no topic %s for %s', reader.path, named, source.name)
+    topics = {name: _take(reader, name, kinds[name], topic) for name, topic in chosen.items()}
+    for name in ('odom', 'fix', CLOSURES, 'global_pose', 'imu'):
+        if name in topics or name not in kinds or _is_named(name, sources):
+            continue
+        guess = _guess(reader, name, kinds, topics, asked=asked)
+        if guess is not None:
+            topics[name] = guess
+    ordered = {name: topics[name] for name in kinds if name in topics}
+    inputs = Inputs(ordered, {name: kinds[name] for name in ordered}, hold_out)
+    if len(inputs.of(Kind.ODOMETRY)) == 0:
+        raise BagError(f'{reader.path}: no topic of type {Kind.ODOMETRY.message_type} for the '
+                       f'odometry; the bag has {reader.describe()}')
+    return inputs
 
-    def take(source: str, name: str | None) -> None:
-        option = f'--{source.replace("_", "-")}'
-        chosen = choose_topic(reader, name, TYPES[source], option)
-        if chosen is not None:
-            topics[source] = chosen
 
-    odom, fix, global_pose, closure = (wanted.get(source) for source in TYPES)
-    poses = [name for name, info in reader.topics.items() if info.type == POSE]
-    if closure is None and CLOSURES in poses:
-        closure = CLOSURES
-    take('odom', odom)
-    if fix is not None or global_pose is None:
-        take('fix', fix)
-    others = [name for name in poses if name != closure]
-    if global_pose is None and 'fix' not in topics and len(others) == 1:
-        global_pose = others[0]
-    if global_pose is not None:
-        take('global_pose', global_pose)
-    if closure is not None:
-        take('loop_closure', closure)
-    if 'odom' not in topics:
-        raise BagError(f'{reader.path}: no topic of type {TYPES["odom"]} for the odometry; '
-                       f'the bag has {reader.describe()}')
-    return Inputs(topics, hold_out)
+def _option(name: str) -> str:
+    return name.replace('_', '-')
+
+
+def _usual_topic(source: Source) -> str | None:
+    return KNOWN_SOURCES[source.name][1] if source.name in KNOWN_SOURCES else None
+
+
+def _is_named(name: str, sources: Sequence[Source]) -> bool:
+    return any(source.name == name and source.topic != _usual_topic(source) for source in sources)
+
+
+def _take(reader: BagReader, name: str, kind: Kind, topic: str) -> str:
+    option = f'--{_option(name)}' if name in OPTIONS else f'{name}.topic'
+    chosen = choose_topic(reader, topic, kind.message_type, option)
+    assert chosen is not None
+    return chosen
+
+
+def _guess(
+    reader: BagReader, name: str, kinds: Mapping[str, Kind], topics: Mapping[str, str],
+    *, asked: bool,
+) -> str | None:
+    """Return the topic of a source that nobody has named, if there is one."""
+    kind = kinds[name]
+    free = [topic for topic, info in reader.topics.items()
+            if info.type == kind.message_type and topic not in topics.values()]
+    if kind is Kind.LOOP_CLOSURE:
+        usual = '/' + KNOWN_SOURCES[CLOSURES][1]
+        return usual if usual in free else None
+    if kind is Kind.GLOBAL_POSE:
+        fixes = any(kinds[source] is Kind.FIX for source in topics)
+        return free[0] if len(free) == 1 and not fixes else None
+    if kind is Kind.FIX and asked:
+        return None
+    return choose_topic(reader, None, kind.message_type, f'--{_option(name)}', among=free)
 
 
 def read_inputs(reader: BagReader, inputs: Inputs) -> Iterator[InputMessage]:
@@ -99,12 +143,27 @@ def read_inputs(reader: BagReader, inputs: Inputs) -> Iterator[InputMessage]:
     sources: dict[str, list[str]] = {}
     for source, topic in inputs.topics.items():
         sources.setdefault(topic, []).append(source)
-    held_source = 'fix' if 'fix' in inputs.topics else 'global_pose'
+    held = inputs.of(Kind.FIX) or inputs.of(Kind.GLOBAL_POSE)
     count = 0
     for message in reader.messages(list(sources)):
         for source in sources[message.topic]:
             held_out = False
-            if source == held_source and inputs.hold_out > 0:
+            if source in held and inputs.hold_out > 0:
                 count += 1
                 held_out = count % inputs.hold_out == 0
             yield InputMessage(source, message, held_out)
+
+
+def read_static_frames(reader: BagReader) -> list[BagMessage]:
+    """Return what a bag holds of /tf_static: it is known before anything else."""
+    topic, type_name = STATIC_FRAMES
+    if topic not in reader.topics or reader.topics[topic].type != type_name:
+        return []
+    good = []
+    for message in reader.messages([topic]):
+        try:
+            message.decode()
+        except MessageError:
+            continue
+        good.append(message)
+    return good

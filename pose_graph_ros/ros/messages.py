@@ -11,12 +11,16 @@ from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
 from geometry_msgs.msg import Pose, PoseWithCovariance, PoseWithCovarianceStamped, TransformStamped
 from nav_msgs.msg import Odometry
 import numpy as np
+from sensor_msgs.msg import NavSatFix, NavSatStatus
 from std_msgs.msg import Header
 
+from pose_graph_ros.core import covariance as cov
 from pose_graph_ros.core.prediction import Prediction
 from pose_graph_ros.core.se2 import FloatArray
+from pose_graph_ros.core.tangent_plane import TangentPlane
 from pose_graph_ros.core.trajectory import Trajectory
-from pose_graph_ros.ros.conversions import NANOSECONDS, PLANAR
+from pose_graph_ros.ros.conversions import PLANAR
+from pose_graph_ros.ros.sources import NANOSECONDS
 
 # Height, roll and pitch are not estimated: their variance says so [m^2, rad^2].
 UNKNOWN_VARIANCE = 1e6
@@ -68,6 +72,21 @@ def stamped_pose_message(
     """Return the pose in the map alone."""
     return PoseWithCovarianceStamped(
         header=Header(stamp=time_message(stamp_ns), frame_id=map_frame), pose=pose)
+
+
+def fix_message(
+    stamp_ns: int, prediction: Prediction, plane: TangentPlane, altitude: float, base_frame: str,
+) -> NavSatFix:
+    """Return where the robot is on the Earth, its covariance turned to east and north."""
+    latitude, longitude, _ = plane.to_geodetic(prediction.T_map_base[:2], altitude)
+    covariance = np.diag((0.0, 0.0, UNKNOWN_VARIANCE))
+    covariance[:2, :2] = cov.turned(prediction.covariance[:2, :2], -plane.yaw)
+    return NavSatFix(
+        header=Header(stamp=time_message(stamp_ns), frame_id=base_frame),
+        status=NavSatStatus(status=NavSatStatus.STATUS_FIX), latitude=float(latitude),
+        longitude=float(longitude), altitude=float(altitude),
+        position_covariance=covariance.ravel(),
+        position_covariance_type=NavSatFix.COVARIANCE_TYPE_KNOWN)
 
 
 def transform_message(

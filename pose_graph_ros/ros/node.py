@@ -8,12 +8,11 @@ newest estimate carried on by that odometry; the path goes out after an update.
 """
 
 from collections import Counter
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from functools import partial
 import time
 from typing import Any
 
-from diagnostic_msgs.msg import DiagnosticStatus
 from geometry_msgs.msg import PoseWithCovarianceStamped
 from nav_msgs.msg import Odometry
 from rcl_interfaces.msg import FloatingPointRange, ParameterDescriptor
@@ -21,20 +20,35 @@ from rclpy.callback_groups import MutuallyExclusiveCallbackGroup
 from rclpy.clock import Clock, ClockType
 from rclpy.node import Node
 from rclpy.parameter import Parameter as RosParameter
-from rclpy.qos import QoSHistoryPolicy, QoSProfile, QoSReliabilityPolicy
+from rclpy.qos import (
+    QoSDurabilityPolicy,
+    QoSHistoryPolicy,
+    QoSProfile,
+    QoSReliabilityPolicy,
+)
 from rclpy.qos_overriding_options import QoSOverridingOptions
 from rclpy.task import Future
-from sensor_msgs.msg import NavSatFix
+from sensor_msgs.msg import Imu, NavSatFix
 from std_srvs.srv import Trigger
 
 from pose_graph_ros.core.backend import PoseGraphBackend
 from pose_graph_ros.core.batch import Status
-from pose_graph_ros.core.estimate import AlignmentState, Estimate
-from pose_graph_ros.core.exceptions import ConfigError
 from pose_graph_ros.core.measurements import Answer, OdometrySample, rejected
-from pose_graph_ros.ros.conversions import FixReader, frame, Message, MessageReader
-from pose_graph_ros.ros.parameters import backend_config, checked, Parameter, PARAMETERS
-from pose_graph_ros.ros.publishers import Publishers
+from pose_graph_ros.ros import diagnostics
+from pose_graph_ros.ros.continuity import Continuity
+from pose_graph_ros.ros.conversions import frame, Message
+from pose_graph_ros.ros.hearing import Hearing
+from pose_graph_ros.ros.parameters import (
+    checked,
+    listed_sources,
+    Parameter,
+    PARAMETERS,
+    source_parameters,
+    type_parameter,
+)
+from pose_graph_ros.ros.publishers import Publishers, TFMessage
+from pose_graph_ros.ros.reader import MessageReader
+from pose_graph_ros.ros.sources import backend_config, Kind, Source
 from pose_graph_ros.ros.worker import Worker
 
 # Every increment of the odometry counts, so the queue is deep; a best-effort reader hears
@@ -43,13 +57,14 @@ SENSOR_QOS = QoSProfile(depth=1000, history=QoSHistoryPolicy.KEEP_LAST,
                         reliability=QoSReliabilityPolicy.BEST_EFFORT)
 # A loop closure is rare and must not get lost.
 CLOSURE_QOS = QoSProfile(depth=100, reliability=QoSReliabilityPolicy.RELIABLE)
+# Every broadcaster's newest message, however late this node starts.
+STATIC_QOS = QoSProfile(depth=100, reliability=QoSReliabilityPolicy.RELIABLE,
+                        durability=QoSDurabilityPolicy.TRANSIENT_LOCAL)
 
-INPUTS: tuple[tuple[str, str, type, QoSProfile], ...] = (
-    ('odom', 'odom', Odometry, SENSOR_QOS),
-    ('global_pose', 'global_pose', PoseWithCovarianceStamped, SENSOR_QOS),
-    ('fix', 'gps/fix', NavSatFix, SENSOR_QOS),
-    ('loop_closure', 'loop_closure', PoseWithCovarianceStamped, CLOSURE_QOS),
-)
+CLASSES: dict[Kind, tuple[type, QoSProfile]] = {
+    Kind.ODOMETRY: (Odometry, SENSOR_QOS), Kind.FIX: (NavSatFix, SENSOR_QOS),
+    Kind.GLOBAL_POSE: (PoseWithCovarianceStamped, SENSOR_QOS), Kind.IMU: (Imu, SENSOR_QOS),
+    Kind.LOOP_CLOSURE: (PoseWithCovarianceStamped, CLOSURE_QOS)}
 
 # How long the end of the node waits for a solve that is under way [s]; launch kills after 5.
 STOP_TIMEOUT = 4.0
@@ -70,28 +85,35 @@ class PoseGraphNode(Node):
 
     def __init__(self, **node_options: Any) -> None:
         super().__init__('pose_graph', **node_options)
-        values = self._declare(PARAMETERS)
-        try:
-            config = backend_config(values)
-            fixes = FixReader(values['datum'], values['fix.lever_arm'])
-        except ValueError as error:
-            raise ConfigError(str(error)) from error
-        self._out = Publishers(self, values, config.odometry_noise)
-        self._reader = MessageReader(self._out.map_frame, fixes)
+        values = self._checked_parameters()
+        config = backend_config(values)
+        self._reader = MessageReader(values)
+        self._out = Publishers(self, values, self._reader.datum)
+        sources = self._reader.sources.values()
+        self._continuity = {
+            name: Continuity(source.maximum_speed) for name, source in config.odometry.items()}
         self._received: Counter[str] = Counter()
         self._refused: Counter[tuple[str, str]] = Counter()
+        self._posted = 0
         self._said: set[tuple[str, str]] = set()
+        self._hearing = Hearing(
+            [source.name for source in sources if source.kind is Kind.LOOP_CLOSURE])
+        self._silent: list[str] = []
         self._closing_silence = values['closing_silence']
         self._heard_at = time.monotonic()
         self._closed = True
 
+        # first: what it tells has to be there before the first fix, if that can be
+        if TFMessage is not None and any(
+                not any(source.lever_arm) for source in sources if source.kind is Kind.FIX):
+            self._subscribe('/tf_static', TFMessage, self._on_static_frames, STATIC_QOS)
         self._fresh = self.create_guard_condition(self._publish_path)
         self._worker = Worker(
             PoseGraphBackend(config), lambda _: self._fresh.trigger(), self._warm_up)
-        for source, topic, message_type, qos in INPUTS:
-            self.create_subscription(
-                message_type, topic, partial(self._on_message, source), qos,
-                qos_overriding_options=QoSOverridingOptions.with_default_policies())
+        for source in sources:
+            message_type, qos = CLASSES[source.kind]
+            self._subscribe(source.topic, message_type, partial(self._on_message, source), qos)
+        self.create_service(Trigger, '~/set_datum', self._on_set_datum)
         # in a group of its own: in the common one a callback that awaits holds all others up
         self.create_service(Trigger, '~/optimize', self._on_optimize,
                             callback_group=MutuallyExclusiveCallbackGroup())
@@ -102,13 +124,31 @@ class PoseGraphNode(Node):
         self.create_timer(values['diagnostics_period'], self._publish_diagnostics, clock=steady)
         self.create_timer(max(values['path_period'], 0.1), self._publish_path, clock=steady)
         self._worker.start()
-        topics = ', '.join(self.resolve_topic_name(topic) for _, topic, _, _ in INPUTS)
+        topics = ', '.join(self.resolve_topic_name(source.topic) for source in sources)
         self.get_logger().info(f'ready, listening to {topics}')
 
-    def _declare(self, parameters: tuple[Parameter, ...]) -> dict[str, Any]:
-        """Declare the parameters and return their values."""
+    def _subscribe(
+        self, topic: str, message_type: type, take: Callable[[Any], None], qos: QoSProfile,
+    ) -> None:
+        self.create_subscription(
+            message_type, topic, take, qos,
+            qos_overriding_options=QoSOverridingOptions.with_default_policies())
+
+    def _checked_parameters(self) -> dict[str, Any]:
+        """Declare all parameters and return their checked values."""
+        given = self._declare(PARAMETERS)
+        for source in listed_sources(given):
+            kind = self._declare([type_parameter(source)])[f'{source}.type']
+            given |= self._declare(source_parameters(source, kind))
+        return checked(given)
+
+    def _declare(self, parameters: Sequence[Parameter]) -> dict[str, Any]:
+        """Declare parameters and return the values of those that are set."""
         given: dict[str, Any] = {}
         for parameter in parameters:
+            if self.has_parameter(parameter.name):
+                given[parameter.name] = self.get_parameter(parameter.name).value
+                continue
             # an array without a value has no type yet; numbers may be given as 5 for 5.0
             unset = parameter.default == []
             declared = self.declare_parameter(
@@ -117,7 +157,7 @@ class PoseGraphNode(Node):
                 given[parameter.name] = (
                     list(declared.value) if isinstance(parameter.default, list)
                     else declared.value)
-        return checked(given)
+        return given
 
     def stop(self) -> None:
         """End the worker."""
@@ -137,24 +177,40 @@ class PoseGraphNode(Node):
         if not stopped():
             self.get_logger().info(f'kernels ready after {seconds:.1f} s')
 
-    def _on_message(self, source: str, message: Message) -> None:
+    def _on_message(self, source: Source, message: Message) -> None:
         """Convert a message and post it; never raises, whatever the message holds."""
-        self._received[source] += 1
+        name = source.name
+        self._received[name] += 1
+        self._hearing.hear(name, time.monotonic())
         try:
-            measurement = self._reader.read(source, message)
+            measurement = self._reader.read(name, message)
         except Exception as error:
             measurement = rejected('malformed', f'{type(error).__name__}: {error}')
-        if not isinstance(measurement, Answer) and not self._worker.post(source, measurement):
+        if not isinstance(measurement, Answer) and not self._worker.post(name, measurement):
             measurement = rejected('inbox_full', 'the solver does not keep up')
         if isinstance(measurement, Answer):
-            self._refuse(source, measurement)
+            self._refuse(name, measurement)
             return
+        self._posted += 1
         self._heard_at, self._closed = time.monotonic(), False
-        if source == 'odom':
-            self._check_frames(message)
+        if isinstance(measurement, OdometrySample):
+            self._carry(name, measurement, message)
+
+    def _carry(self, name: str, sample: OdometrySample, message: Odometry) -> None:
+        """Publish where the robot is by the newest estimate, carried on by odometry."""
         estimate = self._worker.estimate
-        if isinstance(measurement, OdometrySample) and estimate is not None:
-            self._out.publish_pose(estimate, message, measurement.pose)
+        carries = self._continuity[name].carries(estimate, sample)
+        if estimate is None or estimate.lead != name:
+            return
+        self._check_frames(message)
+        if carries:
+            self._out.publish_pose(estimate, message, sample)
+        else:
+            self._worker.request_update()  # with this sample
+
+    def _on_static_frames(self, message: Message) -> None:
+        """Take the transforms between the parts of the robot."""
+        self._reader.frames.take(message)
 
     def _refuse(self, source: str, answer: Answer) -> None:
         """Count what cannot be used, and say so once for each source and reason."""
@@ -189,6 +245,21 @@ class PoseGraphNode(Node):
             self._closed = True
             self._worker.request_closing()
 
+    def _on_set_datum(self, _: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
+        """Make the next good fix the datum, unless the graph refers to the present one."""
+        status, datum = self._worker.status, self._reader.datum
+        used = sum(status.counts[name, 'accepted'] for name in self._reader.fixes)
+        if datum.plane is not None and used > 0:
+            response.message = (f'refused: {used} fixes in the graph refer to the datum '
+                                f'[{datum.plane.latitude:.9f}, {datum.plane.longitude:.9f}]')
+        elif datum.plane is not None and (status.pending > 0 or status.processed < self._posted):
+            response.message = ('refused: measurements that wait for odometry may refer to the '
+                                'present datum')
+        else:
+            datum.renew()
+            response.success, response.message = True, 'the next good fix will be the datum'
+        return response
+
     async def _on_optimize(
         self, _: Trigger.Request, response: Trigger.Response,
     ) -> Trigger.Response:
@@ -220,50 +291,14 @@ class PoseGraphNode(Node):
             self._out.publish_path(estimate)
 
     def _publish_diagnostics(self) -> None:
-        status, estimate = self._worker.status, self._worker.estimate
-        values: dict[str, object] = {
-            'received': sum(self._received.values()),
-            'processed': status.processed + sum(self._refused.values()),
-            'pending': status.pending, 'quarantined': status.quarantined,
-            'updates': status.updates, 'prepared': int(self._worker.prepared),
-            'solve_mean_ms': f'{1e3 * status.solve_mean:.3f}',
-            'solve_max_ms': f'{1e3 * status.solve_max:.3f}'}
-        for source, count in sorted(self._received.items()):
-            values[f'received.{source}'] = count
-        for (source, answer), count in sorted((status.counts + self._refused).items()):
-            values[f'{source}.{answer}'] = count
-        if estimate is not None:
-            values.update({
-                'alignment': estimate.alignment.value,
-                'alignment_sigma_deg': f'{57.29577951308232 * estimate.alignment_sigma:.3f}',
-                'hidden_nodes': estimate.n_hidden, 'edges': estimate.n_edges,
-                'observed_nodes': estimate.n_observed, 'chi2': f'{estimate.chi2:.6g}'})
-        failed = status.report is not None and status.report.status is Status.FAILED
-        level, text = _health(
-            estimate, failed=failed, alive=self._worker.alive, prepared=self._worker.prepared)
-        self._out.publish_diagnostics(level, text, values)
-
-
-def _health(
-    estimate: Estimate | None, *, failed: bool, alive: bool, prepared: bool,
-) -> tuple[bytes, str]:
-    """Return the level of the diagnostics and a sentence that says what to do."""
-    if not alive:
-        return DiagnosticStatus.ERROR, 'The worker has ended: start the node again.'
-    if failed:
-        return (DiagnosticStatus.ERROR, 'The newest measurements made the solver fail and were '
-                'set aside; the last good estimate stays. See the log for the reason.')
-    if estimate is None:
-        return DiagnosticStatus.WARN, (
-            'No odometry yet: check the topic odom.' if prepared else
-            'Compiling, as at every first start: what comes in waits.')
-    if estimate.alignment is AlignmentState.UNALIGNED:
-        return (DiagnosticStatus.WARN, 'Unaligned: the angle between odometry and map is not '
-                'known yet. Drive some metres with a fix.')
-    if estimate.alignment is AlignmentState.LOCAL:
-        return (DiagnosticStatus.OK, 'Running; nothing was measured in the map, which begins '
-                'where odometry does.')
-    return DiagnosticStatus.OK, 'Running.'
+        now = time.monotonic()
+        before, self._silent = self._silent, self._hearing.silent(now)
+        for name in set(self._silent) - set(before):
+            self.get_logger().warning(f'{name} is silent, other sources go on')
+        level, text = diagnostics.health(self._worker, self._silent)
+        self._out.publish_diagnostics(level, text, {
+            **diagnostics.state(self._worker, self._received, self._refused),
+            **diagnostics.inputs(self._reader, self._hearing, now)})
 
 
 def _descriptor(parameter: Parameter) -> ParameterDescriptor:

@@ -1,40 +1,67 @@
 # Copyright 2026 The pose_graph_ros authors
 # SPDX-License-Identifier: Apache-2.0
 """
-The table of all parameters: the node declares them from it, the yaml file and the README show it.
+The tables of all parameters: the node declares them from here, yaml file and README show them.
 
-Defaults come from `core.config`, so that the offline tools have the same. This module imports no
-ROS.
+One table holds those of the node, the other those that every source has under its name. Defaults
+come from `core`, so that the offline tools have the same. This module imports no ROS.
 """
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from enum import Enum
+import re
 from typing import Any
 
-from pose_graph_ros.core.config import AlignmentPolicy, BackendConfig, NodePolicy, OdometryNoise
+from pose_graph_ros.core.config import AlignmentPolicy, BackendConfig, NodePolicy
 from pose_graph_ros.core.exceptions import ConfigError
+from pose_graph_ros.core.sources import (
+    Correlation,
+    CovariancePolicy,
+    Heading,
+    LOOP_CLOSURES,
+    Loss,
+    MeasurementSource,
+    NoiseFrom,
+    OdometrySource,
+)
+from pose_graph_ros.ros.sources import DEFAULT_SOURCES, Kind, KNOWN_SOURCES, source_names
 
-Value = bool | float | str | list[float]
+Value = bool | float | str | list[float] | list[str]
 
 
 @dataclass(frozen=True, slots=True)
 class Parameter:
-    """One parameter of the node."""
+    """One parameter; of a source if it has kinds."""
 
     name: str
+    """That of a source stands without the name of the source."""
     default: Value
     """An empty list of numbers stands for "not set"."""
     unit: str
     description: str
     smallest: float | None = None
-    """Bound of a number, inclusive."""
+    """Bound of a number, or of each in a list, inclusive."""
     largest: float | None = None
+    choices: tuple[str, ...] = ()
+    """What a text may be; empty for anything."""
+    sizes: tuple[int, ...] = ()
+    """How many numbers a list may have; empty for any."""
+    kinds: tuple[Kind, ...] = ()
+    """Kinds of sources that have the parameter."""
 
 
-_NODES, _NOISE, _ALIGNMENT, _BACKEND = (
-    NodePolicy(), OdometryNoise(), AlignmentPolicy(), BackendConfig())
+def _values(choices: type[Enum]) -> tuple[str, ...]:
+    return tuple(str(choice.value) for choice in choices)
+
+
+_NODES, _ALIGNMENT, _BACKEND = NodePolicy(), AlignmentPolicy(), BackendConfig()
+_ODOMETRY, _MEASUREMENT, _COVARIANCE = OdometrySource(), MeasurementSource(), CovariancePolicy()
+_NOISE = _ODOMETRY.noise
 
 PARAMETERS: tuple[Parameter, ...] = (
+    Parameter('sources', list(DEFAULT_SOURCES), '', 'Names of the sources, each with parameters '
+              'as below; of odometry the first one is preferred. `loop_closure` is always there.'),
     Parameter('map_frame', 'map', '', 'Frame of the corrected path.'),
     Parameter('odom_frame', 'odom', '', 'Frame of the odometry, child of `map_frame` in TF.'),
     Parameter('base_link_frame', 'base_link', '', 'Frame of the robot.'),
@@ -48,8 +75,9 @@ PARAMETERS: tuple[Parameter, ...] = (
               'optimised to the end; 0 never does.', 0.0, 3600.0),
     Parameter('datum', [], 'deg, deg, rad', 'Latitude and longitude of the origin of the map and, '
               'as a third number, the angle of its x axis from east; unset: the first fix, '
-              'x east.'),
-    Parameter('fix.lever_arm', [0.0, 0.0], 'm', 'Antenna in the frame of the robot, x and y.'),
+              'x east.', sizes=(0, 2, 3)),
+    Parameter('wait_for_datum', False, '', 'Without `datum`, refuse fixes until `~/set_datum` is '
+              'called.'),
     Parameter('minimum_travel_distance', _NODES.minimum_travel_distance, 'm',
               'Distance from the last hidden node that makes a new one.', 0.0, 1000.0),
     Parameter('minimum_travel_heading', _NODES.minimum_travel_heading, 'rad',
@@ -61,21 +89,8 @@ PARAMETERS: tuple[Parameter, ...] = (
               0.05, 3600.0),
     Parameter('node_heartbeat', _NODES.heartbeat, 's',
               'A hidden node at the latest after this time, even at rest.', 0.1, 86400.0),
-    Parameter('odom.sigma_distance', _NOISE.sigma_distance, 'm/sqrt(m)',
-              'Odometry noise along the path, per root of its length.', 0.0, 10.0),
-    Parameter('odom.sigma_lateral', _NOISE.sigma_lateral, 'm/sqrt(m)',
-              'Odometry noise across the path, per root of its length.', 0.0, 10.0),
-    Parameter('odom.sigma_heading_distance', _NOISE.sigma_heading_distance, 'rad/sqrt(m)',
-              'Heading noise per root of the path length.', 0.0, 10.0),
-    Parameter('odom.sigma_heading_turn', _NOISE.sigma_heading_turn, 'rad/sqrt(rad)',
-              'Heading noise per root of the turn.', 0.0, 10.0),
-    Parameter('default_position_sigma', _BACKEND.default_position_sigma, 'm',
-              'Taken where a fix or a global pose says that its covariance is unknown (all '
-              'zero).', 1e-3, 1e4),
-    Parameter('position_sigma_floor', _BACKEND.position_sigma_floor, 'm',
-              'No measured position is believed to be better.', 1e-4, 100.0),
-    Parameter('heading_sigma_floor', _BACKEND.heading_sigma_floor, 'rad',
-              'No measured heading is believed to be better.', 1e-5, 1.0),
+    Parameter('odometry_patience', _BACKEND.odometry_patience, 's', 'Another odometry makes the '
+              'hidden nodes when the one that did is so much behind.', 0.05, 3600.0),
     Parameter('alignment.sigma_heading', _ALIGNMENT.sigma_heading, 'rad',
               'From positions alone the map is aligned once the angle is this certain.',
               1e-3, 1.0),
@@ -85,13 +100,155 @@ PARAMETERS: tuple[Parameter, ...] = (
               '... and this many of their sigmas.', 1.0, 100.0),
 )
 
+_ALL = tuple(Kind)
+_WHEELS = (Kind.ODOMETRY,)
+_OTHERS = tuple(kind for kind in Kind if kind is not Kind.ODOMETRY)
+_NOT_CLOSURES = tuple(kind for kind in _OTHERS if kind is not Kind.LOOP_CLOSURE)
+
+SOURCE_PARAMETERS: tuple[Parameter, ...] = (
+    Parameter('type', '', '', 'What the source is.', choices=_values(Kind), kinds=_ALL),
+    Parameter('topic', '', '', 'Topic; if it is not given, the name of the source.', kinds=_ALL),
+    Parameter('time_offset', 0.0, 's', 'Added to the stamps.', -3600.0, 3600.0, kinds=_ALL),
+    Parameter('noise', _ODOMETRY.noise_from.value, '', 'Noise by a model of distance and turns, '
+              'or by the covariance of the twist times dt.', choices=_values(NoiseFrom),
+              kinds=_WHEELS),
+    Parameter('sigma_distance', _NOISE.sigma_distance, 'm/sqrt(m)',
+              'Odometry noise along the path, per root of its length.', 0.0, 10.0, kinds=_WHEELS),
+    Parameter('sigma_lateral', _NOISE.sigma_lateral, 'm/sqrt(m)',
+              'Odometry noise across the path, per root of its length.', 0.0, 10.0,
+              kinds=_WHEELS),
+    Parameter('sigma_heading_distance', _NOISE.sigma_heading_distance, 'rad/sqrt(m)',
+              'Heading noise per root of the path length.', 0.0, 10.0, kinds=_WHEELS),
+    Parameter('sigma_heading_turn', _NOISE.sigma_heading_turn, 'rad/sqrt(rad)',
+              'Heading noise per root of the turn.', 0.0, 10.0, kinds=_WHEELS),
+    Parameter('sigma_floor', [_NOISE.sigma_floor_position, _NOISE.sigma_floor_heading], 'm, rad',
+              'Least noise of position and heading between two hidden nodes.', 1e-6, 100.0,
+              sizes=(2,), kinds=_WHEELS),
+    Parameter('reorder_window', _ODOMETRY.reorder_window, 's', 'What is older than the newest '
+              'message by less than this is sorted in.', 0.0, 60.0, kinds=_WHEELS),
+    Parameter('maximum_speed', _ODOMETRY.maximum_speed, 'm/s', 'A faster motion is a jump of the '
+              'odometry, not of the robot.', 0.01, 1e4, kinds=_WHEELS),
+    Parameter('covariance_policy', 'repair', '', 'What becomes of a broken covariance.',
+              choices=('repair', 'refuse'), kinds=_NOT_CLOSURES),
+    Parameter('covariance_policy', 'repair' if LOOP_CLOSURES.covariance.repair else 'refuse', '',
+              'What becomes of a broken covariance.', choices=('repair', 'refuse'),
+              kinds=(Kind.LOOP_CLOSURE,)),
+    Parameter('covariance_override', [], 'm, rad', 'Sigma of the position and, if there are two '
+              'numbers, of the heading, taken instead of the covariances.', 1e-6, 1e6,
+              sizes=(0, 1, 2), kinds=_OTHERS),
+    Parameter('covariance_scale', 1.0, '', 'Factor on every covariance.', 1e-6, 1e6, kinds=_ALL),
+    Parameter('sigma_floor', [_COVARIANCE.position_floor, _COVARIANCE.heading_floor], 'm, rad',
+              'No position and no heading is believed to be better.', 1e-6, 100.0, sizes=(2,),
+              kinds=_OTHERS),
+    Parameter('sigma_ceiling', _COVARIANCE.position_ceiling, 'm',
+              'No position counts as worse.', 1e-3, 1e6, kinds=_OTHERS),
+    Parameter('default_sigma', [_COVARIANCE.default_position, _COVARIANCE.default_heading],
+              'm, rad', 'Taken where a covariance is unknown (all zero) and repaired.', 1e-5, 1e4,
+              sizes=(2,), kinds=_OTHERS),
+    Parameter('heading', _COVARIANCE.heading.value, '', 'Whether the heading is used; auto: if '
+              'its variance is positive and less than that of a flat guess.',
+              choices=_values(Heading), kinds=(Kind.GLOBAL_POSE,)),
+    Parameter('lever_arm', [0.0, 0.0], 'm', 'Antenna in the frame of the robot, x and y; zero: '
+              'from /tf_static if it is there.', -1e3, 1e3, sizes=(2,), kinds=(Kind.FIX,)),
+    Parameter('yaw_offset', 0.0, 'rad', 'Added to the yaw; its zero is east.', -6.3, 6.3,
+              kinds=(Kind.IMU,)),
+    Parameter('robust_loss', _MEASUREMENT.loss.value, '', 'How large errors count.',
+              choices=_values(Loss), kinds=_ALL),
+    Parameter('rejection_threshold', _MEASUREMENT.rejection_threshold, '', 'From so many sigmas '
+              'on the loss holds back.', 0.1, 1e3, kinds=_ALL),
+    Parameter('correlation_time', _MEASUREMENT.correlation_time, 's',
+              'How long an error lives, its time constant; 0: it is white.', 0.0, 1e5,
+              kinds=_OTHERS),
+    Parameter('correlation_model', _MEASUREMENT.correlation.value, '', 'Errors that live on are '
+              'estimated as a bias, or make the covariances larger.',
+              choices=_values(Correlation), kinds=_OTHERS),
+    Parameter('white_share', _MEASUREMENT.white_share, '',
+              'Part of the variance that is white all the same.', 0.0, 1.0, kinds=_OTHERS),
+)
+
+# A source's name begins names of parameters, and of counts in the diagnostics.
+_NAME = re.compile(r'[A-Za-z][A-Za-z0-9_]*')
+_TOPIC = re.compile(r'(~?/)?[A-Za-z_][A-Za-z0-9_]*(/[A-Za-z_][A-Za-z0-9_]*)*')
+_TAKEN = {'solver', 'worker', 'received', 'alignment', 'qos_overrides', 'use_sim_time',
+          'start_type_description_service'} | {parameter.name for parameter in PARAMETERS}
+
+
+def type_parameter(source: str) -> Parameter:
+    """Return the parameter that tells what a source is; it comes before its others."""
+    return _of_source(SOURCE_PARAMETERS[0], source)
+
+
+def source_parameters(source: str, kind: str) -> tuple[Parameter, ...]:
+    """
+    Return all parameters of a source with their full names.
+
+    Raises
+    ------
+    ConfigError
+        If there is no such kind of source.
+
+    """
+    _checked(type_parameter(source), kind)
+    return tuple(_of_source(parameter, source) for parameter in SOURCE_PARAMETERS
+                 if Kind(kind) in parameter.kinds)
+
+
+def _of_source(parameter: Parameter, source: str) -> Parameter:
+    kind, topic = KNOWN_SOURCES.get(source, (None, source))
+    default = parameter.default
+    if parameter.name == 'type' and kind is not None:
+        default = kind.value
+    elif parameter.name == 'topic':
+        default = topic
+    return replace(parameter, name=f'{source}.{parameter.name}', default=default)
+
+
+def listed_sources(given: Mapping[str, Any]) -> list[str]:
+    """
+    Return the names of all sources by the given parameters.
+
+    Raises
+    ------
+    ConfigError
+        If `sources` is no list of names, or a name cannot be one.
+
+    """
+    names = given.get('sources', list(DEFAULT_SOURCES))
+    if not isinstance(names, Sequence) or isinstance(names, str) or not all(
+            isinstance(name, str) for name in names):
+        raise ConfigError(f'parameter sources: expected a list of names, got {names!r}')
+    for name in names:
+        if _NAME.fullmatch(name) is None or name in _TAKEN:
+            raise ConfigError(f'parameter sources: {name!r} cannot be the name of a source; '
+                              'expected letters, digits and _, and no name of something else')
+    if len(set(names)) < len(names):
+        raise ConfigError(f'parameter sources: expected different names, got {list(names)}')
+    return source_names(list(names))
+
+
+def all_parameters(given: Mapping[str, Any]) -> tuple[Parameter, ...]:
+    """
+    Return the parameters of the node and of the sources that the given ones list.
+
+    Raises
+    ------
+    ConfigError
+        If a source is none; says which, and what was expected.
+
+    """
+    parameters = list(PARAMETERS)
+    for source in listed_sources(given):
+        kind = type_parameter(source)
+        parameters += source_parameters(source, given.get(kind.name, kind.default))
+    return tuple(parameters)
+
 
 def defaults() -> dict[str, Value]:
-    """Return every parameter's default."""
-    return {parameter.name: parameter.default for parameter in PARAMETERS}
+    """Return the default of every parameter that is there if nothing is given."""
+    return {parameter.name: parameter.default for parameter in all_parameters({})}
 
 
-def checked(values: Mapping[str, Any]) -> dict[str, Any]:
+def checked(given: Mapping[str, Any]) -> dict[str, Any]:
     """
     Return all parameters: the given ones, with types and ranges checked, and other defaults.
 
@@ -102,11 +259,17 @@ def checked(values: Mapping[str, Any]) -> dict[str, Any]:
         what came.
 
     """
-    unknown = sorted(set(values) - {parameter.name for parameter in PARAMETERS})
-    if len(unknown) > 0:
-        raise ConfigError(f'parameter {unknown[0]!r} is not known')
-    return {parameter.name: _checked(parameter, values[parameter.name])
-            if parameter.name in values else parameter.default for parameter in PARAMETERS}
+    parameters = all_parameters(given)
+    known = {parameter.name for parameter in parameters}
+    for name in sorted(set(given) - known):
+        source, dot, own = name.partition('.')
+        hint = ''
+        if dot and own in {parameter.name for parameter in SOURCE_PARAMETERS}:
+            hint = (f': a source of type {given.get(f"{source}.type", "") or "its kind"} has none'
+                    if f'{source}.type' in known else f': {source} is not in sources')
+        raise ConfigError(f'parameter {name!r} is not known{hint}')
+    return {parameter.name: _checked(parameter, given[parameter.name])
+            if parameter.name in given else parameter.default for parameter in parameters}
 
 
 def _checked(parameter: Parameter, value: Any) -> Value:
@@ -115,86 +278,36 @@ def _checked(parameter: Parameter, value: Any) -> Value:
         if type(value) is not type(default):
             raise ConfigError(f'parameter {name}: expected {type(default).__name__}, '
                               f'got {value!r}')
+        if len(parameter.choices) > 0 and value not in parameter.choices:
+            raise ConfigError(f'parameter {name}: expected one of '
+                              f'{", ".join(parameter.choices)}, got {value!r}')
+        if name.endswith('.topic') and _TOPIC.fullmatch(str(value)) is None:
+            raise ConfigError(f'parameter {name}: expected the name of a topic, got {value!r}')
         return value
+    if name == 'sources':
+        return list(value)
     if isinstance(default, list):
-        if not isinstance(value, Sequence) or isinstance(value, str):
-            raise ConfigError(f'parameter {name}: expected a list of numbers, got {value!r}')
-        return [_number(parameter, item) for item in value]
-    number = _number(parameter, value)
-    low = -float('inf') if parameter.smallest is None else parameter.smallest
-    high = float('inf') if parameter.largest is None else parameter.largest
-    if not low <= number <= high:
-        raise ConfigError(f'parameter {name}: expected a number in [{low:g}, {high:g}], '
-                          f'got {value!r}')
-    return number
+        return _checked_list(parameter, value)
+    return _number(parameter, value)
+
+
+def _checked_list(parameter: Parameter, value: Any) -> list[float]:
+    name, sizes = parameter.name, parameter.sizes
+    if not isinstance(value, Sequence) or isinstance(value, str):
+        raise ConfigError(f'parameter {name}: expected a list of numbers, got {value!r}')
+    if len(sizes) > 0 and len(value) not in sizes:
+        raise ConfigError(f'parameter {name}: expected {" or ".join(map(str, sizes))} numbers '
+                          f'[{parameter.unit}], got {list(value)}')
+    return [_number(parameter, item) for item in value]
 
 
 def _number(parameter: Parameter, value: Any) -> float:
+    name = parameter.name
     if isinstance(value, bool) or not isinstance(value, (int, float)):
-        raise ConfigError(f'parameter {parameter.name}: expected a number, got {value!r}')
+        raise ConfigError(f'parameter {name}: expected a number, got {value!r}')
+    low = -float('inf') if parameter.smallest is None else parameter.smallest
+    high = float('inf') if parameter.largest is None else parameter.largest
+    if not low <= value <= high:
+        raise ConfigError(f'parameter {name}: expected a number in [{low:g}, {high:g}], '
+                          f'got {value!r}')
     return float(value)
-
-
-def backend_config(values: Mapping[str, Any]) -> BackendConfig:
-    """Return the engine's settings from the parameters."""
-    return BackendConfig(
-        nodes=NodePolicy(
-            minimum_travel_distance=values['minimum_travel_distance'],
-            minimum_travel_heading=values['minimum_travel_heading'],
-            minimum_interval=values['minimum_node_interval'],
-            moving_interval=values['moving_node_interval'],
-            heartbeat=values['node_heartbeat']),
-        odometry_noise=OdometryNoise(
-            sigma_distance=values['odom.sigma_distance'],
-            sigma_lateral=values['odom.sigma_lateral'],
-            sigma_heading_distance=values['odom.sigma_heading_distance'],
-            sigma_heading_turn=values['odom.sigma_heading_turn']),
-        alignment=AlignmentPolicy(
-            sigma_heading=values['alignment.sigma_heading'],
-            minimum_baseline=values['alignment.minimum_baseline'],
-            baseline_in_sigmas=values['alignment.baseline_in_sigmas']),
-        default_position_sigma=values['default_position_sigma'],
-        position_sigma_floor=values['position_sigma_floor'],
-        heading_sigma_floor=values['heading_sigma_floor'])
-
-
-def as_yaml() -> str:
-    """Return the content of `config/pose_graph.yaml`: all parameters with their defaults."""
-    lines = ['# All parameters with their defaults; the file is made from the table in',
-             '# pose_graph_ros/ros/parameters.py (pose-graph parameters --yaml).',
-             '/**:', '  ros__parameters:']
-    tree: dict[str, Any] = {}
-    for parameter in PARAMETERS:
-        group, _, leaf = parameter.name.rpartition('.')
-        tree.setdefault(group, {})[leaf] = parameter
-    for group, leaves in tree.items():
-        indent = '    '
-        if group != '':
-            lines.append(f'{indent}{group}:')
-            indent = '      '
-        for leaf, parameter in leaves.items():
-            unit = f' [{parameter.unit}]' if parameter.unit != '' else ''
-            lines.append(f'{indent}# {parameter.description}{unit}')
-            if parameter.default == []:
-                lines.append(f'{indent}# {leaf}: [0.0, 0.0]')
-            else:
-                lines.append(f'{indent}{leaf}: {_yaml(parameter.default)}')
-    return '\n'.join(lines) + '\n'
-
-
-def as_markdown() -> str:
-    """Return the README's table of parameters."""
-    lines = ['| parameter | default | unit | range | what it does |', '|---|---|---|---|---|']
-    for parameter in PARAMETERS:
-        value = 'unset' if parameter.default == [] else _yaml(parameter.default)
-        span = '' if parameter.smallest is None else f'{parameter.smallest:g} to ' \
-            f'{parameter.largest:g}'
-        lines.append(f'| `{parameter.name}` | {value} | {parameter.unit} | {span} | '
-                     f'{parameter.description} |')
-    return '\n'.join(lines) + '\n'
-
-
-def _yaml(value: Value) -> str:
-    if isinstance(value, bool):
-        return str(value).lower()
-    return value if isinstance(value, str) else repr(value)

@@ -10,12 +10,11 @@ the node is asked for the full optimisation, and its last path is recorded.
 
 import argparse
 from collections import Counter
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from functools import partial
 from pathlib import Path
 import sys
 import time
-from typing import Any
 
 from diagnostic_msgs.msg import DiagnosticArray
 from geometry_msgs.msg import PoseWithCovarianceStamped
@@ -25,23 +24,27 @@ from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
 from rclpy.node import Node
 from rclpy.qos import QoSDurabilityPolicy, QoSProfile, QoSReliabilityPolicy
 from rclpy.serialization import deserialize_message
-from sensor_msgs.msg import NavSatFix
+from sensor_msgs.msg import Imu, NavSatFix
 from std_srvs.srv import Trigger
 
 from pose_graph_ros.ros.bag_writer import BagWriter
 from pose_graph_ros.ros.bags import BagError, MessageError, open_bag
-from pose_graph_ros.ros.inputs import Inputs, read_inputs, TOPICS, TYPES
+from pose_graph_ros.ros.inputs import Inputs, read_inputs, read_static_frames, STATIC_FRAMES
+from pose_graph_ros.ros.sources import Kind, MESSAGE_TYPES
 
 try:
     from tf2_msgs.msg import TFMessage
 except ImportError:  # ROS 2 from PyPI lacks tf2_msgs until it is built
     TFMessage = None
 
-CLASSES = {TYPES['odom']: Odometry, TYPES['fix']: NavSatFix,
-           TYPES['global_pose']: PoseWithCovarianceStamped}
+CLASSES = {Kind.ODOMETRY: Odometry, Kind.FIX: NavSatFix, Kind.IMU: Imu,
+           Kind.GLOBAL_POSE: PoseWithCovarianceStamped,
+           Kind.LOOP_CLOSURE: PoseWithCovarianceStamped}
 RELIABLE = QoSProfile(depth=1000, reliability=QoSReliabilityPolicy.RELIABLE)
 LATCHED = QoSProfile(depth=1, reliability=QoSReliabilityPolicy.RELIABLE,
                      durability=QoSDurabilityPolicy.TRANSIENT_LOCAL)
+STATIC = QoSProfile(depth=100, reliability=QoSReliabilityPolicy.RELIABLE,
+                    durability=QoSDurabilityPolicy.TRANSIENT_LOCAL)
 # Messages under way, well below the depth of the node's queues.
 WINDOW = 400
 # Patience with the node: to appear, to compile at its first start, to process another message, to
@@ -67,20 +70,27 @@ class Player(Node):
     Parameters
     ----------
     inputs : Inputs
+    topics : mapping
+        Source to the topic of the node.
     node_name : str
         Name of the node that is played to, for its service and its diagnostics.
 
     """
 
-    def __init__(self, inputs: Inputs, node_name: str = 'pose_graph') -> None:
+    def __init__(
+        self, inputs: Inputs, topics: Mapping[str, str], node_name: str = 'pose_graph',
+    ) -> None:
         super().__init__('pose_graph_player')
         self._inputs = inputs
         self._node_name = node_name
         self._executor = SingleThreadedExecutor()
         self._executor.add_node(self)
         self._writers = {
-            source: self.create_publisher(CLASSES[TYPES[source]], TOPICS[source], RELIABLE)
+            source: self.create_publisher(
+                CLASSES[inputs.kinds[source]], topics[source], RELIABLE)
             for source in inputs.topics}
+        self._static = None if TFMessage is None else self.create_publisher(
+            TFMessage, STATIC_FRAMES[0], STATIC)
         self.recorded: list[tuple[str, str, int, bytes]] = []
         """Topic, type, time of arrival [ns] and bytes of what the node published."""
         self.path: bytes | None = None
@@ -89,8 +99,8 @@ class Player(Node):
         self.diagnostics: dict[str, str] = {}
         """The newest values of the node's diagnostics."""
         self._diagnostics_raw = b''
-        self._record('pose', PoseWithCovarianceStamped, TYPES['global_pose'])
-        self._record('odometry/filtered', Odometry, TYPES['odom'])
+        self._record('pose', PoseWithCovarianceStamped, MESSAGE_TYPES[Kind.GLOBAL_POSE])
+        self._record('odometry/filtered', Odometry, MESSAGE_TYPES[Kind.ODOMETRY])
         if TFMessage is not None:
             self._record('/tf', TFMessage, 'tf2_msgs/msg/TFMessage')
         self.create_subscription(PathMessage, 'path', self._on_path, LATCHED, raw=True)
@@ -144,6 +154,10 @@ class Player(Node):
             'the node does not listen')
         self.spin_until(lambda: self.diagnostics.get('prepared') != '0', PREPARE_TIMEOUT,
                         'the node still compiles')
+        if self._static is not None:
+            with open_bag(bag) as reader:
+                for frames in read_static_frames(reader):
+                    self._static.publish(frames.raw)
         # matching is not simultaneous on both sides
         settled = time.monotonic() + 0.5
         self.spin_until(lambda: time.monotonic() > settled, 2.0, '')
@@ -241,17 +255,17 @@ def main(args: list[str] | None = None) -> int:
     parser = argparse.ArgumentParser(prog='player', description=__doc__)
     parser.add_argument('bag', type=Path)
     parser.add_argument('out', type=Path, help='folder of the rosbag2 to write')
-    for source in TYPES:
-        parser.add_argument(f'--{source}', metavar='TOPIC', help='topic in the bag')
+    parser.add_argument('--input', nargs=4, action='append', default=[],
+                        metavar=('SOURCE', 'TYPE', 'NODE_TOPIC', 'BAG_TOPIC'))
     parser.add_argument('--hold-out', type=int, default=0)
     parser.add_argument('--rate', type=float, default=20.0)
     options = parser.parse_args(args)
-    topics: dict[str, Any] = {source: getattr(options, source) for source in TYPES}
-    inputs = Inputs({source: topic for source, topic in topics.items() if topic is not None},
+    inputs = Inputs({source: topic for source, _, _, topic in options.input},
+                    {source: Kind(kind) for source, kind, _, _ in options.input},
                     options.hold_out)
     rclpy.init()
     try:
-        player = Player(inputs)
+        player = Player(inputs, {source: topic for source, _, topic, _ in options.input})
         published = player.play(options.bag, options.rate)
         success, answer = player.close()
         player.write(options.out)

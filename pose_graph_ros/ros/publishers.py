@@ -17,14 +17,16 @@ from rclpy.node import Node
 from rclpy.publisher import Publisher
 from rclpy.qos import QoSDurabilityPolicy, QoSProfile, QoSReliabilityPolicy
 from rclpy.qos_overriding_options import QoSOverridingOptions
+from sensor_msgs.msg import NavSatFix
 
-from pose_graph_ros.core.config import OdometryNoise
-from pose_graph_ros.core.estimate import Estimate
+from pose_graph_ros.core.estimate import AlignmentState, Estimate
 from pose_graph_ros.core.exceptions import ConfigError
+from pose_graph_ros.core.measurements import OdometrySample
 from pose_graph_ros.core.prediction import predict
-from pose_graph_ros.core.se2 import FloatArray
 from pose_graph_ros.ros import messages
-from pose_graph_ros.ros.conversions import frame, NANOSECONDS, stamp_ns
+from pose_graph_ros.ros.conversions import frame
+from pose_graph_ros.ros.fixes import Datum
+from pose_graph_ros.ros.sources import NANOSECONDS
 
 try:
     from tf2_msgs.msg import TFMessage
@@ -48,14 +50,14 @@ class Publishers:
     node : rclpy.node.Node
     values : mapping
         The node's parameters.
-    noise : OdometryNoise
-        For the covariance of what is carried on by odometry.
+    datum : Datum
+        Where the map lies on the Earth.
 
     """
 
-    def __init__(self, node: Node, values: Mapping[str, Any], noise: OdometryNoise) -> None:
+    def __init__(self, node: Node, values: Mapping[str, Any], datum: Datum) -> None:
         self._node = node
-        self._noise = noise
+        self._datum = datum
         self.map_frame = frame(values['map_frame'])
         self.odom_frame = frame(values['odom_frame'])
         self.base_frame = frame(values['base_link_frame'])
@@ -67,6 +69,7 @@ class Publishers:
                               f'different names, got {", ".join(map(repr, frames))}')
         self._pose = self._publisher(PoseWithCovarianceStamped, 'pose', OUTPUT_QOS)
         self._odometry = self._publisher(Odometry, 'odometry/filtered', OUTPUT_QOS)
+        self._fix = self._publisher(NavSatFix, 'gps/filtered', OUTPUT_QOS)
         self._path = self._publisher(Path, 'path', PATH_QOS)
         self._diagnostics = self._publisher(DiagnosticArray, '/diagnostics', OUTPUT_QOS)
         self._tf: Publisher | None = None
@@ -85,21 +88,21 @@ class Publishers:
             message_type, topic, qos,
             qos_overriding_options=QoSOverridingOptions.with_default_policies())
 
-    def publish_pose(self, estimate: Estimate, odometry: Odometry, pose: FloatArray) -> None:
-        """Publish pose, odometry and transform at an odometry message, whose pose is given."""
-        stamp = stamp_ns(odometry)
+    def publish_pose(self, estimate: Estimate, odometry: Odometry, sample: OdometrySample) -> None:
+        """Publish pose, odometry, fix and transform at an odometry message and its sample."""
+        stamp, plane = sample.stamp_ns, self._datum.plane
         if stamp <= self._newest_ns:
             return
         self._newest_ns = stamp
-        if self._tf is not None:
+        if self._tf is not None and frame(odometry.header.frame_id) in ('', self.odom_frame):
             transform = messages.transform_message(
                 stamp + self._tf_offset_ns, estimate.T_map_odom, self.map_frame, self.odom_frame)
             self._tf.publish(TFMessage(transforms=[transform]))
-        wanted = [publisher for publisher in (self._pose, self._odometry)
+        wanted = [publisher for publisher in (self._pose, self._odometry, self._fix)
                   if publisher.get_subscription_count() > 0]
         if len(wanted) == 0:
             return
-        prediction = predict(estimate, pose, self._noise)
+        prediction = predict(estimate, sample.pose)
         message = messages.odometry_message(
             stamp, prediction, odometry, self.map_frame, self.base_frame)
         if self._odometry in wanted:
@@ -107,6 +110,11 @@ class Publishers:
         if self._pose in wanted:
             self._pose.publish(
                 messages.stamped_pose_message(stamp, message.pose, self.map_frame))
+        # before anything was measured in it, the map may be anywhere on the Earth
+        if (self._fix in wanted and plane is not None
+                and estimate.alignment is not AlignmentState.LOCAL):
+            self._fix.publish(messages.fix_message(
+                stamp, prediction, plane, self._datum.altitude, self.base_frame))
 
     def publish_path(self, estimate: Estimate, *, at_once: bool = False) -> None:
         """

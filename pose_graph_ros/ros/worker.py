@@ -73,6 +73,7 @@ class Worker:
         self._closings: list[Future[UpdateReport]] = []
         self._stopping = False
         self._condition = threading.Condition()
+        self._revision = backend.revision
         self._solves, self._solve_total, self._solve_max = 0, 0.0, 0.0
         self._said: set[tuple[str, str]] = set()
         self.estimate: Estimate | None = None
@@ -141,7 +142,9 @@ class Worker:
                     self._add(source, measurement)
                 if wanted or len(closings) > 0:
                     report = self._update(closing=len(closings) > 0)
-                if report is not None or self.estimate is None:
+                # where odometry has jumped the old estimate cannot be carried on
+                stale = self._revision != self._backend.revision
+                if report is not None or self.estimate is None or stale:
                     self._publish()
                 self._report(report, len(batch))
                 if report is not None:
@@ -192,6 +195,7 @@ class Worker:
         return report
 
     def _publish(self) -> None:
+        self._revision = self._backend.revision
         self.estimate = self._backend.estimate()
         if self.estimate is not None:
             self._on_estimate(self.estimate)

@@ -1,0 +1,58 @@
+# Copyright 2026 The pose_graph_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""Whether the newest estimate can be carried on by odometry that has come since; no rclpy."""
+
+import math
+
+import numpy as np
+
+from pose_graph_ros.core.estimate import Estimate
+from pose_graph_ros.core.measurements import OdometrySample
+from pose_graph_ros.core.se2 import FloatArray
+
+# A step of less is no jump [m] ...
+SLACK = 0.25
+# ... nor one at a speed of less than twice that of late and this [m/s].
+MORE_SPEED = 3.0
+# Stamps lie unevenly: a step is not judged over less time [s].
+LEAST_TIME = 0.1
+
+
+class Continuity:
+    """
+    Watches the raw poses of the odometry that leads for jumps.
+
+    The engine judges jumps more carefully, but only the next estimate tells; until then nothing
+    is to be carried over one. Who is careful without need loses the pose at one message.
+
+    Parameters
+    ----------
+    maximum_speed : float
+        No robot is faster [m/s].
+
+    """
+
+    def __init__(self, maximum_speed: float) -> None:
+        self._maximum_speed = maximum_speed
+        self._stamp_ns = 0
+        self._pose: FloatArray = np.zeros(3)
+        self._speed = math.inf
+        self._jump_ns = 0
+
+    def carries(self, estimate: Estimate | None, sample: OdometrySample) -> bool:
+        """Tell whether an estimate, a little older, can be carried to the newest sample."""
+        if sample.stamp_ns > self._stamp_ns:
+            self._take(sample)
+        return estimate is not None and int(estimate.path.stamps_ns[-1]) >= self._jump_ns
+
+    def _take(self, sample: OdometrySample) -> None:
+        moved = math.hypot(*(sample.pose - self._pose)[:2])
+        time = max((sample.stamp_ns - self._stamp_ns) * 1e-9, LEAST_TIME)
+        first = self._stamp_ns == 0
+        expected = 2.0 * max(self._speed, abs(sample.speed)) + MORE_SPEED
+        jump = not first and moved > SLACK + min(expected, self._maximum_speed) * time
+        if jump:
+            self._jump_ns = sample.stamp_ns
+        elif not first:
+            self._speed = moved / time
+        self._stamp_ns, self._pose = sample.stamp_ns, sample.pose

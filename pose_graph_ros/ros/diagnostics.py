@@ -1,0 +1,87 @@
+# Copyright 2026 The pose_graph_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""What the node says of itself in /diagnostics."""
+
+from collections import Counter
+from collections.abc import Sequence
+import math
+
+from diagnostic_msgs.msg import DiagnosticStatus
+
+from pose_graph_ros.core.batch import Status
+from pose_graph_ros.core.estimate import AlignmentState, Estimate
+from pose_graph_ros.ros.hearing import Hearing
+from pose_graph_ros.ros.reader import MessageReader
+from pose_graph_ros.ros.worker import Worker
+
+
+def state(
+    worker: Worker, received: Counter[str], refused: Counter[tuple[str, str]],
+) -> dict[str, object]:
+    """Return the counts by source and reason, and the state of graph and solver."""
+    status, estimate = worker.status, worker.estimate
+    values: dict[str, object] = {
+        'received': sum(received.values()),
+        'processed': status.processed + sum(refused.values()),
+        'pending': status.pending, 'quarantined': status.quarantined,
+        'updates': status.updates, 'prepared': int(worker.prepared),
+        'solve_mean_ms': f'{1e3 * status.solve_mean:.3f}',
+        'solve_max_ms': f'{1e3 * status.solve_max:.3f}'}
+    for source, count in sorted(received.items()):
+        values[f'received.{source}'] = count
+    for (source, answer), count in sorted((status.counts + refused).items()):
+        values[f'{source}.{answer}'] = count
+    if estimate is not None:
+        values.update({
+            'odometry': estimate.lead,
+            'alignment': estimate.alignment.value,
+            'alignment_sigma_deg': f'{math.degrees(estimate.alignment_sigma):.3f}',
+            'hidden_nodes': estimate.n_hidden, 'edges': estimate.n_edges,
+            'observed_nodes': estimate.n_observed, 'chi2': f'{estimate.chi2:.6g}'})
+    return values
+
+
+def inputs(reader: MessageReader, hearing: Hearing, now: float) -> dict[str, object]:
+    """Return how long each source has been silent, where antennas are, and the datum."""
+    values: dict[str, object] = {}
+    for name in reader.sources:
+        silence = hearing.silence(name, now)
+        values[f'{name}.silence_s'] = 'never heard' if silence is None else f'{silence:.1f}'
+    for name, fixes in reader.fixes.items():
+        if fixes.antenna is not None:
+            x, y = fixes.antenna.lever_arm
+            values[f'{name}.lever_arm'] = f'[{x:.3f}, {y:.3f}] from {fixes.antenna.origin}'
+            values[f'{name}.without_lever_arm'] = fixes.without_lever_arm
+    plane = reader.datum.plane
+    values['datum'] = 'none' if plane is None else (
+        f'[{plane.latitude:.9f}, {plane.longitude:.9f}, {plane.yaw:.6f}]')
+    return values
+
+
+def health(worker: Worker, silent: Sequence[str]) -> tuple[bytes, str]:
+    """Return the level of the diagnostics and a sentence that says what to do."""
+    estimate, report = worker.estimate, worker.status.report
+    if not worker.alive:
+        return DiagnosticStatus.ERROR, 'The worker has ended: start the node again.'
+    if report is not None and report.status is Status.FAILED:
+        return (DiagnosticStatus.ERROR, 'The newest measurements made the solver fail and were '
+                'set aside; the last good estimate stays. See the log for the reason.')
+    if estimate is None:
+        return DiagnosticStatus.WARN, (
+            'No odometry yet: check the topic odom.' if worker.prepared else
+            'Compiling, as at every first start: what comes in waits.')
+    if len(silent) > 0:
+        verb = 'is' if len(silent) == 1 else 'are'
+        return (DiagnosticStatus.WARN,
+                f'{" and ".join(silent)} {verb} silent, others go on: check the drivers.')
+    return _alignment(estimate)
+
+
+def _alignment(estimate: Estimate) -> tuple[bytes, str]:
+    if estimate.alignment is AlignmentState.UNALIGNED:
+        return (DiagnosticStatus.WARN, 'Unaligned: the angle between odometry and map is not '
+                'known yet. Drive some metres with a fix.')
+    if estimate.alignment is AlignmentState.LOCAL:
+        return (DiagnosticStatus.OK, 'Running; nothing was measured in the map, which begins '
+                'where odometry does.')
+    return DiagnosticStatus.OK, 'Running.'

@@ -1,0 +1,99 @@
+# Copyright 2026 The pose_graph_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""The tables of parameters as the README and the yaml file show them; no ROS."""
+
+from collections.abc import Iterable, Iterator
+
+from pose_graph_ros.ros.parameters import (
+    listed_sources,
+    Parameter,
+    PARAMETERS,
+    SOURCE_PARAMETERS,
+    source_parameters,
+    type_parameter,
+    Value,
+)
+from pose_graph_ros.ros.sources import Kind
+
+# Shown for a list that is not set.
+_EXAMPLES = {'datum': '[0.0, 0.0]', 'covariance_override': '[1.0, 0.1]'}
+
+
+def as_yaml() -> str:
+    """Return the content of `config/pose_graph.yaml`: all parameters with their defaults."""
+    lines = ['# All parameters with their defaults; the file is made from the tables in',
+             '# pose_graph_ros/ros/parameters.py (pose-graph parameters --yaml).',
+             '/**:', '  ros__parameters:']
+    said: set[str] = set()
+    group = ''
+    for parameter in PARAMETERS:
+        before, (group, _, leaf) = group, parameter.name.rpartition('.')
+        if group not in ('', before):
+            lines.append(f'    {group}:')
+        lines += _entry(parameter, leaf, '    ' if group == '' else '      ', said)
+    for source in listed_sources({}):
+        lines.append(f'    {source}:')
+        for parameter in source_parameters(source, str(type_parameter(source).default)):
+            lines += _entry(parameter, parameter.name.partition('.')[2], '      ', said)
+    return '\n'.join(lines) + '\n'
+
+
+def _entry(parameter: Parameter, leaf: str, indent: str, said: set[str]) -> Iterator[str]:
+    """Return the lines of one parameter; a comment is made once."""
+    unit = f' [{parameter.unit}]' if parameter.unit != '' else ''
+    choices = f' ({", ".join(parameter.choices)})' if len(parameter.choices) > 0 else ''
+    comment = f'{indent}# {parameter.description}{unit}{choices}'
+    if comment not in said:
+        said.add(comment)
+        yield comment
+    if parameter.default == []:
+        yield f'{indent}# {leaf}: {_EXAMPLES[leaf]}'
+    else:
+        yield f'{indent}{leaf}: {_yaml(parameter.default)}'
+
+
+def as_markdown() -> str:
+    """Return the README's table of the node's parameters."""
+    lines = ['| parameter | default | unit | range | what it does |', '|---|---|---|---|---|']
+    for parameter in PARAMETERS:
+        value = 'unset' if parameter.default == [] else _yaml(parameter.default)
+        lines.append(f'| `{parameter.name}` | {value} | {parameter.unit} | {_range(parameter)} | '
+                     f'{parameter.description} |')
+    return '\n'.join(lines) + '\n'
+
+
+def sources_as_markdown() -> str:
+    """Return the README's table of the parameters of a source."""
+    lines = ['| parameter | types | default | unit | range | what it does |',
+             '|---|---|---|---|---|---|']
+    for parameter in SOURCE_PARAMETERS:
+        value = '' if parameter.name in ('type', 'topic') else (
+            'unset' if parameter.default == [] else _yaml(parameter.default))
+        lines.append(f'| `<source>.{parameter.name}` | {_kinds(parameter.kinds)} | {value} | '
+                     f'{parameter.unit} | {_range(parameter)} | {parameter.description} |')
+    return '\n'.join(lines) + '\n'
+
+
+def _kinds(kinds: Iterable[Kind]) -> str:
+    kinds = set(kinds)
+    missing = [kind.value for kind in Kind if kind not in kinds]
+    if len(missing) == 0:
+        return 'all'
+    if len(missing) == 1:
+        return f'all but {missing[0]}'
+    return ', '.join(kind.value for kind in Kind if kind in kinds)
+
+
+def _range(parameter: Parameter) -> str:
+    if len(parameter.choices) > 0:
+        return ', '.join(parameter.choices)
+    return '' if parameter.smallest is None else (
+        f'{parameter.smallest:g} to {parameter.largest:g}')
+
+
+def _yaml(value: Value) -> str:
+    if isinstance(value, bool):
+        return str(value).lower()
+    if isinstance(value, list):
+        return f'[{", ".join(_yaml(item) for item in value)}]'
+    return value if isinstance(value, str) else repr(value)

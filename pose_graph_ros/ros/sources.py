@@ -1,0 +1,157 @@
+# Copyright 2026 The pose_graph_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""
+The sources that the parameters list: what each of them is, and the engine's settings for it.
+
+No rclpy.
+"""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from enum import Enum
+from typing import Any
+
+from pose_graph_ros.core.config import AlignmentPolicy, BackendConfig, NodePolicy
+from pose_graph_ros.core.exceptions import ConfigError
+from pose_graph_ros.core.sources import (
+    Correlation,
+    CovariancePolicy,
+    Heading,
+    Loss,
+    MeasurementSource,
+    NoiseFrom,
+    OdometryNoise,
+    OdometrySource,
+)
+
+NANOSECONDS = 1_000_000_000
+_POSE = 'geometry_msgs/msg/PoseWithCovarianceStamped'
+
+
+class Kind(Enum):
+    """What a source tells of; the value of its parameter `type`."""
+
+    ODOMETRY = 'odometry'
+    GLOBAL_POSE = 'global_pose'
+    FIX = 'fix'
+    IMU = 'imu'
+    LOOP_CLOSURE = 'loop_closure'
+
+    @property
+    def message_type(self) -> str:
+        """Type of its messages."""
+        return MESSAGE_TYPES[self]
+
+
+MESSAGE_TYPES = {
+    Kind.ODOMETRY: 'nav_msgs/msg/Odometry', Kind.GLOBAL_POSE: _POSE,
+    Kind.FIX: 'sensor_msgs/msg/NavSatFix', Kind.IMU: 'sensor_msgs/msg/Imu',
+    Kind.LOOP_CLOSURE: _POSE}
+
+CLOSURES = 'loop_closure'
+"""Name of the source of loop closures that is always there."""
+KNOWN_SOURCES = {
+    'odom': (Kind.ODOMETRY, 'odom'), 'global_pose': (Kind.GLOBAL_POSE, 'global_pose'),
+    'fix': (Kind.FIX, 'gps/fix'), 'imu': (Kind.IMU, 'imu/data'),
+    CLOSURES: (Kind.LOOP_CLOSURE, 'loop_closure')}
+"""Kind and topic of the sources that need not say them."""
+DEFAULT_SOURCES = ('odom', 'global_pose', 'fix')
+
+
+@dataclass(frozen=True, slots=True)
+class Source:
+    """One source of messages."""
+
+    name: str
+    kind: Kind
+    topic: str
+    """As the node subscribes to it."""
+    time_offset_ns: int = 0
+    """Added to the stamps of its messages."""
+    lever_arm: tuple[float, ...] = (0.0, 0.0)
+    """Antenna of fixes in the frame of the robot [m]; zero if it is not given."""
+    yaw_offset: float = 0.0
+    """Added to the yaw of an imu [rad]."""
+
+
+def source_list(values: Mapping[str, Any]) -> tuple[Source, ...]:
+    """Return the sources by all checked parameters, odometry in the order of preference."""
+    return tuple(
+        Source(name, Kind(values[f'{name}.type']), values[f'{name}.topic'],
+               round(values[f'{name}.time_offset'] * NANOSECONDS),
+               tuple(values.get(f'{name}.lever_arm', (0.0, 0.0))),
+               values.get(f'{name}.yaw_offset', 0.0))
+        for name in source_names(values['sources']))
+
+
+def source_names(listed: list[str]) -> list[str]:
+    """Return the names of all sources: those that are listed, and that of loop closures."""
+    return [*listed, *([] if CLOSURES in listed else [CLOSURES])]
+
+
+def backend_config(values: Mapping[str, Any]) -> BackendConfig:
+    """
+    Return the engine's settings by all checked parameters.
+
+    Raises
+    ------
+    ConfigError
+        If values that are good by themselves do not go together.
+
+    """
+    odometry: dict[str, OdometrySource] = {}
+    measurements: dict[str, MeasurementSource] = {}
+    for source in source_list(values):
+        own = {name.removeprefix(f'{source.name}.'): value for name, value in values.items()
+               if name.startswith(f'{source.name}.')}
+        try:
+            if source.kind is Kind.ODOMETRY:
+                odometry[source.name] = _odometry_source(own)
+            else:
+                measurements[source.name] = _measurement_source(own)
+        except ConfigError as error:
+            raise ConfigError(f'parameters of the source {source.name}: {error}') from error
+    if len(odometry) == 0:
+        raise ConfigError('parameter sources: expected at least one of type odometry, got '
+                          f'{values["sources"]}')
+    return BackendConfig(
+        nodes=NodePolicy(
+            minimum_travel_distance=values['minimum_travel_distance'],
+            minimum_travel_heading=values['minimum_travel_heading'],
+            minimum_interval=values['minimum_node_interval'],
+            moving_interval=values['moving_node_interval'],
+            heartbeat=values['node_heartbeat']),
+        alignment=AlignmentPolicy(
+            sigma_heading=values['alignment.sigma_heading'],
+            minimum_baseline=values['alignment.minimum_baseline'],
+            baseline_in_sigmas=values['alignment.baseline_in_sigmas']),
+        odometry=odometry, measurements=measurements,
+        odometry_patience=values['odometry_patience'])
+
+
+def _odometry_source(own: Mapping[str, Any]) -> OdometrySource:
+    position, heading = own['sigma_floor']
+    return OdometrySource(
+        noise=OdometryNoise(
+            sigma_distance=own['sigma_distance'], sigma_lateral=own['sigma_lateral'],
+            sigma_heading_distance=own['sigma_heading_distance'],
+            sigma_heading_turn=own['sigma_heading_turn'],
+            sigma_floor_position=position, sigma_floor_heading=heading),
+        noise_from=NoiseFrom(own['noise']), covariance_scale=own['covariance_scale'],
+        reorder_window=own['reorder_window'], maximum_speed=own['maximum_speed'],
+        loss=Loss(own['robust_loss']), rejection_threshold=own['rejection_threshold'])
+
+
+def _measurement_source(own: Mapping[str, Any]) -> MeasurementSource:
+    position_floor, heading_floor = own['sigma_floor']
+    default_position, default_heading = own['default_sigma']
+    return MeasurementSource(
+        covariance=CovariancePolicy(
+            repair=own['covariance_policy'] == 'repair',
+            override=tuple(own['covariance_override']), scale=own['covariance_scale'],
+            position_floor=position_floor, heading_floor=heading_floor,
+            position_ceiling=own['sigma_ceiling'], default_position=default_position,
+            default_heading=default_heading, heading=Heading(own.get('heading', 'auto'))),
+        loss=Loss(own['robust_loss']), rejection_threshold=own['rejection_threshold'],
+        correlation_time=own['correlation_time'],
+        correlation=Correlation(own['correlation_model']), white_share=own['white_share'])
