@@ -21,7 +21,7 @@ import rclpy
 from rclpy.context import Context
 from rclpy.executors import SingleThreadedExecutor
 from rclpy.qos import QoSDurabilityPolicy, QoSProfile, QoSReliabilityPolicy
-from sensor_msgs.msg import NavSatFix
+from sensor_msgs.msg import Imu, NavSatFix
 from std_srvs.srv import Trigger
 
 from pose_graph_ros.cli.demo import isolated_environment
@@ -193,4 +193,12 @@ def fix(seconds: float, latitude: float, longitude: float, sigma: float = 0.5) -
     message.latitude, message.longitude, message.altitude = latitude, longitude, 100.0
     message.position_covariance_type = 2
     message.position_covariance = [sigma * sigma, 0.0, 0.0, 0.0, sigma * sigma, 0.0, 0.0, 0.0, 4.0]
+    return message
+
+
+def imu(seconds: float, heading: float, variance: float = 1e-4) -> Imu:
+    message = Imu()
+    message.header = odometry(seconds, 0.0, 0.0, 0.0).header
+    message.orientation = odometry(seconds, 0.0, 0.0, heading).pose.pose.orientation
+    message.orientation_covariance = [variance, 0.0, 0.0, 0.0, variance, 0.0, 0.0, 0.0, variance]
     return message

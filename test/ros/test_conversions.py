@@ -4,14 +4,22 @@
 
 import math
 
-from harness import fix, odometry, pose
+from harness import fix, imu, odometry, pose
 import numpy as np
 import pytest
 
-from pose_graph_ros.core.measurements import Answer, GlobalPose, LoopClosure, Position, Verdict
+from pose_graph_ros.core.measurements import (
+    Answer,
+    GlobalPose,
+    HeadingOnly,
+    LoopClosure,
+    OdometrySample,
+    Verdict,
+)
 from pose_graph_ros.ros import conversions
 from pose_graph_ros.ros.bag_writer import message_types
-from pose_graph_ros.ros.conversions import FixReader, MessageReader
+from pose_graph_ros.ros.parameters import checked
+from pose_graph_ros.ros.reader import MessageReader
 
 
 def test_odometry_is_read_whatever_the_length_of_its_quaternion() -> None:
@@ -83,59 +91,81 @@ def test_odometry_beyond_any_map_is_refused_at_the_door(x: float) -> None:
     assert answer.reason == 'too_large'
 
 
-def test_the_first_good_fix_is_the_datum() -> None:
-    reader = FixReader()
-    bad = fix(1.0, 48.0, 11.0)
-    bad.status.status = -1
-    assert isinstance(reader.position(bad), Answer)
-    worse = fix(1.5, 0.0, 0.0)
-    worse.position_covariance = [-1.0] * 9
-    assert reader.position(worse).reason == 'covariance_not_positive'
-    assert reader.plane is None
-    first = reader.position(fix(2.0, 48.1, 11.6))
-    assert isinstance(first, Position)
-    assert first.position == pytest.approx([0.0, 0.0], abs=1e-9)
-    second = reader.position(fix(3.0, 48.101, 11.6))
-    # a thousandth of a degree of latitude is 111 m
-    assert second.position == pytest.approx([0.0, 111.2], abs=0.1)
+def test_the_twist_of_odometry_tells_speed_and_noise() -> None:
+    message = odometry(1.0, 0.0, 0.0, 0.0, speed=-3.0)
+    message.twist.twist.linear.y = 4.0
+    assert conversions.odometry_sample(message).speed == pytest.approx(5.0)
+    assert conversions.odometry_sample(message).twist_variance is None
+    message.twist.covariance[0], message.twist.covariance[35] = 0.01, 0.02
+    assert conversions.odometry_sample(message).twist_variance.tolist() == [0.01, 0.0, 0.02]
 
 
-def test_a_datum_with_a_yaw_turns_positions_and_covariances() -> None:
-    reader = FixReader([48.1, 11.6, math.pi / 2.0])
-    message = fix(1.0, 48.101, 11.6)
-    message.position_covariance = [1.0, 0.0, 0.0, 0.0, 4.0, 0.0, 0.0, 0.0, 9.0]
-    measurement = reader.position(message)
-    assert measurement.position == pytest.approx([111.2, 0.0], abs=0.1)
-    assert np.diagonal(measurement.covariance) == pytest.approx([4.0, 1.0])
+@pytest.mark.parametrize('number', [math.nan, math.inf, -1.0, 1.7e308])
+def test_a_twist_that_says_nothing_is_left_out(number: float) -> None:
+    message = odometry(1.0, 0.0, 0.0, 0.0, speed=number)
+    message.twist.covariance[0], message.twist.covariance[7] = 1.0, number
+    sample = conversions.odometry_sample(message)
+    assert isinstance(sample, OdometrySample)
+    assert math.isfinite(sample.speed)
+    assert sample.twist_variance is None
 
 
-def test_an_altitude_that_is_not_known_is_that_of_the_datum() -> None:
-    reader = FixReader()
-    reader.position(fix(1.0, 48.1, 11.6))
-    message = fix(2.0, 48.101, 11.6)
-    known = reader.position(message).position
-    message.altitude = math.nan
-    assert reader.position(message).position == pytest.approx(known, abs=1e-6)
+@pytest.mark.parametrize('number', [math.nan, math.inf, -1.0, 0.0, 1.7e308])
+def test_covariances_are_handed_on_as_they_are(number: float) -> None:
+    message = pose(1.0, 0.0, 0.0, 0.0, variances=(number, 1.0, number))
+    message.pose.covariance[5] = number
+    expected = [[number, 0.0, number], [0.0, 1.0, 0.0], [0.0, 0.0, number]]
+    for measurement in (conversions.global_pose(message, 'map'),
+                        conversions.loop_closure(pose_in(message, 'x1'))):
+        np.testing.assert_array_equal(measurement.covariance, expected)
 
 
-def test_the_covariance_of_a_fix_is_honoured_by_its_type() -> None:
-    reader = FixReader()
-    message = fix(1.0, 48.1, 11.6, sigma=2.0)
-    assert reader.position(message).covariance == pytest.approx(4.0 * np.eye(2))
-    message.position_covariance_type = 0
-    assert not np.any(reader.position(message).covariance)
+def pose_in(message: object, frame: str) -> object:
+    message.header.frame_id = frame
+    return message
 
 
-@pytest.mark.parametrize(('datum', 'lever_arm'), [
-    ([1.0], [0.0, 0.0]), ([1.0, 2.0, 3.0, 4.0], [0.0, 0.0]), ([91.0, 0.0], [0.0, 0.0]),
-    ([math.nan, 0.0], [0.0, 0.0]), ([], [1.0]), ([], [math.inf, 0.0])])
-def test_a_bad_datum_or_lever_arm_is_a_value_error(
-    datum: list[float], lever_arm: list[float],
-) -> None:
-    with pytest.raises(ValueError, match=r'expected'):
-        FixReader(datum, lever_arm)
+def test_an_imu_tells_the_heading_from_east() -> None:
+    measurement = conversions.heading(imu(2.5, 1.0, variance=0.04), 0.25, yaw_offset=3.0,
+                                      offset_ns=-500_000_000)
+    assert isinstance(measurement, HeadingOnly)
+    assert measurement.stamp_ns == 2_000_000_000
+    assert measurement.heading == pytest.approx(3.75 - 2.0 * math.pi)
+    assert measurement.variance == 0.04
 
 
-def test_an_input_that_is_not_known_is_a_value_error() -> None:
-    with pytest.raises(ValueError, match='expected odom'):
-        MessageReader('map', FixReader()).read('imu', None)
+def test_an_imu_without_an_orientation_is_refused() -> None:
+    message = imu(1.0, 0.0)
+    message.orientation_covariance[0] = -1.0
+    assert conversions.heading(message).reason == 'no_orientation'
+    message = imu(1.0, 0.0)
+    message.orientation.w = message.orientation.z = 0.0
+    assert conversions.heading(message).reason == 'not_finite'
+
+
+def reader(**values: object) -> MessageReader:
+    return MessageReader(checked({
+        name.replace('__', '.'): value for name, value in values.items()}))
+
+
+def test_the_stamps_of_a_source_are_shifted_but_not_those_that_are_not_set() -> None:
+    shifted = reader(sources=['odom', 'global_pose', 'fix', 'imu'], odom__time_offset=0.25,
+                     global_pose__time_offset=-0.5, fix__time_offset=1.5, imu__time_offset=0.125,
+                     loop_closure__time_offset=-1.0)
+    for name, message, stamp_ns in (
+            ('odom', odometry(10.0, 0.0, 0.0, 0.0), 10_250_000_000),
+            ('global_pose', pose(10.0, 0.0, 0.0, 0.0), 9_500_000_000),
+            ('fix', fix(10.0, 48.0, 11.0), 11_500_000_000),
+            ('imu', imu(10.0, 0.0), 10_125_000_000),
+            ('loop_closure', pose(10.0, 0.0, 0.0, 0.0, '@5.0'), 9_000_000_000)):
+        measurement = shifted.read(name, message)
+        assert measurement.stamp_ns == stamp_ns, name
+        if name == 'loop_closure':
+            assert measurement.reference_ns == 4_000_000_000
+    assert shifted.read('odom', odometry(0.0, 0.0, 0.0, 0.0)).stamp_ns == 0
+    assert shifted.read('fix', fix(0.0, 48.0, 11.0)).reason == 'zero_stamp'
+
+
+def test_a_source_that_is_not_listed_is_not_read() -> None:
+    with pytest.raises(KeyError):
+        reader().read('imu', None)

@@ -16,12 +16,18 @@ from pose_graph_ros.cli.bag_messages import (
 )
 from pose_graph_ros.core.trajectory import Trajectory
 from pose_graph_ros.ros.bags import BagError, open_bag, TopicInfo
-from pose_graph_ros.ros.inputs import choose_inputs, Inputs, POSE, read_inputs, TYPES
+from pose_graph_ros.ros.inputs import choose_inputs, Inputs, read_inputs
+from pose_graph_ros.ros.parameters import checked, defaults
+from pose_graph_ros.ros.sources import Kind, KNOWN_SOURCES, source_list
+
+POSE = Kind.GLOBAL_POSE.message_type
+SOURCES = source_list(defaults())
 
 
 def bag(**topics: str) -> SimpleNamespace:
     """Stand for a reader with topics, each given as name = input whose type it has."""
-    infos = {f'/{name}': TopicInfo(TYPES[source], 1) for name, source in topics.items()}
+    infos = {f'/{name}': TopicInfo(KNOWN_SOURCES[source][0].message_type, 1)
+             for name, source in topics.items()}
     return SimpleNamespace(path='bag', topics=infos, describe=lambda: ', '.join(infos))
 
 
@@ -47,7 +53,7 @@ def bag(**topics: str) -> SimpleNamespace:
 def test_the_choice_of_topics(
     reader: SimpleNamespace, wanted: dict[str, str], expected: dict[str, str],
 ) -> None:
-    assert choose_inputs(reader, wanted).topics == expected
+    assert choose_inputs(reader, SOURCES, wanted).topics == expected
 
 
 @pytest.mark.parametrize(('reader', 'wanted', 'said'), [
@@ -59,7 +65,7 @@ def test_a_choice_that_is_not_clear_names_the_candidates(
     reader: SimpleNamespace, wanted: dict[str, str], said: str,
 ) -> None:
     with pytest.raises(BagError, match=said):
-        choose_inputs(reader, wanted)
+        choose_inputs(reader, SOURCES, wanted)
 
 
 def test_every_fifth_fix_is_held_out_and_nothing_else(tmp_path: Path) -> None:
@@ -71,14 +77,43 @@ def test_every_fifth_fix_is_held_out_and_nothing_else(tmp_path: Path) -> None:
         *loop_closure_messages('/loop_closure', np.column_stack((steps, steps + 9)) * 10**8,
                                np.zeros((50, 3)), np.eye(3))))
     with open_bag(tmp_path / 'bag') as reader:
-        messages = list(read_inputs(reader, choose_inputs(reader, {}, hold_out=5)))
+        messages = list(read_inputs(reader, choose_inputs(reader, SOURCES, {}, hold_out=5)))
     held_out = [message.held_out for message in messages if message.source == 'fix']
     assert held_out == [False, False, False, False, True] * 10
     assert not any(message.held_out for message in messages if message.source != 'fix')
     assert sorted({message.source for message in messages}) == ['fix', 'loop_closure', 'odom']
 
 
+def test_sources_of_other_names_are_looked_up_by_their_topics() -> None:
+    sources = source_list(checked({
+        'sources': ['odom', 'visual', 'fix', 'rear'], 'visual.type': 'odometry',
+        'visual.topic': 'vo', 'rear.type': 'fix', 'rear.topic': '/rear/fix'}))
+    reader = bag(o='odom', vo='odom', f='fix', **{'rear/fix': 'fix'})
+    inputs = choose_inputs(reader, sources, {})
+    assert inputs.topics == {'odom': '/o', 'visual': '/vo', 'fix': '/f', 'rear': '/rear/fix'}
+    assert list(inputs.topics) == ['odom', 'visual', 'fix', 'rear']
+    assert inputs.of(Kind.FIX) == ['fix', 'rear']
+    # what the bag does not have is left out
+    assert choose_inputs(bag(o='odom', f='fix'), sources, {}).topics == {'odom': '/o', 'fix': '/f'}
+    with pytest.raises(BagError, match=r'rear\.topic /rear/fix is of type'):
+        choose_inputs(bag(o='odom', **{'rear/fix': 'odom'}), sources, {'odom': '/o'})
+
+
+def test_a_topic_that_the_parameters_name_is_taken_before_a_guess() -> None:
+    sources = source_list(checked({'odom.topic': '/wheels'}))
+    reader = bag(o='odom', wheels='odom')
+    assert choose_inputs(reader, sources, {}).topics == {'odom': '/wheels'}
+    assert choose_inputs(reader, sources, {'odom': '/o'}).topics == {'odom': '/o'}
+
+
+def test_an_option_for_a_source_that_is_not_there_says_so() -> None:
+    sources = source_list(checked({'sources': ['odom']}))
+    with pytest.raises(BagError, match='--fix /f: the parameter sources has no fix'):
+        choose_inputs(bag(o='odom', f='fix'), sources, {'fix': '/f'})
+    assert choose_inputs(bag(o='odom', f='fix'), sources, {}).topics == {'odom': '/o'}
+
+
 @pytest.mark.parametrize('hold_out', [-1, 1])
 def test_holding_out_all_or_less_than_none_is_refused(hold_out: int) -> None:
     with pytest.raises(BagError, match='hold out'):
-        Inputs({'odom': '/odom'}, hold_out)
+        Inputs({'odom': '/odom'}, hold_out=hold_out)

@@ -53,7 +53,11 @@ def test_every_update_hands_out_a_path_that_is_current() -> None:
     worker.start()
     worker.post('odom', sample(1))
     worker.post('pose', GlobalPose(100_000_000, np.array([5.0, 0.0, 0.0]), 0.01 * np.eye(3)))
-    for step in range(2, 40):
+    # before that the reorder window of the odometry is not over
+    for step in range(2, 5):
+        worker.post('odom', sample(step))
+    wait_until(lambda: worker.status.processed == 5)
+    for step in range(5, 40):
         worker.post('odom', sample(step))
         already = len(estimates)
         worker.request_update()
