@@ -80,7 +80,8 @@ def fix_message(
     """Return where the robot is on the Earth, its covariance turned to east and north."""
     latitude, longitude, _ = plane.to_geodetic(prediction.T_map_base[:2], altitude)
     covariance = np.diag((0.0, 0.0, UNKNOWN_VARIANCE))
-    covariance[:2, :2] = cov.turned(prediction.covariance[:2, :2], -plane.yaw)
+    turned = cov.turned(prediction.covariance[:2, :2], -plane.yaw)
+    covariance[:2, :2] = 0.5 * (turned + turned.T)
     return NavSatFix(
         header=Header(stamp=time_message(stamp_ns), frame_id=base_frame),
         status=NavSatStatus(status=NavSatStatus.STATUS_FIX), latitude=float(latitude),

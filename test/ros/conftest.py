@@ -2,9 +2,11 @@
 # SPDX-License-Identifier: Apache-2.0
 """What the tests of this folder share; those that need ROS 2 import `harness`."""
 
+from collections.abc import Iterator
 import os
 from pathlib import Path
 import sys
+from typing import Any
 
 import pytest
 
@@ -19,3 +21,19 @@ def _on_this_machine_alone(
     monkeypatch.setenv('ROS_AUTOMATIC_DISCOVERY_RANGE', 'LOCALHOST')
     monkeypatch.setenv('ROS_LOG_DIR', str(tmp_path_factory.mktemp('ros_log')))
     assert 'ROS_LOCALHOST_ONLY' not in os.environ, 'unset it: it overrides the discovery range'
+
+
+@pytest.fixture
+def node(tmp_path: Path, request: pytest.FixtureRequest) -> Iterator[Any]:
+    from harness import NodeProcess  # noqa: PLC0415  (needs ROS, which other tests do not)
+
+    with NodeProcess(tmp_path, getattr(request, 'param', ())) as process:
+        yield process
+
+
+@pytest.fixture
+def client(node: Any) -> Iterator[Any]:
+    from harness import Client  # noqa: PLC0415
+
+    with Client(int(node.env['ROS_DOMAIN_ID'])) as connected:
+        yield connected

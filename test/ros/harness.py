@@ -2,7 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """A real node in a process of its own, and an independent client that talks to it over DDS."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 import math
 from pathlib import Path
 import signal
@@ -75,7 +75,12 @@ class NodeProcess:
 class Client:
     """Publishes what sensors would, and keeps everything that the node publishes."""
 
-    def __init__(self, domain: int, namespace: str = '', odom: str = 'odom') -> None:
+    def __init__(
+        self, domain: int, namespace: str = '', odom: str = 'odom', *,
+        listens: Sequence[str] = ('odom', 'global_pose', 'fix', 'loop_closure'),
+        more: Mapping[str, type] | None = None,
+    ) -> None:
+        self._listens = listens
         self._context = Context()
         rclpy.init(context=self._context, domain_id=domain)
         self.node = rclpy.create_node('client', context=self._context, namespace=namespace)
@@ -86,23 +91,28 @@ class Client:
         self.global_pose = create(PoseWithCovarianceStamped, 'global_pose', RELIABLE)
         self.fix = create(NavSatFix, 'gps/fix', RELIABLE)
         self.loop_closure = create(PoseWithCovarianceStamped, 'loop_closure', RELIABLE)
+        self.more = {topic: create(kind, topic, RELIABLE) for topic, kind in (more or {}).items()}
+        """Publishers on further topics, which the node listens to as well."""
         self.poses: list[PoseWithCovarianceStamped] = []
         self.filtered: list[Odometry] = []
+        self.fixes: list[NavSatFix] = []
         self.paths: list[PathMessage] = []
         self.transforms: list[object] = []
         self.diagnostics: list[DiagnosticArray] = []
         subscribe = self.node.create_subscription
         subscribe(PoseWithCovarianceStamped, 'pose', self.poses.append, RELIABLE)
         subscribe(Odometry, 'odometry/filtered', self.filtered.append, RELIABLE)
+        subscribe(NavSatFix, 'gps/filtered', self.fixes.append, RELIABLE)
         subscribe(PathMessage, 'path', self.paths.append, LATCHED)
         subscribe(DiagnosticArray, '/diagnostics', self.diagnostics.append, RELIABLE)
         if TFMessage is not None:
             subscribe(TFMessage, '/tf', lambda message: self.transforms.extend(message.transforms),
                       RELIABLE)
         self._optimize = self.node.create_client(Trigger, 'pose_graph/optimize')
+        self._set_datum = self.node.create_client(Trigger, 'pose_graph/set_datum')
 
     def __enter__(self) -> 'Client':
-        inputs = (self.odom, self.global_pose, self.fix, self.loop_closure)
+        inputs = (*(getattr(self, name) for name in self._listens), *self.more.values())
         self.spin_until(lambda: all(p.get_subscription_count() > 0 for p in inputs)
                         and len(self.diagnostics) > 0 and self._optimize.service_is_ready(),
                         'the node listens')
@@ -137,6 +147,11 @@ class Client:
     def wait_processed(self, count: int) -> None:
         self.spin_until(lambda: int(self.values['processed']) >= count,
                         f'{count} messages are processed')
+
+    def set_datum(self) -> Trigger.Response:
+        future = self._set_datum.call_async(Trigger.Request())
+        self.spin_until(future.done, 'the service answers')
+        return future.result()
 
     def optimize(self) -> Trigger.Response:
         """Have the node optimise; return when its outputs after that have come."""

@@ -2,68 +2,27 @@
 # SPDX-License-Identifier: Apache-2.0
 """The real node, driven over DDS by an independent process: this one."""
 
-from collections.abc import Iterator
 import math
 from pathlib import Path
 import random
 import signal
 import time
 
+from circle import (
+    check_pose,
+    drive,
+    odometry_pose,
+    path_error,
+    PLANE,
+    START,
+    true_pose,
+)
 from harness import Client, fix, NodeProcess, odometry, pose, RELIABLE, stamp_ns, TFMessage, yaw
 import numpy as np
 import pytest
 from rclpy.serialization import serialize_message
 
 from pose_graph_ros.core import se2
-from pose_graph_ros.core.tangent_plane import TangentPlane
-
-ANGLE = math.radians(122.0)
-"""Between the odometry frame and the map in these drives."""
-START = 1_700_000_000.0
-PLANE = TangentPlane(48.1, 11.6, 100.0)
-
-
-@pytest.fixture
-def node(tmp_path: Path, request: pytest.FixtureRequest) -> Iterator[NodeProcess]:
-    with NodeProcess(tmp_path, getattr(request, 'param', ())) as process:
-        yield process
-
-
-@pytest.fixture
-def client(node: NodeProcess) -> Iterator[Client]:
-    with Client(int(node.env['ROS_DOMAIN_ID'])) as connected:
-        yield connected
-
-
-def true_pose(seconds: float) -> np.ndarray:
-    """A circle of 20 m radius, at 2 m/s, in the map; it begins at the origin."""
-    angle = seconds / 10.0
-    return np.array([20.0 * math.sin(angle), 20.0 * (1.0 - math.cos(angle)), angle])
-
-
-def odometry_pose(seconds: float) -> np.ndarray:
-    """The same drive without noise, in the odometry frame."""
-    return se2.compose(np.array([5.0, -3.0, -ANGLE]), true_pose(seconds))
-
-
-def drive(client: Client, end: float, *, fixes: bool = True) -> None:
-    """Publish a drive: odometry at 10 Hz, exact fixes at 2 Hz."""
-    already = int(client.values['processed'])
-    count = 0
-    for step in range(round(end * 10)):
-        seconds = step / 10.0
-        client.odom.publish(odometry(START + seconds, *odometry_pose(seconds).tolist(), speed=2.0))
-        count += 1
-        if fixes and step % 5 == 0:
-            latitude, longitude, _ = PLANE.to_geodetic(true_pose(seconds)[:2])
-            client.fix.publish(fix(START + seconds, latitude, longitude))
-            count += 1
-        if step < 5:
-            # from the first estimate on every odometry message is answered; it comes when the
-            # reorder window of 0.25 s is over
-            client.wait_processed(already + count)
-        client.spin_for(0.002)
-    client.wait_processed(already + count)
 
 
 def test_every_message_of_a_drive_is_sound(node: NodeProcess, client: Client) -> None:
@@ -105,16 +64,6 @@ def test_every_message_of_a_drive_is_sound(node: NodeProcess, client: Client) ->
     position = newest.pose.pose.position
     assert math.hypot(position.x - at[0], position.y - at[1]) < 0.1
     assert newest.pose.covariance[0] < 1.0
-
-
-def check_pose(message: object) -> None:
-    position, q = message.pose.position, message.pose.orientation
-    assert np.all(np.isfinite((position.x, position.y, position.z)))
-    assert math.hypot(q.x, q.y, q.z, q.w) == pytest.approx(1.0, abs=1e-9)
-    covariance = np.asarray(message.covariance).reshape(6, 6)
-    assert np.all(np.isfinite(covariance))
-    assert np.array_equal(covariance, covariance.T)
-    assert np.min(np.linalg.eigvalsh(covariance)) >= 0.0
 
 
 @pytest.mark.skipif(TFMessage is None, reason='tf2_msgs is not built: no /tf')
@@ -188,13 +137,6 @@ def test_a_silence_ends_with_the_full_optimisation(tmp_path: Path) -> None:
         drive(client, 20.0)
         client.spin_until(lambda: len(client.paths) > 0 and path_error(client) < 1e-3,
                           'the optimised path comes')
-
-
-def path_error(client: Client) -> float:
-    """Return the largest distance of the newest path from the truth."""
-    return max(math.hypot(item.pose.position.x - x, item.pose.position.y - y)
-               for item in client.paths[-1].poses
-               for x, y, _ in [true_pose(stamp_ns(item) * 1e-9 - START)])
 
 
 def test_the_path_is_current_without_an_optimisation(node: NodeProcess, client: Client) -> None:
