@@ -182,7 +182,7 @@ def outliers(runs: int) -> Section:
     """Measure what a loss does against wrong fixes."""
     section = Section(
         'Wrong fixes', 'Fixes of 1 m at 1 Hz of which some are up to 50 m off, with the '
-        'covariance of the others. Position error of the closed path, rms over all nodes and runs.')
+        'covariance of the others. Position error of the closed path, rms over nodes and runs.')
     table = Table('', ('share of wrong fixes', *(loss.value for loss in Loss)))
     for share in (0.0, 0.05, 0.2):
         cells = []

@@ -11,7 +11,9 @@ from pose_graph_ros.core.autocorrelation import estimate, LEAST_RESIDUALS
 SECOND = 1_000_000_000
 
 
-def errors(rng: np.random.Generator, n: int, period: float, tau: float, white: float) -> np.ndarray:
+def errors(
+    rng: np.random.Generator, n: int, period: float, tau: float, white: float,
+) -> np.ndarray:
     """Return a first-order Gauss-Markov process and a white one, of variance 1 in all."""
     slow = rng.standard_normal((n, 2))
     phi = np.exp(-period / tau)
@@ -27,7 +29,8 @@ def stamps(n: int, period: float) -> np.ndarray:
 @pytest.mark.parametrize(('tau', 'period', 'n', 'white'), [
     (5.0, 0.1, 5000, 0.0), (60.0, 0.5, 5000, 0.1), (2.0, 1.0, 2000, 0.3), (60.0, 1.0, 3000, 0.5)])
 def test_tau_and_both_sigmas_are_found(tau: float, period: float, n: int, white: float) -> None:
-    found = [estimate(stamps(n, period), errors(np.random.default_rng(seed), n, period, tau, white))
+    found = [estimate(stamps(n, period),
+                      errors(np.random.default_rng(seed), n, period, tau, white))
              for seed in range(10)]
     assert all(one.significant for one in found)
     assert np.median([one.tau for one in found]) == pytest.approx(tau, rel=0.3)

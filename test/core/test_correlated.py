@@ -66,9 +66,8 @@ def ties(stamps: list[float]) -> set[tuple[object, ...]]:
         sizes = GraphSizes(sizes.n_nodes + len(additions.biases),
                            sizes.n_edges + len(additions.edges),
                            sizes.n_observed + len(additions.observed))
-    named = {row: when for row, when in rows.items()}
-    return ({(named.get(i, 'pose'), named[j], *rest) for i, j, *rest in edges.values()}
-            | {('prior', named[node]) for node in priors.values()})
+    return ({(rows.get(i, 'pose'), rows[j], *rest) for i, j, *rest in edges.values()}
+            | {('prior', rows[node]) for node in priors.values()})
 
 
 def test_the_order_of_arrival_does_not_change_how_states_are_tied() -> None:
@@ -169,11 +168,11 @@ def test_poses_and_sigma_are_those_of_the_full_covariance() -> None:
     estimate = backend.estimate()
     assert estimate is not None
     gap = np.abs(np.subtract.outer(np.arange(40), np.arange(40)))
-    # a second lies in the middle of a bin but for half a bin's shift
+    # the fixes lie at the ends of bins, where the state of a bin is worth least
     correlation = sigma**2 * (np.exp(-gap / TAU) + share * np.eye(40))
     expected, deviation = generalised_least_squares(fixes, 40, correlation)
-    np.testing.assert_allclose(estimate.path.poses[:, 0], expected, atol=0.02 * sigma)
-    assert np.sqrt(estimate.covariance[0, 0]) == pytest.approx(deviation[-1], rel=0.02)
+    np.testing.assert_allclose(estimate.path.poses[:, 0], expected, atol=0.04 * sigma)
+    assert np.sqrt(estimate.covariance[0, 0]) == pytest.approx(deviation[-1], rel=0.04)
     alone = run(fixes, MeasurementSource())
     alone.optimize()
     white = alone.estimate()
@@ -184,7 +183,8 @@ def test_poses_and_sigma_are_those_of_the_full_covariance() -> None:
 def drive(seed: int) -> list[Measurement]:
     rng = np.random.default_rng(seed)
     return [
-        *(position(2.0 + 0.7 * k, 1.0 + 0.7 * k + rng.normal(), rng.normal()) for k in range(50)),
+        *(position(2.03 + 0.7 * k, 1.03 + 0.7 * k + rng.normal(), rng.normal())
+          for k in range(50)),
         *(GlobalPose(round((3.1 + 3 * k) * SECOND),
                      np.array((2.1 + 3 * k, 0.0, 0.0)) + rng.normal(0.0, (1.0, 1.0, 0.05)),
                      np.diag((1.0, 2.0, 0.0025))) for k in range(10)),
