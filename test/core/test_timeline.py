@@ -11,9 +11,11 @@ import pytest
 from random_graphs import matrix, random_poses, vector
 
 from pose_graph_ros.core import se2
+from pose_graph_ros.core.motion import between_one, compose_one, wrap_one
 from pose_graph_ros.core.se2 import FloatArray
-from pose_graph_ros.core.timeline import OdometryTimeline
+from pose_graph_ros.core.timeline import next_row, OdometryTimeline
 
+SECOND = 1_000_000_000
 # Sums of tens of lengths of some 10 m.
 ROUNDING = 1e-11
 # The Unix time of 2026 in nanoseconds: a double does not hold it.
@@ -146,3 +148,86 @@ def test_slow_motion_is_counted_whole() -> None:
     poses = np.column_stack((np.arange(n) * 0.001, np.zeros(n), np.zeros(n)))
     timeline = filled([k + 1 for k in range(n)], poses)
     assert timeline.motion(1, n).distance == pytest.approx(1.0, abs=0.011)
+
+
+# --- Variances, gaps and rest ----------------------------------------------------------------
+
+@given(st.data())
+def test_variances_are_those_of_a_slow_walk(data: st.DataObject) -> None:
+    stamps = data.draw(stamp_lists)
+    rng = np.random.default_rng(data.draw(st.integers(0, 999)))
+    poses, row = random_poses(rng, len(stamps)), None
+    steps, loose = rng.uniform(0.0, 1.0, (2, len(stamps), 3))
+    timeline = OdometryTimeline()
+    for stamp, pose, step, jump in zip(stamps, poses, steps, loose, strict=True):
+        row = next_row(row, stamp, tuple(pose), tuple(step), tuple(jump))
+        timeline.append_row(row)
+    a, b = sorted(data.draw(st.tuples(*2 * (st.sampled_from(range(len(stamps))),))))
+    motion = timeline.motion(stamps[a], stamps[b])
+    np.testing.assert_allclose(
+        motion.variance, np.sum((steps + loose)[a + 1:b + 1], axis=0), atol=ROUNDING)
+    # between samples their part, and what the robot may have done in between
+    if a < b:
+        middle = (stamps[b - 1] + stamps[b]) // 2
+        fraction = (middle - stamps[b - 1]) / (stamps[b] - stamps[b - 1])
+        part = timeline.motion(stamps[b - 1], middle).variance - fraction * (steps + loose)[b]
+        time = (stamps[b] - stamps[b - 1]) * 1e-9
+        bend = 0.5 * fraction * (1.0 - fraction) * time**2
+        assert np.all(part >= -ROUNDING)
+        assert np.all(part <= (np.array([1.0, 1.0, 0.5]) * bend)**2 + ROUNDING)
+        way = timeline.motion(stamps[b - 1], stamps[b])
+        assert np.all(part <= np.array([way.distance, way.distance, way.turn])**2 + ROUNDING)
+
+
+def test_what_an_acceleration_hides_between_samples_is_in_the_noise() -> None:
+    for rate in (1, 5, 20):
+        times = np.arange(0.0, 4.0, 1.0 / rate)
+        poses = np.column_stack((0.5 * times**2, np.zeros_like(times), np.zeros_like(times)))
+        timeline = filled([EPOCH + round(t * 1e9) for t in times.tolist()], poses)
+        for t in np.linspace(0.0, times[-1], 97).tolist():
+            stamp = EPOCH + round(t * 1e9)
+            motion = timeline.motion(EPOCH, stamp)
+            off = abs(motion.increment[0] - 0.5 * t**2)
+            assert off <= np.sqrt(motion.variance[0]) + 1e-3     # less is jitter
+
+
+@pytest.mark.parametrize('hold', [5, 300])
+def test_rest_is_covered_closely_but_not_a_gap_in_it(hold: int) -> None:
+    timeline, stamps = OdometryTimeline(), [SECOND * k // 10 for k in range(1, hold)]
+    gap = stamps[-1] + 3 * SECOND
+    for stamp in (*stamps, gap, *(gap + stamp for stamp in stamps)):
+        timeline.append(stamp, np.ones(3))
+    assert len(timeline) == 4
+    for stamp in stamps[1:]:
+        assert timeline.covers(stamp - 7, closely=True)
+        assert timeline.covers(gap + stamp - 7, closely=True)
+    for stamp in (stamps[-1] + 1, gap - 1):
+        assert timeline.covers(stamp)
+        assert not timeline.covers(stamp, closely=True)
+    assert timeline.covers(gap, closely=True)
+
+
+@given(st.lists(st.sampled_from((0, 1)), min_size=1, max_size=60), st.integers(0, 10**6))
+def test_leaving_out_rest_changes_no_motion(moves: list[int], seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    poses = np.cumsum(np.outer(moves, [0.3, 0.1, 0.05]), axis=0)
+    stamps = [EPOCH + k * SECOND // 10 for k in range(len(moves))]
+    timeline = filled(stamps, poses)
+    for _ in range(10):
+        a, b = np.sort(rng.integers(stamps[0], stamps[-1] + 1, 2)).tolist()
+        motion = timeline.motion(a, b)
+        expected = vector(np.linalg.inv(matrix(slow_pose(stamps, poses, a)))
+                          @ matrix(slow_pose(stamps, poses, b)))
+        np.testing.assert_allclose(motion.increment, expected, atol=ROUNDING)
+        distance, turn = slow_travel(stamps, poses, a, b)
+        assert motion.distance == pytest.approx(distance, abs=ROUNDING)
+        assert motion.turn == pytest.approx(turn, abs=ROUNDING)
+
+
+@given(st.floats(-1e4, 1e4), st.floats(-10.0, 10.0), st.floats(-10.0, 10.0))
+def test_one_pose_at_a_time_is_the_same_as_arrays(x: float, a: float, b: float) -> None:
+    first, second = se2.wrapped(np.array([x, a, b])), se2.wrapped(np.array([b, x, a]))
+    assert wrap_one(a) == se2.wrap(a)
+    one, two = tuple(first.tolist()), tuple(second.tolist())
+    np.testing.assert_allclose(compose_one(one, two), se2.compose(first, second), atol=1e-11)
+    np.testing.assert_allclose(between_one(one, two), se2.between(first, second), atol=1e-11)
