@@ -110,6 +110,12 @@ def execute(options: argparse.Namespace) -> int:
     print(f'{estimate.n_hidden} hidden nodes, {estimate.n_edges} edges, {estimate.n_observed} '
           f'observed nodes in {seconds:.2f} s; {report.status.value}, chi2 {report.chi2:.6g}; '
           f'{estimate.alignment.value}')
+    for source, fit in sorted(backend.reports().items()):
+        print(f'{source}: squared residual {fit.energy:.3g} sigma^2' + (
+            f'; errors of {fit.errors.sigma_correlated:.3g} m live for {fit.errors.tau:.3g} s'
+            if fit.errors.significant else '') + (
+            f', but are taken for white: see {source}.correlation_time'
+            if fit.wrongly_white else ''))
     print('counts: ' + ', '.join(f'{name} {count}' for name, count in counts.items()))
     print(f'\n{table}\n\nwritten: {options.out}/path.tum, drive.png, summary.json, graph.g2o')
     return 0 if report.status is Status.CONVERGED else 1

@@ -33,6 +33,8 @@ from pose_graph_ros.core.sources import (
 # So many of the newest residuals of a source are looked at, anew when there are so many more.
 MOST_RESIDUALS = 5000
 MORE_RESIDUALS = 1.05
+# Residuals that are so much smaller than was claimed do no harm, whatever they look like.
+LEAST_ENERGY = 0.1
 
 
 class Bound(NamedTuple):
@@ -69,6 +71,13 @@ class SourceReport(NamedTuple):
     """Mean squared residual of a coordinate in units of the sigmas that it came with."""
     errors: autocorrelation.Autocorrelation
     """Of the newest residuals [m]."""
+    white: bool
+    """Whether its errors are taken for white."""
+
+    @property
+    def wrongly_white(self) -> bool:
+        """Whether its errors look correlated but are taken for white: the claims are too good."""
+        return self.white and self.errors.significant and self.energy > LEAST_ENERGY
 
 
 class _Own:
@@ -171,8 +180,9 @@ class Joining:
         else:
             residuals, information = _residuals(graph, graph.observed_at(rows))
         energy = np.einsum('ki,kij,kj->k', residuals, information, residuals)
-        return SourceReport(len(own.rows), float(np.mean(energy)) / 2.0,
-                            autocorrelation.estimate(stamps, residuals))
+        return SourceReport(
+            len(own.rows), float(np.mean(energy)) / 2.0,
+            autocorrelation.estimate(stamps, residuals), source not in self._correlated)
 
 
 def _residuals(graph: Graph, observed: ObservedNodes) -> tuple[FloatArray, FloatArray]:
