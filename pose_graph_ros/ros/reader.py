@@ -6,12 +6,20 @@ from collections.abc import Mapping
 from typing import Any
 
 from pose_graph_ros.core.exceptions import ConfigError
-from pose_graph_ros.core.measurements import Answer, Measurement, OdometrySample
+from pose_graph_ros.core.measurements import Answer, Measurement, OdometrySample, rejected
 from pose_graph_ros.ros import conversions
 from pose_graph_ros.ros.conversions import frame, Message
 from pose_graph_ros.ros.fixes import Datum, FixReader
-from pose_graph_ros.ros.sources import Kind, source_list
+from pose_graph_ros.ros.sources import Kind, NANOSECONDS, Source, source_list
 from pose_graph_ros.ros.static_frames import StaticFrames
+
+# Odometry that is ahead of all before by more than this [ns] is taken for a clock gone wrong,
+LEAP_NS = 60 * NANOSECONDS
+# unless so many more messages in a row are: odometry had been away. As its poses are accumulated,
+# those few are not missed.
+LEAPS = 10
+# The seconds of a stamp have 31 bits; some are left for the offsets of what is published [ns].
+LARGEST_STAMP_NS = (2**31 - 3600) * NANOSECONDS
 
 
 class MessageReader:
@@ -33,6 +41,7 @@ class MessageReader:
     def __init__(self, values: Mapping[str, Any]) -> None:
         self.sources = {source.name: source for source in source_list(values)}
         """All sources by name."""
+        self._leaps = {name: _Leaps() for name in self.sources}
         self._map_frame = frame(values['map_frame'])
         base_frame = frame(values['base_link_frame'])
         self.frames = StaticFrames()
@@ -48,6 +57,17 @@ class MessageReader:
     def read(self, name: str, message: Message) -> OdometrySample | Measurement | Answer:
         """Read a message of the source with this name."""
         source = self.sources[name]
+        measurement = self._read(source, message)
+        if isinstance(measurement, Answer):
+            return measurement
+        stamp_ns = measurement.stamp_ns
+        if stamp_ns > LARGEST_STAMP_NS:
+            return rejected('stamp_out_of_range', f'{stamp_ns} ns')
+        if source.kind is Kind.ODOMETRY and self._leaps[name].refuses(stamp_ns):
+            return rejected('stamp_leap', f'{stamp_ns} ns is far ahead of all before')
+        return measurement
+
+    def _read(self, source: Source, message: Message) -> OdometrySample | Measurement | Answer:
         offset_ns = source.time_offset_ns
         match source.kind:
             case Kind.ODOMETRY:
@@ -55,9 +75,32 @@ class MessageReader:
             case Kind.GLOBAL_POSE:
                 return conversions.global_pose(message, self._map_frame, offset_ns)
             case Kind.FIX:
-                return self.fixes[name].position(message)
+                return self.fixes[source.name].position(message)
             case Kind.IMU:
                 return conversions.heading(
                     message, self.datum.yaw, source.yaw_offset, offset_ns)
             case Kind.LOOP_CLOSURE:
                 return conversions.loop_closure(message, offset_ns)
+
+
+class _Leaps:
+    """
+    Keeps a stamp far in the future away from odometry.
+
+    All that came after it with good stamps would be too old.
+    """
+
+    def __init__(self) -> None:
+        self._newest_ns = 0
+        self._ahead = 0
+
+    def refuses(self, stamp_ns: int) -> bool:
+        """Tell whether a stamp is far ahead of those before, and not of those to come."""
+        ahead = self._newest_ns > 0 and stamp_ns > self._newest_ns + LEAP_NS
+        self._ahead = self._ahead + 1 if ahead else 0
+        if 0 < self._ahead <= LEAPS:
+            return True
+        if self._ahead > 0:
+            self._newest_ns, self._ahead = stamp_ns, 0
+        self._newest_ns = max(self._newest_ns, stamp_ns)
+        return False
