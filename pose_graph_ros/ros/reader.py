@@ -13,11 +13,11 @@ from pose_graph_ros.ros.fixes import Datum, FixReader
 from pose_graph_ros.ros.sources import Kind, NANOSECONDS, Source, source_list
 from pose_graph_ros.ros.static_frames import StaticFrames
 
-# Odometry that is ahead of all before by more than this [ns] is taken for a clock gone wrong,
+# Odometry whose stamp is so far [ns] from those before is taken for that of a clock gone wrong,
 LEAP_NS = 60 * NANOSECONDS
-# unless so many more messages in a row are: odometry had been away. As its poses are accumulated,
-# those few are not missed.
-LEAPS = 10
+# unless so many more messages in a row are: odometry had been away, or began with a wrong clock.
+# As its poses are accumulated, those few are not missed.
+LEAPS = 5
 # The seconds of a stamp have 31 bits; some are left for the offsets of what is published [ns].
 LARGEST_STAMP_NS = (2**31 - 3600) * NANOSECONDS
 
@@ -63,8 +63,9 @@ class MessageReader:
         stamp_ns = measurement.stamp_ns
         if stamp_ns > LARGEST_STAMP_NS:
             return rejected('stamp_out_of_range', f'{stamp_ns} ns')
-        if source.kind is Kind.ODOMETRY and self._leaps[name].refuses(stamp_ns):
-            return rejected('stamp_leap', f'{stamp_ns} ns is far ahead of all before')
+        # zero and less is the engine's to refuse
+        if source.kind is Kind.ODOMETRY and stamp_ns > 0 and self._leaps[name].refuses(stamp_ns):
+            return rejected('stamp_leap', f'{stamp_ns} ns is far from those before')
         return measurement
 
     def _read(self, source: Source, message: Message) -> OdometrySample | Measurement | Answer:
@@ -85,22 +86,22 @@ class MessageReader:
 
 class _Leaps:
     """
-    Keeps a stamp far in the future away from odometry.
+    Keeps stamps of another time away from odometry.
 
-    All that came after it with good stamps would be too old.
+    After one of the future all others would be too old; one of the past could be the first.
     """
 
     def __init__(self) -> None:
         self._newest_ns = 0
-        self._ahead = 0
+        self._count = 0
 
     def refuses(self, stamp_ns: int) -> bool:
-        """Tell whether a stamp is far ahead of those before, and not of those to come."""
-        ahead = self._newest_ns > 0 and stamp_ns > self._newest_ns + LEAP_NS
-        self._ahead = self._ahead + 1 if ahead else 0
-        if 0 < self._ahead <= LEAPS:
+        """Tell whether a stamp is far from those before, and not from those to come."""
+        if self._newest_ns == 0 or abs(stamp_ns - self._newest_ns) <= LEAP_NS:
+            self._newest_ns, self._count = max(self._newest_ns, stamp_ns), 0
+            return False
+        self._count += 1
+        if self._count <= LEAPS:
             return True
-        if self._ahead > 0:
-            self._newest_ns, self._ahead = stamp_ns, 0
-        self._newest_ns = max(self._newest_ns, stamp_ns)
+        self._newest_ns, self._count = stamp_ns, 0
         return False

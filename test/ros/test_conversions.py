@@ -169,3 +169,28 @@ def test_the_stamps_of_a_source_are_shifted_but_not_those_that_are_not_set() -> 
 def test_a_source_that_is_not_listed_is_not_read() -> None:
     with pytest.raises(KeyError):
         reader().read('imu', None)
+
+
+def test_odometry_with_the_stamp_of_another_time_is_refused_unless_it_goes_on() -> None:
+    one = reader()
+
+    def answers(*seconds: float) -> list[str]:
+        return [getattr(one.read('odom', odometry(at, 0.0, 0.0, 0.0)), 'reason', 'read')
+                for at in seconds]
+
+    assert answers(1e9, 1e9 + 59.0, 1e9 + 58.0) == 3 * ['read']
+    assert answers(2e9, 1e9 + 60.0, 5.0, 5.1, 2e9, 2e9, 2e9) == [
+        'stamp_leap', 'read', *(5 * ['stamp_leap'])]
+    assert answers(1e9 + 61.0) == ['read']
+    # it had been away, and is again
+    assert answers(*(1.1e9 + 0.1 * step for step in range(8))) == (
+        5 * ['stamp_leap'] + 3 * ['read'])
+    assert answers(*(1e9 + 0.1 * step for step in range(8))) == (
+        5 * ['stamp_leap'] + 3 * ['read'])
+
+
+def test_stamps_that_no_message_can_hold_are_refused() -> None:
+    one = reader(odom__time_offset=10.0, fix__time_offset=-10.0)
+    assert one.read('odom', odometry(2**31 - 1.0, 0.0, 0.0, 0.0)).reason == 'stamp_out_of_range'
+    assert one.read('fix', fix(2**31 - 1.0, 48.0, 11.0)).reason == 'stamp_out_of_range'
+    assert one.read('fix', fix(5.0, 48.0, 11.0)).reason == 'zero_stamp'
