@@ -3,7 +3,7 @@
 """What the node says of itself in /diagnostics."""
 
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 import math
 
 from diagnostic_msgs.msg import DiagnosticStatus
@@ -13,6 +13,9 @@ from pose_graph_ros.core.estimate import AlignmentState, Estimate
 from pose_graph_ros.ros.hearing import Hearing
 from pose_graph_ros.ros.reader import MessageReader
 from pose_graph_ros.ros.worker import Worker
+
+# Residuals this small, in units of the sigmas squared, are correlated by rounding.
+LEAST_ENERGY = 1e-3
 
 
 def state(
@@ -55,6 +58,30 @@ def inputs(reader: MessageReader, hearing: Hearing, now: float) -> dict[str, obj
     plane = reader.datum.plane
     values['datum'] = 'none' if plane is None else (
         f'[{plane.latitude:.9f}, {plane.longitude:.9f}, {plane.yaw:.6f}]')
+    return values
+
+
+def fits(worker: Worker, white: Collection[str]) -> dict[str, object]:
+    """
+    Return how well the measurements of each source fit the estimate.
+
+    Parameters
+    ----------
+    worker : Worker
+    white : collection of str
+        Sources whose errors are taken for independent of each other.
+
+    """
+    values: dict[str, object] = {}
+    for name, report in worker.status.sources.items():
+        # 1 where the sigmas are right, less where a source is all that the estimate has
+        values[f'{name}.squared_residual'] = f'{report.energy:.4g}'
+        errors = report.errors
+        if errors.significant and report.energy >= LEAST_ENERGY:
+            values[f'{name}.errors_live'] = (
+                f'{errors.tau:.0f} s, with a sigma of {errors.sigma_correlated:.2g} m'
+                + (f'; they are treated as white: set {name}.correlation_time'
+                   if name in white else ''))
     return values
 
 

@@ -8,7 +8,7 @@ frozen estimate that the thread swaps in. Imports no ROS.
 """
 
 from collections import Counter, deque
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from concurrent.futures import Future
 from dataclasses import dataclass, field
 import logging
@@ -17,6 +17,7 @@ import time
 
 from pose_graph_ros.core.backend import PoseGraphBackend
 from pose_graph_ros.core.estimate import Estimate, UpdateReport
+from pose_graph_ros.core.joining import SourceReport
 from pose_graph_ros.core.measurements import Measurement, OdometrySample, Verdict
 
 logger = logging.getLogger(__name__)
@@ -42,6 +43,8 @@ class WorkerStatus:
     solve_max: float = 0.0
     report: UpdateReport | None = None
     """Of the newest update."""
+    sources: Mapping[str, SourceReport] = field(default_factory=dict)
+    """How well the measurements of each source fit."""
 
 
 class Worker:
@@ -207,4 +210,5 @@ class Worker:
             processed=status.processed + processed, counts=Counter(backend.counts),
             pending=backend.n_pending, quarantined=backend.n_quarantined, updates=self._solves,
             solve_mean=self._solve_total / max(self._solves, 1), solve_max=self._solve_max,
-            report=status.report if report is None else report)
+            report=status.report if report is None else report,
+            sources=status.sources if report is None else backend.reports())

@@ -250,6 +250,30 @@ def test_without_fixes_there_is_no_latitude(node: NodeProcess, client: Client) -
     assert client.values['datum'] == 'none'
 
 
+@pytest.mark.parametrize('node', [(), ('-p', 'fix.correlation_time:=20.0')], indirect=True)
+def test_errors_that_live_on_show_in_the_diagnostics(
+    node: NodeProcess, client: Client, request: pytest.FixtureRequest,
+) -> None:
+    generator = random.Random(3)
+    error = [0.0, 0.0]
+
+    def wandering(seconds: float) -> NavSatFix:
+        for k in range(2):
+            error[k] = 0.95 * error[k] + generator.gauss(0.0, 0.3)
+        message = fix_at(seconds, sigma=1.0)
+        message.latitude += error[0] / 111_200.0
+        message.longitude += error[1] / 74_300.0
+        return message
+
+    play(client, range(800), every(1, client.odom, odometry_at), every(5, client.fix, wandering))
+    assert client.optimize().success
+    told = client.values['fix.errors_live']
+    assert 0.5 < float(told.partition(' ')[0]) < 100.0
+    treated = 'they are treated as white: set fix.correlation_time' in told
+    assert treated == (request.node.callspec.params['node'] == ())
+    assert 0.01 < float(client.values['fix.squared_residual']) < 3.0
+
+
 def test_an_imu_turns_the_map_before_the_robot_has_moved_far(tmp_path: Path) -> None:
     arguments = ('-p', 'sources:=[odom, fix, imu]', '-p', 'imu.yaw_offset:=0.25',
                  '-p', f'datum:=[{PLANE.latitude}, {PLANE.longitude}, 1.0]')
