@@ -34,6 +34,8 @@ from pose_graph_ros.core.sources import MeasurementSource
 
 # Bins in a time constant.
 BINS = 16
+# An error that is known to the last digit would be told to the solver twice.
+LEAST_WHITE = 1e-3
 # The third number of a state is wrapped as a heading is, so it is kept small: in units of so many
 # sigmas. Its variance is 1 / STRETCH^2.
 STRETCH = 10.0
@@ -125,7 +127,8 @@ class BiasChain:
             self._make_bin(number, additions)
         phi = self._phi(abs(rest_ns - self._width_ns / 2))
         return additions.add_edge(_biased_constraint(
-            measurement, anchor, self._bins[number].row, phi, self._source.white_share))
+            measurement, anchor, self._bins[number].row, phi,
+            max(self._source.white_share, LEAST_WHITE)))
 
     def _phi(self, gap_ns: float) -> float:
         return math.exp(-gap_ns * 1e-9 / self._source.correlation_time)

@@ -158,13 +158,13 @@ class MeasurementSource:
     """How long an error lives, its time constant [s]; 0 for white noise."""
     correlation: Correlation = Correlation.BIAS
     white_share: float = 0.05
-    """Variance of what is white beside that, in parts of the variance, in [0.001, 1]."""
+    """Variance of what is white beside that, in parts of the variance, in [0, 1]."""
 
     def __post_init__(self) -> None:
         require(self, 'rejection_threshold', positive=True)
         require(self, 'correlation_time', 'white_share')
-        if not 0.001 <= self.white_share <= 1.0:
-            raise ConfigError('MeasurementSource.white_share: expected a number in [0.001, 1], '
+        if self.white_share > 1.0:
+            raise ConfigError('MeasurementSource.white_share: expected a number in [0, 1], '
                               f'got {self.white_share!r}')
         if (self.correlation_time > 0.0 and self.correlation is Correlation.INFLATE
                 and self.loss is not Loss.NONE):

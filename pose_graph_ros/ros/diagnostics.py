@@ -3,19 +3,17 @@
 """What the node says of itself in /diagnostics."""
 
 from collections import Counter
-from collections.abc import Collection, Sequence
+from collections.abc import Mapping, Sequence
 import math
 
 from diagnostic_msgs.msg import DiagnosticStatus
 
 from pose_graph_ros.core.batch import Status
 from pose_graph_ros.core.estimate import AlignmentState, Estimate
+from pose_graph_ros.core.joining import LEAST_ENERGY, SourceReport
 from pose_graph_ros.ros.hearing import Hearing
 from pose_graph_ros.ros.reader import MessageReader
 from pose_graph_ros.ros.worker import Worker
-
-# Residuals this small, in units of the sigmas squared, are correlated by rounding.
-LEAST_ENERGY = 1e-3
 
 
 def state(
@@ -61,17 +59,8 @@ def inputs(reader: MessageReader, hearing: Hearing, now: float) -> dict[str, obj
     return values
 
 
-def fits(worker: Worker, white: Collection[str]) -> dict[str, object]:
-    """
-    Return how well the measurements of each source fit the estimate.
-
-    Parameters
-    ----------
-    worker : Worker
-    white : collection of str
-        Sources whose errors are taken for independent of each other.
-
-    """
+def fits(worker: Worker) -> dict[str, object]:
+    """Return how well the measurements of each source fit the estimate."""
     values: dict[str, object] = {}
     for name, report in worker.status.sources.items():
         # 1 where the sigmas are right, less where a source is all that the estimate has
@@ -79,9 +68,9 @@ def fits(worker: Worker, white: Collection[str]) -> dict[str, object]:
         errors = report.errors
         if errors.significant and report.energy >= LEAST_ENERGY:
             values[f'{name}.errors_live'] = (
-                f'{errors.tau:.0f} s, with a sigma of {errors.sigma_correlated:.2g} m'
+                f'{errors.tau:.2g} s, with a sigma of {errors.sigma_correlated:.2g} m'
                 + (f'; they are treated as white: set {name}.correlation_time'
-                   if name in white else ''))
+                   if report.wrongly_white else ''))
     return values
 
 
@@ -101,14 +90,19 @@ def health(worker: Worker, silent: Sequence[str]) -> tuple[bytes, str]:
         verb = 'is' if len(silent) == 1 else 'are'
         return (DiagnosticStatus.WARN,
                 f'{" and ".join(silent)} {verb} silent, others go on: check the drivers.')
-    return _alignment(estimate)
+    return _fit(estimate, worker.status.sources)
 
 
-def _alignment(estimate: Estimate) -> tuple[bytes, str]:
+def _fit(estimate: Estimate, sources: Mapping[str, SourceReport]) -> tuple[bytes, str]:
     if estimate.alignment is AlignmentState.UNALIGNED:
         return (DiagnosticStatus.WARN, 'Unaligned: the angle between odometry and map is not '
                 'known yet. Drive some metres with a fix.')
     if estimate.alignment is AlignmentState.LOCAL:
         return (DiagnosticStatus.OK, 'Running; nothing was measured in the map, which begins '
                 'where odometry does.')
+    for name, report in sources.items():
+        if report.wrongly_white:
+            return (DiagnosticStatus.WARN, f'The errors of {name} live on but are treated as '
+                    f'white, so the covariances are too small: set {name}.correlation_time to '
+                    f'about {report.errors.tau:.2g} s.')
     return DiagnosticStatus.OK, 'Running.'

@@ -95,8 +95,6 @@ class PoseGraphNode(Node):
         self._received: Counter[str] = Counter()
         self._refused: Counter[tuple[str, str]] = Counter()
         self._posted = 0
-        self._white = [name for name, source in config.measurements.items()
-                       if source.correlation_time == 0.0]
         self._said: set[tuple[str, str]] = set()
         self._hearing = Hearing(
             [source.name for source in sources if source.kind is Kind.LOOP_CLOSURE])
@@ -301,7 +299,7 @@ class PoseGraphNode(Node):
         self._out.publish_diagnostics(level, text, {
             **diagnostics.state(self._worker, self._received, self._refused),
             **diagnostics.inputs(self._reader, self._hearing, now),
-            **diagnostics.fits(self._worker, self._white)})
+            **diagnostics.fits(self._worker)})
 
 
 def _descriptor(parameter: Parameter) -> ParameterDescriptor:
