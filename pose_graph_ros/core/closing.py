@@ -4,7 +4,7 @@
 The full optimisation at the end of a stream.
 
 Its result must not depend on what the updates before it did. So the graph is solved from two
-starts, and where sources have a robust loss, their weights begin at those of plain least squares.
+starts, and where sources have a robust loss, their weights begin anew.
 """
 
 from dataclasses import replace
@@ -22,6 +22,10 @@ from pose_graph_ros.core.starts import SAME_MINIMUM, Solve, solve_from_two_start
 REWEIGHINGS = 200
 # ... and they are settled when none changes by more than this.
 SAME_WEIGHT = 1e-12
+# Factors on the thresholds on the way from plain least squares to the losses.
+WIDENED = (32.0, 16.0, 8.0, 4.0, 2.0)
+# Weight of constraints with a loss where those without one are to speak first.
+FAINT = 1e-4
 
 
 def optimize(
@@ -56,26 +60,39 @@ def optimize(
 def _optimize_robustly(
     graph: Graph, reweighing: Reweighing, config: SolverConfig, solve: Solve,
 ) -> BatchResult:
-    """Reweigh from plain least squares on, and from the present estimate; keep the lower cost."""
-    result = _reweighed(graph, reweighing, config, solve)
-    own, poses, weights = result, graph.poses.copy(), (graph.edges.weight, graph.observed.weight)
-    _weigh(graph, *reweighing.ones())
-    result = solve_from_two_starts(graph, config, solve, closing=True)
-    if result.status is not Status.FAILED:
-        result = _reweighed(graph, reweighing, config, solve)
-    if own.status is not Status.FAILED and (
-            result.status is Status.FAILED or own.chi2 < result.chi2 * (1.0 - SAME_MINIMUM)):
-        _weigh(graph, *(dict(enumerate(weight.tolist())) for weight in weights))
-        graph.set_poses(poses)
-        result = own
-    return result
+    """
+    Reweigh from two starts, and keep the lower of the robust costs.
+
+    One start is plain least squares, from where the thresholds narrow; the other is where the
+    constraints without a loss put the nodes. Neither looks at the weights that there are: what
+    the updates have made of them depends on the order in which measurements came.
+    """
+    best, poses, weights = None, graph.poses, (graph.edges.weight, graph.observed.weight)
+    for weight, widened in ((1.0, WIDENED), (FAINT, ())):
+        _weigh(graph, *reweighing.all_alike(weight))
+        result = solve_from_two_starts(graph, config, solve, closing=True)
+        for factor in widened:
+            if result.status is not Status.FAILED:
+                _weigh(graph, *reweighing.all_changes(graph, factor))
+                result = solve(graph, config)
+        if result.status is not Status.FAILED:
+            result = _reweighed(graph, reweighing, config, solve)
+        failed = result.status is Status.FAILED
+        if best is None or best.status is Status.FAILED or (
+                not failed and result.chi2 < best.chi2 * (1.0 - SAME_MINIMUM)):
+            best, poses = result, graph.poses.copy()
+            weights = graph.edges.weight, graph.observed.weight
+    assert best is not None
+    _weigh(graph, *(dict(enumerate(weight.tolist())) for weight in weights))
+    graph.set_poses(poses)
+    return best
 
 
 def _reweighed(
     graph: Graph, reweighing: Reweighing, config: SolverConfig, solve: Solve,
 ) -> BatchResult:
     """Solve and reweigh in turn until the weights stay; chi2 of the result is the robust cost."""
-    iterations = 0
+    iterations, largest = 0, 1.0
     for _ in range(REWEIGHINGS):
         edges, observed = reweighing.all_changes(graph)
         before = graph.edges.weight, graph.observed.weight
@@ -89,6 +106,8 @@ def _reweighed(
             break
     if result.status is Status.FAILED:
         return result
+    if largest >= SAME_WEIGHT:
+        result = replace(result, status=Status.MAX_ITERATIONS)
     return replace(result, iterations=iterations, chi2=result.chi2 + reweighing.cost(graph))
 
 

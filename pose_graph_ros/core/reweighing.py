@@ -82,16 +82,19 @@ class Reweighing:
                 self._changed(graph, self._observed, self._observed.some(), LEAST_CHANGE,
                               edges=False))
 
-    def all_changes(self, graph: Graph) -> tuple[Mapping[int, float], Mapping[int, float]]:
-        """Return all weights that are not exactly as they should be."""
+    def all_changes(
+        self, graph: Graph, widened: float = 1.0,
+    ) -> tuple[Mapping[int, float], Mapping[int, float]]:
+        """Return all weights that are not exactly as they should be, by widened thresholds."""
         return tuple(  # type: ignore[return-value]
-            self._changed(graph, table, np.arange(len(table.rows)), 0.0, edges=edges)
+            self._changed(graph, table, np.arange(len(table.rows)), 0.0, edges=edges,
+                          widened=widened)
             for table, edges in ((self._edges, True), (self._observed, False)))
 
-    def ones(self) -> tuple[Mapping[int, float], Mapping[int, float]]:
-        """Return the weights of plain least squares."""
-        return (dict.fromkeys(self._edges.rows.values.tolist(), 1.0),
-                dict.fromkeys(self._observed.rows.values.tolist(), 1.0))
+    def all_alike(self, weight: float) -> tuple[Mapping[int, float], Mapping[int, float]]:
+        """Return the same weight for all; 1 is plain least squares."""
+        return (dict.fromkeys(self._edges.rows.values.tolist(), weight),
+                dict.fromkeys(self._observed.rows.values.tolist(), weight))
 
     def cost(self, graph: Graph) -> float:
         """Return how much the robust costs lie above the weighted energies, in all."""
@@ -108,6 +111,7 @@ class Reweighing:
 
     def _changed(
         self, graph: Graph, table: _Rows, index: IntArray, least: float, *, edges: bool,
+        widened: float = 1.0,
     ) -> Mapping[int, float]:
         if len(index) == 0:
             return {}
@@ -115,7 +119,7 @@ class Reweighing:
         energy, weight = _energies(graph, rows, edges=edges)
         wanted = np.empty(len(index))
         for loss, threshold, chosen in _groups(table, index):
-            wanted[chosen] = robust.weights(loss, energy[chosen], threshold)
+            wanted[chosen] = robust.weights(loss, energy[chosen], widened * threshold)
         changed = np.abs(wanted - weight) > least * np.minimum(wanted, weight)
         return dict(zip(rows[changed].tolist(), wanted[changed].tolist(), strict=True))
 
