@@ -43,6 +43,8 @@ from pose_graph_ros.core.sources import OdometrySource
 from pose_graph_ros.core.starts import Solve
 from pose_graph_ros.core.trajectory import Trajectory
 
+# Measurements that wait for the angle between odometry and map; the oldest make way.
+MOST_UNALIGNED = 20_000
 # So often the weights of robust losses follow the estimate within one update.
 REWEIGHINGS = 3
 
@@ -168,13 +170,16 @@ class PoseGraphBackend:
         return self._count(source, self._add_measurement(measurement, source))
 
     def _add_measurement(self, measurement: Measurement, source: str) -> Answer:
-        closure = isinstance(measurement, LoopClosure)
-        admitted = admit(measurement, self._joins.settings(source, closure=closure).covariance)
+        settings = self._joins.settings(source, closure=isinstance(measurement, LoopClosure))
+        admitted = admit(measurement, settings.covariance)
         if isinstance(admitted, Answer):
             return admitted
         checked = admitted.measurement
         if self._seen.has(source, checked):
             return rejected('duplicate_stamp', f'{source} at {checked.stamp_ns} came before')
+        if settings.minimum_period > 0.0 and self._seen.near(
+                source, checked.stamp_ns, round(settings.minimum_period * 1e9)):
+            return rejected('thinned', f'less than {settings.minimum_period} s from another one')
         if due_ns(checked) <= self._nodes.covered_ns:
             answer = self._bind(checked, source)
         else:
@@ -204,6 +209,10 @@ class PoseGraphBackend:
         if not isinstance(measurement, LoopClosure):
             self._queue.observed.append(Bound(
                 source, binding.absolute_constraint(measurement, anchor), measurement, anchor))
+            if (len(self._queue.observed) > MOST_UNALIGNED
+                    and self._aligning.state is not AlignmentState.ALIGNED):
+                # where a robot stands for days, unaligned, memory must not run full
+                self.counts[self._queue.observed.pop(0).source, 'dropped_unaligned'] += 1
             return ACCEPTED
         reference = self._reference(measurement)
         if isinstance(reference, Answer):

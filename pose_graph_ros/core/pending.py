@@ -62,6 +62,9 @@ def _last_first(waiting: Waiting) -> tuple[int, int]:
     return -waiting.due_ns, -waiting.arrival
 
 
+_NONE: 'array[int]' = array('q')
+
+
 class Seen:
     """Which measurements have come before, by source and stamps: 16 bytes each."""
 
@@ -72,6 +75,13 @@ class Seen:
     def has(self, source: str, measurement: Measurement) -> bool:
         """Tell whether there was one with the same stamp, and the same reference."""
         return self._find(source, measurement) >= 0
+
+    def near(self, source: str, stamp_ns: int, period_ns: int) -> bool:
+        """Tell whether a stamp of the source lies closer than a period to this one."""
+        stamps = self._stamps.get(source, _NONE)
+        at = bisect.bisect_left(stamps, stamp_ns)
+        return ((at > 0 and stamp_ns - stamps[at - 1] < period_ns)
+                or (at < len(stamps) and stamps[at] - stamp_ns < period_ns))
 
     def add(self, source: str, measurement: Measurement) -> None:
         """Add a measurement; in order it costs nothing."""

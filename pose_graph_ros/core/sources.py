@@ -154,6 +154,8 @@ class MeasurementSource:
     loss: Loss = Loss.NONE
     rejection_threshold: float = 3.0
     """From so many sigmas on the loss holds back."""
+    minimum_period: float = 0.0
+    """Of measurements whose stamps lie closer than this the first to come is used [s]."""
     correlation_time: float = 0.0
     """How long an error lives, its time constant [s]; 0 for white noise."""
     correlation: Correlation = Correlation.BIAS
@@ -162,7 +164,7 @@ class MeasurementSource:
 
     def __post_init__(self) -> None:
         require(self, 'rejection_threshold', positive=True)
-        require(self, 'correlation_time', 'white_share')
+        require(self, 'minimum_period', 'correlation_time', 'white_share')
         if self.white_share > 1.0:
             raise ConfigError('MeasurementSource.white_share: expected a number in [0, 1], '
                               f'got {self.white_share!r}')
