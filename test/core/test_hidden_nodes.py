@@ -133,6 +133,7 @@ def slow_nodes(
     return result
 
 
+@settings(max_examples=40)
 @given(st.integers(0, 10**6))
 def test_nodes_are_where_a_slow_walk_puts_them(seed: int) -> None:
     rng = np.random.default_rng(seed)
@@ -179,6 +180,7 @@ def test_a_node_that_cannot_be_made_is_made_at_the_next_sample() -> None:
 
 # --- Several sources -------------------------------------------------------------------------
 
+@settings(max_examples=30)
 @given(st.floats(0.02, 0.4), st.floats(0.02, 0.4), st.floats(-3.0, 3.0), st.floats(-3.0, 3.0))
 def test_another_source_ties_the_nodes_that_it_covers(
     period: float, phase: float, late: float, early: float,
