@@ -23,7 +23,7 @@ NUMBERS = [(kind, item.name)
 MAY_BE_ZERO = {
     'minimum_travel_distance', 'minimum_travel_heading', 'minimum_interval', 'sigma_distance',
     'sigma_lateral', 'sigma_heading_distance', 'sigma_heading_turn', 'initial_damping',
-    'reorder_window', 'correlation_time', 'white_share',
+    'reorder_window', 'correlation_time', 'white_share', 'minimum_period',
 }
 
 

@@ -246,7 +246,7 @@ def test_reports_tell_what_is_correlated_and_what_fits() -> None:
 
 
 @pytest.mark.parametrize(('settings', 'expected'), [
-    ({'white_share': 0.0}, 'white_share'), ({'white_share': 1.5}, 'white_share'),
+    ({'white_share': -0.1}, 'white_share'), ({'white_share': 1.5}, 'white_share'),
     ({'correlation_time': -1.0}, 'correlation_time'),
     ({'correlation_time': 5.0, 'correlation': Correlation.INFLATE, 'loss': Loss.HUBER},
      'inflation')])
