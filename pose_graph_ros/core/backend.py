@@ -44,7 +44,7 @@ from pose_graph_ros.core.starts import Solve
 from pose_graph_ros.core.trajectory import Trajectory
 
 # Measurements that wait for the angle between odometry and map; the oldest make way.
-MOST_UNALIGNED = 20_000
+MOST_UNALIGNED = 5000
 # So often the weights of robust losses follow the estimate within one update.
 REWEIGHINGS = 3
 
