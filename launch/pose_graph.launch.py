@@ -19,6 +19,7 @@ PACKAGE = 'pose_graph_ros'
 INPUTS = (
     ('odom', 'odom', 'nav_msgs/Odometry'),
     ('fix', 'gps/fix', 'sensor_msgs/NavSatFix'),
+    ('imu', 'imu/data', 'sensor_msgs/Imu, if the parameter sources lists imu'),
     ('global_pose', 'global_pose', 'geometry_msgs/PoseWithCovarianceStamped'),
     ('loop_closure', 'loop_closure', 'geometry_msgs/PoseWithCovarianceStamped'),
 )
