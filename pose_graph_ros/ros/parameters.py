@@ -163,7 +163,7 @@ SOURCE_PARAMETERS: tuple[Parameter, ...] = (
               'estimated as a bias, or make the covariances larger.',
               choices=_values(Correlation), kinds=_OTHERS),
     Parameter('white_share', _MEASUREMENT.white_share, '',
-              'Part of the variance that is white all the same.', 0.0, 1.0, kinds=_OTHERS),
+              'Part of the variance that is white all the same.', 1e-3, 1.0, kinds=_OTHERS),
 )
 
 # A source's name begins names of parameters, and of counts in the diagnostics.

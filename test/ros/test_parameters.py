@@ -112,7 +112,8 @@ def test_a_name_that_is_not_known_has_to_have_a_type() -> None:
 @pytest.mark.parametrize(('values', 'said'), [
     ({'sources': ['fix']}, 'at least one of type odometry'),
     ({'fix.sigma_floor': [2.0, 0.1], 'fix.sigma_ceiling': 1.0}, 'source fix: .*ceiling'),
-    ({'odom.maximum_speed': 0.001}, 'maximum_speed')])
+    ({'fix.correlation_time': 9.0, 'fix.correlation_model': 'inflate', 'fix.robust_loss': 'huber'},
+     'source fix: .*inflation')])
 def test_values_that_do_not_go_together_are_refused(values: dict[str, object], said: str) -> None:
     with pytest.raises(ConfigError, match=said):
         backend_config(checked(values))
@@ -130,7 +131,7 @@ def test_every_setting_of_a_source_reaches_the_engine() -> None:
         'rear.type': 'fix', 'rear.covariance_policy': 'refuse',
         'rear.covariance_override': [1.2], 'rear.covariance_scale': 1.3,
         'rear.sigma_floor': [1, 1.5], 'rear.sigma_ceiling': 16.0, 'rear.default_sigma': [1.7, 1.8],
-        'rear.robust_loss': 'none', 'rear.rejection_threshold': 1.9,
+        'rear.rejection_threshold': 1.9, 'compass.robust_loss': 'cauchy',
         'rear.correlation_time': 20.0, 'rear.correlation_model': 'inflate',
         'rear.white_share': 0.21, 'rear.lever_arm': [0.22, 0.23],
         'compass.type': 'imu', 'compass.yaw_offset': 0.24,
@@ -149,6 +150,7 @@ def test_every_setting_of_a_source_reaches_the_engine() -> None:
     rear, policy = config.measurements['rear'], config.measurements['rear'].covariance
     assert (rear.loss, rear.rejection_threshold, rear.correlation_time, rear.correlation,
             rear.white_share) == (Loss.NONE, 1.9, 20.0, Correlation.INFLATE, 0.21)
+    assert config.measurements['compass'].loss is Loss.CAUCHY
     assert (policy.repair, policy.override, policy.scale, policy.position_floor,
             policy.heading_floor, policy.position_ceiling, policy.default_position,
             policy.default_heading, policy.heading) == (
