@@ -74,8 +74,21 @@ def fits(worker: Worker) -> dict[str, object]:
     return values
 
 
-def health(worker: Worker, silent: Sequence[str]) -> tuple[bytes, str]:
-    """Return the level of the diagnostics and a sentence that says what to do."""
+def health(
+    worker: Worker, silent: Sequence[str], odometry: Sequence[str],
+) -> tuple[bytes, str]:
+    """
+    Return the level of the diagnostics and a sentence that says what to do.
+
+    Parameters
+    ----------
+    worker : Worker
+    silent : sequence of str
+        Sources that have ended while others go on.
+    odometry : sequence of str
+        Topics of odometry.
+
+    """
     estimate, report = worker.estimate, worker.status.report
     if not worker.alive:
         return DiagnosticStatus.ERROR, 'The worker has ended: start the node again.'
@@ -84,7 +97,7 @@ def health(worker: Worker, silent: Sequence[str]) -> tuple[bytes, str]:
                 'set aside; the last good estimate stays. See the log for the reason.')
     if estimate is None:
         return DiagnosticStatus.WARN, (
-            'No odometry yet: check the topic odom.' if worker.prepared else
+            f'No odometry yet: check {" or ".join(odometry)}.' if worker.prepared else
             'Compiling, as at every first start: what comes in waits.')
     if len(silent) > 0:
         verb = 'is' if len(silent) == 1 else 'are'

@@ -8,7 +8,7 @@ newest estimate carried on by that odometry; the path goes out after an update.
 """
 
 from collections import Counter
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from functools import partial
 import time
 from typing import Any
@@ -43,6 +43,7 @@ from pose_graph_ros.ros.parameters import (
     listed_sources,
     Parameter,
     PARAMETERS,
+    SOURCE_PARAMETERS,
     source_parameters,
     type_parameter,
 )
@@ -140,7 +141,15 @@ class PoseGraphNode(Node):
         for source in listed_sources(given):
             kind = self._declare([type_parameter(source)])[f'{source}.type']
             given |= self._declare(source_parameters(source, kind))
-        return checked(given)
+        values = checked(given)
+        # rclpy does not tell what was given in vain; a file may hold parameters of other nodes
+        overrides: Mapping[str, object] = getattr(self, '_parameter_overrides', {})
+        for name in sorted(set(overrides) - set(values)):
+            if name.rpartition('.')[2] in {own.name for own in SOURCE_PARAMETERS}:
+                self.get_logger().warning(
+                    f'parameter {name} is not known: {name.rpartition(".")[0]} is not in '
+                    'sources, or is of a type that has none')
+        return values
 
     def _declare(self, parameters: Sequence[Parameter]) -> dict[str, Any]:
         """Declare parameters and return the values of those that are set."""
@@ -295,7 +304,10 @@ class PoseGraphNode(Node):
         before, self._silent = self._silent, self._hearing.silent(now)
         for name in set(self._silent) - set(before):
             self.get_logger().warning(f'{name} is silent, other sources go on')
-        level, text = diagnostics.health(self._worker, self._silent)
+        level, text = diagnostics.health(
+            self._worker, self._silent,
+            [self.resolve_topic_name(source.topic) for source in self._reader.sources.values()
+             if source.kind is Kind.ODOMETRY])
         self._out.publish_diagnostics(level, text, {
             **diagnostics.state(self._worker, self._received, self._refused),
             **diagnostics.inputs(self._reader, self._hearing, now),

@@ -108,6 +108,18 @@ def test_two_of_each_from_a_file_and_one_falls_silent(tmp_path: Path) -> None:
         assert len(client.transforms) in (0, len(client.poses))
 
 
+def test_the_file_of_defaults_is_taken_and_what_is_not_known_is_said(tmp_path: Path) -> None:
+    file = Path(__file__).resolve().parents[2] / 'config' / 'pose_graph.yaml'
+    arguments = ('--params-file', str(file), '-p', 'wheels.type:=odometry',
+                 '-p', 'odom.lever_arm:=[1.0, 0.0]', '-p', 'other_node.gain:=1.0')
+    with NodeProcess(tmp_path, arguments) as node, connected(node) as client:
+        play(client, range(10), every(1, client.odom, odometry_at))
+        log = node.stderr()
+        assert 'parameter wheels.type is not known' in log
+        assert 'parameter odom.lever_arm is not known' in log
+        assert 'other_node' not in log
+
+
 def pose_error(message: object) -> float:
     """Return how far a published pose is from the truth at its stamp."""
     expected = true_pose(stamp_ns(message) * 1e-9 - START)
