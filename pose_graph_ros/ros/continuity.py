@@ -16,6 +16,8 @@ SLACK = 0.25
 MORE_SPEED = 3.0
 # Stamps lie unevenly: a step is not judged over less time [s].
 LEAST_TIME = 0.1
+# A stamp so far ahead of the one before may be a mistake: those after it tell [ns].
+FAR_NS = 10_000_000_000
 
 
 class Continuity:
@@ -43,15 +45,17 @@ class Continuity:
         """Tell whether an estimate, a little older, can be carried to the newest sample."""
         if sample.stamp_ns > self._stamp_ns:
             self._take(sample)
+        elif sample.stamp_ns < self._stamp_ns - FAR_NS:
+            # a stamp from the future had come before
+            self._stamp_ns, self._pose, self._jump_ns = sample.stamp_ns, sample.pose, 0
         return estimate is not None and int(estimate.path.stamps_ns[-1]) >= self._jump_ns
 
     def _take(self, sample: OdometrySample) -> None:
+        elapsed_ns, first = sample.stamp_ns - self._stamp_ns, self._stamp_ns == 0
         moved = math.hypot(*(sample.pose - self._pose)[:2])
-        time = max((sample.stamp_ns - self._stamp_ns) * 1e-9, LEAST_TIME)
-        first = self._stamp_ns == 0
-        expected = 2.0 * max(self._speed, abs(sample.speed)) + MORE_SPEED
-        jump = not first and moved > SLACK + min(expected, self._maximum_speed) * time
-        if jump:
+        time = max(elapsed_ns * 1e-9, LEAST_TIME)
+        allowed = min(2.0 * max(self._speed, abs(sample.speed)) + MORE_SPEED, self._maximum_speed)
+        if not first and (moved > SLACK + allowed * time or elapsed_ns > FAR_NS):
             self._jump_ns = sample.stamp_ns
         elif not first:
             self._speed = moved / time

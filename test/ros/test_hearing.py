@@ -102,3 +102,14 @@ def test_old_samples_and_no_estimate() -> None:
     continuity = Continuity(60.0)
     assert drive(continuity, (2.0, 0.0), (1.0, 50.0), (2.0, 70.0), (2.1, 0.1)) == 4 * [True]
     assert not continuity.carries(None, OdometrySample(3_000_000_000, np.zeros(3)))
+
+
+def test_one_stamp_from_the_future_does_not_stop_the_output() -> None:
+    continuity = Continuity(60.0)
+    assert drive(continuity, (1.0, 0.0), (1.1, 0.1), newest=1.1) == [True, True]
+    assert drive(continuity, (31.0, 0.2), newest=1.1) == [False]
+    # the engine has taken it, then it drops it
+    assert drive(continuity, (1.2, 0.2), newest=31.0) == [True]
+    assert drive(continuity, (1.3, 0.3), (1.4, 0.4), newest=1.2) == [True, True]
+    # and jumps are seen again
+    assert drive(continuity, (1.5, 50.0), newest=1.4) == [False]
