@@ -103,6 +103,7 @@ PARAMETERS: tuple[Parameter, ...] = (
 _ALL = tuple(Kind)
 _WHEELS = (Kind.ODOMETRY,)
 _OTHERS = tuple(kind for kind in Kind if kind is not Kind.ODOMETRY)
+_POSITIONS = (Kind.GLOBAL_POSE, Kind.FIX)
 _NOT_CLOSURES = tuple(kind for kind in _OTHERS if kind is not Kind.LOOP_CLOSURE)
 
 SOURCE_PARAMETERS: tuple[Parameter, ...] = (
@@ -156,14 +157,18 @@ SOURCE_PARAMETERS: tuple[Parameter, ...] = (
               choices=_values(Loss), kinds=_ALL),
     Parameter('rejection_threshold', _MEASUREMENT.rejection_threshold, '', 'From so many sigmas '
               'on the loss holds back.', 0.1, 1e3, kinds=_ALL),
+    Parameter('minimum_period', _MEASUREMENT.minimum_period, 's', 'Of messages whose stamps lie '
+              'closer the first to come is used; 0: all.', 0.0, 3600.0, kinds=_POSITIONS),
+    Parameter('minimum_period', 0.5, 's', 'Of messages whose stamps lie closer the first to come '
+              'is used; 0: all.', 0.0, 3600.0, kinds=(Kind.IMU,)),
     Parameter('correlation_time', _MEASUREMENT.correlation_time, 's',
               'How long an error lives, its time constant; 0: it is white.', 0.0, 1e5,
-              kinds=_OTHERS),
+              kinds=_NOT_CLOSURES),
     Parameter('correlation_model', _MEASUREMENT.correlation.value, '', 'Errors that live on are '
               'estimated as a bias, or make the covariances larger.',
-              choices=_values(Correlation), kinds=_OTHERS),
-    Parameter('white_share', _MEASUREMENT.white_share, '',
-              'Part of the variance that is white all the same.', 1e-3, 1.0, kinds=_OTHERS),
+              choices=_values(Correlation), kinds=_NOT_CLOSURES),
+    Parameter('white_share', _MEASUREMENT.white_share, '', 'Variance of what is white beside an '
+              'error that lives on, in parts of the variance.', 0.0, 1.0, kinds=_NOT_CLOSURES),
 )
 
 # A source's name begins names of parameters, and of counts in the diagnostics.

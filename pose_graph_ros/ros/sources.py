@@ -153,5 +153,8 @@ def _measurement_source(own: Mapping[str, Any]) -> MeasurementSource:
             position_ceiling=own['sigma_ceiling'], default_position=default_position,
             default_heading=default_heading, heading=Heading(own.get('heading', 'auto'))),
         loss=Loss(own['robust_loss']), rejection_threshold=own['rejection_threshold'],
-        correlation_time=own['correlation_time'],
-        correlation=Correlation(own['correlation_model']), white_share=own['white_share'])
+        # of loop closures there are no more than of places that are seen again
+        **{} if 'correlation_time' not in own else {
+            'minimum_period': own['minimum_period'], 'correlation_time': own['correlation_time'],
+            'correlation': Correlation(own['correlation_model']),
+            'white_share': own['white_share']})
