@@ -33,7 +33,7 @@ from pose_graph_ros.core.se2 import FloatArray
 from pose_graph_ros.core.sources import MeasurementSource
 
 # Bins in a time constant.
-BINS = 16
+BINS = 64
 # An error that is known to the last digit would be told to the solver twice.
 LEAST_WHITE = 1e-3
 # The third number of a state is wrapped as a heading is, so it is kept small: in units of so many

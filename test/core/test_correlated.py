@@ -33,7 +33,7 @@ from pose_graph_ros.core.sources import (
 )
 
 SECOND = 1_000_000_000
-TAU = 16.0
+TAU = float(BINS)
 """So that a bin is a second."""
 NOWHERE = Anchor(0, np.zeros(3), np.zeros((3, 3)))
 
@@ -56,7 +56,7 @@ def ties(stamps: list[float]) -> set[tuple[object, ...]]:
         for number, table in enumerate(additions.edges, sizes.n_edges):
             edges[number] = (int(table.i[0]), int(table.j[0]), table.information.tobytes(),
                              table.bias.tobytes())
-        rows[edges[edge][1]] = round(stamp) * (BINS // 16)
+        rows[edges[edge][1]] = round(stamp)
         for number, table in enumerate(additions.observed, sizes.n_observed):
             priors[number] = int(table.node[0])
         for number in additions.remove_edges:
@@ -171,8 +171,8 @@ def test_poses_and_sigma_are_those_of_the_full_covariance() -> None:
     # the fixes lie at the ends of bins, where the state of a bin is worth least
     correlation = sigma**2 * (np.exp(-gap / TAU) + share * np.eye(40))
     expected, deviation = generalised_least_squares(fixes, 40, correlation)
-    np.testing.assert_allclose(estimate.path.poses[:, 0], expected, atol=0.04 * sigma)
-    assert np.sqrt(estimate.covariance[0, 0]) == pytest.approx(deviation[-1], rel=0.04)
+    np.testing.assert_allclose(estimate.path.poses[:, 0], expected, atol=0.02 * sigma)
+    assert np.sqrt(estimate.covariance[0, 0]) == pytest.approx(deviation[-1], rel=0.02)
     alone = run(fixes, MeasurementSource())
     alone.optimize()
     white = alone.estimate()
