@@ -132,6 +132,7 @@ def test_every_setting_of_a_source_reaches_the_engine() -> None:
         'rear.covariance_override': [1.2], 'rear.covariance_scale': 1.3,
         'rear.sigma_floor': [1, 1.5], 'rear.sigma_ceiling': 16.0, 'rear.default_sigma': [1.7, 1.8],
         'rear.rejection_threshold': 1.9, 'compass.robust_loss': 'cauchy',
+        'rear.minimum_period': 0.19,
         'rear.correlation_time': 20.0, 'rear.correlation_model': 'inflate',
         'rear.white_share': 0.21, 'rear.lever_arm': [0.22, 0.23],
         'compass.type': 'imu', 'compass.yaw_offset': 0.24,
@@ -150,6 +151,7 @@ def test_every_setting_of_a_source_reaches_the_engine() -> None:
     rear, policy = config.measurements['rear'], config.measurements['rear'].covariance
     assert (rear.loss, rear.rejection_threshold, rear.correlation_time, rear.correlation,
             rear.white_share) == (Loss.NONE, 1.9, 20.0, Correlation.INFLATE, 0.21)
+    assert rear.minimum_period == 0.19
     assert config.measurements['compass'].loss is Loss.CAUCHY
     assert (policy.repair, policy.override, policy.scale, policy.position_floor,
             policy.heading_floor, policy.position_ceiling, policy.default_position,
