@@ -8,7 +8,9 @@ own. Without a bag a simulated drive is made first, with a known truth.
 """
 
 import argparse
+from collections import deque
 from collections.abc import Mapping, Sequence
+import fcntl
 import os
 from pathlib import Path
 import random
@@ -17,7 +19,7 @@ import subprocess
 import sys
 import tempfile
 import time
-from typing import Any
+from typing import Any, IO
 
 import numpy as np
 
@@ -39,6 +41,8 @@ STOP_TIMEOUT = 15.0
 POLL_PERIOD = 0.1
 # As the player says it; its module cannot be imported without ROS.
 NOT_CONVERGED = 3
+# Locks of the domains of the newest environments: older ones are no longer in use.
+_DOMAINS: deque[IO[str]] = deque(maxlen=8)
 
 
 class DemoError(PoseGraphError):
@@ -142,10 +146,25 @@ def isolated_environment(log: Path) -> dict[str, str]:
     # the wheels from PyPI do not set it; a sourced ROS does
     env.setdefault('AMENT_PREFIX_PATH', sys.prefix)
     env['ROS_AUTOMATIC_DISCOVERY_RANGE'] = 'LOCALHOST'
-    env['ROS_DOMAIN_ID'] = str(random.SystemRandom().randint(1, 100))
+    env['ROS_DOMAIN_ID'] = str(_free_domain())
     env['ROS_LOG_DIR'] = str(log)
     env.pop('ROS_LOCALHOST_ONLY', None)
     return env
+
+
+def _free_domain() -> int:
+    """Return a domain that no other program of this package on this machine uses now."""
+    domains = random.SystemRandom().sample(range(1, 101), 100)
+    for domain in domains:
+        name = Path(tempfile.gettempdir()) / f'pose_graph_ros_domain_{domain}'
+        try:
+            lock = name.open('a', encoding='utf-8')
+            fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except OSError:
+            continue
+        _DOMAINS.append(lock)
+        return domain
+    return domains[0]
 
 
 def _stop(node: 'subprocess.Popen[bytes]') -> int:
