@@ -167,8 +167,9 @@ class Joining:
         for source, own in self._own.items():
             if own.report is None or len(own.rows) > MORE_RESIDUALS * own.report.n:
                 own.report = self._report(graph, source, own)
+        # a source of headings alone has no residuals of positions
         return {source: own.report for source, own in self._own.items()
-                if own.report is not None}
+                if own.report is not None and own.report.energy > 0.0}
 
     def _report(self, graph: Graph, source: str, own: _Own) -> SourceReport:
         newest = own.rows.values[-MOST_RESIDUALS:].astype(np.int64)
