@@ -287,6 +287,44 @@ def door() -> Section:
     return section
 
 
+def stamps() -> Section:
+    """Tabulate what becomes of bad stamps."""
+    section = Section(
+        'Bad stamps', 'What the engine answers after 10 s of odometry at 10 Hz. (The node refuses '
+        'odometry whose stamp leaps by more than a minute beforehand.)')
+    table = Table('', ('what comes', 'stamp', 'answer'))
+    newest, tenth = 11 * drives.SECOND, drives.SECOND // 10
+
+    def odometry(stamp_ns: int) -> OdometrySample:
+        return OdometrySample(stamp_ns, np.array((stamp_ns * 1e-9, 0.0, 0.0)))
+
+    def fix(stamp_ns: int) -> Position:
+        return Position(stamp_ns, np.zeros(2), np.eye(2), np.zeros(2))
+
+    for name, stamp_ns, make in (
+            ('odometry', 0, odometry), ('odometry', -1, odometry), ('odometry', newest, odometry),
+            ('odometry, in the window', newest - tenth // 2, odometry),
+            ('odometry, before the window', newest - 5 * drives.SECOND - 1, odometry),
+            ('odometry, an hour ahead', newest + 3600 * drives.SECOND, odometry),
+            ('odometry, beyond the clock', 2**63 - 1, odometry),
+            ('fix', 0, fix), ('fix', -1, fix), ('fix, before any odometry', 1, fix),
+            ('fix, late', newest - 5 * drives.SECOND, fix),
+            ('fix, the same again', newest - 5 * drives.SECOND, fix),
+            ('fix, newer than odometry', newest + tenth, fix),
+            ('fix, an hour ahead', newest + 3600 * drives.SECOND, fix)):
+        backend = drives.new_backend(MeasurementSource())
+        for stamp in range(drives.SECOND, newest + 1, tenth):
+            backend.add_odometry(odometry(stamp))
+        event = make(stamp_ns)
+        if name.endswith('again'):
+            backend.add_measurement(fix(stamp_ns), 'fix')
+        answer = (backend.add_odometry(event) if isinstance(event, OdometrySample)
+                  else backend.add_measurement(event, 'fix'))
+        table.add(name, f'{stamp_ns * 1e-9:g} s', answer.reason or answer.verdict.value)
+    section.tables.append(table)
+    return section
+
+
 def cost() -> Section:
     """Time what one message costs."""
     section = Section('Cost', 'Mean time of one call, in a drive of 20 000 samples at 100 Hz.')
@@ -326,7 +364,8 @@ def main(arguments: list[str]) -> int:
     parser.add_argument('--out', type=Path, default=Path('build/benchmark/inputs'), metavar='DIR')
     options = parser.parse_args(arguments)
     few = max(options.runs // 20, 1)
-    sections = [uncertainty(options.runs), arrival(few), outliers(few), plaza(few), door(), cost()]
+    sections = [uncertainty(options.runs), arrival(few), outliers(few), plaza(few), door(),
+                stamps(), cost()]
     command = shlex.join(['python', '-m', 'benchmark.inputs', *arguments])
     path = report.write(sections, options.out, command, title='Measurements as they come',
                         remarks=(__doc__ or '').strip().split('\n\n')[-1].replace('\n', ' '))

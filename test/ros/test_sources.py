@@ -294,7 +294,6 @@ def test_errors_that_live_on_show_in_the_diagnostics(
 
 def test_an_imu_turns_the_map_before_the_robot_has_moved_far(tmp_path: Path) -> None:
     arguments = ('-p', 'sources:=[odom, fix, imu]', '-p', 'imu.yaw_offset:=0.25',
-                 '-p', 'imu.minimum_period:=0.0',
                  '-p', f'datum:=[{PLANE.latitude}, {PLANE.longitude}, 1.0]')
     with NodeProcess(tmp_path, arguments) as node, connected(
             node, listens=('odom', 'fix', 'loop_closure'), more={'imu/data': Imu}) as client:
