@@ -104,7 +104,8 @@ def execute(options: argparse.Namespace) -> int:
     table = write_results(drive, options.out, options.bag.stem, {
         'seconds': seconds, 'alignment': estimate.alignment.value,
         'hidden_nodes': estimate.n_hidden, 'edges': estimate.n_edges,
-        'observed_nodes': estimate.n_observed, 'chi2': estimate.chi2,
+        'observed_nodes': estimate.n_observed, 'biases': estimate.n_biases,
+        'chi2': estimate.chi2,
         'status': report.status.value, 'counts': counts})
     write_g2o(backend.graph, options.out / 'graph.g2o')
     print(f'{estimate.n_hidden} hidden nodes, {estimate.n_edges} edges, {estimate.n_observed} '

@@ -377,7 +377,8 @@ class PoseGraphBackend:
             T_map_odom=se2.compose(newest, se2.inverse(odometry)), covariance=cov,
             alignment=state, chi2=self._chi2, alignment_sigma=(
                 math.sqrt(cov[2, 2]) if state is AlignmentState.ALIGNED else sigma),
-            n_hidden=len(self._nodes), n_edges=graph.n_edges, n_observed=graph.n_observed,
+            n_hidden=len(self._nodes), n_edges=graph.n_edges - self._joins.n_bias_edges,
+            n_observed=self._joins.n_measurements, n_biases=graph.n_nodes - len(self._nodes),
             lead=lead, noise=self._config.odometry.get(lead, OdometrySource()).noise)
 
     def _count(self, source: str, answer: Answer) -> Answer:

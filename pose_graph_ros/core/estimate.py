@@ -67,7 +67,11 @@ class Estimate:
     chi2: float
     n_hidden: int
     n_edges: int
+    """Edges between hidden nodes."""
     n_observed: int
+    """Observed nodes, those with an error that lives on included."""
+    n_biases: int
+    """States of such errors."""
     lead: str
     """Source of the odometry in `T_odom_base`."""
     noise: OdometryNoise

@@ -107,11 +107,19 @@ class Joining:
         self._correlated: dict[str, BiasChain | Shares] = {}
         self._own: dict[str, _Own] = {}
         self._enlisted: list[tuple[bool, int, str, int]] = []
+        self._n_new = 0
+        self.n_bias_edges = 0
+        """Edges of the graph that lead to states of an error."""
 
     def settings(self, source: str, *, closure: bool = False) -> MeasurementSource:
         """Return the settings of a source of measurements."""
         default = LOOP_CLOSURES if closure else MeasurementSource()
         return self._config.measurements.get(source, default)
+
+    @property
+    def n_measurements(self) -> int:
+        """Number of measurements in the map that have joined the graph."""
+        return sum(len(own.rows) for own in self._own.values())
 
     def begin(self, queue: Queue, graph: Graph) -> GraphUpdate:
         """Return the update that adds all of a queue; `finish` or `undo` comes next."""
@@ -131,6 +139,7 @@ class Joining:
             else:
                 row = additions.add_observed(bound.observed)
             self._enlisted.append((isinstance(chain, BiasChain), row, bound.source, stamp_ns))
+        self._n_new = len(additions.edges) - len(queue.edges)
         return GraphUpdate(
             biases=np.array(additions.biases).reshape(-1, 3),
             edges=Edges.joined(additions.edges), observed=ObservedNodes.joined(additions.observed),
@@ -153,6 +162,7 @@ class Joining:
 
     def finish(self) -> None:
         """Remember what the update that was begun has added."""
+        self.n_bias_edges += self._n_new
         for is_edge, row, source, stamp_ns in self._enlisted:
             settings: MeasurementSource | OdometrySource | None = (
                 self._config.odometry.get(source) if stamp_ns < 0 else None)

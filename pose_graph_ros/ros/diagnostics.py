@@ -38,7 +38,8 @@ def state(
             'alignment': estimate.alignment.value,
             'alignment_sigma_deg': f'{math.degrees(estimate.alignment_sigma):.3f}',
             'hidden_nodes': estimate.n_hidden, 'edges': estimate.n_edges,
-            'observed_nodes': estimate.n_observed, 'chi2': f'{estimate.chi2:.6g}'})
+            'observed_nodes': estimate.n_observed, 'biases': estimate.n_biases,
+            'chi2': f'{estimate.chi2:.6g}'})
     return values
 
 

@@ -225,6 +225,8 @@ def test_biases_are_no_part_of_the_path_and_odometry_goes_on_from_poses() -> Non
     estimate = backend.estimate()
     assert estimate is not None
     assert estimate.n_hidden == len(estimate.path) == 40
+    assert (estimate.n_edges, estimate.n_observed) == (39, 21)
+    assert estimate.n_biases == backend.graph.n_nodes - 40 > 0
     steps = se2.between(estimate.path.poses[:-1], estimate.path.poses[1:])
     np.testing.assert_allclose(steps, np.tile((1.0, 0.0, 0.0), (39, 1)), atol=0.3)
 
