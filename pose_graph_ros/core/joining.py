@@ -108,6 +108,7 @@ class Joining:
         self._own: dict[str, _Own] = {}
         self._enlisted: list[tuple[bool, int, str, int]] = []
         self._n_new = 0
+        self._shares: dict[int, float] = {}
         self.n_bias_edges = 0
         """Edges of the graph that lead to states of an error."""
 
@@ -140,6 +141,7 @@ class Joining:
                 row = additions.add_observed(bound.observed)
             self._enlisted.append((isinstance(chain, BiasChain), row, bound.source, stamp_ns))
         self._n_new = len(additions.edges) - len(queue.edges)
+        self._shares = additions.weigh_observed
         return GraphUpdate(
             biases=np.array(additions.biases).reshape(-1, 3),
             edges=Edges.joined(additions.edges), observed=ObservedNodes.joined(additions.observed),
@@ -171,6 +173,8 @@ class Joining:
             enlist(row, settings.loss, settings.rejection_threshold)
             if stamp_ns >= 0:
                 self._own.setdefault(source, _Own()).rows.append_one((stamp_ns, row))
+        for row, share in self._shares.items():
+            self._reweighing.share(row, share)
 
     def reports(self, graph: Graph) -> dict[str, SourceReport]:
         """Return how well each source fits, by its newest measurements."""

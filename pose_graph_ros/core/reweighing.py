@@ -35,6 +35,8 @@ class _Rows:
     rows: GrowingArray = field(default_factory=lambda: GrowingArray((), np.int64))
     losses: GrowingArray = field(default_factory=lambda: GrowingArray((2,), np.float64))
     """Index of the loss, and its threshold."""
+    shares: GrowingArray = field(default_factory=lambda: GrowingArray((), np.float64))
+    """What they weigh without the loss."""
     cursor: int = 0
 
     @property
@@ -45,6 +47,16 @@ class _Rows:
     def add(self, row: int, loss: Loss, threshold: float) -> None:
         self.rows.append_one(row)
         self.losses.append_one((_LOSSES.index(loss), threshold))
+        self.shares.append_one(1.0)
+
+    def share(self, row: int, share: float) -> None:
+        at = int(np.searchsorted(self.numbers, row))
+        if at < len(self.rows) and self.numbers[at] == row:
+            self.shares.values[at] = share
+
+    def alike(self, weight: float) -> Mapping[int, float]:
+        shares = cast('FloatArray', self.shares.values)
+        return dict(zip(self.numbers.tolist(), (weight * shares).tolist(), strict=True))
 
     def some(self) -> IntArray:
         """Return the newest ones, and others in turn, as indices."""
@@ -76,6 +88,10 @@ class Reweighing:
         if loss is not Loss.NONE:
             self._observed.add(row, loss, threshold)
 
+    def share(self, row: int, share: float) -> None:
+        """Let an observed node weigh so much without its loss; by its row, if it was added."""
+        self._observed.share(row, share)
+
     def changes(self, graph: Graph) -> tuple[Mapping[int, float], Mapping[int, float]]:
         """Return new weights of edges and of observed nodes, of a bounded number of them."""
         return (self._changed(graph, self._edges, self._edges.some(), LEAST_CHANGE, edges=True),
@@ -92,9 +108,8 @@ class Reweighing:
             for table, edges in ((self._edges, True), (self._observed, False)))
 
     def all_alike(self, weight: float) -> tuple[Mapping[int, float], Mapping[int, float]]:
-        """Return the same weight for all; 1 is plain least squares."""
-        return (dict.fromkeys(self._edges.rows.values.tolist(), weight),
-                dict.fromkeys(self._observed.rows.values.tolist(), weight))
+        """Return the same weight, of what they have without losses; 1 is plain least squares."""
+        return self._edges.alike(weight), self._observed.alike(weight)
 
     def cost(self, graph: Graph) -> float:
         """Return how much the robust costs lie above the weighted energies, in all."""
@@ -104,9 +119,10 @@ class Reweighing:
             if len(index) == 0:
                 continue
             energy, weight = _energies(graph, table.numbers[index], edges=edges)
+            shares = cast('FloatArray', table.shares.values)
             for loss, threshold, chosen in _groups(table, index):
-                total += float(np.sum(robust.costs(loss, energy[chosen], threshold)
-                                      - weight[chosen] * energy[chosen]))
+                costs = robust.costs(loss, energy[chosen], threshold)
+                total += float(np.sum(shares[chosen] * costs - weight[chosen] * energy[chosen]))
         return total
 
     def _changed(
@@ -120,6 +136,7 @@ class Reweighing:
         wanted = np.empty(len(index))
         for loss, threshold, chosen in _groups(table, index):
             wanted[chosen] = robust.weights(loss, energy[chosen], widened * threshold)
+        wanted *= cast('FloatArray', table.shares.values)[index]
         changed = np.abs(wanted - weight) > least * np.minimum(wanted, weight)
         return dict(zip(rows[changed].tolist(), wanted[changed].tolist(), strict=True))
 

@@ -168,10 +168,6 @@ class MeasurementSource:
         if self.white_share > 1.0:
             raise ConfigError('MeasurementSource.white_share: expected a number in [0, 1], '
                               f'got {self.white_share!r}')
-        if (self.correlation_time > 0.0 and self.correlation is Correlation.INFLATE
-                and self.loss is not Loss.NONE):
-            raise ConfigError('MeasurementSource: inflation and a robust loss both set weights; '
-                              'take the correlation as a bias, or no loss')
 
 
 LOOP_CLOSURES = MeasurementSource(covariance=CovariancePolicy(repair=False))

@@ -153,8 +153,10 @@ SOURCE_PARAMETERS: tuple[Parameter, ...] = (
               'from /tf_static if it is there.', -1e3, 1e3, sizes=(2,), kinds=(Kind.FIX,)),
     Parameter('yaw_offset', 0.0, 'rad', 'Added to the yaw; its zero is east.', -6.3, 6.3,
               kinds=(Kind.IMU,)),
-    Parameter('robust_loss', _MEASUREMENT.loss.value, '', 'How large errors count.',
-              choices=_values(Loss), kinds=_ALL),
+    Parameter('robust_loss', Loss.HUBER.value, '', 'How large errors count.',
+              choices=_values(Loss), kinds=_POSITIONS),
+    Parameter('robust_loss', Loss.NONE.value, '', 'How large errors count.',
+              choices=_values(Loss), kinds=tuple(kind for kind in Kind if kind not in _POSITIONS)),
     Parameter('rejection_threshold', _MEASUREMENT.rejection_threshold, '', 'From so many sigmas '
               'on the loss holds back.', 0.1, 1e3, kinds=_ALL),
     Parameter('minimum_period', _MEASUREMENT.minimum_period, 's', 'Of messages whose stamps lie '

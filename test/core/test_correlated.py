@@ -193,12 +193,14 @@ def drive(seed: int) -> list[Measurement]:
 
 
 @settings(max_examples=15, deadline=None)
-@given(seed=st.integers(0, 10), data=st.data(), inflate=st.booleans())
+@given(seed=st.integers(0, 10), data=st.data(), model=st.sampled_from(Correlation),
+       loss=st.sampled_from(Loss))
 def test_shuffled_measurements_give_the_same_path(
-    seed: int, data: st.DataObject, inflate: bool,
+    seed: int, data: st.DataObject, model: Correlation, loss: Loss,
 ) -> None:
+    # with a threshold below 1 the loss acts on most of them
     source = MeasurementSource(
-        correlation_time=5.0, correlation=Correlation.INFLATE if inflate else Correlation.BIAS)
+        correlation_time=5.0, correlation=model, loss=loss, rejection_threshold=0.7)
     measurements = drive(seed)
     paths = []
     for order in (measurements, data.draw(st.permutations(measurements))):
@@ -249,9 +251,7 @@ def test_reports_tell_what_is_correlated_and_what_fits() -> None:
 
 @pytest.mark.parametrize(('settings', 'expected'), [
     ({'white_share': -0.1}, 'white_share'), ({'white_share': 1.5}, 'white_share'),
-    ({'correlation_time': -1.0}, 'correlation_time'),
-    ({'correlation_time': 5.0, 'correlation': Correlation.INFLATE, 'loss': Loss.HUBER},
-     'inflation')])
+    ({'correlation_time': -1.0}, 'correlation_time')])
 def test_settings_that_cannot_be_are_refused(settings: dict[str, object], expected: str) -> None:
     with pytest.raises(ConfigError, match=expected):
         replace(MeasurementSource(), **settings)
