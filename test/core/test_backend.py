@@ -1012,3 +1012,28 @@ def test_one_poor_position_does_not_delay_the_alignment() -> None:
         raise AssertionError('never aligned')
 
     assert updates(poor=True) <= updates(poor=False) + 20
+
+
+@pytest.mark.parametrize('fails', [False, True])
+def test_an_alignment_that_cannot_be_done_over_leaves_the_one_in_use(
+    fails: bool, monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    def solve(graph: Graph, config: SolverConfig) -> BatchResult:
+        if fails:
+            return BatchResult(Status.FAILED, 'on purpose', 0, 0.0, 0.0)
+        return batch.optimize(graph, config)
+
+    backend = PoseGraphBackend(BackendConfig(odometry=PROMPT), solve=solve)
+    for event in in_order(DRIVE.odometry, DRIVE.positions):
+        feed(backend, event)
+    backend.update()
+    before = backend.graph.poses.copy()
+    # as if all had been seen the other way round
+    other = se2.compose(T_MAP_ODOM, np.array([0.0, 0.0, np.pi]))
+    monkeypatch.setattr(backend._aligning, 'judge_again', lambda *_: other)
+    backend.add_measurement(replace(DRIVE.positions[-1], stamp_ns=DRIVE.odometry[-2].stamp_ns),
+                            'again')
+    assert backend.update().status is not Status.FAILED
+    assert backend.counts['alignment', 'done_over'] == (not fails)
+    moved = np.max(np.abs((backend.graph.poses - before)[:, :2]))
+    assert moved < 1.0
