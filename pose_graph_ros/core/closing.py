@@ -7,8 +7,10 @@ Its result must not depend on what the updates before it did. So the graph is so
 starts, and where sources have a robust loss, their weights begin anew.
 """
 
+from collections.abc import Mapping
 from dataclasses import replace
-from typing import Any
+
+import numpy as np
 
 from pose_graph_ros.core import tables as tb
 from pose_graph_ros.core.batch import BatchResult, Status
@@ -16,6 +18,7 @@ from pose_graph_ros.core.config import SolverConfig
 from pose_graph_ros.core.graph import Graph, GraphUpdate
 from pose_graph_ros.core.incremental import IncrementalSmoother
 from pose_graph_ros.core.reweighing import Reweighing
+from pose_graph_ros.core.se2 import FloatArray
 from pose_graph_ros.core.starts import SAME_MINIMUM, Solve, solve_from_two_starts
 
 # So often the weights of robust losses follow the estimate at the most ...
@@ -37,7 +40,7 @@ def optimize(
     If that fails, whatever happens, all poses and weights are as before.
     """
     graph = smoother.graph
-    poses, edges, observed = graph.poses.copy(), graph.edges.weight, graph.observed.weight
+    poses, weights = graph.poses.copy(), graph.weights
     try:
         if len(reweighing) == 0:
             result = solve_from_two_starts(graph, config, solve, closing=True)
@@ -49,7 +52,7 @@ def optimize(
         result = BatchResult(Status.FAILED, reason, 0, float('nan'), float('nan'))
     if result.status is Status.FAILED:
         if len(reweighing) > 0:
-            _weigh(graph, dict(enumerate(edges.tolist())), dict(enumerate(observed.tolist())))
+            _weigh_all(graph, weights)
         graph.set_poses(poses)
     elif graph.memory.head[tb.N_SEEDS] > 0:
         # the solver has left the elimination to the smoother
@@ -67,7 +70,7 @@ def _optimize_robustly(
     constraints without a loss put the nodes. Neither looks at the weights that there are: what
     the updates have made of them depends on the order in which measurements came.
     """
-    best, poses, weights = None, graph.poses, (graph.edges.weight, graph.observed.weight)
+    best, poses, weights = None, graph.poses, graph.weights
     for weight, widened in ((1.0, WIDENED), (FAINT, ())):
         _weigh(graph, *reweighing.all_alike(weight))
         result = solve_from_two_starts(graph, config, solve, closing=True)
@@ -80,10 +83,9 @@ def _optimize_robustly(
         failed = result.status is Status.FAILED
         if best is None or best.status is Status.FAILED or (
                 not failed and result.chi2 < best.chi2 * (1.0 - SAME_MINIMUM)):
-            best, poses = result, graph.poses.copy()
-            weights = graph.edges.weight, graph.observed.weight
+            best, poses, weights = result, graph.poses.copy(), graph.weights
     assert best is not None
-    _weigh(graph, *(dict(enumerate(weight.tolist())) for weight in weights))
+    _weigh_all(graph, weights)
     graph.set_poses(poses)
     return best
 
@@ -94,12 +96,10 @@ def _reweighed(
     """Solve and reweigh in turn until the weights stay; chi2 of the result is the robust cost."""
     iterations, largest = 0, 1.0
     for _ in range(REWEIGHINGS):
-        edges, observed = reweighing.all_changes(graph)
-        before = graph.edges.weight, graph.observed.weight
-        largest = max((abs(weight - table[row]) for table, changes in zip(
-            before, (edges, observed), strict=True) for row, weight in changes.items()),
-            default=0.0)
-        _weigh(graph, edges, observed)
+        before = graph.weights
+        _weigh(graph, *reweighing.all_changes(graph))
+        largest = max(float(np.max(np.abs(new - old), initial=0.0))
+                      for new, old in zip(graph.weights, before, strict=True))
         result = solve(graph, config)
         iterations += result.iterations
         if result.status is Status.FAILED or largest < SAME_WEIGHT:
@@ -111,5 +111,12 @@ def _reweighed(
     return replace(result, iterations=iterations, chi2=result.chi2 + reweighing.cost(graph))
 
 
-def _weigh(graph: Graph, edges: Any, observed: Any) -> None:
+def _weigh_all(graph: Graph, weights: tuple[FloatArray, FloatArray]) -> None:
+    """Give all edges and observed nodes these weights, where they differ."""
+    _weigh(graph, *(
+        {int(row): float(wanted[row]) for row in np.flatnonzero(wanted != present)}
+        for wanted, present in zip(weights, graph.weights, strict=True)))
+
+
+def _weigh(graph: Graph, edges: Mapping[int, float], observed: Mapping[int, float]) -> None:
     graph.apply(GraphUpdate(weigh_edges=edges, weigh_observed=observed))

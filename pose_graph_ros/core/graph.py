@@ -153,6 +153,12 @@ class Graph:
             numbers[:, tb.MEAN:tb.MEAN + 3].copy(), _unpacked(numbers[:, tb.INFO:tb.INFO + 6]),
             integers[:, tb.OBS_KIND], numbers[:, tb.WEIGHT].copy())
 
+    @property
+    def weights(self) -> tuple[FloatArray, FloatArray]:
+        """Weights of all edges and of all observed nodes."""
+        return (self.memory['edge_f'][:self.n_edges, tb.WEIGHT].copy(),
+                self.memory['observed_f'][:self.n_observed, tb.WEIGHT].copy())
+
     def apply(self, update: GraphUpdate) -> None:
         """
         Make the edits of one update, all of them or none.
