@@ -81,6 +81,11 @@ class Aligning:
         if self._next_verdict <= LAST_VERDICT:
             self._heard += placed(joined)
 
+    def settle(self) -> None:
+        """Judge no more: the path is not what odometry alone tells."""
+        self._heard.clear()
+        self._next_verdict = LAST_VERDICT + 1
+
     def judge_again(self, solved: FloatArray, nodes: HiddenNodes) -> FloatArray | None:
         """
         Return the motion from the odometry frame into the map if the angle in use is wrong.

@@ -30,6 +30,7 @@ from pose_graph_ros.core.joining import Bound, Joining, Queue, SourceReport
 from pose_graph_ros.core.measurements import (
     ACCEPTED,
     Answer,
+    GlobalPose,
     LoopClosure,
     Measurement,
     OdometrySample,
@@ -45,6 +46,8 @@ from pose_graph_ros.core.trajectory import Trajectory
 
 # Measurements that wait for the angle between odometry and map; the oldest make way.
 MOST_UNALIGNED = 5000
+# A robot that was put elsewhere may have come from anywhere: sigmas [m, m, rad].
+ELSEWHERE = (1000.0, 1000.0, 3.0)
 # So often the weights of robust losses follow the estimate within one update.
 REWEIGHINGS = 3
 
@@ -189,6 +192,45 @@ class PoseGraphBackend:
             for repair in admitted.repairs:
                 self.counts[source, repair] += 1
         return answer
+
+    def set_pose(self, pose: GlobalPose, source: str) -> Answer:
+        """
+        Take where the robot is from somebody who knows, whatever odometry tells of the way there.
+
+        The pose counts at its stamp or, if that is not within odometry, at the nearest of it. In a
+        graph that does not lie in the map yet it is a global pose like any other; else the robot
+        was put elsewhere: the newest node is left behind, and the path goes on at the pose.
+        """
+        self.finish()
+        if self.graph.n_nodes == 0:
+            return self._count(source, rejected('before_odometry', 'there is no odometry yet'))
+        first_ns, last_ns = int(self.node_stamps_ns[0]), self._nodes.covered_ns
+        pose = replace(pose, stamp_ns=min(max(pose.stamp_ns, first_ns), last_ns))
+        if self._aligning.state is not AlignmentState.ALIGNED:
+            return self.add_measurement(pose, source)
+        admitted = admit(pose, self._joins.settings(source).covariance)
+        if isinstance(admitted, Answer):
+            return self._count(source, admitted)
+        measurement = admitted.measurement
+        begin, end = self._anchor(pose.stamp_ns), self._anchor(last_ns)
+        if isinstance(begin, Answer) or isinstance(end, Answer) or not isinstance(
+                measurement, GlobalPose):
+            return self._count(source, rejected('no_odometry', 'no odometry at that time'))
+        poses = self.graph.poses
+        moved = se2.between(se2.compose(poses[begin.node], begin.motion),
+                            se2.compose(poses[end.node], end.motion))
+        now = se2.compose(measurement.pose, moved)
+        row = self._nodes.put_elsewhere(
+            se2.between(poses[self._nodes.rows[-1]], now), np.diag(ELSEWHERE) ** 2)
+        if row < 0:
+            return self._count(source, rejected('failed', 'the solver failed'))
+        self._collect()
+        self._aligning.settle()
+        here = binding.Anchor(row, np.zeros(3), np.zeros((3, 3)))
+        measurement = replace(measurement, stamp_ns=last_ns + 1, pose=now)
+        self._queue.observed.append(Bound(
+            source, binding.absolute_constraint(measurement, here), measurement, here))
+        return self._count(source, ACCEPTED)
 
     def _let_wait(self, measurement: Measurement, source: str) -> Answer:
         """Let a measurement wait for odometry, in the place of the one that waits longest."""

@@ -233,6 +233,39 @@ class HiddenNodes:
         self._base, self._lead_ns = (x, y, theta), last_ns
         self._catch_up()
 
+    def put_elsewhere(self, mean: FloatArray, noise: FloatArray) -> int:
+        """
+        Make a node just after the newest odometry, for a robot that was put elsewhere by hand.
+
+        All odometry is to be settled. What it tells of the motion up to there counts no more.
+
+        Parameters
+        ----------
+        mean : ndarray, shape (3,)
+            Where the robot is now, seen from the newest node.
+        noise : ndarray, shape (3, 3)
+
+        Returns
+        -------
+        row : int
+            Of the new node, or -1 if it could not be made.
+
+        """
+        timeline = self.streams[self.lead].timeline
+        moved = self._moved(self.streams[self.lead], self._lead_ns)[0]
+        row = self._make_node(mean, covariance.information(noise), self.lead)
+        if row < 0:
+            return row
+        x, y, theta = timeline.poses[-1].tolist()
+        stamp_ns = max(self._lead_ns, int(self.stamps_ns[-1])) + 1
+        self._append(stamp_ns, row, (x, y, theta), se2.compose(self.odometry[-1], moved))
+        self._base_ns = self._lead_ns
+        # no other source ties the place before to the one after
+        for source in self.streams:
+            if source != self.lead:
+                self._tied[source] = -1, len(self) - 1
+        return row
+
     def _catch_up(self) -> None:
         """Make the nodes that are due at settled samples of a source that has begun to lead."""
         source = self.lead

@@ -1,105 +1,125 @@
 # Copyright 2026 The pose_graph_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""What the node says of itself in /diagnostics."""
+"""What the node says of itself in /diagnostics; no rclpy but messages."""
 
-from collections import Counter
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 import math
+import os
+from pathlib import Path
+import time
+from typing import TYPE_CHECKING
 
 from diagnostic_msgs.msg import DiagnosticStatus
 
 from pose_graph_ros.core.batch import Status
 from pose_graph_ros.core.estimate import AlignmentState, Estimate
 from pose_graph_ros.core.joining import LEAST_ENERGY, SourceReport
-from pose_graph_ros.ros.hearing import Hearing
-from pose_graph_ros.ros.reader import MessageReader
-from pose_graph_ros.ros.worker import Worker
+
+if TYPE_CHECKING:
+    from pose_graph_ros.ros.session import Session
 
 
-def state(
-    worker: Worker, received: Counter[str], refused: Counter[tuple[str, str]],
-) -> dict[str, object]:
+def values(session: 'Session') -> dict[str, object]:
+    """Return all values of the diagnostics."""
+    return {**_state(session), **_inputs(session), **_fits(session)}
+
+
+def _state(session: 'Session') -> dict[str, object]:
     """Return the counts by source and reason, and the state of graph and solver."""
+    worker, received, refused = session.worker, session.received, session.refused
     status, estimate = worker.status, worker.estimate
-    values: dict[str, object] = {
+    found: dict[str, object] = {
         'received': sum(received.values()),
         'processed': status.processed + sum(refused.values()),
         'pending': status.pending, 'quarantined': status.quarantined,
         'updates': status.updates, 'prepared': int(worker.prepared),
+        'active': int(session.active), 'paused': int(session.paused),
+        'resets': session.n_resets,
         'solve_mean_ms': f'{1e3 * status.solve_mean:.3f}',
-        'solve_max_ms': f'{1e3 * status.solve_max:.3f}'}
+        'solve_max_ms': f'{1e3 * status.solve_max:.3f}',
+        'memory_mb': f'{memory() / 1e6:.0f}'}
+    if session.reset_reason != '':
+        found['reset_reason'] = session.reset_reason
     for source, count in sorted(received.items()):
-        values[f'received.{source}'] = count
+        found[f'received.{source}'] = count
     for (source, answer), count in sorted((status.counts + refused).items()):
-        values[f'{source}.{answer}'] = count
+        found[f'{source}.{answer}'] = count
     if estimate is not None:
-        values.update({
+        found.update({
             'odometry': estimate.lead,
             'alignment': estimate.alignment.value,
             'alignment_sigma_deg': f'{math.degrees(estimate.alignment_sigma):.3f}',
             'hidden_nodes': estimate.n_hidden, 'edges': estimate.n_edges,
             'observed_nodes': estimate.n_observed, 'biases': estimate.n_biases,
             'chi2': f'{estimate.chi2:.6g}'})
-    return values
+    for rank, strain in enumerate(session.strained, 1):
+        found[f'largest_energy.{rank}'] = str(strain)
+    return found
 
 
-def inputs(reader: MessageReader, hearing: Hearing, now: float) -> dict[str, object]:
-    """Return how long each source has been silent, where antennas are, and the datum."""
-    values: dict[str, object] = {}
+def memory() -> int:
+    """Return the resident memory of the process [bytes]; 0 where the system does not tell."""
+    try:
+        return int(Path('/proc/self/statm').read_text().split()[1]) * os.sysconf('SC_PAGE_SIZE')
+    except OSError:
+        return 0
+
+
+def _inputs(session: 'Session') -> dict[str, object]:
+    """Return how often each source is heard, its silence, where antennas are, and the datum."""
+    reader, hearing, now = session.reader, session.hearing, time.monotonic()
+    found: dict[str, object] = {}
     for name in reader.sources:
-        silence = hearing.silence(name, now)
-        values[f'{name}.silence_s'] = 'never heard' if silence is None else f'{silence:.1f}'
+        silence, rate = hearing.silence(name, now), hearing.rate(name)
+        found[f'{name}.silence_s'] = 'never heard' if silence is None else f'{silence:.1f}'
+        if rate > 0.0:
+            found[f'{name}.rate_hz'] = f'{rate:.4g}'
     for name, fixes in reader.fixes.items():
         if fixes.antenna is not None:
             x, y = fixes.antenna.lever_arm
-            values[f'{name}.lever_arm'] = f'[{x:.3f}, {y:.3f}] from {fixes.antenna.origin}'
-            values[f'{name}.without_lever_arm'] = fixes.without_lever_arm
+            found[f'{name}.lever_arm'] = f'[{x:.3f}, {y:.3f}] from {fixes.antenna.origin}'
+            found[f'{name}.without_lever_arm'] = fixes.without_lever_arm
     plane = reader.datum.plane
-    values['datum'] = 'none' if plane is None else (
+    found['datum'] = 'none' if plane is None else (
         f'[{plane.latitude:.9f}, {plane.longitude:.9f}, {plane.yaw:.6f}]')
-    return values
+    return found
 
 
-def fits(worker: Worker) -> dict[str, object]:
+def _fits(session: 'Session') -> dict[str, object]:
     """Return how well the measurements of each source fit the estimate."""
-    values: dict[str, object] = {}
-    for name, report in worker.status.sources.items():
+    found: dict[str, object] = {}
+    for name, report in session.worker.status.sources.items():
         # 1 where the sigmas are right, less where a source is all that the estimate has
-        values[f'{name}.squared_residual'] = f'{report.energy:.4g}'
+        found[f'{name}.squared_residual'] = f'{report.energy:.4g}'
         errors = report.errors
         if errors.significant and report.energy >= LEAST_ENERGY:
-            values[f'{name}.errors_live'] = (
+            found[f'{name}.errors_live'] = (
                 f'{errors.tau:.2g} s, with a sigma of {errors.sigma_correlated:.2g} m'
                 + (f'; they are treated as white: set {name}.correlation_time'
                    if report.wrongly_white else ''))
-    return values
+    return found
 
 
-def health(
-    worker: Worker, silent: Sequence[str], odometry: Sequence[str],
-) -> tuple[bytes, str]:
-    """
-    Return the level of the diagnostics and a sentence that says what to do.
-
-    Parameters
-    ----------
-    worker : Worker
-    silent : sequence of str
-        Sources that have ended while others go on.
-    odometry : sequence of str
-        Topics of odometry.
-
-    """
+def health(session: 'Session') -> tuple[bytes, str]:
+    """Return the level of the diagnostics and a sentence that says what to do."""
+    worker = session.worker
     estimate, report = worker.estimate, worker.status.report
     if not worker.alive:
         return DiagnosticStatus.ERROR, 'The worker has ended: start the node again.'
     if report is not None and report.status is Status.FAILED:
         return (DiagnosticStatus.ERROR, 'The newest measurements made the solver fail and were '
                 'set aside; the last good estimate stays. See the log for the reason.')
+    if not session.active:
+        return DiagnosticStatus.OK, 'Inactive: activate the node (ros2 lifecycle set).'
+    if session.paused:
+        return DiagnosticStatus.WARN, 'Paused: call ~/pause with false to go on.'
     if estimate is None:
         return DiagnosticStatus.WARN, (
-            f'No odometry yet: check {" or ".join(odometry)}.' if worker.prepared else
-            'Compiling, as at every first start: what comes in waits.')
+            f'No odometry yet: check {" or ".join(session.odometry_topics)}.'
+            if worker.prepared else 'Compiling, as at every first start: what comes in waits.')
+    transforms, silent = session.out.transforms, session.silent
+    if transforms is not None and transforms.other != '':
+        return DiagnosticStatus.WARN, transforms.other[0].upper() + transforms.other[1:] + '.'
     if len(silent) > 0:
         verb = 'is' if len(silent) == 1 else 'are'
         return (DiagnosticStatus.WARN,

@@ -57,6 +57,11 @@ class Hearing:
         heard = self._heard.get(source)
         return None if heard is None else now - heard.at
 
+    def rate(self, source: str) -> float:
+        """Return how often a source is heard of late [Hz]; 0 before its second message."""
+        heard = self._heard.get(source)
+        return 1.0 / heard.period if heard is not None and heard.period > 0.0 else 0.0
+
     def silent(self, now: float) -> list[str]:
         """Return the sources that have ended while another one goes on."""
         going = [heard for heard in self._heard.values() if now - heard.at <= heard.patience]

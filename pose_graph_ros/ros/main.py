@@ -42,6 +42,8 @@ def main(args: list[str] | None = None) -> int:
     try:
         rclpy.init(args=args, signal_handler_options=SignalHandlerOptions.NO)
         node = PoseGraphNode()
+        if node.autostarts:
+            node.start()
     except (ConfigError, InvalidParameterTypeException, InvalidParameterValueException,
             RuntimeError) as error:  # the errors of rcl, such as for bad arguments
         print(f'pose_graph_node: {error}', file=sys.stderr)
@@ -55,7 +57,7 @@ def main(args: list[str] | None = None) -> int:
         except Exception:
             # whatever a message or the middleware does, the node goes on
             node.get_logger().error(f'a callback failed:\n{traceback.format_exc()}')
-    node.stop()
+    node.close()
     executor.shutdown()
     node.destroy_node()
     rclpy.try_shutdown()

@@ -1,12 +1,14 @@
 # Copyright 2026 The pose_graph_ros authors
 # SPDX-License-Identifier: Apache-2.0
 """
-What the node publishes, with strictly increasing stamps.
+What the node publishes, with strictly increasing stamps and while someone listens.
 
-Path, pose and odometry go out only while someone listens.
+Pose, odometry, fix and transform go out with an odometry message, from the executor's thread; path
+and markers, which can be large, from the thread that owns the engine.
 """
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
+import threading
 import time
 from typing import Any
 
@@ -18,27 +20,26 @@ from rclpy.publisher import Publisher
 from rclpy.qos import QoSDurabilityPolicy, QoSProfile, QoSReliabilityPolicy
 from rclpy.qos_overriding_options import QoSOverridingOptions
 from sensor_msgs.msg import NavSatFix
+from std_msgs.msg import Header
+from visualization_msgs.msg import Marker, MarkerArray
 
 from pose_graph_ros.core.estimate import AlignmentState, Estimate
 from pose_graph_ros.core.exceptions import ConfigError
 from pose_graph_ros.core.measurements import OdometrySample
 from pose_graph_ros.core.prediction import predict
+from pose_graph_ros.core.view import GraphView
 from pose_graph_ros.ros import messages
 from pose_graph_ros.ros.conversions import frame
 from pose_graph_ros.ros.fixes import Datum
+from pose_graph_ros.ros.markers import markers_cdr
+from pose_graph_ros.ros.slew import Slew
 from pose_graph_ros.ros.sources import NANOSECONDS
-
-try:
-    from tf2_msgs.msg import TFMessage
-except ImportError:  # ROS 2 from PyPI lacks tf2_msgs until it is built
-    TFMessage = None
+from pose_graph_ros.ros.transforms import TF_QOS, TFMessage, TOPIC, TransformPublisher
 
 OUTPUT_QOS = QoSProfile(depth=10, reliability=QoSReliabilityPolicy.RELIABLE)
-# Who joins late gets the newest path at once.
-PATH_QOS = QoSProfile(depth=1, reliability=QoSReliabilityPolicy.RELIABLE,
+# Who joins late gets the newest path and graph at once.
+LATCHED_QOS = QoSProfile(depth=1, reliability=QoSReliabilityPolicy.RELIABLE,
                       durability=QoSDurabilityPolicy.TRANSIENT_LOCAL)
-# As tf2_ros has it.
-TF_QOS = QoSProfile(depth=100, reliability=QoSReliabilityPolicy.RELIABLE)
 
 
 class Publishers:
@@ -50,19 +51,24 @@ class Publishers:
     node : rclpy.node.Node
     values : mapping
         The node's parameters.
-    datum : Datum
-        Where the map lies on the Earth.
+    on_other : callable
+        Called with a sentence when somebody else publishes the same transform.
+
+    Raises
+    ------
+    ConfigError
+        If the names of the frames do not go together.
 
     """
 
-    def __init__(self, node: Node, values: Mapping[str, Any], datum: Datum) -> None:
+    def __init__(
+        self, node: Node, values: Mapping[str, Any], on_other: Callable[[str], None],
+    ) -> None:
         self._node = node
-        self._datum = datum
+        self._publishers: list[Publisher] = []
         self.map_frame = frame(values['map_frame'])
         self.odom_frame = frame(values['odom_frame'])
         self.base_frame = frame(values['base_link_frame'])
-        self._tf_offset_ns = round(values['transform_time_offset'] * NANOSECONDS)
-        self._path_period = values['path_period']
         frames = (self.map_frame, self.odom_frame, self.base_frame)
         if '' in frames or len(set(frames)) < len(frames):
             raise ConfigError('map_frame, odom_frame and base_link_frame: expected three '
@@ -70,34 +76,60 @@ class Publishers:
         self._pose = self._publisher(PoseWithCovarianceStamped, 'pose', OUTPUT_QOS)
         self._odometry = self._publisher(Odometry, 'odometry/filtered', OUTPUT_QOS)
         self._fix = self._publisher(NavSatFix, 'gps/filtered', OUTPUT_QOS)
-        self._path = self._publisher(Path, 'path', PATH_QOS)
+        self._path = self._publisher(Path, 'path', LATCHED_QOS)
+        self._graph = self._publisher(MarkerArray, 'graph', LATCHED_QOS)
         self._diagnostics = self._publisher(DiagnosticArray, '/diagnostics', OUTPUT_QOS)
-        self._tf: Publisher | None = None
-        if values['publish_tf'] and TFMessage is None:
+        self.transforms: TransformPublisher | None = None
+        """None without tf2_msgs."""
+        if TFMessage is None:
             node.get_logger().warning(
                 'tf2_msgs is not installed: the transform from map to odom is not published')
-        elif values['publish_tf']:
-            self._tf = self._publisher(TFMessage, '/tf', TF_QOS)
+        else:
+            self.transforms = TransformPublisher(
+                node, self._publisher(TFMessage, TOPIC, TF_QOS), self.map_frame, self.odom_frame,
+                on_other)
+        self._slew = Slew()
+        self._aligned = False
         self._newest_ns = 0
+        self.graph = 0
+        """Number of the present graph: how often one began anew."""
+        # what the two threads share
+        self._lock = threading.Lock()
         self._path_shown: Estimate | None = None
-        self._path_stamp_ns = 0
-        self._path_at = -float('inf')
+        self._path_stamp_ns = self._graph_stamp_ns = 0
+        self._path_at = self._graph_at = -float('inf')
+        self.configure(values)
 
     def _publisher(self, message_type: type, topic: str, qos: QoSProfile) -> Publisher:
-        return self._node.create_publisher(
+        publisher = self._node.create_publisher(
             message_type, topic, qos,
             qos_overriding_options=QoSOverridingOptions.with_default_policies())
+        self._publishers.append(publisher)
+        return publisher
 
-    def publish_pose(self, estimate: Estimate, odometry: Odometry, sample: OdometrySample) -> None:
+    def configure(self, values: Mapping[str, Any]) -> None:
+        """Take the parameters that can change while the node runs."""
+        self._publish_tf = values['publish_tf']
+        self._tf_offset_ns = round(values['transform_time_offset'] * NANOSECONDS)
+        self._slew_limits = values['transform_slew_linear'], values['transform_slew_angular']
+        self._path_period, self._graph_period = values['path_period'], values['graph_period']
+
+    def publish_pose(
+        self, estimate: Estimate, odometry: Odometry, sample: OdometrySample, datum: Datum,
+    ) -> None:
         """Publish pose, odometry, fix and transform at an odometry message and its sample."""
-        stamp, plane = sample.stamp_ns, self._datum.plane
+        stamp, plane = sample.stamp_ns, datum.plane
         if stamp <= self._newest_ns:
             return
         self._newest_ns = stamp
-        if self._tf is not None and frame(odometry.header.frame_id) in ('', self.odom_frame):
-            transform = messages.transform_message(
-                stamp + self._tf_offset_ns, estimate.T_map_odom, self.map_frame, self.odom_frame)
-            self._tf.publish(TFMessage(transforms=[transform]))
+        if (self.transforms is not None and self._publish_tf
+                and frame(odometry.header.frame_id) in ('', self.odom_frame)):
+            if (estimate.alignment is AlignmentState.ALIGNED) != self._aligned:
+                # the map was not where it is: that is no correction
+                self._aligned = not self._aligned
+                self._slew.forget()
+            self.transforms.publish(stamp + self._tf_offset_ns, self._slew.limited(
+                stamp, estimate.T_map_odom, sample.pose, *self._slew_limits))
         wanted = [publisher for publisher in (self._pose, self._odometry, self._fix)
                   if publisher.get_subscription_count() > 0]
         if len(wanted) == 0:
@@ -114,24 +146,63 @@ class Publishers:
         if (self._fix in wanted and plane is not None
                 and estimate.alignment is not AlignmentState.LOCAL):
             self._fix.publish(messages.fix_message(
-                stamp, prediction, plane, self._datum.altitude, self.base_frame))
+                stamp, prediction, plane, datum.altitude, self.base_frame))
 
-    def publish_path(self, estimate: Estimate, *, at_once: bool = False) -> None:
+    def jump(self) -> None:
+        """Let the next transform be published as it is: the robot was put elsewhere."""
+        self._slew.forget()
+
+    def publish_path(self, estimate: Estimate, graph: int, *, at_once: bool = False) -> None:
         """
         Publish the path of an estimate that was not shown yet.
 
-        That is done at most once in the period, except `at_once`.
+        That is done at most once in the period, except `at_once`, and only while the graph is
+        the present one.
         """
         now = time.monotonic()
         early = now - self._path_at < self._path_period and not at_once
         if (estimate is self._path_shown or early
                 or self._path.get_subscription_count() == 0):
             return
-        self._path_shown, self._path_at = estimate, now
-        # the same newest odometry with better poses: a nanosecond keeps the stamps increasing
-        self._path_stamp_ns = max(int(estimate.path.stamps_ns[-1]), self._path_stamp_ns + 1)
-        self._path.publish(
-            messages.path_cdr(estimate.path, self._path_stamp_ns, self.map_frame))
+        with self._lock:
+            if graph != self.graph:
+                return
+            self._path_shown, self._path_at = estimate, now
+            # the same newest odometry with better poses: a nanosecond keeps the stamps increasing
+            self._path_stamp_ns = max(int(estimate.path.stamps_ns[-1]), self._path_stamp_ns + 1)
+            self._path.publish(
+                messages.path_cdr(estimate.path, self._path_stamp_ns, self.map_frame))
+
+    def graph_is_due(self) -> bool:
+        """Tell whether someone wants to see the graph, and the last time is long enough ago."""
+        return (self._graph.get_subscription_count() > 0
+                and time.monotonic() - self._graph_at >= self._graph_period)
+
+    def publish_graph(self, view: GraphView, stamp_ns: int, graph: int) -> None:
+        """Publish the markers of a graph, if it is the present one; with a stamp [ns]."""
+        with self._lock:
+            if graph != self.graph:
+                return
+            self._graph_at = time.monotonic()
+            self._graph_stamp_ns = max(stamp_ns, self._graph_stamp_ns + 1)
+            self._graph.publish(markers_cdr(view, self._graph_stamp_ns, self.map_frame))
+
+    def begin_anew(self) -> None:
+        """Forget all stamps, and take back the path and the markers: there is no graph."""
+        self._newest_ns = 0
+        self._aligned = False
+        self._slew.forget()
+        if self.transforms is not None:
+            self.transforms.forget()
+        with self._lock:
+            self.graph += 1
+            self._path_shown, self._path_at = None, -float('inf')
+            self._graph_at = -float('inf')
+            self._path_stamp_ns = self._graph_stamp_ns = 0
+            header = Header(frame_id=self.map_frame)
+            self._path.publish(Path(header=header))
+            self._graph.publish(MarkerArray(
+                markers=[Marker(header=header, action=Marker.DELETEALL)]))
 
     def publish_diagnostics(
         self, level: bytes, text: str, values: Mapping[str, object],
@@ -140,3 +211,11 @@ class Publishers:
         name = f'{self._node.get_fully_qualified_name()}: pose graph'
         self._diagnostics.publish(messages.diagnostics_message(
             self._node.get_clock().now().to_msg(), name, level, text, values))
+
+    def close(self) -> None:
+        """Take all publishers away."""
+        if self.transforms is not None:
+            self.transforms.close()
+        with self._lock:
+            for publisher in self._publishers:
+                self._node.destroy_publisher(publisher)

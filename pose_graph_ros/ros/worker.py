@@ -3,8 +3,9 @@
 """
 The thread that owns the engine: the single writer of the graph.
 
-Callbacks post measurements and ask for updates; they never wait for a solver. What they read is a
-frozen estimate that the thread swaps in. Imports no ROS.
+Callbacks post measurements and ask for updates or jobs; they never wait for a solver. What they
+read is a frozen estimate that the thread swaps in. A worker serves one graph: where that begins
+anew, another worker takes over. Imports no ROS.
 """
 
 from collections import Counter, deque
@@ -14,6 +15,7 @@ from dataclasses import dataclass, field
 import logging
 import threading
 import time
+from typing import TypeVar
 
 from pose_graph_ros.core.backend import PoseGraphBackend
 from pose_graph_ros.core.estimate import Estimate, UpdateReport
@@ -21,6 +23,10 @@ from pose_graph_ros.core.joining import SourceReport
 from pose_graph_ros.core.measurements import Measurement, OdometrySample, Verdict
 
 logger = logging.getLogger(__name__)
+
+Result = TypeVar('Result')
+Job = Callable[[PoseGraphBackend], Result]
+"""Something to be done in the thread that owns the engine."""
 
 # More than this waiting means that the worker has lost touch; what comes then is counted as lost.
 INBOX_LIMIT = 100_000
@@ -73,7 +79,7 @@ class Worker:
         """Whether the preparation is over."""
         self._inbox: deque[tuple[str, OdometrySample | Measurement]] = deque()
         self._update_wanted = False
-        self._closings: list[Future[UpdateReport]] = []
+        self._jobs: list[tuple[Job[object], Future[object]]] = []
         self._stopping = False
         self._condition = threading.Condition()
         self._revision = backend.revision
@@ -119,10 +125,17 @@ class Worker:
 
     def request_closing(self) -> 'Future[UpdateReport]':
         """Ask for a full optimisation of all that has been posted."""
-        future: Future[UpdateReport] = Future()
+        return self.call(self.close)
+
+    def call(self, job: Job[Result]) -> 'Future[Result]':
+        """Have something done in the thread, after all that has been posted."""
+        future: Future[Result] = Future()
         with self._condition:
-            self._closings.append(future)
-            self._condition.notify()
+            if self._stopping:
+                future.cancel()
+            else:
+                self._jobs.append((job, future))  # type: ignore[arg-type]
+                self._condition.notify()
         return future
 
     def _run(self) -> None:
@@ -131,35 +144,51 @@ class Worker:
             with self._condition:
                 self._condition.wait_for(lambda: (
                     self._stopping or self._update_wanted
-                    or len(self._inbox) + len(self._closings) > 0))
-                batch, self._inbox = self._inbox, deque()
-                wanted, self._update_wanted = self._update_wanted, False
-                closings, self._closings = self._closings, []
+                    or len(self._inbox) + len(self._jobs) > 0))
                 if self._stopping:
-                    for future in closings:
+                    for _, future in self._jobs:
                         future.cancel()
                     return
-            report: UpdateReport | None = None
+                batch, self._inbox = self._inbox, deque()
+                wanted, self._update_wanted = self._update_wanted, False
+                jobs, self._jobs = self._jobs, []
             try:
                 for source, measurement in batch:
                     self._add(source, measurement)
-                if wanted or len(closings) > 0:
-                    report = self._update(closing=len(closings) > 0)
+                report = self._update(self._backend.update) if wanted else None
                 # where odometry has jumped the old estimate cannot be carried on
                 stale = self._revision != self._backend.revision
                 if report is not None or self.estimate is None or stale:
                     self._publish()
                 self._report(report, len(batch))
-                if report is not None:
-                    for future in closings:
-                        future.set_result(report)
-            except Exception as error:
+            except Exception:
                 # the thread must outlive whatever comes: it is the only one that writes
                 logger.exception('the worker failed')
                 self._backend.counts['worker', 'internal_error'] += 1
-                for future in closings:
-                    if not future.done():
-                        future.set_exception(error)
+            for job, future in jobs:
+                self._do(job, future)
+
+    def _do(self, job: Job[object], future: 'Future[object]') -> None:
+        if not future.set_running_or_notify_cancel():
+            return
+        try:
+            result = job(self._backend)
+        except Exception as error:
+            future.set_exception(error)
+        else:
+            future.set_result(result)
+
+    def close(self, backend: PoseGraphBackend) -> UpdateReport:
+        """Optimise fully; a job for `call`."""
+        try:
+            report = self._update(backend.optimize)
+            self._publish()
+            self._report(report, 0)
+        except Exception:
+            logger.exception('the worker failed')
+            backend.counts['worker', 'internal_error'] += 1
+            raise
+        return report
 
     def _run_preparation(self) -> None:
         try:
@@ -185,9 +214,9 @@ class Worker:
             self._backend.counts[source, 'internal_error'] += 1
             logger.exception('a measurement of %s could not be added', source)
 
-    def _update(self, *, closing: bool) -> UpdateReport:
+    def _update(self, update: Callable[[], UpdateReport]) -> UpdateReport:
         start = time.monotonic()
-        report = self._backend.optimize() if closing else self._backend.update()
+        report = update()
         if report.iterations > 0:
             seconds = time.monotonic() - start
             self._solves += 1
@@ -200,7 +229,7 @@ class Worker:
     def _publish(self) -> None:
         self._revision = self._backend.revision
         self.estimate = self._backend.estimate()
-        if self.estimate is not None:
+        if self.estimate is not None and not self._stopping:
             self._on_estimate(self.estimate)
 
     def _report(self, report: UpdateReport | None, processed: int) -> None:

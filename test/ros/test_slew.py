@@ -1,0 +1,53 @@
+# Copyright 2026 The pose_graph_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""The published transform follows the estimate at a limited speed, at the robot."""
+
+import math
+
+from hypothesis import given, strategies as st
+import numpy as np
+import pytest
+
+from pose_graph_ros.core import se2
+from pose_graph_ros.ros.slew import Slew
+
+poses = st.tuples(st.floats(-500.0, 500.0), st.floats(-500.0, 500.0), st.floats(-3.0, 3.0)).map(
+    np.array)
+SECOND = 1_000_000_000
+
+
+@given(poses, poses, poses, poses, st.floats(0.01, 2.0), st.floats(0.01, 2.0))
+def test_the_robot_is_moved_no_faster_than_asked(
+    before: np.ndarray, after: np.ndarray, then: np.ndarray, now: np.ndarray, linear: float,
+    angular: float,
+) -> None:
+    slew = Slew()
+    slew.limited(SECOND, before, then, linear, angular)
+    shown = se2.compose(before, now)
+    moved = se2.compose(
+        slew.limited(SECOND + SECOND // 10, after, now, linear, angular), now)
+    wanted = se2.compose(after, now)
+    step, whole = moved - shown, wanted - shown
+    distance, turn = np.hypot(*whole[:2]), abs(se2.wrap(whole[2]))
+    assert np.hypot(*step[:2]) == pytest.approx(min(distance, 0.1 * linear), abs=1e-9)
+    assert abs(se2.wrap(step[2])) == pytest.approx(min(turn, 0.1 * angular), abs=1e-9)
+
+
+def test_it_arrives_and_then_follows_exactly() -> None:
+    slew = Slew()
+    odometry = np.array([300.0, 40.0, 1.0])
+    target = np.array([1.0, -2.0, 0.02])
+    slew.limited(SECOND, np.zeros(3), odometry, 1.0, 0.01)
+    distance = math.hypot(*(se2.compose(target, odometry) - odometry)[:2])
+    for step in range(1, 2 * math.ceil(10.0 * distance)):
+        shown = slew.limited(SECOND + step * SECOND // 10, target, odometry, 1.0, 0.01)
+    np.testing.assert_allclose(shown, target, atol=1e-9)
+
+
+def test_without_limits_or_after_a_jump_it_is_as_estimated() -> None:
+    slew = Slew()
+    target = np.array([100.0, 0.0, 1.0])
+    slew.limited(SECOND, np.zeros(3), np.zeros(3), 0.0, 0.0)
+    assert slew.limited(2 * SECOND, target, np.zeros(3), 0.0, 0.0) is target
+    slew.forget()
+    assert slew.limited(3 * SECOND, 2.0 * target, np.zeros(3), 0.1, 0.1)[0] == 200.0
