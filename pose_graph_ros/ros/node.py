@@ -12,6 +12,7 @@ from rclpy.parameter import Parameter as RosParameter
 
 from pose_graph_ros.core.exceptions import ConfigError
 from pose_graph_ros.ros.parameters import (
+    all_parameters,
     changed,
     Change,
     checked,
@@ -44,9 +45,10 @@ class PoseGraphNode(LifecycleNode):
         self.failure = ''
         """Why the last configuration failed."""
         self._session: Session | None = None
-        self._services: Services | None = None
+        self._offer: Services | None = None
         self._given = self._declared()
         """Parameters of the node's own that are set."""
+        self._own = frozenset(parameter.name for parameter in all_parameters(self._given))
         self._warn_of_unknown()
         self.add_on_set_parameters_callback(self._on_set_parameters)
         self.add_post_set_parameters_callback(self._on_parameters_set)
@@ -98,14 +100,13 @@ class PoseGraphNode(LifecycleNode):
         return self._transition(self.close, state)
 
     def _transition(
-        self, change: Callable[[], None], state: LifecycleState,
+        self, change: Callable[[], None], _: LifecycleState,
     ) -> TransitionCallbackReturn:
-        """Change the state; say why if that fails, which rclpy does not."""
+        """Change the state; keep the reason if that fails, which rclpy does not."""
         try:
             change()
         except ConfigError as error:
             self.failure = str(error)
-            self.get_logger().error(f'stays {state.label}: {error}')
             return TransitionCallbackReturn.FAILURE
         except Exception as error:
             self.failure = f'{type(error).__name__}: {error}'
@@ -120,33 +121,35 @@ class PoseGraphNode(LifecycleNode):
 
     def _configure(self) -> None:
         self._session = Session(self, checked(self._given))
-        self._services = Services(self, self._session)
+        self._offer = Services(self, self._session)
 
     def close(self) -> None:
         """End the worker and let go what was configured."""
-        services, self._services = self._services, None
+        offer, self._offer = self._offer, None
         session, self._session = self._session, None
-        if services is not None:
-            services.close()
+        if offer is not None:
+            offer.close()
         if session is not None:
             session.close()
 
     def _answer_every_change_of_state(self) -> None:
         """
-        Answer requests for a transition that is not possible now.
+        Answer requests for a transition that is not possible now, and say why one failed.
 
-        rclpy raises for them, and who asked would wait for ever.
+        For the first rclpy raises, and who asked would wait for ever; of the second it is silent.
         """
         service = self._service_change_state
         change = service.callback
 
         def answer(request: Any, response: Any) -> Any:
+            self.failure = ''
             try:
-                return change(request, response)
+                response = change(request, response)
             except Exception as error:
-                self.get_logger().warning(f'no transition: {error}')
-                response.success = False
-                return response
+                self.failure, response.success = str(error), False
+            if not response.success:
+                self.get_logger().error(f'no transition: {self.failure}')
+            return response
 
         service.callback = answer
 
@@ -179,7 +182,7 @@ class PoseGraphNode(LifecycleNode):
         """Say what was given in vain: rclpy does not, as a file may be for other nodes as well."""
         overrides: Mapping[str, object] = getattr(self, '_parameter_overrides', {})
         own = {parameter.name for parameter in SOURCE_PARAMETERS}
-        for name in sorted(set(overrides) - set(self._parameters)):
+        for name in sorted(set(overrides) - self._own):
             source, _, leaf = name.rpartition('.')
             if leaf in own:
                 self.get_logger().warning(
@@ -196,13 +199,15 @@ class PoseGraphNode(LifecycleNode):
 
     def _on_parameters_set(self, parameters: list[RosParameter]) -> None:
         """Let changes that were found to be possible take effect."""
-        self._given = self._changed(parameters)
-        if self._session is not None:
-            self._session.configure(self._given)
+        # rclpy calls this for every declaration as well
+        if any(parameter.name in self._own for parameter in parameters):
+            self._given = self._changed(parameters)
+            if self._session is not None:
+                self._session.configure(checked(self._given))
 
     def _changed(self, parameters: list[RosParameter]) -> dict[str, Any]:
         wanted = {parameter.name: parameter.value for parameter in parameters
-                  if parameter.name in self._known}
+                  if parameter.name in self._own}
         return changed(self._given, wanted, configured=self._session is not None)
 
 

@@ -40,7 +40,7 @@ class Services:
                 ('optimize', Trigger, self._optimize), ('reset', Trigger, self._reset),
                 ('pause', SetBool, self._pause), ('set_datum', Trigger, self._set_datum),
                 ('save_graph', Trigger, self._save_graph),
-                ('load_graph', Trigger, self._load_graph)):
+                ):
             # each in a group of its own: one that awaits holds up all others in its group
             self._offered.append(node.create_service(
                 kind, f'~/{name}', answer, callback_group=MutuallyExclusiveCallbackGroup()))

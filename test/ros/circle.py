@@ -45,11 +45,11 @@ def fix_at(
     return fix(START + seconds, latitude, longitude, sigma)
 
 
-def drive(client: Client, end: float, *, fixes: bool = True) -> None:
-    """Publish a drive: odometry at 10 Hz, exact fixes at 2 Hz."""
+def drive(client: Client, end: float, *, begin: float = 0.0, fixes: bool = True) -> None:
+    """Publish a drive, or a part of it: odometry at 10 Hz, exact fixes at 2 Hz."""
     already = int(client.values['processed'])
     count = 0
-    for step in range(round(end * 10)):
+    for step in range(round(begin * 10), round(end * 10)):
         seconds = step / 10.0
         client.odom.publish(odometry_at(seconds))
         count += 1

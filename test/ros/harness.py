@@ -109,9 +109,14 @@ class Client:
             subscribe(TFMessage, '/tf', lambda message: self.transforms.extend(message.transforms),
                       RELIABLE)
         self._optimize = self.node.create_client(Trigger, 'pose_graph/optimize')
-        self._set_datum = self.node.create_client(Trigger, 'pose_graph/set_datum')
+        self._triggers = {'optimize': self._optimize}
 
     def __enter__(self) -> 'Client':
+        self.wait_for_the_node()
+        return self
+
+    def wait_for_the_node(self) -> None:
+        """Wait until an active node listens and has compiled."""
         inputs = (*(getattr(self, name) for name in self._listens), *self.more.values())
         self.spin_until(lambda: all(p.get_subscription_count() > 0 for p in inputs)
                         and len(self.diagnostics) > 0 and self._optimize.service_is_ready(),
@@ -120,9 +125,11 @@ class Client:
                         PREPARE_PATIENCE)
         # the other side may know of the match a little later
         self.spin_for(0.3)
-        return self
 
     def __exit__(self, *_: object) -> None:
+        self.close()
+
+    def close(self) -> None:
         self._executor.shutdown()
         self.node.destroy_node()
         rclpy.shutdown(context=self._context)
@@ -148,22 +155,33 @@ class Client:
         self.spin_until(lambda: int(self.values['processed']) >= count,
                         f'{count} messages are processed')
 
-    def set_datum(self) -> Trigger.Response:
-        future = self._set_datum.call_async(Trigger.Request())
+    def call(self, service: object, request: object) -> object:
+        """Call a service and return its answer."""
+        self.spin_until(service.service_is_ready, 'the service is there')
+        future = service.call_async(request)
         self.spin_until(future.done, 'the service answers')
         return future.result()
 
+    def trigger(self, name: str) -> Trigger.Response:
+        """Call a service of the node that needs nothing but the call."""
+        if name not in self._triggers:
+            self._triggers[name] = self.node.create_client(Trigger, f'pose_graph/{name}')
+        return self.call(self._triggers[name], Trigger.Request())
+
+    def set_datum(self) -> Trigger.Response:
+        return self.trigger('set_datum')
+
     def optimize(self) -> Trigger.Response:
         """Have the node optimise; return when its outputs after that have come."""
-        future = self._optimize.call_async(Trigger.Request())
-        self.spin_until(future.done, 'the optimisation is answered')
-        answered_ns = time.time_ns()
-        self.spin_until(lambda: stamp_ns(self.diagnostics[-1]) > answered_ns,
+        response = self.trigger('optimize')
+        # one may have been on its way
+        count = len(self.diagnostics) + 2
+        self.spin_until(lambda: len(self.diagnostics) >= count,
                         'diagnostics come that were made after the answer')
-        if future.result().success:
+        if response.success:
             self.spin_until(lambda: len(self.paths) > 0 and len(self.paths[-1].poses)
                             == int(self.values['hidden_nodes']) + 1, 'the whole path comes')
-        return future.result()
+        return response
 
 
 def stamp_ns(message: object) -> int:

@@ -1,0 +1,118 @@
+# Copyright 2026 The pose_graph_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""Clocks that jump, bags in a loop and at ten times their speed: the real node over DDS."""
+
+from pathlib import Path
+
+from circle import drive, fix_at, odometry_at, path_error, START
+from harness import Client, NodeProcess, RELIABLE, stamp_ns
+import numpy as np
+import pytest
+from rosgraph_msgs.msg import Clock
+
+LOOPS = 10
+DATUM = ('-p', 'datum:=[48.1, 11.6]')
+
+
+def set_clock(publisher: object, seconds: float) -> None:
+    message = Clock()
+    sec, nanosec = divmod(round((START + seconds) * 1e9), 1_000_000_000)
+    message.clock.sec, message.clock.nanosec = sec, nanosec
+    publisher.publish(message)
+
+
+def publish_lap(client: Client) -> None:
+    """Publish 8 s of the drive without a look at what becomes of it."""
+    for step in range(80):
+        client.odom.publish(odometry_at(step / 10.0))
+        if step % 5 == 0:
+            client.fix.publish(fix_at(step / 10.0))
+        client.spin_for(0.003)
+
+
+def check_one_lap(client: Client, path_begins_at: float = 0.0) -> None:
+    """The graph is that of one lap, and nothing of an earlier one is in it."""
+    answer = client.optimize()
+    assert answer.success, answer.message
+    path = client.paths[-1]
+    stamps = np.array([stamp_ns(item) for item in path.poses])
+    assert np.all(np.diff(stamps) > 0)
+    assert stamps[0] == pytest.approx((START + path_begins_at) * 1e9, abs=1e3)
+    assert path_error(client) < 1e-3
+
+
+@pytest.mark.parametrize('node', [('-p', 'use_sim_time:=true', *DATUM)], indirect=True)
+def test_ten_loops_of_a_bag_with_its_clock(node: NodeProcess, client: Client) -> None:
+    clock = client.node.create_publisher(Clock, '/clock', RELIABLE)
+    client.spin_until(lambda: clock.get_subscription_count() > 0, 'the clock is heard')
+    datum = client.values['datum']
+    for loop in range(LOOPS):
+        set_clock(clock, 0.0)
+        if loop > 0:
+            client.spin_until(lambda n=loop: client.values['resets'] == str(n), 'it begins anew')
+            assert 'clock jumped back' in client.values['reset_reason']
+            assert len(client.paths[-1].poses) == 0, 'the old path is taken back'
+        client.poses.clear()
+        client.transforms.clear()
+        drive(client, 4.0)
+        set_clock(clock, 4.0)
+        drive(client, 8.0, begin=4.0)
+        set_clock(clock, 8.0)
+        check_one_lap(client)
+        for messages in (client.poses, client.transforms):
+            assert np.all(np.diff([stamp_ns(message) for message in messages]) > 0)
+        # nothing is counted of the laps before
+        assert client.values['odom.accepted'] == '80'
+        assert client.values['datum'].split(',')[:2] == datum.split(',')[:2]
+    assert client.values['resets'] == str(LOOPS - 1)
+
+
+def test_ten_loops_of_a_bag_without_a_clock(node: NodeProcess, client: Client) -> None:
+    for loop in range(LOOPS):
+        publish_lap(client)
+        if loop > 0:
+            client.spin_until(lambda n=loop: client.values['resets'] == str(n), 'it begins anew')
+        check_one_lap(client)
+        assert client.values['odom.accepted'] == '80'
+        assert int(client.values['fix.accepted']) >= 15
+    assert 'jumped back' in client.values['reset_reason']
+
+
+@pytest.mark.parametrize('node', [('-p', 'use_sim_time:=true', *DATUM)], indirect=True)
+def test_small_corrections_and_jumps_forward_of_the_clock_change_nothing(
+    node: NodeProcess, client: Client,
+) -> None:
+    clock = client.node.create_publisher(Clock, '/clock', RELIABLE)
+    client.spin_until(lambda: clock.get_subscription_count() > 0, 'the clock is heard')
+    set_clock(clock, 0.0)
+    drive(client, 4.0)
+    for seconds in (4.0, 3.2, 4.1, 3.9, 4000.0, 3999.5):
+        set_clock(clock, seconds)
+        client.spin_for(0.05)
+    drive(client, 8.0, begin=4.0)
+    check_one_lap(client)
+    assert client.values['resets'] == '0'
+
+
+def test_a_single_stamp_of_the_past_or_the_future_changes_nothing(
+    node: NodeProcess, client: Client,
+) -> None:
+    drive(client, 4.0)
+    for seconds in (-100.0, 20.0, 2000.0, 1.0):
+        client.odom.publish(odometry_at(seconds))
+        client.spin_for(0.02)
+    client.wait_processed(48 + 4)
+    drive(client, 25.0, begin=4.0)
+    assert client.values['resets'] == '0'
+    assert client.optimize().success
+
+
+def test_a_drive_at_many_times_its_speed_is_not_lost(tmp_path: Path) -> None:
+    """Ten messages a millisecond: 20 s within a fraction of one."""
+    with NodeProcess(tmp_path, DATUM) as node, Client(int(node.env['ROS_DOMAIN_ID'])) as client:
+        for step in range(200):
+            client.odom.publish(odometry_at(step / 10.0))
+        client.wait_processed(200)
+        assert client.values['odom.accepted'] == '200'
+        assert client.optimize().success
+        assert len(client.paths[-1].poses) > 19
