@@ -18,7 +18,7 @@ from pose_graph_ros.core.estimate import AlignmentState
 from pose_graph_ros.core.hidden_nodes import HiddenNodes
 from pose_graph_ros.core.joining import Bound
 from pose_graph_ros.core.se2 import FloatArray
-from pose_graph_ros.core.sources import MeasurementSource, OdometryNoise, OdometrySource
+from pose_graph_ros.core.sources import MeasurementSource, OdometryNoise
 
 # With so many measurements the angle has been judged often enough.
 LAST_VERDICT = 4096
@@ -43,6 +43,10 @@ class Aligning:
         """Of the angle when it was found [rad]."""
         self._heard: list[Bound] = []
         self._next_verdict = FIRST_VERDICT
+
+    def configure(self, config: BackendConfig) -> None:
+        """Take other settings, for verdicts from now on, over all that has come."""
+        self._config = config
 
     def find(self, poses: FloatArray, waiting: list[Bound], lead: str) -> FloatArray | None:
         """
@@ -116,7 +120,7 @@ class Aligning:
         return turn.T_map_graph
 
     def _noise(self, lead: str) -> OdometryNoise:
-        return self._config.odometry.get(lead, OdometrySource()).noise
+        return self._config.odometry_source(lead).noise
 
     def _lifetime(self, bounds: list[Bound]) -> Lifetime:
         times = {name: source.correlation_time

@@ -40,7 +40,6 @@ from pose_graph_ros.core.measurements import (
 from pose_graph_ros.core.pending import due_ns, MAX_PENDING, Pending, Seen
 from pose_graph_ros.core.reweighing import Reweighing
 from pose_graph_ros.core.se2 import FloatArray, IntArray
-from pose_graph_ros.core.sources import OdometrySource
 from pose_graph_ros.core.starts import Solve
 from pose_graph_ros.core.trajectory import Trajectory
 
@@ -88,6 +87,13 @@ class PoseGraphBackend:
         self._chi2 = 0.0
         self.counts: Counter[tuple[str, str]] = Counter()
         """How often each source got each answer: (source, 'accepted' or the reason)."""
+
+    def configure(self, config: BackendConfig) -> None:
+        """Take other settings for what comes from now on; ConfigError for what must stay."""
+        self._config = self._config.changed_to(config)
+        self._nodes.configure(config)
+        self._joins.configure(config)
+        self._aligning.configure(config)
 
     @property
     def graph(self) -> Graph:
@@ -152,7 +158,7 @@ class PoseGraphBackend:
             return -1
         self._settled = self._settled and result.status is Status.CONVERGED
         self._newest_node_covariance = self._smoother.newest_covariance()
-        settings = self._config.odometry.get(source, OdometrySource())
+        settings = self._config.odometry_source(source)
         self._reweighing.add_edge(
             self.graph.n_edges - 1, settings.loss, settings.rejection_threshold)
         return self.graph.newest_pose
@@ -424,7 +430,7 @@ class PoseGraphBackend:
                 math.sqrt(cov[2, 2]) if state is AlignmentState.ALIGNED else sigma),
             n_hidden=len(self._nodes), n_edges=graph.n_edges - self._joins.n_bias_edges,
             n_observed=self._joins.n_measurements, n_biases=graph.n_nodes - len(self._nodes),
-            lead=lead, noise=self._config.odometry.get(lead, OdometrySource()).noise)
+            lead=lead, noise=self._config.odometry_source(lead).noise)
 
     def _count(self, source: str, answer: Answer) -> Answer:
         if answer.verdict is Verdict.ACCEPTED:

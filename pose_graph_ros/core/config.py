@@ -126,3 +126,40 @@ class BackendConfig:
 
     def __post_init__(self) -> None:
         require(self, 'odometry_patience', positive=True)
+
+    def odometry_source(self, name: str) -> OdometrySource:
+        """Return the settings of a source of odometry."""
+        return self.odometry.get(name, OdometrySource())
+
+    def changed_to(self, wanted: 'BackendConfig') -> 'BackendConfig':
+        """
+        Return the wanted settings, if a back end with these can take them while it runs.
+
+        What decides how the past was kept stays: where odometry has its noise from, which is
+        summed up sample by sample, and how errors live on, for which the graph holds states.
+
+        Raises
+        ------
+        ConfigError
+            If something else is wanted there: what it is, and what is wanted.
+
+        """
+        _require_same('SmootherConfig', self.smoother, wanted.smoother)
+        for name in sorted({*self.odometry, *wanted.odometry}):
+            _require_same(f'{name}: OdometrySource.noise_from',
+                          self.odometry_source(name).noise_from,
+                          wanted.odometry_source(name).noise_from)
+        default = MeasurementSource()
+        for name in sorted({*self.measurements, *wanted.measurements}):
+            old = self.measurements.get(name, default)
+            new = wanted.measurements.get(name, default)
+            for setting in ('correlation_time', 'correlation', 'white_share'):
+                _require_same(f'{name}: MeasurementSource.{setting}',
+                              getattr(old, setting), getattr(new, setting))
+        return wanted
+
+
+def _require_same(what: str, present: object, wanted: object) -> None:
+    if wanted != present:
+        raise ConfigError(
+            f'{what}: cannot change while it runs, expected {present!r}, got {wanted!r}')

@@ -28,7 +28,6 @@ from pose_graph_ros.core.measurements import Answer, OdometrySample
 from pose_graph_ros.core.motion import Pose, wrap_one
 from pose_graph_ros.core.odometry_stream import LOOSE, MEMORY_TIME, OdometryStream
 from pose_graph_ros.core.se2 import FloatArray, IntArray
-from pose_graph_ros.core.sources import OdometrySource
 from pose_graph_ros.core.timeline import OdometryTimeline
 
 MakeNode = Callable[[FloatArray, FloatArray | None, str], int]
@@ -54,7 +53,6 @@ class HiddenNodes:
 
     def __init__(self, config: BackendConfig, make_node: MakeNode) -> None:
         self._config = config
-        self._patience_ns = round(config.odometry_patience * 1e9)
         self._make_node = make_node
         self._stamps = GrowingArray((), np.int64)
         self._rows = GrowingArray((), np.int64)
@@ -112,11 +110,25 @@ class HiddenNodes:
         """Stamp of the newest sample of the leading source [ns]."""
         return self.streams[self.lead].newest_ns if self._leads else -1
 
+    def configure(self, config: BackendConfig) -> None:
+        """
+        Take other settings, for nodes and edges that are made from now on.
+
+        The motion since the newest node makes one edge: its noise is then by the new ones.
+        """
+        self._config = config
+        for name, stream in self.streams.items():
+            stream.configure(config.odometry_source(name))
+
+    @property
+    def _patience_ns(self) -> int:
+        return round(self._config.odometry_patience * 1e9)
+
     def take(self, sample: OdometrySample, source: str) -> Answer:
         """Take an odometry sample, and make what nodes and edges are due."""
         stream = self.streams.get(source)
         if stream is None:
-            stream = OdometryStream(self._config.odometry.get(source, OdometrySource()))
+            stream = OdometryStream(self._config.odometry_source(source))
             self.streams[source] = stream
             self._tied[source] = -1, 0
         answer = stream.add(sample)

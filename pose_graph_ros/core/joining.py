@@ -112,6 +112,10 @@ class Joining:
         self.n_bias_edges = 0
         """Edges of the graph that lead to states of an error."""
 
+    def configure(self, config: BackendConfig) -> None:
+        """Take other settings, for what joins from now on; of errors that live on the same."""
+        self._config = config
+
     def settings(self, source: str, *, closure: bool = False) -> MeasurementSource:
         """Return the settings of a source of measurements."""
         default = LOOP_CLOSURES if closure else MeasurementSource()

@@ -110,13 +110,6 @@ class OdometryStream:
         """Jumps among the settled samples."""
         self.n_dropped = 0
         """Samples that were taken, but whose stamps turned out to be far ahead of their time."""
-        self._source = source
-        self._noise = source.noise
-        if source.noise_from is NoiseFrom.TWIST:
-            # the timeline brings all of it
-            self._noise = replace(source.noise, sigma_distance=0.0, sigma_lateral=0.0,
-                                  sigma_heading_distance=0.0, sigma_heading_turn=0.0)
-        self._window_ns = round(source.reorder_window * 1e9)
         self._waiting: list[_Sample] = []
         """By stamp, all newer than what is settled."""
         self._ahead: list[_Instant] = []
@@ -124,6 +117,23 @@ class OdometryStream:
         self._last: _Instant | None = None
         self._n_behind = 0
         """How many have come since that are far behind the newest."""
+        self.configure(source)
+
+    def configure(self, source: OdometrySource) -> None:
+        """
+        Take settings, for samples that are not settled yet and for covariances from now on.
+
+        Where the noise comes from stays the same: settled samples have theirs with them.
+        """
+        self._source = source
+        self._noise = source.noise
+        if source.noise_from is NoiseFrom.TWIST:
+            # the timeline brings all of it
+            self._noise = replace(source.noise, sigma_distance=0.0, sigma_lateral=0.0,
+                                  sigma_heading_distance=0.0, sigma_heading_turn=0.0)
+        self._window_ns = round(source.reorder_window * 1e9)
+        # how far ahead somebody has looked must not decide which settings a sample meets
+        self._ahead.clear()
 
     @property
     def newest_ns(self) -> int:
