@@ -35,7 +35,7 @@ CORE_NEEDS = {'numpy', 'scipy', 'numba', 'pyproj'}
 # Modules of ros that the offline tools share: they know messages by their fields alone.
 WITHOUT_RCLPY = {
     'bag_writer', 'bags', 'continuity', 'conversions', 'fixes', 'hearing', 'inputs',
-    'parameter_texts', 'parameters', 'reader', 'sources', 'static_frames'}
+    'parameter_changes', 'parameter_texts', 'parameters', 'reader', 'sources', 'static_frames'}
 ROS = {'rclpy', 'rosidl_runtime_py', 'ament_index_python', 'launch', 'launch_ros'}
 
 MOST_LINES = 400

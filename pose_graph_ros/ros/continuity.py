@@ -35,7 +35,8 @@ class Continuity:
     """
 
     def __init__(self, maximum_speed: float) -> None:
-        self._maximum_speed = maximum_speed
+        self.maximum_speed = maximum_speed
+        """No robot is faster [m/s]; can be changed, for steps from then on."""
         self._stamp_ns = 0
         self._pose: FloatArray = np.zeros(3)
         self._speed = math.inf
@@ -54,7 +55,7 @@ class Continuity:
         elapsed_ns, first = sample.stamp_ns - self._stamp_ns, self._stamp_ns == 0
         moved = math.hypot(*(sample.pose - self._pose)[:2])
         time = max(elapsed_ns * 1e-9, LEAST_TIME)
-        allowed = min(2.0 * max(self._speed, abs(sample.speed)) + MORE_SPEED, self._maximum_speed)
+        allowed = min(2.0 * max(self._speed, abs(sample.speed)) + MORE_SPEED, self.maximum_speed)
         if not first and (moved > SLACK + allowed * time or elapsed_ns > FAR_NS):
             self._jump_ns = sample.stamp_ns
         elif not first:

@@ -113,15 +113,19 @@ class FixReader:
     def __init__(
         self, source: Source, datum: Datum, frames: StaticFrames, base_frame: str,
     ) -> None:
-        if len(source.lever_arm) != 2 or not np.all(np.isfinite(source.lever_arm)):
-            raise ValueError(f'{source.name}.lever_arm: expected [x, y] in metres, got '
-                             f'{list(source.lever_arm)}')
-        self._source, self._datum = source, datum
-        self._frames, self._base_frame = frames, base_frame
+        self.configure(source)
+        self._datum, self._frames, self._base_frame = datum, frames, base_frame
         self.antenna: Antenna | None = None
         """As the newest fix was read; None before the first."""
         self.without_lever_arm = 0
         """Fixes that were read while nobody told where the antenna is."""
+
+    def configure(self, source: Source) -> None:
+        """Take time offset and lever arm for fixes from now on; ValueError as when made."""
+        if len(source.lever_arm) != 2 or not np.all(np.isfinite(source.lever_arm)):
+            raise ValueError(f'{source.name}.lever_arm: expected [x, y] in metres, got '
+                             f'{list(source.lever_arm)}')
+        self._source = source
 
     def position(self, message: Message) -> Position | Answer:
         """Read a sensor_msgs/NavSatFix; an unknown covariance comes back as zeros."""

@@ -20,9 +20,10 @@ _EXAMPLES = {'datum': '[0.0, 0.0]', 'covariance_override': '[1.0, 0.1]'}
 
 
 def as_yaml() -> str:
-    """Return the content of `config/pose_graph.yaml`: all parameters with their defaults."""
-    lines = ['# All parameters with their defaults; the file is made from the tables in',
-             '# pose_graph_ros/ros/parameters.py (pose-graph parameters --yaml).',
+    """Return the content of `config/pose_graph_full.yaml`: all parameters, their defaults."""
+    lines = ['# All parameters with their defaults: what they do [unit; range; when they change].',
+             '# The file is made from the tables in pose_graph_ros/ros/parameters.py',
+             '# (pose-graph parameters --yaml); pose_graph.yaml has those that most robots need.',
              '/**:', '  ros__parameters:']
     said: set[str] = set()
     group = ''
@@ -40,9 +41,9 @@ def as_yaml() -> str:
 
 def _entry(parameter: Parameter, leaf: str, indent: str, said: set[str]) -> Iterator[str]:
     """Return the lines of one parameter; a comment is made once."""
-    unit = f' [{parameter.unit}]' if parameter.unit != '' else ''
-    choices = f' ({", ".join(parameter.choices)})' if len(parameter.choices) > 0 else ''
-    comment = f'{indent}# {parameter.description}{unit}{choices}'
+    facts = '; '.join(fact for fact in (
+        parameter.unit, _range(parameter), parameter.change.value) if fact != '')
+    comment = f'{indent}# {parameter.description} [{facts}]'
     if comment not in said:
         said.add(comment)
         yield comment
@@ -54,23 +55,25 @@ def _entry(parameter: Parameter, leaf: str, indent: str, said: set[str]) -> Iter
 
 def as_markdown() -> str:
     """Return the README's table of the node's parameters."""
-    lines = ['| parameter | default | unit | range | what it does |', '|---|---|---|---|---|']
+    lines = ['| parameter | default | unit | range | changes | what it does |',
+             '|---|---|---|---|---|---|']
     for parameter in PARAMETERS:
         value = 'unset' if parameter.default == [] else _yaml(parameter.default)
         lines.append(f'| `{parameter.name}` | {value} | {parameter.unit} | {_range(parameter)} | '
-                     f'{parameter.description} |')
+                     f'{parameter.change.value} | {parameter.description} |')
     return '\n'.join(lines) + '\n'
 
 
 def sources_as_markdown() -> str:
     """Return the README's table of the parameters of a source."""
-    lines = ['| parameter | types | default | unit | range | what it does |',
-             '|---|---|---|---|---|---|']
+    lines = ['| parameter | types | default | unit | range | changes | what it does |',
+             '|---|---|---|---|---|---|---|']
     for parameter in SOURCE_PARAMETERS:
         value = '' if parameter.name in ('type', 'topic') else (
             'unset' if parameter.default == [] else _yaml(parameter.default))
         lines.append(f'| `<source>.{parameter.name}` | {_kinds(parameter.kinds)} | {value} | '
-                     f'{parameter.unit} | {_range(parameter)} | {parameter.description} |')
+                     f'{parameter.unit} | {_range(parameter)} | {parameter.change.value} | '
+                     f'{parameter.description} |')
     return '\n'.join(lines) + '\n'
 
 
@@ -96,4 +99,4 @@ def _yaml(value: Value) -> str:
         return str(value).lower()
     if isinstance(value, list):
         return f'[{", ".join(_yaml(item) for item in value)}]'
-    return value if isinstance(value, str) else repr(value)
+    return value if isinstance(value, str) and value != '' else repr(value)

@@ -11,6 +11,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from enum import Enum
 import re
+import sys
 from typing import Any
 
 from pose_graph_ros.core.config import AlignmentPolicy, BackendConfig, NodePolicy
@@ -28,6 +29,17 @@ from pose_graph_ros.core.sources import (
 from pose_graph_ros.ros.sources import DEFAULT_SOURCES, Kind, KNOWN_SOURCES, source_names
 
 Value = bool | float | str | list[float] | list[str]
+
+
+class Change(Enum):
+    """When a parameter can be changed."""
+
+    ALWAYS = 'running'
+    """At any time, for what comes from then on."""
+    UNCONFIGURED = 'unconfigured'
+    """While the node is not configured: it is taken when that is done."""
+    START = 'read-only'
+    """Only at the start: it decides which parameters there are, or what happens then."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -49,6 +61,7 @@ class Parameter:
     """How many numbers a list may have; empty for any."""
     kinds: tuple[Kind, ...] = ()
     """Kinds of sources that have the parameter."""
+    change: Change = Change.ALWAYS
 
 
 def _values(choices: type[Enum]) -> tuple[str, ...]:
@@ -61,23 +74,39 @@ _NOISE = _ODOMETRY.noise
 
 PARAMETERS: tuple[Parameter, ...] = (
     Parameter('sources', list(DEFAULT_SOURCES), '', 'Names of the sources, each with parameters '
-              'as below; of odometry the first one is preferred. `loop_closure` is always there.'),
-    Parameter('map_frame', 'map', '', 'Frame of the corrected path.'),
-    Parameter('odom_frame', 'odom', '', 'Frame of the odometry, child of `map_frame` in TF.'),
-    Parameter('base_link_frame', 'base_link', '', 'Frame of the robot.'),
+              'as below; of odometry the first one is preferred. `loop_closure` is always there.',
+              change=Change.START),
+    Parameter('autostart', True, '', 'Configure and activate by itself; else a lifecycle manager '
+              'does.', change=Change.START),
+    Parameter('map_frame', 'map', '', 'Frame of the corrected path.',
+              change=Change.UNCONFIGURED),
+    Parameter('odom_frame', 'odom', '', 'Frame of the odometry, child of `map_frame` in TF.',
+              change=Change.UNCONFIGURED),
+    Parameter('base_link_frame', 'base_link', '', 'Frame of the robot.',
+              change=Change.UNCONFIGURED),
     Parameter('publish_tf', True, '', 'Publish `map_frame` to `odom_frame` on /tf.'),
     Parameter('transform_time_offset', 0.0, 's', 'Added to the stamp of the transform.',
               0.0, 10.0),
-    Parameter('frequency', 2.0, 'Hz', 'How often the graph is optimised.', 0.01, 100.0),
+    Parameter('transform_slew_linear', 0.0, 'm/s', 'What is corrected moves the robot in the '
+              'published transform no faster than this; 0: at once.', 0.0, 1000.0),
+    Parameter('transform_slew_angular', 0.0, 'rad/s', 'What is corrected turns the robot in the '
+              'published transform no faster than this; 0: at once.', 0.0, 1000.0),
+    Parameter('frequency', 10.0, 'Hz', 'How often the graph is optimised.', 0.01, 100.0),
     Parameter('path_period', 1.0, 's', 'The path is published at most this often.', 0.0, 3600.0),
+    Parameter('graph_period', 2.0, 's', 'The markers of the graph are published at most this '
+              'often.', 0.1, 3600.0),
     Parameter('diagnostics_period', 1.0, 's', 'How often /diagnostics is published.', 0.01, 60.0),
     Parameter('closing_silence', 2.0, 's', 'After so long without any message the graph is '
               'optimised to the end; 0 never does.', 0.0, 3600.0),
+    Parameter('clock_jump_threshold', 1.0, 's', 'When time, the clock of the node or the stamps '
+              'of odometry, jumps back by more than this the graph begins anew.', 0.01, 3600.0),
+    Parameter('graph_file', '', '', 'File that `~/save_graph` writes and `~/load_graph` reads: '
+              'graph.g2o, with .json and .tum beside it.'),
     Parameter('datum', [], 'deg, deg, rad', 'Latitude and longitude of the origin of the map and, '
               'as a third number, the angle of its x axis from east; unset: the first fix, '
-              'x east.', sizes=(0, 2, 3)),
+              'x east.', sizes=(0, 2, 3), change=Change.UNCONFIGURED),
     Parameter('wait_for_datum', False, '', 'Without `datum`, refuse fixes until `~/set_datum` is '
-              'called.'),
+              'called.', change=Change.UNCONFIGURED),
     Parameter('minimum_travel_distance', _NODES.minimum_travel_distance, 'm',
               'Distance from the last hidden node that makes a new one.', 0.0, 1000.0),
     Parameter('minimum_travel_heading', _NODES.minimum_travel_heading, 'rad',
@@ -107,12 +136,14 @@ _POSITIONS = (Kind.GLOBAL_POSE, Kind.FIX)
 _NOT_CLOSURES = tuple(kind for kind in _OTHERS if kind is not Kind.LOOP_CLOSURE)
 
 SOURCE_PARAMETERS: tuple[Parameter, ...] = (
-    Parameter('type', '', '', 'What the source is.', choices=_values(Kind), kinds=_ALL),
-    Parameter('topic', '', '', 'Topic; if it is not given, the name of the source.', kinds=_ALL),
+    Parameter('type', '', '', 'What the source is.', choices=_values(Kind), kinds=_ALL,
+              change=Change.START),
+    Parameter('topic', '', '', 'Topic; if it is not given, the name of the source.', kinds=_ALL,
+              change=Change.UNCONFIGURED),
     Parameter('time_offset', 0.0, 's', 'Added to the stamps.', -3600.0, 3600.0, kinds=_ALL),
     Parameter('noise', _ODOMETRY.noise_from.value, '', 'Noise by a model of distance and turns, '
               'or by the covariance of the twist times dt.', choices=_values(NoiseFrom),
-              kinds=_WHEELS),
+              kinds=_WHEELS, change=Change.UNCONFIGURED),
     Parameter('sigma_distance', _NOISE.sigma_distance, 'm/sqrt(m)',
               'Odometry noise along the path, per root of its length.', 0.0, 10.0, kinds=_WHEELS),
     Parameter('sigma_lateral', _NOISE.sigma_lateral, 'm/sqrt(m)',
@@ -165,12 +196,13 @@ SOURCE_PARAMETERS: tuple[Parameter, ...] = (
               'is used; 0: all.', 0.0, 3600.0, kinds=(Kind.IMU,)),
     Parameter('correlation_time', _MEASUREMENT.correlation_time, 's',
               'How long an error lives, its time constant; 0: it is white.', 0.0, 1e5,
-              kinds=_NOT_CLOSURES),
+              kinds=_NOT_CLOSURES, change=Change.UNCONFIGURED),
     Parameter('correlation_model', _MEASUREMENT.correlation.value, '', 'Errors that live on are '
               'estimated as a bias, or make the covariances larger.',
-              choices=_values(Correlation), kinds=_NOT_CLOSURES),
+              choices=_values(Correlation), kinds=_NOT_CLOSURES, change=Change.UNCONFIGURED),
     Parameter('white_share', _MEASUREMENT.white_share, '', 'Variance of what is white beside an '
-              'error that lives on, in parts of the variance.', 0.0, 1.0, kinds=_NOT_CLOSURES),
+              'error that lives on, in parts of the variance.', 0.0, 1.0, kinds=_NOT_CLOSURES,
+              change=Change.UNCONFIGURED),
 )
 
 # A source's name begins names of parameters, and of counts in the diagnostics.
@@ -195,7 +227,7 @@ def source_parameters(source: str, kind: str) -> tuple[Parameter, ...]:
         If there is no such kind of source.
 
     """
-    _checked(type_parameter(source), kind)
+    checked_value(type_parameter(source), kind)
     return tuple(_of_source(parameter, source) for parameter in SOURCE_PARAMETERS
                  if Kind(kind) in parameter.kinds)
 
@@ -221,16 +253,14 @@ def listed_sources(given: Mapping[str, Any]) -> list[str]:
 
     """
     names = given.get('sources', list(DEFAULT_SOURCES))
-    if not isinstance(names, Sequence) or isinstance(names, str) or not all(
-            isinstance(name, str) for name in names):
-        raise ConfigError(f'parameter sources: expected a list of names, got {names!r}')
+    names = checked_value(PARAMETERS[0], names)
     for name in names:
         if _NAME.fullmatch(name) is None or name in _TAKEN:
             raise ConfigError(f'parameter sources: {name!r} cannot be the name of a source; '
                               'expected letters, digits and _, and no name of something else')
     if len(set(names)) < len(names):
         raise ConfigError(f'parameter sources: expected different names, got {list(names)}')
-    return source_names(list(names))
+    return source_names(names)
 
 
 def all_parameters(given: Mapping[str, Any]) -> tuple[Parameter, ...]:
@@ -275,11 +305,20 @@ def checked(given: Mapping[str, Any]) -> dict[str, Any]:
             hint = (f': a source of type {given.get(f"{source}.type", "") or "its kind"} has none'
                     if f'{source}.type' in known else f': {source} is not in sources')
         raise ConfigError(f'parameter {name!r} is not known{hint}')
-    return {parameter.name: _checked(parameter, given[parameter.name])
+    return {parameter.name: checked_value(parameter, given[parameter.name])
             if parameter.name in given else parameter.default for parameter in parameters}
 
 
-def _checked(parameter: Parameter, value: Any) -> Value:
+def checked_value(parameter: Parameter, value: Any) -> Any:
+    """
+    Return the value of a parameter as the tables have it: a float for 5, a list for a tuple.
+
+    Raises
+    ------
+    ConfigError
+        If it has a wrong type or is out of range: what was expected, what came.
+
+    """
     name, default = parameter.name, parameter.default
     if isinstance(default, bool | str):
         if type(value) is not type(default):
@@ -291,17 +330,20 @@ def _checked(parameter: Parameter, value: Any) -> Value:
         if name.endswith('.topic') and _TOPIC.fullmatch(str(value)) is None:
             raise ConfigError(f'parameter {name}: expected the name of a topic, got {value!r}')
         return value
-    if name == 'sources':
-        return list(value)
     if isinstance(default, list):
         return _checked_list(parameter, value)
     return _number(parameter, value)
 
 
-def _checked_list(parameter: Parameter, value: Any) -> list[float]:
+def _checked_list(parameter: Parameter, value: Any) -> Value:
     name, sizes = parameter.name, parameter.sizes
-    if not isinstance(value, Sequence) or isinstance(value, str):
-        raise ConfigError(f'parameter {name}: expected a list of numbers, got {value!r}')
+    of_names = name == 'sources'
+    if not isinstance(value, Sequence) or isinstance(value, str | bytes) or (
+            of_names and not all(isinstance(item, str) for item in value)):
+        raise ConfigError(f'parameter {name}: expected a list of '
+                          f'{"names" if of_names else "numbers"}, got {value!r}')
+    if of_names:
+        return list(value)
     if len(sizes) > 0 and len(value) not in sizes:
         raise ConfigError(f'parameter {name}: expected {" or ".join(map(str, sizes))} numbers '
                           f'[{parameter.unit}], got {list(value)}')
@@ -312,9 +354,10 @@ def _number(parameter: Parameter, value: Any) -> float:
     name = parameter.name
     if isinstance(value, bool) or not isinstance(value, (int, float)):
         raise ConfigError(f'parameter {name}: expected a number, got {value!r}')
-    low = -float('inf') if parameter.smallest is None else parameter.smallest
-    high = float('inf') if parameter.largest is None else parameter.largest
+    low = -sys.float_info.max if parameter.smallest is None else parameter.smallest
+    high = sys.float_info.max if parameter.largest is None else parameter.largest
     if not low <= value <= high:
-        raise ConfigError(f'parameter {name}: expected a number in [{low:g}, {high:g}], '
-                          f'got {value!r}')
+        expected = ('a finite number' if parameter.smallest is None
+                    else f'a number in [{low:g}, {high:g}]')
+        raise ConfigError(f'parameter {name}: expected {expected}, got {value!r}')
     return float(value)

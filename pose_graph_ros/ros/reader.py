@@ -30,6 +30,8 @@ class MessageReader:
     ----------
     values : mapping
         All checked parameters.
+    frames : StaticFrames
+        Where the robot's frames are, if something is known already.
 
     Raises
     ------
@@ -38,13 +40,13 @@ class MessageReader:
 
     """
 
-    def __init__(self, values: Mapping[str, Any]) -> None:
+    def __init__(self, values: Mapping[str, Any], frames: StaticFrames | None = None) -> None:
         self.sources = {source.name: source for source in source_list(values)}
         """All sources by name."""
         self._leaps = {name: _Leaps() for name in self.sources}
         self._map_frame = frame(values['map_frame'])
         base_frame = frame(values['base_link_frame'])
-        self.frames = StaticFrames()
+        self.frames = StaticFrames() if frames is None else frames
         """Where the robot's frames are, as far as /tf_static has told."""
         try:
             self.datum = Datum(values['datum'], wait=values['wait_for_datum'])
@@ -53,6 +55,24 @@ class MessageReader:
                 for source in self.sources.values() if source.kind is Kind.FIX}
         except ValueError as error:
             raise ConfigError(f'parameter {error}') from error
+
+    def renewed(self, values: Mapping[str, Any]) -> 'MessageReader':
+        """Return a reader for a graph that begins anew: it knows the same transforms, no more."""
+        return MessageReader(values, self.frames)
+
+    def configure(self, values: Mapping[str, Any]) -> None:
+        """
+        Take other time offsets, lever arms and yaw offsets, for messages from now on.
+
+        What is taken when the node is configured (sources, topics, frames, datum) stays, and so
+        do the transforms that are known and all counts.
+        """
+        for source in source_list(values):
+            before = self.sources[source.name]
+            self._leaps[source.name].shift(source.time_offset_ns - before.time_offset_ns)
+            self.sources[source.name] = source
+            if source.kind is Kind.FIX:
+                self.fixes[source.name].configure(source)
 
     def read(self, name: str, message: Message) -> OdometrySample | Measurement | Answer:
         """Read a message of the source with this name."""
@@ -94,6 +114,11 @@ class _Leaps:
     def __init__(self) -> None:
         self._newest_ns = 0
         self._count = 0
+
+    def shift(self, by_ns: int) -> None:
+        """Let all stamps be later from now on by so much."""
+        if self._newest_ns > 0:
+            self._newest_ns = max(self._newest_ns + by_ns, 1)
 
     def refuses(self, stamp_ns: int) -> bool:
         """Tell whether a stamp is far from those before, and not from those to come."""

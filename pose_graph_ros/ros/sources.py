@@ -89,6 +89,11 @@ def source_names(listed: list[str]) -> list[str]:
     return [*listed, *([] if CLOSURES in listed else [CLOSURES])]
 
 
+# Those whose range hangs on others, as the engine calls them.
+_SETTINGS = {'CovariancePolicy.position_ceiling': 'sigma_ceiling',
+             'CovariancePolicy.heading_floor': 'sigma_floor'}
+
+
 def backend_config(values: Mapping[str, Any]) -> BackendConfig:
     """
     Return the engine's settings by all checked parameters.
@@ -110,7 +115,9 @@ def backend_config(values: Mapping[str, Any]) -> BackendConfig:
             else:
                 measurements[source.name] = _measurement_source(own)
         except ConfigError as error:
-            raise ConfigError(f'parameters of the source {source.name}: {error}') from error
+            setting, _, rest = str(error).partition(': ')
+            raise ConfigError(
+                f'parameter {source.name}.{_SETTINGS.get(setting, setting)}: {rest}') from error
     if len(odometry) == 0:
         raise ConfigError('parameter sources: expected at least one of type odometry, got '
                           f'{values["sources"]}')

@@ -189,6 +189,20 @@ def test_odometry_with_the_stamp_of_another_time_is_refused_unless_it_goes_on() 
         5 * ['stamp_leap'] + 3 * ['read'])
 
 
+@pytest.mark.parametrize('offset', [-3600.0, -90.0, 0.5, 90.0, 3600.0])
+def test_another_time_offset_is_no_leap_of_the_stamps(offset: float) -> None:
+    values = checked({'sources': ['odom', 'imu']})
+    one = MessageReader(values)
+    one.configure({**values, 'odom.time_offset': 0.0})
+    assert one.read('odom', odometry(1e9, 0.0, 0.0, 0.0)).stamp_ns == 10**18
+    one.configure({**values, 'odom.time_offset': offset, 'imu.yaw_offset': 0.25})
+    for at in (1e9 + 0.1, 1e9 + 0.2):
+        sample = one.read('odom', odometry(at, 0.0, 0.0, 0.0))
+        assert sample.stamp_ns == pytest.approx(1e9 * (at + offset), abs=1e3)
+    assert one.read('odom', odometry(1e9 + 70.0, 0.0, 0.0, 0.0)).reason == 'stamp_leap'
+    assert one.read('imu', imu(1e9, 0.5)).heading == pytest.approx(0.75)
+
+
 def test_stamps_that_no_message_can_hold_are_refused() -> None:
     one = reader(odom__time_offset=10.0, fix__time_offset=-10.0)
     assert one.read('odom', odometry(2**31 - 1.0, 0.0, 0.0, 0.0)).reason == 'stamp_out_of_range'

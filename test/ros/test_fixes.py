@@ -220,6 +220,30 @@ def test_the_antenna_is_where_the_parameter_says_else_where_tf_static_does() -> 
     assert reader.fixes['rear'].antenna.origin == 'parameter'
 
 
+def test_another_lever_arm_is_taken_for_fixes_from_then_on_and_all_else_stays() -> None:
+    values = checked({'fix.lever_arm': [0.5, 0.0]})
+    reader = MessageReader(values)
+    first = reader.read('fix', fix(1.0, 48.1, 11.6))
+    plane, one = reader.datum.plane, reader.fixes['fix']
+    reader.frames.take(Transforms(transform('base_link', 'gps', (0.75, -0.25, 1.0))))
+    reader.configure({**values, 'fix.lever_arm': [1.5, 0.25], 'fix.time_offset': -0.5})
+    second = reader.read('fix', fix(2.0, 48.1, 11.6))
+    assert (first.lever_arm.tolist(), second.lever_arm.tolist()) == ([0.5, 0.0], [1.5, 0.25])
+    assert second.stamp_ns == 1_500_000_000
+    assert second.position == pytest.approx(first.position, abs=1e-9)
+    assert reader.datum.plane is plane
+    assert reader.fixes['fix'] is one
+    # zero: from the transforms that came before
+    reader.configure({**values, 'fix.lever_arm': [0.0, 0.0]})
+    assert reader.read('fix', fix(3.0, 48.1, 11.6)).lever_arm.tolist() == [0.75, -0.25]
+    assert reader.sources['fix'].time_offset_ns == 0
+    # and those are all that stays where the graph begins anew
+    renewed = reader.renewed(values | {'fix.lever_arm': [0.0, 0.0]})
+    assert renewed.datum.plane is None
+    assert renewed.fixes['fix'].antenna is None
+    assert renewed.read('fix', fix(4.0, 50.0, 9.0)).lever_arm.tolist() == [0.75, -0.25]
+
+
 def test_a_real_message_of_tf_static_is_read() -> None:
     if TFMessage is None:
         pytest.skip('tf2_msgs is not built')

@@ -96,6 +96,10 @@ def test_a_robot_is_not_faster_than_the_parameter_says() -> None:
     places = [(1.0 + step * 0.1, 0.5 * step) for step in range(20)]
     assert all(drive(Continuity(60.0), *places))
     assert not any(drive(Continuity(1.0), *places, newest=1.0)[1:])
+    continuity = Continuity(60.0)
+    assert all(drive(continuity, *places[:10], newest=1.0))
+    continuity.maximum_speed = 1.0
+    assert not any(drive(continuity, *places[10:], newest=1.0))
 
 
 def test_old_samples_and_no_estimate() -> None:

@@ -115,7 +115,7 @@ def test_two_of_each_from_a_file_and_one_falls_silent(tmp_path: Path) -> None:
 
 
 def test_the_file_of_defaults_is_taken_and_what_is_not_known_is_said(tmp_path: Path) -> None:
-    file = Path(__file__).resolve().parents[2] / 'config' / 'pose_graph.yaml'
+    file = Path(__file__).resolve().parents[2] / 'config' / 'pose_graph_full.yaml'
     arguments = ('--params-file', str(file), '-p', 'wheels.type:=odometry',
                  '-p', 'odom.lever_arm:=[1.0, 0.0]', '-p', 'other_node.gain:=1.0')
     with NodeProcess(tmp_path, arguments) as node, connected(node) as client:
