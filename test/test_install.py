@@ -24,7 +24,8 @@ pytest.importorskip('setuptools')
 
 PACKAGE = 'pose_graph_ros'
 EXECUTABLES = ('pose_graph_node', 'replay')
-SHARED_FILES = ('package.xml', 'config/pose_graph.yaml', 'launch/pose_graph.launch.py')
+SHARED_FILES = ('package.xml', 'config/pose_graph.yaml', 'config/pose_graph_full.yaml',
+                'launch/pose_graph.launch.py')
 TREE = Path(__file__).resolve().parents[1]
 LEFT_OUT = shutil.ignore_patterns(
     '.*', '*.egg-info', '__pycache__', 'build', 'install', 'log', 'demo', 'docs', 'test')
