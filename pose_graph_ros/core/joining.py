@@ -12,6 +12,7 @@ from dataclasses import dataclass, field
 from typing import NamedTuple
 
 import numpy as np
+import numpy.typing as npt
 
 from pose_graph_ros.core import autocorrelation, linearize, se2
 from pose_graph_ros.core.arrays import GrowingArray
@@ -80,6 +81,14 @@ class SourceReport(NamedTuple):
         return self.white and self.errors.significant and self.energy > LEAST_ENERGY
 
 
+class Origin(NamedTuple):
+    """Where a constraint comes from."""
+
+    source: str
+    stamp_ns: int
+    """Of the measurement [ns]; -1 for an edge between poses."""
+
+
 class _Own:
     """The constraints of one source."""
 
@@ -106,6 +115,8 @@ class Joining:
         self._reweighing = reweighing
         self._correlated: dict[str, BiasChain | Shares] = {}
         self._own: dict[str, _Own] = {}
+        self._ties: dict[str, GrowingArray] = {}
+        """Of each source its edges between poses, by their numbers in the graph."""
         self._enlisted: list[tuple[bool, int, str, int]] = []
         self._n_new = 0
         self._shares: dict[int, float] = {}
@@ -177,8 +188,30 @@ class Joining:
             enlist(row, settings.loss, settings.rejection_threshold)
             if stamp_ns >= 0:
                 self._own.setdefault(source, _Own()).rows.append_one((stamp_ns, row))
+            else:
+                ties = self._ties.setdefault(source, GrowingArray((), np.int64))
+                ties.append_one(row)
         for row, share in self._shares.items():
             self._reweighing.share(row, share)
+
+    def origin(self, row: int, *, edge: bool) -> Origin | None:
+        """Return where an edge or an observed node comes from, if it came through here."""
+        for source, own in self._own.items():
+            if isinstance(self._correlated.get(source), BiasChain) is edge:
+                # rows grow in the order in which they came
+                at = _find(own.rows.values[:, 1], row)
+                if at >= 0:
+                    return Origin(source, int(own.rows.values[at, 0]))
+        for source, ties in self._ties.items() if edge else ():
+            if _find(ties.values, row) >= 0:
+                return Origin(source, -1)
+        return None
+
+    def bias_origin(self, row: int) -> Origin:
+        """Return the source of a state of an error, by its row, and when the state begins."""
+        return next(Origin(source, begin_ns) for source, chain in self._correlated.items()
+                    if isinstance(chain, BiasChain)
+                    and (begin_ns := chain.begin_ns(row)) is not None)
 
     def reports(self, graph: Graph) -> dict[str, SourceReport]:
         """Return how well each source fits, by its newest measurements."""
@@ -202,6 +235,12 @@ class Joining:
         return SourceReport(
             len(own.rows), float(np.mean(energy)) / 2.0,
             autocorrelation.estimate(stamps, residuals), source not in self._correlated)
+
+
+def _find(rows: npt.NDArray[np.generic], row: int) -> int:
+    """Return where a number stands among numbers that grow, or -1."""
+    at = int(np.searchsorted(rows, row))
+    return at if at < len(rows) and rows[at] == row else -1
 
 
 def _residuals(graph: Graph, observed: ObservedNodes) -> tuple[FloatArray, FloatArray]:

@@ -214,6 +214,7 @@ def _drive() -> None:
     backend.update()
     backend.optimize()
     backend.estimate()
+    backend.view()
 
 
 # Between two of them the warm-up can be stopped.
