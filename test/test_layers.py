@@ -27,15 +27,16 @@ CORE = (
     # what drives it
     'timeline', 'odometry_stream', 'trajectory', 'consensus', 'alignment', 'tangent_plane',
     'binding', 'hidden_nodes', 'pending', 'reweighing', 'closing', 'autocorrelation',
-    'correlated', 'joining', 'estimate', 'aligning', 'backend', 'prediction', 'io', 'io.g2o',
-    'io.tum', 'helper_process', 'warm_up',
+    'correlated', 'joining', 'springs', 'estimate', 'aligning', 'backend', 'prediction', 'io',
+    'io.g2o', 'io.tum', 'helper_process', 'warm_up',
 )
 CORE_NEEDS = {'numpy', 'scipy', 'numba', 'pyproj'}
 
 # Modules of ros that the offline tools share: they know messages by their fields alone.
 WITHOUT_RCLPY = {
     'bag_writer', 'bags', 'continuity', 'conversions', 'fixes', 'hearing', 'inputs',
-    'parameter_changes', 'parameter_texts', 'parameters', 'reader', 'sources', 'static_frames'}
+    'markers', 'parameter_changes', 'parameter_texts', 'parameters', 'reader', 'rewind',
+    'setting', 'slew', 'sources', 'static_frames'}
 ROS = {'rclpy', 'rosidl_runtime_py', 'ament_index_python', 'launch', 'launch_ros'}
 
 MOST_LINES = 400

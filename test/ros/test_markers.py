@@ -1,0 +1,184 @@
+# Copyright 2026 The pose_graph_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""The markers of the graph: held to rclpy's own serialisation of messages built field by field."""
+
+import re
+import time
+from typing import Any
+
+import pytest
+
+pytest.importorskip('rclpy', reason='ROS 2 is not there: no rclpy')
+
+from geometry_msgs.msg import Point
+from hypothesis import given, settings, strategies as st
+import numpy as np
+from rclpy.serialization import deserialize_message, serialize_message
+from std_msgs.msg import ColorRGBA
+from visualization_msgs.msg import Marker, MarkerArray
+
+from pose_graph_ros.core.springs import GraphView, Lines
+from pose_graph_ros.ros import markers
+from pose_graph_ros.ros.messages import time_message
+
+STAMP = 1_800_000_000_000_000_007
+SIZES = {'boolean': 1, 'uint8': 1, 'int32': 4, 'uint32': 4, 'float': 4, 'double': 8}
+frames = st.text(st.characters(codec='utf-8', exclude_characters='\0'), max_size=12)
+counts = st.integers(0, 4)
+
+
+def random_view(counts: tuple[int, int, int, int], seed: int = 0) -> GraphView:
+    """Return a view with so many nodes and lines of each kind."""
+    rng = np.random.default_rng(seed)
+    lines = [Lines(rng.normal(0.0, 100.0, (n, 2, 2)), rng.uniform(0.0, 5.0, n))
+             for n in counts[1:]]
+    return GraphView(rng.normal(0.0, 100.0, (counts[0], 2)), *lines)
+
+
+def point(position: np.ndarray) -> Point:
+    return Point(x=float(position[0]), y=float(position[1]))
+
+
+def colour(sigmas: float) -> ColorRGBA:
+    r, g, b, a = markers.colours(np.array([sigmas]))[0].tolist()
+    return ColorRGBA(r=r, g=g, b=b, a=a)
+
+
+def marker(frame: str) -> Marker:
+    made = Marker()
+    for header in (made.header, made.texture.header):
+        header.stamp, header.frame_id = time_message(STAMP), frame
+    made.pose.orientation.w = 1.0
+    made.color = ColorRGBA(**dict(zip(
+        'rgba', np.float32(markers.NODE_COLOUR).tolist(), strict=True)))
+    return made
+
+
+def message(view: GraphView, frame: str) -> MarkerArray:
+    """Build the message field by field."""
+    first = marker(frame)
+    first.action = Marker.DELETEALL
+    array = [first]
+    nodes, odometry, closures, errors, observed = (marker(frame) for _ in range(5))
+    for each, namespace, number in (
+            (nodes, 'hidden_nodes', 0), (odometry, 'odometry', 1), (closures, 'loop_closures', 2),
+            (errors, 'observed_errors', 3), (observed, 'observed_nodes', 4)):
+        each.ns, each.id, each.action = namespace, number, Marker.ADD
+    nodes.type, observed.type = Marker.POINTS, Marker.POINTS
+    nodes.scale.x = nodes.scale.y = markers.NODE_SIZE
+    observed.scale.x = observed.scale.y = markers.OBSERVED_SIZE
+    nodes.points = [point(position) for position in view.nodes]
+    for line, lines, width in (
+            (odometry, view.odometry, markers.EDGE_WIDTH),
+            (closures, view.loop_closures, markers.CLOSURE_WIDTH),
+            (errors, view.observed, markers.EDGE_WIDTH)):
+        line.type = Marker.LINE_LIST
+        line.scale.x = line.scale.y = width
+        for ends, sigmas in zip(lines.ends, lines.sigmas, strict=True):
+            line.points += [point(ends[0]), point(ends[1])]
+            line.colors += [colour(sigmas), colour(sigmas)]
+    for ends, sigmas in zip(view.observed.ends, view.observed.sigmas, strict=True):
+        observed.points.append(point(ends[1]))
+        observed.colors.append(colour(sigmas))
+    array += [each for each in (nodes, odometry, closures, errors, observed)
+              if len(each.points) > 0]
+    return MarkerArray(markers=array)
+
+
+def gaps(value: Any, kind: str, at: int, found: list[int]) -> int:
+    """Walk over a value of a message as the CDR rules say; note gaps, return where it ends."""
+    def number(size: int) -> None:
+        nonlocal at
+        while at % size != 0:
+            found.append(at)
+            at += 1
+        at += size
+
+    sequence = re.fullmatch(r'sequence<(.+)>', kind)
+    if sequence is not None:
+        number(4)
+        for item in value:
+            at = gaps(item, sequence[1], at, found)
+    elif kind == 'string':
+        number(4)
+        at += len(value.encode()) + 1
+    elif kind in SIZES:
+        number(SIZES[kind])
+    else:
+        for name, field in value.get_fields_and_field_types().items():
+            at = gaps(getattr(value, name), field, at, found)
+    return at
+
+
+def blank(data: bytes, offsets: list[int]) -> bytes:
+    """Return data with zeros in the gaps."""
+    blanked = bytearray(data)
+    for at in offsets:
+        blanked[at] = 0
+    return bytes(blanked)
+
+
+def assert_same(view: GraphView, frame: str) -> None:
+    ours, theirs = markers.markers_cdr(view, STAMP, frame), message(view, frame)
+    assert deserialize_message(ours, MarkerArray) == theirs
+    serialized = bytes(serialize_message(theirs))
+    holes: list[int] = []
+    assert gaps(theirs, 'visualization_msgs/MarkerArray', 0, holes) == len(ours) - 4
+    assert len(serialized) - len(ours) in range(4), 'at most the end is padded'
+    # the middleware leaves what was in memory in the gaps before aligned numbers
+    assert ours[:4] == serialized[:4]
+    assert ours[4:] == blank(ours[4:], holes)
+    assert ours[4:] == blank(serialized[4:len(ours)], holes)
+
+
+@pytest.mark.parametrize('frame', ['', 'm', 'ma', 'map', 'map1', 'world', 'robot1', 'robot/1',
+                                   'robot/map', 'kürzel'])
+@pytest.mark.parametrize('counts', [
+    (0, 0, 0, 0), (1, 0, 0, 0), (2, 1, 0, 0), (3, 2, 1, 0), (3, 2, 0, 1), (9, 8, 3, 5)])
+def test_markers_are_byte_for_byte_what_rclpy_makes(
+    frame: str, counts: tuple[int, int, int, int],
+) -> None:
+    assert_same(random_view(counts), frame)
+
+
+@settings(deadline=None, derandomize=True)
+@given(frames, st.tuples(counts, counts, counts, counts), st.integers(0, 100))
+def test_the_same_for_any_frame_and_graph(
+    frame: str, counts: tuple[int, int, int, int], seed: int,
+) -> None:
+    assert_same(random_view(counts, seed), frame)
+
+
+def test_springs_go_from_green_over_yellow_to_red() -> None:
+    sigmas = np.linspace(0.0, 6.0, 601)
+    red, green, _, alpha = markers.colours(sigmas).T
+    assert np.all(alpha == 1.0)
+    assert np.ptp(markers.colours(sigmas[sigmas <= 1.0]), axis=0).max() == 0.0
+    assert np.ptp(markers.colours(sigmas[sigmas >= 3.0]), axis=0).max() == 0.0
+    assert green[0] - red[0] > 0.4
+    assert red[-1] - green[-1] > 0.4
+    assert min(red[200], green[200]) > 0.7, 'yellow at 2 sigmas'
+    assert np.abs(np.diff(markers.colours(sigmas), axis=0)).max() < 0.02, 'smooth'
+    assert np.all(np.diff(red[:201]) >= 0.0)
+    assert np.all(np.diff(green[200:]) <= 0.0)
+
+
+def test_the_namespaces_and_ids_stay_whatever_there_is_to_draw() -> None:
+    for counts in ((1, 0, 0, 1), (3, 2, 1, 0), (9, 8, 3, 5)):
+        array = deserialize_message(
+            markers.markers_cdr(random_view(counts), STAMP, 'map'), MarkerArray).markers
+        assert array[0].action == Marker.DELETEALL
+        for each in array[1:]:
+            assert each.action == Marker.ADD
+            assert markers.NAMESPACES[each.id] == each.ns
+            assert len(each.points) > 0
+            assert len(each.colors) in {0, len(each.points)}
+
+
+def test_many_markers_are_quick() -> None:
+    view = random_view((100_000, 100_000, 1000, 20_000))
+    markers.markers_cdr(view, STAMP, 'map')
+    start = time.process_time()
+    markers.markers_cdr(view, STAMP, 'map')
+    # fifty times what it takes
+    assert time.process_time() - start < 1.0
