@@ -2,7 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """What the node says of itself in /diagnostics; no rclpy but messages."""
 
-from collections.abc import Mapping
+from collections.abc import Iterator
 import math
 import os
 from pathlib import Path
@@ -12,8 +12,8 @@ from typing import TYPE_CHECKING
 from diagnostic_msgs.msg import DiagnosticStatus
 
 from pose_graph_ros.core.batch import Status
-from pose_graph_ros.core.estimate import AlignmentState, Estimate
-from pose_graph_ros.core.joining import LEAST_ENERGY, SourceReport
+from pose_graph_ros.core.estimate import AlignmentState
+from pose_graph_ros.core.joining import LEAST_ENERGY
 
 if TYPE_CHECKING:
     from pose_graph_ros.ros.session import Session
@@ -26,14 +26,14 @@ def values(session: 'Session') -> dict[str, object]:
 
 def _state(session: 'Session') -> dict[str, object]:
     """Return the counts by source and reason, and the state of graph and solver."""
-    worker, received, refused = session.worker, session.received, session.refused
+    worker, received, refused = session.worker, session.intake.received, session.intake.refused
     status, estimate = worker.status, worker.estimate
     found: dict[str, object] = {
         'received': sum(received.values()),
         'processed': status.processed + sum(refused.values()),
         'pending': status.pending, 'quarantined': status.quarantined,
         'updates': status.updates, 'prepared': int(worker.prepared),
-        'active': int(session.active), 'paused': int(session.paused),
+        'active': int(session.active), 'paused': int(session.intake.paused),
         'resets': session.n_resets,
         'solve_mean_ms': f'{1e3 * status.solve_mean:.3f}',
         'solve_max_ms': f'{1e3 * status.solve_max:.3f}',
@@ -67,7 +67,8 @@ def memory() -> int:
 
 def _inputs(session: 'Session') -> dict[str, object]:
     """Return how often each source is heard, its silence, where antennas are, and the datum."""
-    reader, hearing, now = session.reader, session.hearing, time.monotonic()
+    reader, hearing = session.intake.reader, session.intake.hearing
+    now = time.monotonic()
     found: dict[str, object] = {}
     for name in reader.sources:
         silence, rate = hearing.silence(name, now), hearing.rate(name)
@@ -102,41 +103,42 @@ def _fits(session: 'Session') -> dict[str, object]:
 
 def health(session: 'Session') -> tuple[bytes, str]:
     """Return the level of the diagnostics and a sentence that says what to do."""
+    return next(_concerns(session))
+
+
+def _concerns(session: 'Session') -> Iterator[tuple[bytes, str]]:
+    """Yield what is to be said of the node, the most urgent first."""
+    error, warn, good = DiagnosticStatus.ERROR, DiagnosticStatus.WARN, DiagnosticStatus.OK
     worker = session.worker
     estimate, report = worker.estimate, worker.status.report
     if not worker.alive:
-        return DiagnosticStatus.ERROR, 'The worker has ended: start the node again.'
+        yield error, 'The worker has ended: start the node again.'
     if report is not None and report.status is Status.FAILED:
-        return (DiagnosticStatus.ERROR, 'The newest measurements made the solver fail and were '
-                'set aside; the last good estimate stays. See the log for the reason.')
+        yield error, ('The newest measurements made the solver fail and were set aside; the last '
+                      'good estimate stays. See the log for the reason.')
     if not session.active:
-        return DiagnosticStatus.OK, 'Inactive: activate the node (ros2 lifecycle set).'
-    if session.paused:
-        return DiagnosticStatus.WARN, 'Paused: call ~/pause with false to go on.'
+        yield good, 'Inactive: activate the node (ros2 lifecycle set).'
+    if session.intake.paused:
+        yield warn, 'Paused: call ~/pause with false to go on.'
+    if not worker.prepared:
+        yield warn, 'Compiling, as at every first start: what comes in waits.'
     if estimate is None:
-        return DiagnosticStatus.WARN, (
-            f'No odometry yet: check {" or ".join(session.odometry_topics)}.'
-            if worker.prepared else 'Compiling, as at every first start: what comes in waits.')
+        yield warn, f'No odometry yet: check {" or ".join(session.odometry_topics)}.'
+        return
     transforms, silent = session.out.transforms, session.silent
     if transforms is not None and transforms.other != '':
-        return DiagnosticStatus.WARN, transforms.other[0].upper() + transforms.other[1:] + '.'
+        yield warn, transforms.other[0].upper() + transforms.other[1:] + '.'
     if len(silent) > 0:
-        verb = 'is' if len(silent) == 1 else 'are'
-        return (DiagnosticStatus.WARN,
-                f'{" and ".join(silent)} {verb} silent, others go on: check the drivers.')
-    return _fit(estimate, worker.status.sources)
-
-
-def _fit(estimate: Estimate, sources: Mapping[str, SourceReport]) -> tuple[bytes, str]:
+        yield warn, (f'{" and ".join(silent)} {"is" if len(silent) == 1 else "are"} silent, '
+                     'others go on: check the drivers.')
     if estimate.alignment is AlignmentState.UNALIGNED:
-        return (DiagnosticStatus.WARN, 'Unaligned: the angle between odometry and map is not '
-                'known yet. Drive some metres with a fix.')
+        yield warn, ('Unaligned: the angle between odometry and map is not known yet. Drive some '
+                     'metres with a fix.')
     if estimate.alignment is AlignmentState.LOCAL:
-        return (DiagnosticStatus.OK, 'Running; nothing was measured in the map, which begins '
-                'where odometry does.')
-    for name, report in sources.items():
-        if report.wrongly_white:
-            return (DiagnosticStatus.WARN, f'The errors of {name} live on but are treated as '
-                    f'white, so the covariances are too small: set {name}.correlation_time to '
-                    f'about {report.errors.tau:.2g} s.')
-    return DiagnosticStatus.OK, 'Running.'
+        yield good, 'Running; nothing was measured in the map, which begins where odometry does.'
+    for name, fit in worker.status.sources.items():
+        if fit.wrongly_white:
+            yield warn, (f'The errors of {name} live on but are treated as white, so the '
+                         f'covariances are too small: set {name}.correlation_time to about '
+                         f'{fit.errors.tau:.2g} s.')
+    yield good, 'Running.'

@@ -11,9 +11,9 @@ from rclpy.lifecycle import LifecycleNode, LifecycleState, TransitionCallbackRet
 from rclpy.parameter import Parameter as RosParameter
 
 from pose_graph_ros.core.exceptions import ConfigError
+from pose_graph_ros.ros.parameter_changes import changed, require_together
 from pose_graph_ros.ros.parameters import (
     all_parameters,
-    changed,
     Change,
     checked,
     listed_sources,
@@ -120,7 +120,9 @@ class PoseGraphNode(LifecycleNode):
         return self._session
 
     def _configure(self) -> None:
-        self._session = Session(self, checked(self._given))
+        values = checked(self._given)
+        require_together(values)
+        self._session = Session(self, values)
         self._offer = Services(self, self._session)
 
     def close(self) -> None:

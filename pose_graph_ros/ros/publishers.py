@@ -24,10 +24,9 @@ from std_msgs.msg import Header
 from visualization_msgs.msg import Marker, MarkerArray
 
 from pose_graph_ros.core.estimate import AlignmentState, Estimate
-from pose_graph_ros.core.exceptions import ConfigError
 from pose_graph_ros.core.measurements import OdometrySample
 from pose_graph_ros.core.prediction import predict
-from pose_graph_ros.core.view import GraphView
+from pose_graph_ros.core.springs import GraphView
 from pose_graph_ros.ros import messages
 from pose_graph_ros.ros.conversions import frame
 from pose_graph_ros.ros.fixes import Datum
@@ -54,11 +53,6 @@ class Publishers:
     on_other : callable
         Called with a sentence when somebody else publishes the same transform.
 
-    Raises
-    ------
-    ConfigError
-        If the names of the frames do not go together.
-
     """
 
     def __init__(
@@ -69,10 +63,6 @@ class Publishers:
         self.map_frame = frame(values['map_frame'])
         self.odom_frame = frame(values['odom_frame'])
         self.base_frame = frame(values['base_link_frame'])
-        frames = (self.map_frame, self.odom_frame, self.base_frame)
-        if '' in frames or len(set(frames)) < len(frames):
-            raise ConfigError('map_frame, odom_frame and base_link_frame: expected three '
-                              f'different names, got {", ".join(map(repr, frames))}')
         self._pose = self._publisher(PoseWithCovarianceStamped, 'pose', OUTPUT_QOS)
         self._odometry = self._publisher(Odometry, 'odometry/filtered', OUTPUT_QOS)
         self._fix = self._publisher(NavSatFix, 'gps/filtered', OUTPUT_QOS)

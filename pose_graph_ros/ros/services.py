@@ -2,10 +2,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """The services of the node: each answers what was done, or why not."""
 
-from collections.abc import Callable
 from concurrent.futures import CancelledError, Future as DoneFuture
 import logging
-from pathlib import Path
 from typing import Any
 
 from rclpy.callback_groups import MutuallyExclusiveCallbackGroup
@@ -14,9 +12,7 @@ from rclpy.service import Service
 from rclpy.task import Future
 from std_srvs.srv import SetBool, Trigger
 
-from pose_graph_ros.core.backend import PoseGraphBackend
 from pose_graph_ros.core.batch import Status
-from pose_graph_ros.core.exceptions import PoseGraphError
 from pose_graph_ros.ros.session import Session
 
 logger = logging.getLogger(__name__)
@@ -38,9 +34,7 @@ class Services:
         self._offered: list[Service] = []
         for name, kind, answer in (
                 ('optimize', Trigger, self._optimize), ('reset', Trigger, self._reset),
-                ('pause', SetBool, self._pause), ('set_datum', Trigger, self._set_datum),
-                ('save_graph', Trigger, self._save_graph),
-                ):
+                ('pause', SetBool, self._pause), ('set_datum', Trigger, self._set_datum)):
             # each in a group of its own: one that awaits holds up all others in its group
             self._offered.append(node.create_service(
                 kind, f'~/{name}', answer, callback_group=MutuallyExclusiveCallbackGroup()))
@@ -81,7 +75,7 @@ class Services:
         estimate = self._session.worker.estimate
         self._session.begin_anew('a call of ~/reset')
         response.success = True
-        plane = self._session.reader.datum.plane
+        plane = self._session.intake.reader.datum.plane
         response.message = (
             f'{0 if estimate is None else estimate.n_hidden} hidden nodes are gone; '
             + ('the next good fix will be the datum' if plane is None else
@@ -90,10 +84,10 @@ class Services:
 
     def _pause(self, request: SetBool.Request, response: SetBool.Response) -> SetBool.Response:
         session, response.success = self._session, True
-        if session.paused == request.data:
+        if session.intake.paused == request.data:
             response.message = 'paused already' if request.data else 'was not paused'
             return response
-        session.paused = request.data
+        session.intake.paused = request.data
         response.message = (
             'paused: what comes is counted and not used; the outputs go on with odometry'
             if request.data else 'going on')
@@ -102,39 +96,16 @@ class Services:
     def _set_datum(self, _: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
         """Make the next good fix the datum, unless the graph refers to the present one."""
         session = self._session
-        status, datum = session.worker.status, session.reader.datum
-        used = sum(status.counts[name, 'accepted'] for name in session.reader.fixes)
+        status, datum = session.worker.status, session.intake.reader.datum
+        used = sum(status.counts[name, 'accepted'] for name in session.intake.reader.fixes)
         if datum.plane is not None and used > 0:
             response.message = (f'refused: {used} fixes in the graph refer to the datum '
                                 f'[{datum.plane.latitude:.9f}, {datum.plane.longitude:.9f}]')
         elif datum.plane is not None and (
-                status.pending > 0 or status.processed < session.posted):
+                status.pending > 0 or status.processed < session.intake.posted):
             response.message = ('refused: measurements that wait for odometry may refer to the '
                                 'present datum')
         else:
             datum.renew()
             response.success, response.message = True, 'the next good fix will be the datum'
         return response
-
-    async def _save_graph(
-        self, _: Trigger.Request, response: Trigger.Response,
-    ) -> Trigger.Response:
-        session, name = self._session, self._session.values['graph_file']
-        if name == '':
-            response.message = 'set the parameter graph_file first, such as to ~/map.g2o'
-            return response
-        plane = session.reader.datum.plane
-
-        def save(backend: PoseGraphBackend) -> str:
-            return write_graph(Path(name).expanduser(), backend.saved(), plane)
-
-        try:
-            response.message = await self._done(session.worker.call(save))
-        except CancelledError:
-            response.message = 'the graph was given up meanwhile'
-        except PoseGraphError as error:
-            response.message = f'nothing was saved: {error}'
-        else:
-            response.success = True
-        return response
-

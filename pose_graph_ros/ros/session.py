@@ -7,7 +7,6 @@ Callbacks convert, post and return. The newest pose goes out with every odometry
 newest estimate carried on by that odometry; path and markers follow the updates.
 """
 
-from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import Future
 from functools import partial
@@ -33,16 +32,15 @@ from sensor_msgs.msg import Imu, NavSatFix
 
 from pose_graph_ros.core.backend import PoseGraphBackend
 from pose_graph_ros.core.estimate import Estimate
-from pose_graph_ros.core.measurements import Answer, OdometrySample, rejected
+from pose_graph_ros.core.measurements import OdometrySample
 from pose_graph_ros.ros import diagnostics
 from pose_graph_ros.ros.continuity import Continuity
-from pose_graph_ros.ros.conversions import frame, Message, stamp_ns
-from pose_graph_ros.ros.hearing import Hearing
+from pose_graph_ros.ros.conversions import frame, Message
+from pose_graph_ros.ros.intake import Intake
 from pose_graph_ros.ros.publishers import Publishers
-from pose_graph_ros.ros.reader import MessageReader
-from pose_graph_ros.ros.rewind import Heard, Rewind
+from pose_graph_ros.ros.rewind import Heard
 from pose_graph_ros.ros.setting import PoseSetting
-from pose_graph_ros.ros.sources import backend_config, Kind, NANOSECONDS, Source
+from pose_graph_ros.ros.sources import backend_config, Kind, Source
 from pose_graph_ros.ros.transforms import TFMessage
 from pose_graph_ros.ros.worker import Worker
 
@@ -91,40 +89,30 @@ class Session:
     def __init__(self, node: Node, values: Mapping[str, Any]) -> None:
         self.node, self.values = node, dict(values)
         self._config = backend_config(values)
-        self.reader = MessageReader(values)
+        self.intake = Intake(values, node.get_logger().warning)
         self.out = Publishers(node, values, node.get_logger().warning)
         self._setting = PoseSetting(
             self.out.map_frame, self.out.odom_frame, self.out.base_frame)
-        self.active = self.paused = False
+        self.active = False
         self.n_resets, self.reset_reason = 0, ''
-        self._said: set[tuple[str, str]] = set()
         self._subscriptions: list[Subscription] = []
         self._timers: dict[str, Timer] = {}
         self._jump_handle: JumpHandle | None = None
         # steady: a clock that is set, or a bag that starts again, must not stall a timer
         self._steady = Clock(clock_type=ClockType.STEADY_TIME)
-        self._rewind = Rewind(round(values['clock_jump_threshold'] * NANOSECONDS))
         self._clear()
         self.worker = self._begin(PoseGraphBackend(self._config), self._warm_up)
         self._set_timer('diagnostics', values['diagnostics_period'], self.publish_diagnostics)
 
     def _clear(self) -> None:
-        """Forget all that was heard."""
-        sources = self.reader.sources.values()
         self._continuity = {
             name: Continuity(source.maximum_speed)
             for name, source in self._config.odometry.items()}
-        self.hearing = Hearing(
-            [source.name for source in sources if source.kind is Kind.LOOP_CLOSURE])
-        self.received: Counter[str] = Counter()
-        self.refused: Counter[tuple[str, str]] = Counter()
-        self.posted = 0
         self.silent: list[str] = []
         """Sources that have ended while others go on."""
         self.strained: Sequence[object] = []
         """The constraints with the largest energies."""
         self._strain_at = -math.inf
-        self._heard_at, self._closed = time.monotonic(), True
 
     def _begin(
         self, backend: PoseGraphBackend,
@@ -152,10 +140,10 @@ class Session:
 
     def activate(self) -> None:
         """Begin to listen and to publish, or go on."""
-        sources = self.reader.sources.values()
+        sources = self.intake.reader.sources.values()
         # first: what it tells has to be there before the first fix, if that can be
         if TFMessage is not None and any(source.kind is Kind.FIX for source in sources):
-            self._subscribe('/tf_static', TFMessage, self.reader.frames.take, STATIC_QOS)
+            self._subscribe('/tf_static', TFMessage, self.intake.reader.frames.take, STATIC_QOS)
         for topic in ('initialpose', 'set_pose'):
             self._subscribe(topic, PoseWithCovarianceStamped, self._on_set_pose, SETTING_QOS)
         for source in sources:
@@ -196,12 +184,12 @@ class Session:
         """Take parameters that can be changed now."""
         before, self.values = self.values, dict(values)
         self._config = backend_config(values)
-        self.reader.configure(values)
+        self.intake.configure(values)
         self.out.configure(values)
         for name, source in self._config.odometry.items():
             self._continuity[name].maximum_speed = source.maximum_speed
-        self.worker.call(lambda backend, config=self._config: backend.configure(config))
-        self._rewind.threshold_ns = round(values['clock_jump_threshold'] * NANOSECONDS)
+        config = self._config
+        self.worker.call(lambda backend: backend.configure(config))
         if values['diagnostics_period'] != before['diagnostics_period']:
             self._set_timer('diagnostics', values['diagnostics_period'], self.publish_diagnostics)
         if not self.active:
@@ -230,39 +218,23 @@ class Session:
 
     def _on_message(self, source: Source, message: Message) -> None:
         """Take a message; never raises, whatever it holds."""
-        self.received[source.name] += 1
-        self.hearing.hear(source.name, time.monotonic())
-        lead = '' if self.worker.estimate is None else self.worker.estimate.lead
-        taken = self._rewind.take(Heard(
-            source.name, message, stamp_ns(message, source.time_offset_ns),
-            source.kind is Kind.ODOMETRY and lead in ('', source.name)))
-        if taken.is_old:
-            self._refuse(source.name, rejected('before_rewind', 'it is of the time before that'))
+        estimate = self.worker.estimate
+        taken = self.intake.hear(source, message, '' if estimate is None else estimate.lead)
         if taken.jump_ns > 0:
             self.begin_anew(f'the stamps of {source.name} jumped back by '
-                            f'{taken.jump_ns * 1e-9:.3f} s')
-            self.received.update(heard.source for heard in taken.released)
-        for heard in taken.released:
-            self._use(heard.source, heard.message)
+                            f'{taken.jump_ns * 1e-9:.3f} s', taken.released)
+        else:
+            for heard in taken.released:
+                self._use(heard)
 
-    def _use(self, name: str, message: Message) -> None:
-        """Convert a message and post it."""
-        try:
-            measurement = self.reader.read(name, message)
-        except Exception as error:
-            measurement = rejected('malformed', f'{type(error).__name__}: {error}')
-        if not isinstance(measurement, Answer):
-            if self.paused:
-                self._refuse(name, rejected('paused', 'call ~/pause with false to go on'))
-            elif not self.worker.post(name, measurement):
-                self._refuse(name, rejected('inbox_full', 'the solver does not keep up'))
-            else:
-                self.posted += 1
-                self._heard_at, self._closed = time.monotonic(), False
-            if isinstance(measurement, OdometrySample):
-                self._carry(name, measurement, message)
+    def _use(self, heard: Heard) -> None:
+        """Read a message and hand it to the engine; publish what follows from it at once."""
+        measurement = self.intake.read(heard)
+        if measurement is None:
             return
-        self._refuse(name, measurement)
+        self.intake.post(heard.source, measurement, self.worker.post)
+        if isinstance(measurement, OdometrySample):
+            self._carry(heard.source, measurement, heard.message)
 
     def _carry(self, name: str, sample: OdometrySample, message: Odometry) -> None:
         """Publish where the robot is by the newest estimate, carried on by odometry."""
@@ -272,15 +244,25 @@ class Session:
             return
         self._check_frames(message)
         if carries:
-            self.out.publish_pose(estimate, message, sample, self.reader.datum)
-        elif not self.paused:
+            self.out.publish_pose(estimate, message, sample, self.intake.reader.datum)
+        elif not self.intake.paused:
             self.worker.request_update()  # with this sample
+
+    def _check_frames(self, odometry: Odometry) -> None:
+        """Say once if the odometry's frames are not those that the outputs are given in."""
+        for name, parameter, expected in (
+                (odometry.header.frame_id, 'odom_frame', self.out.odom_frame),
+                (odometry.child_frame_id, 'base_link_frame', self.out.base_frame)):
+            if frame(name) not in ('', expected):
+                self.intake.say_once(parameter, name, (
+                    f'the odometry has the frame {frame(name)!r}, but the parameter {parameter} '
+                    f'is {expected!r}: set it, or the transform does not fit the tree'))
 
     def _on_set_pose(self, message: Message) -> None:
         """Take where the robot is from somebody who knows."""
         answer = self._setting.take(message)
         if answer is not None:
-            self._refuse('set_pose', answer)
+            self.intake.refuse('set_pose', answer)
         self._set_pose()
 
     def _set_pose(self) -> None:
@@ -294,27 +276,6 @@ class Session:
         self.out.jump()
         self.worker.call(lambda backend: backend.set_pose(pose, 'set_pose'))
         self.worker.request_update()
-
-    def _refuse(self, source: str, answer: Answer) -> None:
-        """Count what cannot be used, and say so once for each source and reason."""
-        key = (source, answer.reason)
-        self.refused[key] += 1
-        if key not in self._said:
-            self._said.add(key)
-            self.node.get_logger().warning(
-                f'{source}: {answer.reason}: {answer.detail} (said once, counted in diagnostics)')
-
-    def _check_frames(self, odometry: Odometry) -> None:
-        """Say once if the odometry's frames are not those that the outputs are given in."""
-        for name, parameter, expected in (
-                (odometry.header.frame_id, 'odom_frame', self.out.odom_frame),
-                (odometry.child_frame_id, 'base_link_frame', self.out.base_frame)):
-            key = (parameter, name)
-            if frame(name) not in ('', expected) and key not in self._said:
-                self._said.add(key)
-                self.node.get_logger().warning(
-                    f'the odometry has the frame {frame(name)!r}, but the parameter {parameter} '
-                    f'is {expected!r}: set it, or the transform does not fit the tree')
 
     # ---- time
 
@@ -330,17 +291,16 @@ class Session:
 
     def _on_clock_jump(self, jump: TimeJump) -> None:
         back_ns = -jump.delta.nanoseconds
-        self._rewind.clock_jumped(back_ns)
-        self.begin_anew(f'the clock jumped back by {back_ns * 1e-9:.3f} s')
-        for heard in self._rewind.release():
-            self.received[heard.source] += 1
-            self._use(heard.source, heard.message)
+        self.intake.rewind.clock_jumped(back_ns)
+        self.begin_anew(f'the clock jumped back by {back_ns * 1e-9:.3f} s',
+                        self.intake.rewind.release())
 
-    def begin_anew(self, reason: str) -> None:
-        """Begin a new graph; only a datum that was given, and what /tf_static told, stay."""
+    def begin_anew(self, reason: str, messages: Sequence[Heard] = ()) -> None:
+        """Begin a new graph; a datum that was given, and what /tf_static told, stay."""
         self.replace(PoseGraphBackend(self._config), reason)
-        self.reader = self.reader.renewed(self.values)
-        self._setting.forget()
+        for heard in messages:
+            self.intake.received[heard.source] += 1
+            self._use(heard)
 
     def replace(self, backend: PoseGraphBackend, reason: str) -> None:
         """Go on with another graph."""
@@ -348,6 +308,8 @@ class Session:
         prepare = None if self.worker.prepared else self._warm_up
         self.worker.stop(0.0)  # a solve that is under way ends in vain
         self.out.begin_anew()
+        self.intake.begin_anew(self.values)
+        self._setting.forget()
         self._clear()
         self.n_resets, self.reset_reason = self.n_resets + 1, reason
         self.worker = self._begin(backend, prepare)
@@ -357,14 +319,14 @@ class Session:
     def _on_update_timer(self) -> None:
         """Ask for an update with what has come in."""
         self._set_pose()
-        if not self._closed:
+        if self.intake.goes_on:
             self.worker.request_update()
 
     def _on_silence_timer(self) -> None:
         """Ask for the full optimisation that ends a stream, once, when nothing usable comes."""
-        silence = time.monotonic() - self._heard_at
-        if not self._closed and 0.0 < self.values['closing_silence'] < silence:
-            self._closed = True
+        silence = time.monotonic() - self.intake.heard_at
+        if self.intake.goes_on and 0.0 < self.values['closing_silence'] < silence:
+            self.intake.goes_on = False
             self.worker.request_closing()
 
     def _on_views_timer(self) -> None:
@@ -398,12 +360,14 @@ class Session:
     def odometry_topics(self) -> list[str]:
         """Where odometry is expected."""
         return [self.node.resolve_topic_name(source.topic)
-                for source in self.reader.sources.values() if source.kind is Kind.ODOMETRY]
+                for source in self.intake.reader.sources.values()
+                if source.kind is Kind.ODOMETRY]
 
     def publish_diagnostics(self) -> None:
         """Publish the state of the node."""
         now = time.monotonic()
-        before, self.silent = self.silent, self.hearing.silent(now) if self.active else []
+        before, self.silent = self.silent, (
+            self.intake.hearing.silent(now) if self.active else [])
         for name in sorted(set(self.silent) - set(before)):
             self.node.get_logger().warning(f'{name} is silent, other sources go on')
         if self.out.transforms is not None and self.active and self.values['publish_tf']:

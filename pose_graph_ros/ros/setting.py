@@ -7,7 +7,7 @@ import numpy as np
 from pose_graph_ros.core import covariance, se2
 from pose_graph_ros.core.estimate import Estimate
 from pose_graph_ros.core.measurements import Answer, GlobalPose, rejected, value_defect
-from pose_graph_ros.ros.conversions import frame, Message, planar_pose, PLANAR, stamp_ns
+from pose_graph_ros.ros.conversions import frame, Message, PLANAR, planar_pose, stamp_ns
 
 # Taken where no covariance is given: what RViz says [m, m, rad].
 DEFAULT_SIGMA = (0.5, 0.5, 0.26)

@@ -119,7 +119,7 @@ def test_what_came_before_the_jump_of_the_clock_was_told_is_kept_if_it_is_new() 
 
 def test_a_doubt_without_an_end_holds_nothing_back_for_ever() -> None:
     rewind = Rewind(SECOND)
-    messages = lap(100.0, 5.0) + [odometry(50.0)] + [fix(105.0 + step) for step in range(500)]
+    messages = [*lap(100.0, 5.0), odometry(50.0), *(fix(105.0 + step) for step in range(500))]
     released, jumps = taken(rewind, messages)
     assert jumps == []
     assert len(released) == len(messages)

@@ -16,11 +16,11 @@ poses = st.tuples(st.floats(-500.0, 500.0), st.floats(-500.0, 500.0), st.floats(
 SECOND = 1_000_000_000
 
 
-@given(poses, poses, poses, poses, st.floats(0.01, 2.0), st.floats(0.01, 2.0))
+@given(st.tuples(poses, poses, poses, poses), st.floats(0.01, 2.0), st.floats(0.01, 2.0))
 def test_the_robot_is_moved_no_faster_than_asked(
-    before: np.ndarray, after: np.ndarray, then: np.ndarray, now: np.ndarray, linear: float,
-    angular: float,
+    some: tuple[np.ndarray, ...], linear: float, angular: float,
 ) -> None:
+    before, after, then, now = some
     slew = Slew()
     slew.limited(SECOND, before, then, linear, angular)
     shown = se2.compose(before, now)
