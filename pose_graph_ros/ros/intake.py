@@ -19,6 +19,9 @@ from pose_graph_ros.ros.reader import MessageReader
 from pose_graph_ros.ros.rewind import Heard, Rewind, Taken
 from pose_graph_ros.ros.sources import Kind, NANOSECONDS, Source
 
+# So long a message is held back while nothing else comes that would tell what it is [s].
+LONGEST_DOUBT = 1.0
+
 
 class Intake:
     """
@@ -43,6 +46,7 @@ class Intake:
         self.rewind = Rewind(_threshold_ns(values))
         self._say = say
         self._said: set[tuple[str, str]] = set()
+        self._in_doubt_at = 0.0
         self.paused = False
         """Whether everything is refused."""
         self._clear()
@@ -90,10 +94,16 @@ class Intake:
         taken = self.rewind.take(Heard(
             name, message, stamp_ns(message),
             source.kind is Kind.ODOMETRY and lead in ('', name)))
+        self._in_doubt_at = time.monotonic()
         if taken.is_old:
             self.refuse(name, rejected(
                 'before_clock_jump', 'a message of the time before the clock was set back'))
         return taken
+
+    def overdue(self) -> list[Heard]:
+        """Return what was held back long enough, as nothing has come to end the doubt."""
+        late = time.monotonic() - self._in_doubt_at > LONGEST_DOUBT
+        return self.rewind.release() if late else []
 
     def read(self, heard: Heard) -> OdometrySample | Measurement | None:
         """Read a message; None if it cannot be used."""

@@ -324,6 +324,8 @@ class Session:
 
     def _on_silence_timer(self) -> None:
         """Ask for the full optimisation that ends a stream, once, when nothing usable comes."""
+        for heard in self.intake.overdue():
+            self._use(heard)
         silence = time.monotonic() - self.intake.heard_at
         if self.intake.goes_on and 0.0 < self.values['closing_silence'] < silence:
             self.intake.goes_on = False

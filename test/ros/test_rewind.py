@@ -79,7 +79,7 @@ def test_many_of_the_past_that_do_not_go_on_are_no_new_time() -> None:
 
 def test_a_stamp_of_the_future_does_not_make_the_present_a_past() -> None:
     rewind = Rewind(SECOND)
-    messages = lap(100.0, 5.0) + [odometry(5000.0)] + lap(105.0, 5.0)
+    messages = [*lap(100.0, 5.0), odometry(5000.0), *lap(105.0, 5.0)]
     released, jumps = taken(rewind, messages)
     assert released == messages
     assert jumps == []
