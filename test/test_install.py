@@ -24,9 +24,11 @@ pytest.importorskip('setuptools')
 
 PACKAGE = 'pose_graph_ros'
 EXECUTABLES = ('pose_graph_node', 'replay')
-SHARED_FILES = ('package.xml', 'config/pose_graph.yaml', 'config/pose_graph_full.yaml',
-                'launch/pose_graph.launch.py')
 TREE = Path(__file__).resolve().parents[1]
+# whoever adds a file to one of the folders wants it to be installed
+SHARED_FILES = ('package.xml', *(
+    str(path.relative_to(TREE)) for folder in ('config', 'launch')
+    for path in sorted((TREE / folder).iterdir()) if path.is_file()))
 LEFT_OUT = shutil.ignore_patterns(
     '.*', '*.egg-info', '__pycache__', 'build', 'install', 'log', 'demo', 'docs', 'test')
 DEADLINE = 110.0    # [s] of any one command, below the time limit of a test

@@ -1,0 +1,266 @@
+# Copyright 2026 The pose_graph_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""
+Launch file, RViz configuration and Foxglove layout: all that they name is there.
+
+None of the three programs can be asked here, so the names are read from the files, and compared
+with the tables of the node and with the strings in its source.
+"""
+
+import ast
+from collections.abc import Iterator
+import importlib.util
+import json
+from pathlib import Path
+import re
+from typing import Any
+
+import pytest
+import yaml
+
+import pose_graph_ros
+from pose_graph_ros.ros.markers import NAMESPACES
+from pose_graph_ros.ros.parameters import PARAMETERS
+from pose_graph_ros.ros.sources import KNOWN_SOURCES
+
+TREE = Path(__file__).resolve().parents[2]
+LAUNCH = TREE / 'launch' / 'pose_graph.launch.py'
+RVIZ = TREE / 'config' / 'pose_graph.rviz'
+FOXGLOVE = TREE / 'config' / 'foxglove_layout.json'
+PARAMETER_FILE = TREE / 'config' / 'pose_graph.yaml'
+
+ARGUMENTS = {
+    'params_file', 'name', 'namespace', 'use_sim_time', 'log_level', 'autostart', 'rviz',
+    'rviz_config', 'odom', 'fix', 'imu', 'global_pose', 'loop_closure', 'path', 'pose',
+    'filtered_odometry'}
+"""Of the launch file."""
+# of launch_ros.actions.Node in Jazzy, and those of launch.actions.ExecuteProcess that are used
+NODE_KEYWORDS = {
+    'executable', 'package', 'name', 'namespace', 'exec_name', 'parameters', 'remappings',
+    'ros_arguments', 'arguments', 'output', 'condition'}
+
+
+def strings(path: Path) -> set[str]:
+    """Return all strings in a module."""
+    return {node.value for node in ast.walk(ast.parse(path.read_text(encoding='utf-8')))
+            if isinstance(node, ast.Constant) and isinstance(node.value, str)}
+
+
+def publications() -> dict[str, str]:
+    """Return the topics that the node publishes, each with the name of its quality of service."""
+    tree = ast.parse((SOURCES / 'publishers.py').read_text(encoding='utf-8'))
+    return {node.args[1].value: ast.unparse(node.args[2]) for node in ast.walk(tree)
+            if isinstance(node, ast.Call) and ast.unparse(node.func) == 'self._publisher'
+            and isinstance(node.args[1], ast.Constant)}
+
+
+SOURCES = Path(pose_graph_ros.__file__).parent / 'ros'
+PUBLISHED = publications()
+SUBSCRIBED = strings(SOURCES / 'session.py') & {'initialpose', 'set_pose'}
+TOPICS = PUBLISHED.keys() | SUBSCRIBED
+LATCHED = {topic for topic, quality in PUBLISHED.items() if quality == 'LATCHED_QOS'}
+"""Topics whose newest message everyone gets who joins late."""
+
+
+# --- The launch file -------------------------------------------------------------------------
+
+TEXT = ast.parse(LAUNCH.read_text(encoding='utf-8'))
+
+
+def calls(name: str) -> list[ast.Call]:
+    return [node for node in ast.walk(TEXT) if isinstance(node, ast.Call)
+            and isinstance(node.func, ast.Name) and node.func.id == name]
+
+
+def constant(name: str) -> Any:
+    """Return a constant of the module."""
+    return next(ast.literal_eval(node.value) for node in TEXT.body
+                if isinstance(node, ast.Assign) and ast.unparse(node.targets[0]) == name)
+
+
+def literal_first_arguments(name: str) -> set[str]:
+    return {call.args[0].value for call in calls(name) if isinstance(call.args[0], ast.Constant)}
+
+
+def keywords(call: ast.Call) -> dict[str, ast.expr]:
+    return {str(keyword.arg): keyword.value for keyword in call.keywords}
+
+
+def test_every_argument_is_declared_and_used() -> None:
+    tables = {name for name, _, _ in constant('INPUTS') + constant('OUTPUTS')}
+    declared = literal_first_arguments('DeclareLaunchArgument') | tables
+    assert declared == ARGUMENTS
+    assert literal_first_arguments('LaunchConfiguration') | tables == declared
+
+
+def test_inputs_are_those_of_the_sources_and_outputs_those_of_the_node() -> None:
+    inputs = {name: topic for name, topic, _ in constant('INPUTS')}
+    assert inputs == {name: topic for name, (_, topic) in KNOWN_SOURCES.items()}
+    kinds = {name: kind.message_type.replace('/msg/', '/') for name, (kind, _)
+             in KNOWN_SOURCES.items()}
+    for name, _, type_name in constant('INPUTS'):
+        assert type_name.startswith(kinds[name])
+    assert {topic for _, topic, _ in constant('OUTPUTS')} <= PUBLISHED.keys()
+
+
+def test_parameters_are_those_of_the_node() -> None:
+    known = {parameter.name for parameter in PARAMETERS} | {'use_sim_time'}     # that of rclpy
+    given = {key.value for node in calls('Node') for item in keywords(node)['parameters'].elts
+             if isinstance(item, ast.Dict) for key in item.keys}
+    assert given == {'use_sim_time', 'autostart'}
+    assert given <= known
+
+
+def test_nodes_are_called_with_what_they_take() -> None:
+    node, rviz = calls('Node')
+    for call in (node, rviz):
+        assert len(call.args) == 0
+        assert set(keywords(call)) <= NODE_KEYWORDS
+    executable = keywords(node)['executable'].value
+    assert f"'{executable} = " in (TREE / 'setup.py').read_text(encoding='utf-8')
+    assert 'condition' not in keywords(node)
+    assert ast.unparse(keywords(rviz)['condition']) == "IfCondition(LaunchConfiguration('rviz'))"
+    # its displays have to find the topics wherever the node has them
+    assert ast.unparse(keywords(rviz)['namespace']) == ast.unparse(keywords(node)['namespace'])
+    assert ast.unparse(keywords(rviz)['remappings']) == 'outputs'
+
+
+def test_files_of_the_package_are_there() -> None:
+    names = [call.args[0].elts[-1].value for call in calls('PathJoinSubstitution')
+             if ast.unparse(call.args[0].elts[0]) == 'config']
+    assert sorted(names) == ['pose_graph.rviz', 'pose_graph.yaml']
+    for name in names:
+        assert (TREE / 'config' / name).is_file()
+
+
+def test_the_description_can_be_made_and_rviz_starts_only_when_asked_for() -> None:
+    launch = pytest.importorskip('launch')
+    pytest.importorskip('launch_ros')
+    specification = importlib.util.spec_from_file_location('pose_graph_launch', LAUNCH)
+    module = importlib.util.module_from_spec(specification)
+    specification.loader.exec_module(module)
+    entities = module.generate_launch_description().entities
+    arguments = {entity.name: entity for entity in entities
+                 if isinstance(entity, launch.actions.DeclareLaunchArgument)}
+    assert set(arguments) == ARGUMENTS
+    node, rviz = entities[len(arguments):]
+    context = launch.LaunchContext()
+    for wanted in (False, True):
+        context.launch_configurations['rviz'] = str(wanted).lower()
+        assert rviz.condition.evaluate(context) is wanted
+    assert node.condition is None
+
+
+# --- RViz ------------------------------------------------------------------------------------
+
+CONFIGURATION = yaml.safe_load(RVIZ.read_text(encoding='utf-8'))
+MANAGER = CONFIGURATION['Visualization Manager']
+
+
+def rviz_topics() -> list[dict[str, Any]]:
+    return [item['Topic'] for item in MANAGER['Displays'] + MANAGER['Tools'] if 'Topic' in item]
+
+
+def test_rviz_shows_what_the_node_publishes() -> None:
+    shown = {display['Class'].removeprefix('rviz_default_plugins/'):
+             display.get('Topic', {}).get('Value') for display in MANAGER['Displays']}
+    assert shown == {
+        'Grid': None, 'Path': 'path', 'MarkerArray': 'graph', 'PoseWithCovariance': 'pose',
+        'Odometry': 'odometry/filtered', 'TF': None}
+    assert {topic['Value'] for topic in rviz_topics()} <= TOPICS
+
+
+def test_rviz_topics_are_relative_so_that_namespaces_and_remaps_hold() -> None:
+    for topic in rviz_topics():
+        assert re.fullmatch(r'[a-z]\w*(/[a-z]\w*)*', topic['Value'])
+
+
+def test_rviz_asks_for_what_is_latched_and_for_nothing_that_is_not_offered() -> None:
+    assert sorted(LATCHED) == ['graph', 'path']
+    for topic in rviz_topics():
+        latched = topic['Value'] in LATCHED
+        assert topic['Durability Policy'] == ('Transient Local' if latched else 'Volatile')
+        assert topic['Reliability Policy'] == 'Reliable'
+        assert topic['History Policy'] == 'Keep Last'
+        assert topic['Depth'] == 1 or not latched
+
+
+def test_rviz_has_the_frames_of_the_node() -> None:
+    frames = yaml.safe_load(PARAMETER_FILE.read_text(encoding='utf-8'))['/**']['ros__parameters']
+    assert MANAGER['Global Options']['Fixed Frame'] == frames['map_frame']
+    view = MANAGER['Views']['Current']
+    assert view['Class'] == 'rviz_default_plugins/TopDownOrtho'
+    assert view['Target Frame'] == frames['base_link_frame']
+
+
+def test_rviz_knows_the_namespaces_of_the_markers() -> None:
+    markers = next(display for display in MANAGER['Displays'] if display['Name'] == 'Graph')
+    assert set(markers['Namespaces']) == set(NAMESPACES)
+
+
+# --- Foxglove --------------------------------------------------------------------------------
+
+LAYOUT = json.loads(FOXGLOVE.read_text(encoding='utf-8'))
+PANELS = LAYOUT['configById']
+
+
+def shown_panels(layout: Any) -> Iterator[str]:
+    """Walk over the panels of a layout, and of the tabs in it."""
+    if isinstance(layout, str):
+        yield layout
+        for tab in PANELS[layout].get('tabs', []):
+            yield from shown_panels(tab['layout'])
+    else:
+        assert set(layout) == {'first', 'second', 'direction', 'splitPercentage'}
+        assert layout['direction'] in {'row', 'column'}
+        yield from shown_panels(layout['first'])
+        yield from shown_panels(layout['second'])
+
+
+def named_topics(value: Any) -> Iterator[str]:
+    """Walk over all that begins with a slash: topics, and paths into their messages."""
+    if isinstance(value, dict):
+        for key, inner in value.items():
+            yield from named_topics(key)
+            yield from named_topics(inner)
+    elif isinstance(value, list):
+        for inner in value:
+            yield from named_topics(inner)
+    elif isinstance(value, str) and value.startswith('/'):
+        yield re.match(r'[\w/]+', value)[0]
+
+
+def test_foxglove_shows_every_panel_once() -> None:
+    shown = list(shown_panels(LAYOUT['layout']))
+    assert sorted(shown) == sorted(PANELS)
+    assert {panel.partition('!')[0] for panel in shown} == {
+        '3D', 'map', 'Plot', 'DiagnosticSummary', 'DiagnosticStatusPanel', 'RawMessages', 'Tab'}
+    assert all('!' in panel for panel in shown)
+
+
+def test_foxglove_names_topics_of_the_node() -> None:
+    # of other tools of the 3D panel, which the format wants to be there
+    named = set(named_topics(PANELS)) - {'/move_base_simple/goal', '/clicked_point'}
+    assert {'/graph', '/path', '/pose', '/gps/filtered', '/odometry/filtered',
+            '/initialpose', '/diagnostics'} == named
+    # /diagnostics is absolute in the node, too
+    assert {topic if topic in TOPICS else topic.removeprefix('/') for topic in named} <= TOPICS
+
+
+def test_foxglove_takes_a_click_for_a_pose_estimate() -> None:
+    publish = PANELS['3D!graph']['publish']
+    assert publish['type'] == 'pose_estimate'
+    assert publish['poseEstimateTopic'] == '/initialpose'
+
+
+def test_foxglove_plots_what_is_in_the_diagnostics() -> None:
+    keys = {key for panel in PANELS.values() for path in panel.get('paths', [])
+            for key in re.findall(r'key=="(\w+)"', path['value'])}
+    assert len(keys) > 0
+    assert keys <= strings(SOURCES / 'diagnostics.py')
+    hardware = {name for panel in PANELS.values() for path in panel.get('paths', [])
+                for name in re.findall(r'hardware_id=="(\w+)"', path['value'])}
+    hardware |= {panel['selectedHardwareId'] for panel in PANELS.values()
+                 if 'selectedHardwareId' in panel}
+    assert hardware == {'pose_graph'}
+    assert hardware <= strings(SOURCES / 'messages.py')
