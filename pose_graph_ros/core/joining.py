@@ -207,11 +207,13 @@ class Joining:
                 return Origin(source, -1)
         return None
 
-    def bias_origin(self, row: int) -> Origin:
+    def bias_origin(self, row: int) -> Origin | None:
         """Return the source of a state of an error, by its row, and when the state begins."""
-        return next(Origin(source, begin_ns) for source, chain in self._correlated.items()
-                    if isinstance(chain, BiasChain)
-                    and (begin_ns := chain.begin_ns(row)) is not None)
+        for source, chain in self._correlated.items():
+            begin_ns = chain.begin_ns(row) if isinstance(chain, BiasChain) else None
+            if begin_ns is not None:
+                return Origin(source, begin_ns)
+        return None
 
     def reports(self, graph: Graph) -> dict[str, SourceReport]:
         """Return how well each source fits, by its newest measurements."""

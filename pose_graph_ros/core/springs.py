@@ -164,8 +164,7 @@ def _edge_name(
     start, end, kind = (
         int(integers[column]) for column in (tb.END_I, tb.END_J, tb.EDGE_KIND))
     if kind == EdgeKind.BIAS:
-        return (_bias_name(start, joins) if origin is None
-                else _measurement_name(origin, start, edges.numbers[row], nodes))
+        return _measurement_name(origin, start, edges.numbers[row], nodes, joins)
     i, j = np.searchsorted(nodes.rows, (start, end)).tolist()
     source = '' if origin is None else origin.source
     if origin is None and kind == EdgeKind.ODOMETRY:
@@ -178,24 +177,28 @@ def _observed_name(
     row: int, observed: _Table, nodes: HiddenNodes, joins: Joining,
 ) -> tuple[str, str, str]:
     """Return the same of an observed node."""
-    origin, node = joins.origin(row, edge=False), int(observed.integers[row, tb.OBS_NODE])
-    return (_bias_name(node, joins) if origin is None
-            else _measurement_name(origin, node, observed.numbers[row], nodes))
+    return _measurement_name(
+        joins.origin(row, edge=False), int(observed.integers[row, tb.OBS_NODE]),
+        observed.numbers[row], nodes, joins)
 
 
 def _measurement_name(
-    origin: Origin, node: int, numbers: FloatArray, nodes: HiddenNodes,
+    origin: Origin | None, node: int, numbers: FloatArray, nodes: HiddenNodes, joins: Joining,
 ) -> tuple[str, str, str]:
-    """Return the same of a measurement in the map, given its row in the table."""
-    position, _, heading = numbers[_DIAGONAL] > 0.0
-    kind = 'heading' if not position else 'global_pose' if heading else 'position'
+    """
+    Return the same of a measurement in the map, given its node and its row in the table.
+
+    On a node that is a state of an error it is no measurement, but what is known of that state
+    beforehand.
+    """
     number = int(np.searchsorted(nodes.rows, node))
-    return origin.source, kind, (
-        f'{origin.source} at {origin.stamp_ns * 1e-9:.3f} s near x{number}')
-
-
-def _bias_name(row: int, joins: Joining) -> tuple[str, str, str]:
-    """Return the same of what is known of a state of an error beforehand."""
-    origin = joins.bias_origin(row)
-    return origin.source, 'bias', (
-        f'error of {origin.source} at {origin.stamp_ns * 1e-9:.3f} s')
+    if number == len(nodes) or nodes.rows[number] != node:
+        origin, kind, where = joins.bias_origin(node), 'bias', ''
+    else:
+        position, _, heading = numbers[_DIAGONAL] > 0.0
+        kind = 'heading' if not position else 'global_pose' if heading else 'position'
+        where = f' near x{number}'
+    if origin is None:
+        return '', kind, f'{kind}{where}'
+    what = f'error of {origin.source}' if kind == 'bias' else origin.source
+    return origin.source, kind, f'{what} at {origin.stamp_ns * 1e-9:.3f} s{where}'

@@ -269,6 +269,23 @@ def test_when_another_odometry_leads_its_edges_are_its_own() -> None:
     assert {'wheels x3 - x4', 'visual x3 - x4'} <= names
 
 
+def test_where_the_source_is_not_known_the_kind_is_the_name() -> None:
+    backend = driven()
+    before = backend.largest_energies(10_000)
+    # of what a loaded graph had by other settings nothing is known
+    for known in ('_own', '_ties', '_correlated'):
+        getattr(backend._joins, known).clear()
+    for old, new in zip(before, backend.largest_energies(10_000), strict=True):
+        assert (new.energy, new.kind, new.freedom) == (old.energy, old.kind, old.freedom)
+        if old.kind == 'bias':
+            assert new.name == 'bias'
+        elif old.kind == 'odometry':
+            assert new.name.partition(' ')[2] == old.name.partition(' ')[2]
+        else:
+            ends = old.name[old.name.index('near' if 'near' in old.name else 'x'):]
+            assert (new.source, new.name) == ('', f'{old.kind} {ends}')
+
+
 def test_a_large_graph_is_looked_at_quickly() -> None:
     n = 50_000
     graph, ahead = Graph(), np.arange(n - 1)
