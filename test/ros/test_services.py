@@ -1,0 +1,148 @@
+# Copyright 2026 The pose_graph_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""Services and poses that are set: the real node over DDS."""
+
+import math
+
+from circle import drive, odometry_at, odometry_pose, path_error, START, true_pose
+from harness import Client, LATCHED, NodeProcess, pose, RELIABLE, yaw
+from geometry_msgs.msg import PoseWithCovarianceStamped
+import numpy as np
+import pytest
+from std_srvs.srv import SetBool
+from visualization_msgs.msg import Marker, MarkerArray
+
+from pose_graph_ros.core import se2
+
+
+def newest(client: Client) -> np.ndarray:
+    """Return the pose that the node publishes with the newest odometry."""
+    message = client.poses[-1].pose.pose
+    return np.array([message.position.x, message.position.y, yaw(message.orientation)])
+
+
+def go_on(client: Client, begin: float, end: float) -> None:
+    """Publish odometry, exact, and nothing else."""
+    already = int(client.values['processed'])
+    for step in range(round(begin * 10), round(end * 10)):
+        client.odom.publish(odometry_at(step / 10.0))
+        client.spin_for(0.01)
+    client.wait_processed(already + round((end - begin) * 10))
+
+
+def test_a_reset_begins_a_new_graph(node: NodeProcess, client: Client) -> None:
+    drive(client, 8.0)
+    assert client.optimize().success
+    answer = client.trigger('reset')
+    assert answer.success
+    assert 'hidden nodes are gone' in answer.message
+    assert 'next good fix' in answer.message
+    client.spin_until(lambda: client.values['resets'] == '1', 'it is reset')
+    client.spin_until(lambda: len(client.paths[-1].poses) == 0, 'the path is taken back')
+    assert 'hidden_nodes' not in client.values
+    drive(client, 20.0, begin=10.0)
+    assert client.optimize().success
+    assert client.paths[-1].poses[0].header.stamp.sec == START + 10.0
+    # the map begins at the first fix now
+    first = client.paths[-1].poses[0].pose.position
+    assert math.hypot(first.x, first.y) < 1e-2
+
+
+def test_a_pause_lets_nothing_in_and_the_outputs_go_on(
+    node: NodeProcess, client: Client,
+) -> None:
+    pause = client.node.create_client(SetBool, 'pose_graph/pause')
+    drive(client, 10.0)
+    assert client.optimize().success
+    answer = client.call(pause, SetBool.Request(data=True))
+    assert answer.success
+    assert answer.message.startswith('paused')
+    assert client.call(pause, SetBool.Request(data=True)).message == 'paused already'
+    nodes, accepted = client.values['hidden_nodes'], client.values['odom.accepted']
+    count = len(client.poses)
+    drive(client, 13.0, begin=10.0)
+    assert len(client.poses) - count >= 29
+    np.testing.assert_allclose(newest(client), true_pose(12.9), atol=1e-2)
+    assert client.values['hidden_nodes'] == nodes
+    assert client.values['odom.accepted'] == accepted
+    assert client.values['odom.paused'] == '30'
+    assert client.diagnostics[-1].status[0].message.startswith('Paused')
+    assert client.call(pause, SetBool.Request(data=False)).success
+    drive(client, 20.0, begin=13.0)
+    assert client.optimize().success
+    assert path_error(client) < 1e-2
+    assert int(client.values['hidden_nodes']) > int(nodes)
+
+
+def test_a_reset_and_optimize_while_there_is_nothing(node: NodeProcess, client: Client) -> None:
+    answer = client.trigger('optimize')
+    assert not answer.success
+    assert answer.message == 'there is no odometry yet'
+    assert client.trigger('reset').success
+
+
+@pytest.mark.parametrize('topic', ['initialpose', 'set_pose'])
+@pytest.mark.parametrize('frame', ['map', 'odom', 'base_link'])
+def test_a_pose_is_set_in_the_frame_that_it_names(
+    node: NodeProcess, client: Client, topic: str, frame: str,
+) -> None:
+    setter = client.node.create_publisher(PoseWithCovarianceStamped, topic, RELIABLE)
+    client.spin_until(lambda: setter.get_subscription_count() > 0, f'{topic} is heard')
+    drive(client, 8.0)
+    assert client.optimize().success
+    before = true_pose(7.9)
+    wanted = np.array([100.0, -40.0, 2.0])
+    origin = {'map': np.zeros(3), 'base_link': before,
+              'odom': se2.compose(before, se2.inverse(odometry_pose(7.9)))}[frame]
+    setter.publish(pose(START + 7.9, *se2.between(origin, wanted).tolist(), frame=frame,
+                        variances=(0.04, 0.04, 0.01)))
+    client.spin_until(lambda: client.values.get('set_pose.accepted') == '1', 'it is set')
+    client.spin_for(0.3)
+    go_on(client, 8.0, 9.0)
+    client.spin_until(lambda: client.values['updates'] != '0', 'it is updated')
+    moved = se2.between(before, true_pose(8.9))
+    np.testing.assert_allclose(newest(client), se2.compose(wanted, moved), atol=0.02)
+    assert client.poses[-1].pose.covariance[0] < 0.2
+    # what was before stays where it was
+    assert client.optimize().success
+    assert math.hypot(client.paths[-1].poses[0].pose.position.x,
+                      client.paths[-1].poses[0].pose.position.y) < 0.05
+
+
+def test_a_pose_that_is_set_before_there_is_odometry_waits_for_it(
+    node: NodeProcess, client: Client,
+) -> None:
+    setter = client.node.create_publisher(PoseWithCovarianceStamped, 'initialpose', RELIABLE)
+    client.spin_until(lambda: setter.get_subscription_count() > 0, 'it is heard')
+    setter.publish(pose(START, 0.0, 0.0, 0.0, frame='elsewhere'))
+    message = pose(0.0, 7.0, 8.0, 1.0)
+    message.pose.covariance = [0.0] * 36
+    setter.publish(message)
+    client.spin_until(lambda: client.values.get('set_pose.wrong_frame') == '1', 'one is refused')
+    go_on(client, 0.0, 6.0)
+    client.spin_until(lambda: client.values['alignment'] == 'aligned', 'the map is laid')
+    assert client.optimize().success
+    first = client.paths[-1].poses[0].pose
+    assert math.hypot(first.position.x - 7.0, first.position.y - 8.0) < 0.6
+    assert abs(se2.wrap(yaw(first.orientation) - 1.0)) < 0.1
+
+
+def test_the_markers_show_the_graph_while_someone_looks(
+    node: NodeProcess, client: Client,
+) -> None:
+    drive(client, 10.0)
+    arrays: list[MarkerArray] = []
+    client.node.create_subscription(MarkerArray, 'graph', arrays.append, LATCHED)
+    client.spin_until(lambda: len(arrays) > 0 and len(arrays[-1].markers) > 1, 'they come')
+    markers = arrays[-1].markers
+    assert markers[0].action == Marker.DELETEALL
+    assert {marker.header.frame_id for marker in markers} == {'map'}
+    by_name = {marker.ns: marker for marker in markers[1:]}
+    nodes = int(client.values['hidden_nodes'])
+    assert len(by_name['hidden_nodes'].points) == nodes
+    assert len(by_name['odometry'].points) == 2 * (nodes - 1)
+    assert len(by_name['observed_nodes'].points) > 10
+    for point in by_name['observed_nodes'].points:
+        assert abs(math.hypot(point.x, point.y - 20.0) - 20.0) < 1e-2
+    client.trigger('reset')
+    client.spin_until(lambda: len(arrays[-1].markers) == 1, 'they are taken back')
