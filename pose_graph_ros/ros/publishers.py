@@ -8,6 +8,7 @@ and markers, which can be large, from the thread that owns the engine.
 """
 
 from collections.abc import Callable, Mapping
+from copy import copy
 import threading
 import time
 from typing import Any
@@ -92,7 +93,7 @@ class Publishers:
 
     def _publisher(self, message_type: type, topic: str, qos: QoSProfile) -> Publisher:
         publisher = self._node.create_publisher(
-            message_type, topic, qos,
+            message_type, topic, copy(qos),  # rclpy writes the overrides into it
             qos_overriding_options=QoSOverridingOptions.with_default_policies())
         self._publishers.append(publisher)
         return publisher

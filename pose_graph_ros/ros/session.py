@@ -9,6 +9,7 @@ newest estimate carried on by that odometry; path and markers follow the updates
 
 from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import Future
+from copy import copy
 from functools import partial
 import math
 import time
@@ -206,7 +207,7 @@ class Session:
         self, topic: str, message_type: type, take: Callable[[Any], None], qos: QoSProfile,
     ) -> None:
         self._subscriptions.append(self.node.create_subscription(
-            message_type, topic, take, qos,
+            message_type, topic, take, copy(qos),  # rclpy writes the overrides into it
             qos_overriding_options=QoSOverridingOptions.with_default_policies()))
 
     def _set_timer(self, name: str, period: float, tick: Callable[[], None]) -> None:

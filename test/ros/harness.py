@@ -17,9 +17,11 @@ pytest.importorskip('rclpy', reason='ROS 2 is not there: no rclpy')
 from diagnostic_msgs.msg import DiagnosticArray
 from geometry_msgs.msg import PoseWithCovarianceStamped
 from nav_msgs.msg import Odometry, Path as PathMessage
+from rcl_interfaces.srv import SetParameters
 import rclpy
 from rclpy.context import Context
 from rclpy.executors import SingleThreadedExecutor
+from rclpy.parameter import Parameter as RosParameter
 from rclpy.qos import QoSDurabilityPolicy, QoSProfile, QoSReliabilityPolicy
 from sensor_msgs.msg import Imu, NavSatFix
 from std_srvs.srv import Trigger
@@ -44,8 +46,12 @@ PREPARE_PATIENCE = 300.0
 class NodeProcess:
     """The node as a user starts it."""
 
-    def __init__(self, log: Path, arguments: Sequence[str] = ()) -> None:
+    def __init__(
+        self, log: Path, arguments: Sequence[str] = (), domain: int | None = None,
+    ) -> None:
         self.env = isolated_environment(log)
+        if domain is not None:
+            self.env['ROS_DOMAIN_ID'] = str(domain)
         self._stderr = (log / 'stderr').open('w+')
         self.process = subprocess.Popen(
             [sys.executable, '-m', 'pose_graph_ros.ros.main', '--ros-args',
@@ -76,11 +82,12 @@ class Client:
     """Publishes what sensors would, and keeps everything that the node publishes."""
 
     def __init__(
-        self, domain: int, namespace: str = '', odom: str = 'odom', *,
+        self, domain: int, namespace: str = '', odom: str = 'odom', *, name: str = 'pose_graph',
         listens: Sequence[str] = ('odom', 'global_pose', 'fix', 'loop_closure'),
         more: Mapping[str, type] | None = None,
     ) -> None:
-        self._listens = listens
+        self._listens, self._name = listens, name
+        self._status = f'/{namespace}/{name}: pose graph'.replace('//', '/')
         self._context = Context()
         rclpy.init(context=self._context, domain_id=domain)
         self.node = rclpy.create_node('client', context=self._context, namespace=namespace)
@@ -104,12 +111,12 @@ class Client:
         subscribe(Odometry, 'odometry/filtered', self.filtered.append, RELIABLE)
         subscribe(NavSatFix, 'gps/filtered', self.fixes.append, RELIABLE)
         subscribe(PathMessage, 'path', self.paths.append, LATCHED)
-        subscribe(DiagnosticArray, '/diagnostics', self.diagnostics.append, RELIABLE)
+        subscribe(DiagnosticArray, '/diagnostics', self._diagnose, RELIABLE)
         if TFMessage is not None:
             subscribe(TFMessage, '/tf', lambda message: self.transforms.extend(message.transforms),
                       RELIABLE)
-        self._optimize = self.node.create_client(Trigger, 'pose_graph/optimize')
-        self._triggers = {'optimize': self._optimize}
+        self._optimize = self.node.create_client(Trigger, f'{name}/optimize')
+        self._services = {'optimize': self._optimize}
 
     def __enter__(self) -> 'Client':
         self.wait_for_the_node()
@@ -147,6 +154,10 @@ class Client:
         while (left := end - time.monotonic()) > 0.0:
             self._executor.spin_once(timeout_sec=left)
 
+    def _diagnose(self, message: DiagnosticArray) -> None:
+        if message.status[0].name == self._status:
+            self.diagnostics.append(message)
+
     @property
     def values(self) -> dict[str, str]:
         return {item.key: item.value for item in self.diagnostics[-1].status[0].values}
@@ -164,9 +175,23 @@ class Client:
 
     def trigger(self, name: str) -> Trigger.Response:
         """Call a service of the node that needs nothing but the call."""
-        if name not in self._triggers:
-            self._triggers[name] = self.node.create_client(Trigger, f'pose_graph/{name}')
-        return self.call(self._triggers[name], Trigger.Request())
+        return self.call(self._service(Trigger, name), Trigger.Request())
+
+    def set_parameter(self, name: str, value: object) -> tuple[bool, str]:
+        """Set a parameter as `ros2 param set` does; return whether it was, or why not."""
+        return self.set_parameters({name: value})[0]
+
+    def set_parameters(self, values: Mapping[str, object]) -> list[tuple[bool, str]]:
+        service = self._service(SetParameters, 'set_parameters')
+        wanted = [RosParameter(name, value=value).to_parameter_msg()
+                  for name, value in values.items()]
+        results = self.call(service, SetParameters.Request(parameters=wanted)).results
+        return [(result.successful, result.reason) for result in results]
+
+    def _service(self, kind: type, name: str) -> object:
+        if name not in self._services:
+            self._services[name] = self.node.create_client(kind, f'{self._name}/{name}')
+        return self._services[name]
 
     def set_datum(self) -> Trigger.Response:
         return self.trigger('set_datum')

@@ -11,8 +11,6 @@ from harness import Client, NodeProcess
 from lifecycle_msgs.msg import State, Transition
 from lifecycle_msgs.srv import ChangeState, GetState
 import pytest
-from rcl_interfaces.msg import Parameter, ParameterType, ParameterValue
-from rcl_interfaces.srv import SetParameters
 
 
 class Manager:
@@ -23,10 +21,6 @@ class Manager:
         create = client.node.create_client
         self._change = create(ChangeState, 'pose_graph/change_state')
         self._state = create(GetState, 'pose_graph/get_state')
-        self._set = create(SetParameters, 'pose_graph/set_parameters')
-        client.spin_until(
-            lambda: all(service.service_is_ready() for service in (
-                self._change, self._state, self._set)), 'the node can be managed')
 
     def change(self, transition: int) -> bool:
         request = ChangeState.Request(transition=Transition(id=transition))
@@ -35,12 +29,6 @@ class Manager:
     @property
     def state(self) -> int:
         return self._client.call(self._state, GetState.Request()).current_state.id
-
-    def set_double(self, name: str, value: float) -> tuple[bool, str]:
-        parameter = Parameter(name=name, value=ParameterValue(
-            type=ParameterType.PARAMETER_DOUBLE, double_value=value))
-        result = self._client.call(self._set, SetParameters.Request(parameters=[parameter]))
-        return result.results[0].successful, result.results[0].reason
 
 
 @pytest.fixture
@@ -129,7 +117,7 @@ def test_what_does_not_go_together_is_mended_while_unconfigured(tmp_path: Path) 
         manager = Manager(client)
         assert not manager.change(Transition.TRANSITION_CONFIGURE)
         assert manager.state == State.PRIMARY_STATE_UNCONFIGURED
-        assert manager.set_double('fix.sigma_ceiling', 100.0) == (True, '')
+        assert client.set_parameter('fix.sigma_ceiling', 100.0) == (True, '')
         assert manager.change(Transition.TRANSITION_CONFIGURE)
         client.close()
         assert node.signal_and_wait(signal.SIGTERM) == 0

@@ -1,0 +1,121 @@
+# Copyright 2026 The pose_graph_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""`ros2 param`, quality of service, and two robots on one machine: the real node over DDS."""
+
+from pathlib import Path
+
+from circle import drive, fix_at, odometry_at, path_error
+from harness import Client, NodeProcess
+import pytest
+from rcl_interfaces.srv import DescribeParameters, ListParameters
+from rclpy.qos import QoSHistoryPolicy, QoSReliabilityPolicy
+
+from pose_graph_ros.ros.parameters import all_parameters, Change
+
+
+def test_every_parameter_is_described(node: NodeProcess, client: Client) -> None:
+    names = client.call(client.node.create_client(
+        ListParameters, 'pose_graph/list_parameters'), ListParameters.Request()).result.names
+    own = {parameter.name: parameter for parameter in all_parameters({})}
+    assert set(own) <= set(names)
+    described = client.call(
+        client.node.create_client(DescribeParameters, 'pose_graph/describe_parameters'),
+        DescribeParameters.Request(names=list(own))).descriptors
+    for descriptor in described:
+        parameter = own[descriptor.name]
+        assert parameter.description in descriptor.description
+        assert descriptor.read_only == (parameter.change is Change.START)
+        if parameter.smallest is not None:
+            (interval,) = descriptor.floating_point_range
+            assert (interval.from_value, interval.to_value) == (
+                parameter.smallest, parameter.largest)
+
+
+def test_a_change_takes_effect_or_is_refused_with_the_reason(
+    node: NodeProcess, client: Client,
+) -> None:
+    drive(client, 8.0)
+    assert client.optimize().success
+    before = int(client.values['hidden_nodes'])
+    # 2 m/s: until now a node every half second, from now on every 2 s
+    assert client.set_parameter('minimum_travel_distance', 4.0) == (True, '')
+    assert client.set_parameter('minimum_travel_heading', 3) == (True, '')
+    assert client.set_parameter('moving_node_interval', 10.0) == (True, '')
+    drive(client, 28.0, begin=8.0)
+    assert client.optimize().success
+    added = int(client.values['hidden_nodes']) - before
+    assert 9 <= added <= 12
+    assert path_error(client) < 0.01
+
+    for name, value, expected in (
+            ('map_frame', 'world', 'configured'), ('odom.topic', 'elsewhere', 'configured'),
+            ('sources', ['odom'], 'read-only'), ('fix.robust_loss', 'l1', 'none, huber, cauchy'),
+            ('frequency', -1.0, 'range'), ('frequency', 'often', ''),
+            ('datum', [48.0, 11.0], 'datum'), ('fix.lever_arm', [1.0], '2 numbers'),
+            ('no_such_parameter', 1.0, ''), ('fix.sigma_ceiling', 0.001, 'ceiling')):
+        successful, reason = client.set_parameter(name, value)
+        assert not successful, name
+        assert expected in reason, (name, reason)
+        assert reason != ''
+
+    # together, and each by itself
+    results = client.set_parameters({'path_period': 0.2, 'map_frame': 'world'})
+    assert [successful for successful, _ in results] == [True, False]
+
+
+def test_the_rate_of_the_diagnostics_changes_while_it_runs(
+    node: NodeProcess, client: Client,
+) -> None:
+    assert client.set_parameter('diagnostics_period', 2.0) == (True, '')
+    client.spin_for(0.2)
+    count = len(client.diagnostics)
+    client.spin_for(1.0)
+    assert len(client.diagnostics) <= count + 1
+    assert client.set_parameter('diagnostics_period', 0.05) == (True, '')
+    client.spin_for(1.0)
+    assert len(client.diagnostics) > count + 10
+
+
+def test_qualities_of_service_are_as_asked(tmp_path: Path) -> None:
+    overrides = ('-r', 'odom:=wheels/odom',
+                 '-p', 'qos_overrides./wheels/odom.subscription.depth:=7',
+                 '-p', 'qos_overrides./wheels/odom.subscription.reliability:=reliable',
+                 '-p', 'qos_overrides./pose.publisher.reliability:=best_effort')
+    with NodeProcess(tmp_path, overrides) as node, \
+            Client(int(node.env['ROS_DOMAIN_ID']), odom='wheels/odom') as client:
+        (heard,) = client.node.get_subscriptions_info_by_topic('/wheels/odom')
+        assert heard.qos_profile.reliability is QoSReliabilityPolicy.RELIABLE
+        if heard.qos_profile.history is QoSHistoryPolicy.KEEP_LAST:
+            assert heard.qos_profile.depth == 7
+        (published,) = client.node.get_publishers_info_by_topic('/pose')
+        assert published.qos_profile.reliability is QoSReliabilityPolicy.BEST_EFFORT
+        (fixes,) = client.node.get_subscriptions_info_by_topic('/gps/fix')
+        assert fixes.qos_profile.reliability is QoSReliabilityPolicy.BEST_EFFORT
+
+
+def test_two_robots_on_one_machine(tmp_path: Path) -> None:
+    """Each in its namespace, with its frames: what one hears is nothing to the other."""
+    (tmp_path / 'b').mkdir()
+    with NodeProcess(tmp_path, ('-r', '__ns:=/a', '-p', 'odom_frame:=a/odom')) as first:
+        domain = int(first.env['ROS_DOMAIN_ID'])
+        with NodeProcess(tmp_path / 'b', ('-r', '__ns:=/b', '-p', 'odom_frame:=b/odom'),
+                         domain=domain) as _, \
+                Client(domain, namespace='a') as one, Client(domain, namespace='b') as other:
+            drive(one, 10.0)
+            for step in range(30):
+                other.odom.publish(odometry_at(step / 10.0))
+                other.fix.publish(fix_at(step / 10.0))
+                other.spin_for(0.002)
+            other.wait_processed(60)
+            assert one.optimize().success
+            assert other.optimize().success
+            assert one.values['odom.accepted'] == '100'
+            assert other.values['odom.accepted'] == '30'
+            assert len(one.paths[-1].poses) > len(other.paths[-1].poses)
+            assert one.diagnostics[-1].status[0].name == '/a/pose_graph: pose graph'
+
+
+@pytest.mark.parametrize('node', [('-r', '__node:=back_end')], indirect=True)
+def test_it_can_have_another_name(node: NodeProcess) -> None:
+    with Client(int(node.env['ROS_DOMAIN_ID']), name='back_end') as client:
+        assert client.trigger('reset').success
