@@ -1,8 +1,15 @@
 # Copyright 2026 The pose_graph_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""From estimates to messages."""
+"""
+From estimates to messages.
+
+What goes out with each message of odometry is written as the bytes of the middleware (CDR, little
+endian): filling in messages number by number would take ten times as long. There every number lies
+at a multiple of its size, counted from behind the four bytes that open the stream.
+"""
 
 from collections.abc import Mapping
+import functools
 import math
 import struct
 
@@ -24,6 +31,12 @@ from pose_graph_ros.ros.sources import NANOSECONDS
 
 # Height, roll and pitch are not estimated: their variance says so [m^2, rad^2].
 UNKNOWN_VARIANCE = 1e6
+
+CDR = b'\x00\x01\x00\x00'
+_STAMP, _LENGTH = struct.Struct('<iI'), struct.Struct('<I')
+_POSE_WITH_COVARIANCE, _TRANSFORM = struct.Struct('<43d'), struct.Struct('<7d')
+_TWIST = struct.Struct('<6d')
+_UNKNOWN_TWIST = bytes(48) + (UNKNOWN_VARIANCE * np.eye(6)).tobytes()
 
 
 def time_message(stamp_ns: int) -> Time:
@@ -103,13 +116,69 @@ def transform_message(
     return message
 
 
+@functools.cache
+def _names(at: int, frame_id: str, child_frame_id: str = '') -> bytes:
+    """Return one frame id, or two, from an offset on, up to where a double may begin."""
+    data = b''
+    for text in (frame_id, child_frame_id) if child_frame_id else (frame_id,):
+        data += bytes(-(at + len(data)) % 4)
+        name = text.encode() + b'\0'
+        data += _LENGTH.pack(len(name)) + name
+    return data + bytes(-(at + len(data)) % 8)
+
+
+def odometry_cdr(
+    stamp_ns: int, prediction: Prediction, source: Odometry, map_frame: str, base_frame: str,
+) -> bytes:
+    """Serialise the pose in the map, with the twist of the odometry if it is finite."""
+    twist = source.twist
+    linear, angular = twist.twist.linear, twist.twist.angular
+    numbers = (linear.x, linear.y, linear.z, angular.x, angular.y, angular.z)
+    covariance = np.asarray(twist.covariance, dtype='<f8')
+    finite = all(map(math.isfinite, numbers)) and bool(np.isfinite(covariance).all())
+    return b''.join((
+        CDR, _STAMP.pack(*divmod(stamp_ns, NANOSECONDS)), _names(8, map_frame, base_frame),
+        _pose_with_covariance_cdr(prediction),
+        _TWIST.pack(*numbers) + covariance.tobytes() if finite else _UNKNOWN_TWIST))
+
+
+def stamped_pose_cdr(stamp_ns: int, prediction: Prediction, map_frame: str) -> bytes:
+    """Serialise the pose in the map as a geometry_msgs/PoseWithCovarianceStamped."""
+    return b''.join((CDR, _STAMP.pack(*divmod(stamp_ns, NANOSECONDS)), _names(8, map_frame),
+                     _pose_with_covariance_cdr(prediction)))
+
+
+def _pose_with_covariance_cdr(prediction: Prediction) -> bytes:
+    x, y, theta = prediction.T_map_base.tolist()
+    (xx, xy, xt), (yx, yy, yt), (tx, ty, tt) = prediction.covariance.tolist()
+    u = UNKNOWN_VARIANCE
+    return _POSE_WITH_COVARIANCE.pack(
+        x, y, 0.0, 0.0, 0.0, math.sin(theta / 2.0), math.cos(theta / 2.0),
+        xx, xy, 0.0, 0.0, 0.0, xt,
+        yx, yy, 0.0, 0.0, 0.0, yt,
+        0.0, 0.0, u, 0.0, 0.0, 0.0,
+        0.0, 0.0, 0.0, u, 0.0, 0.0,
+        0.0, 0.0, 0.0, 0.0, u, 0.0,
+        tx, ty, 0.0, 0.0, 0.0, tt)
+
+
+def transform_cdr(
+    stamp_ns: int, T_map_odom: FloatArray, map_frame: str, odom_frame: str,
+) -> bytes:
+    """Serialise a tf2_msgs/TFMessage with the transform from the map to the odometry frame."""
+    x, y, theta = T_map_odom.tolist()
+    return b''.join((
+        CDR, _LENGTH.pack(1), _STAMP.pack(*divmod(stamp_ns, NANOSECONDS)),
+        _names(12, map_frame, odom_frame),
+        _TRANSFORM.pack(x, y, 0.0, 0.0, 0.0, math.sin(theta / 2.0), math.cos(theta / 2.0))))
+
+
 def path_cdr(path: Trajectory, stamp_ns: int, frame_id: str) -> bytes:
     """
     Serialise a nav_msgs/Path whose poses all lie in one frame, without a message a pose.
 
-    The layout is CDR, little endian: every number lies at a multiple of its size, counted from
-    behind the four bytes that open the stream. A PoseStamped ends at a multiple of 8, so all but
-    the first have the same layout, and NumPy fills them at once.
+    A PoseStamped ends at a multiple of 8, so all but the first have the same layout, and NumPy
+    fills them at once.
     """
     name = frame_id.encode() + b'\0'
     stamps, poses = path.stamps_ns, path.poses
@@ -128,7 +197,7 @@ def path_cdr(path: Trajectory, stamp_ns: int, frame_id: str) -> bytes:
         first = struct.pack('<iII', *records[0].item()[:3]) + name
         padding = -(len(body) + len(first)) % 8
         body += first + bytes(padding) + records['pose'][0].tobytes() + records[1:].tobytes()
-    return b'\x00\x01\x00\x00' + body
+    return CDR + body
 
 
 def diagnostics_message(

@@ -2,6 +2,9 @@
 # SPDX-License-Identifier: Apache-2.0
 """From the newest estimate to the newest odometry."""
 
+from dataclasses import replace
+
+from hypothesis import given, strategies as st
 import numpy as np
 import pytest
 
@@ -9,7 +12,7 @@ from pose_graph_ros.core import covariance, se2
 from pose_graph_ros.core.backend import PoseGraphBackend
 from pose_graph_ros.core.estimate import Estimate
 from pose_graph_ros.core.measurements import GlobalPose, OdometrySample
-from pose_graph_ros.core.motion import NO_MOTION
+from pose_graph_ros.core.motion import Motion, NO_MOTION
 from pose_graph_ros.core.prediction import predict
 from pose_graph_ros.core.se2 import FloatArray
 
@@ -64,3 +67,36 @@ def test_later_odometry_is_appended_as_the_next_estimate_would(
     floor = covariance.odometry_covariance(estimate.noise, NO_MOTION)
     difference = then.covariance - ahead.covariance
     assert np.abs(difference[:2, :2]).max() <= 2.0 * floor[0, 0]
+
+
+coordinates = st.floats(-1e3, 1e3)
+poses = st.tuples(coordinates, coordinates, st.floats(-np.pi, np.pi)).map(np.array)
+ESTIMATE: list[Estimate] = []
+
+
+@given(poses, poses, poses, st.integers(0, 2**32 - 1), st.booleans())
+def test_plain_numbers_say_what_matrices_say(
+    T_map_base: FloatArray, T_odom_base: FloatArray, now: FloatArray, seed: int, near: bool,
+) -> None:
+    if not ESTIMATE:
+        backend = PoseGraphBackend()
+        backend.add_odometry(OdometrySample(SECOND, odometry(0)))
+        backend.finish()
+        ESTIMATE.append(estimate_of(backend))
+    if near:
+        now = T_odom_base + 1e-3 * now / 1e3
+    root = np.random.default_rng(seed).normal(0.0, 1.0, (3, 3))
+    estimate = replace(
+        ESTIMATE[0], T_map_base=T_map_base, T_odom_base=T_odom_base, covariance=root @ root.T)
+    prediction = predict(estimate, now)
+    increment = se2.between(T_odom_base, now)
+    motion = Motion(increment, float(np.hypot(*increment[:2])), abs(float(increment[2])))
+    expected = covariance.propagated(
+        T_map_base, estimate.covariance, increment,
+        covariance.odometry_covariance(estimate.noise, motion, floor=False))
+    pose = se2.compose(T_map_base, increment)
+    np.testing.assert_allclose(prediction.T_map_base[:2], pose[:2], rtol=0.0, atol=1e-10)
+    assert abs(se2.wrap(prediction.T_map_base[2] - pose[2])) < 1e-12
+    np.testing.assert_allclose(
+        prediction.covariance, expected, rtol=0.0, atol=1e-13 * np.abs(expected).max())
+    np.testing.assert_array_equal(prediction.covariance, prediction.covariance.T)

@@ -104,3 +104,75 @@ def test_an_odometry_without_a_finite_twist_gets_none() -> None:
     assert message.twist.covariance[0] == messages.UNKNOWN_VARIANCE
     covariance = np.asarray(message.pose.covariance).reshape(6, 6)
     assert np.array_equal(np.diagonal(covariance), [1.0, 2.0, 1e6, 1e6, 1e6, 3.0])
+
+
+FRAMES = ['m', 'ma', 'map', 'map1', 'world', 'robot/map', 'kürzel']
+
+
+def names_padding(at: int, *frames: str) -> list[int]:
+    """Return the offsets of the gaps around frame ids that begin at an offset."""
+    gaps: list[int] = []
+    for frame in frames:
+        gaps += range(at, at + -at % 4)
+        at += -at % 4 + 4 + len(frame.encode()) + 1
+    return gaps + list(range(at, at + -at % 8))
+
+
+def assert_same_bytes(ours: bytes, theirs: object, gaps: list[int]) -> None:
+    assert deserialize_message(ours, type(theirs)) == theirs
+    serialized = bytes(serialize_message(theirs))
+    assert len(serialized) - len(ours) in range(4), 'at most the end is padded'
+    assert blank(ours[4:], gaps) == blank(serialized[4:len(ours)], gaps)
+
+
+def some_prediction(seed: int) -> Prediction:
+    rng = np.random.default_rng(seed)
+    return Prediction(rng.normal(0.0, 1.0, 3), rng.normal(0.0, 1.0, (3, 3)))
+
+
+@pytest.mark.parametrize('map_frame', FRAMES)
+@pytest.mark.parametrize('base_frame', ['b', 'ba', 'base', 'base_link', 'robot/base'])
+def test_odometry_is_byte_for_byte_what_rclpy_makes(map_frame: str, base_frame: str) -> None:
+    prediction, stamp = some_prediction(len(map_frame)), 1_700_000_000_123_456_789
+    source = Odometry()
+    source.twist.twist.linear.x, source.twist.twist.angular.z = 1.25, -0.5
+    source.twist.covariance = np.arange(36.0)
+    assert_same_bytes(
+        messages.odometry_cdr(stamp, prediction, source, map_frame, base_frame),
+        messages.odometry_message(stamp, prediction, source, map_frame, base_frame),
+        names_padding(8, map_frame, base_frame))
+
+
+@pytest.mark.parametrize('frame', FRAMES)
+def test_the_pose_is_byte_for_byte_what_rclpy_makes(frame: str) -> None:
+    prediction = some_prediction(1)
+    assert_same_bytes(
+        messages.stamped_pose_cdr(2**31 * 10**9 - 1, prediction, frame),
+        messages.stamped_pose_message(
+            2**31 * 10**9 - 1, messages.pose_with_covariance(prediction), frame),
+        names_padding(8, frame))
+
+
+@pytest.mark.parametrize('child', ['o', 'odom', 'robot/odom'])
+@pytest.mark.parametrize('frame', FRAMES)
+def test_the_transform_is_byte_for_byte_what_rclpy_makes(frame: str, child: str) -> None:
+    tf2_msgs = pytest.importorskip('tf2_msgs.msg', reason='tf2_msgs is not there')
+    pose = np.array([1.5, -2.5, 3.0])
+    assert_same_bytes(
+        messages.transform_cdr(7, pose, frame, child),
+        tf2_msgs.TFMessage(transforms=[messages.transform_message(7, pose, frame, child)]),
+        names_padding(12, frame, child))
+
+
+@pytest.mark.parametrize('where', ['twist', 'covariance'])
+def test_serialised_odometry_without_a_finite_twist_gets_none(where: str) -> None:
+    prediction, source = some_prediction(0), Odometry()
+    source.twist.twist.linear.x = 1.0
+    if where == 'twist':
+        source.twist.twist.angular.z = math.inf
+    else:
+        source.twist.covariance[35] = math.nan
+    assert_same_bytes(
+        messages.odometry_cdr(1, prediction, source, 'map', 'base_link'),
+        messages.odometry_message(1, prediction, source, 'map', 'base_link'),
+        names_padding(8, 'map', 'base_link'))
