@@ -15,7 +15,6 @@ import struct
 
 from builtin_interfaces.msg import Time
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
-from geometry_msgs.msg import Pose, PoseWithCovariance, PoseWithCovarianceStamped, TransformStamped
 from nav_msgs.msg import Odometry
 import numpy as np
 from sensor_msgs.msg import NavSatFix, NavSatStatus
@@ -26,11 +25,12 @@ from pose_graph_ros.core.prediction import Prediction
 from pose_graph_ros.core.se2 import FloatArray
 from pose_graph_ros.core.tangent_plane import TangentPlane
 from pose_graph_ros.core.trajectory import Trajectory
-from pose_graph_ros.ros.conversions import PLANAR
 from pose_graph_ros.ros.sources import NANOSECONDS
 
-# Height, roll and pitch are not estimated: their variance says so [m^2, rad^2].
+# Height, roll and pitch are not estimated: their variance says so to filters [m^2, rad^2] ...
 UNKNOWN_VARIANCE = 1e6
+# ... but of a pose for viewers, who would draw a pillar of a kilometre.
+PLANAR_VARIANCE = 1e-6
 
 CDR = b'\x00\x01\x00\x00'
 _STAMP, _LENGTH = struct.Struct('<iI'), struct.Struct('<I')
@@ -43,48 +43,6 @@ def time_message(stamp_ns: int) -> Time:
     """Return a stamp [ns] as a message."""
     seconds, nanoseconds = divmod(stamp_ns, NANOSECONDS)
     return Time(sec=seconds, nanosec=nanoseconds)
-
-
-def pose_message(pose: FloatArray) -> Pose:
-    """Return a planar pose, shape (3,), as a message."""
-    message = Pose()
-    message.position.x, message.position.y = float(pose[0]), float(pose[1])
-    message.orientation.z = math.sin(pose[2] / 2.0)
-    message.orientation.w = math.cos(pose[2] / 2.0)
-    return message
-
-
-def pose_with_covariance(prediction: Prediction) -> PoseWithCovariance:
-    """Return a prediction as a message; what is not planar has a large variance."""
-    covariance = np.diag((0.0, 0.0, *(4 * [UNKNOWN_VARIANCE])))
-    covariance[PLANAR] = prediction.covariance
-    return PoseWithCovariance(
-        pose=pose_message(prediction.T_map_base), covariance=covariance.ravel())
-
-
-def odometry_message(
-    stamp_ns: int, prediction: Prediction, source: Odometry, map_frame: str, base_frame: str,
-) -> Odometry:
-    """Return the pose in the map, with the twist that the odometry came with if it is finite."""
-    message = Odometry(
-        header=Header(stamp=time_message(stamp_ns), frame_id=map_frame),
-        child_frame_id=base_frame, pose=pose_with_covariance(prediction))
-    twist = source.twist
-    linear, angular = twist.twist.linear, twist.twist.angular
-    numbers = (linear.x, linear.y, linear.z, angular.x, angular.y, angular.z)
-    if all(map(math.isfinite, numbers)) and np.all(np.isfinite(twist.covariance)):
-        message.twist = twist
-    else:
-        message.twist.covariance = (UNKNOWN_VARIANCE * np.eye(6)).ravel()
-    return message
-
-
-def stamped_pose_message(
-    stamp_ns: int, pose: PoseWithCovariance, map_frame: str,
-) -> PoseWithCovarianceStamped:
-    """Return the pose in the map alone."""
-    return PoseWithCovarianceStamped(
-        header=Header(stamp=time_message(stamp_ns), frame_id=map_frame), pose=pose)
 
 
 def fix_message(
@@ -101,19 +59,6 @@ def fix_message(
         longitude=float(longitude), altitude=float(altitude),
         position_covariance=covariance.ravel(),
         position_covariance_type=NavSatFix.COVARIANCE_TYPE_KNOWN)
-
-
-def transform_message(
-    stamp_ns: int, T_map_odom: FloatArray, map_frame: str, odom_frame: str,
-) -> TransformStamped:
-    """Return the transform from the map to the odometry frame."""
-    message = TransformStamped(
-        header=Header(stamp=time_message(stamp_ns), frame_id=map_frame), child_frame_id=odom_frame)
-    pose = pose_message(T_map_odom)
-    message.transform.translation.x = pose.position.x
-    message.transform.translation.y = pose.position.y
-    message.transform.rotation = pose.orientation
-    return message
 
 
 @functools.cache
@@ -138,20 +83,20 @@ def odometry_cdr(
     finite = all(map(math.isfinite, numbers)) and bool(np.isfinite(covariance).all())
     return b''.join((
         CDR, _STAMP.pack(*divmod(stamp_ns, NANOSECONDS)), _names(8, map_frame, base_frame),
-        _pose_with_covariance_cdr(prediction),
+        _pose_with_covariance_cdr(prediction, UNKNOWN_VARIANCE),
         _TWIST.pack(*numbers) + covariance.tobytes() if finite else _UNKNOWN_TWIST))
 
 
 def stamped_pose_cdr(stamp_ns: int, prediction: Prediction, map_frame: str) -> bytes:
     """Serialise the pose in the map as a geometry_msgs/PoseWithCovarianceStamped."""
     return b''.join((CDR, _STAMP.pack(*divmod(stamp_ns, NANOSECONDS)), _names(8, map_frame),
-                     _pose_with_covariance_cdr(prediction)))
+                     _pose_with_covariance_cdr(prediction, PLANAR_VARIANCE)))
 
 
-def _pose_with_covariance_cdr(prediction: Prediction) -> bytes:
+def _pose_with_covariance_cdr(prediction: Prediction, u: float) -> bytes:
+    """Serialise a planar pose; what is not planar has the variance u."""
     x, y, theta = prediction.T_map_base.tolist()
     (xx, xy, xt), (yx, yy, yt), (tx, ty, tt) = prediction.covariance.tolist()
-    u = UNKNOWN_VARIANCE
     return _POSE_WITH_COVARIANCE.pack(
         x, y, 0.0, 0.0, 0.0, math.sin(theta / 2.0), math.cos(theta / 2.0),
         xx, xy, 0.0, 0.0, 0.0, xt,

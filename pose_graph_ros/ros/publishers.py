@@ -126,13 +126,11 @@ class Publishers:
         if len(wanted) == 0:
             return
         prediction = predict(estimate, sample.pose)
-        message = messages.odometry_message(
-            stamp, prediction, odometry, self.map_frame, self.base_frame)
         if self._odometry in wanted:
-            self._odometry.publish(message)
+            self._odometry.publish(messages.odometry_cdr(
+                stamp, prediction, odometry, self.map_frame, self.base_frame))
         if self._pose in wanted:
-            self._pose.publish(
-                messages.stamped_pose_message(stamp, message.pose, self.map_frame))
+            self._pose.publish(messages.stamped_pose_cdr(stamp, prediction, self.map_frame))
         # before anything was measured in it, the map may be anywhere on the Earth
         if (self._fix in wanted and plane is not None
                 and estimate.alignment is not AlignmentState.LOCAL):

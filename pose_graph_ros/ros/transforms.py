@@ -4,6 +4,7 @@
 
 from collections import deque
 from collections.abc import Callable
+import math
 import time
 
 from rclpy.node import Node
@@ -66,10 +67,9 @@ class TransformPublisher:
         if at_ns <= self._newest_ns:
             return
         self._newest_ns = at_ns
-        transform = messages.transform_message(
-            at_ns, T_map_odom, self._map_frame, self._odom_frame)
-        self._own.append(_key(transform))
-        self._publisher.publish(TFMessage(transforms=[transform]))
+        self._own.append((at_ns, float(T_map_odom[0]), math.sin(T_map_odom[2] / 2.0)))
+        self._publisher.publish(messages.transform_cdr(
+            at_ns, T_map_odom, self._map_frame, self._odom_frame))
 
     def forget(self) -> None:
         """Let time begin anew."""
