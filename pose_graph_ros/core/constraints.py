@@ -201,6 +201,20 @@ class ObservedNodes(_Table):
         return self.node, self.offset, self.mean, self.information, self.kind, self.weight
 
 
+_FULL: IntArray = np.array((0, 1, 2, 1, 3, 4, 2, 4, 5))
+
+
+def full(triangles: FloatArray) -> FloatArray:
+    """Return symmetric matrices, shape (M, 3, 3), from their upper triangles, shape (M, 6)."""
+    return triangles[:, _FULL].reshape(-1, 3, 3)
+
+
+def upper(matrices: FloatArray) -> FloatArray:
+    """Return upper triangles, (M, 6), row by row, of nearly symmetric matrices, (M, 3, 3)."""
+    both = 0.5 * (matrices + np.swapaxes(matrices, 1, 2))
+    return np.asarray(both[:, (0, 0, 0, 1, 1, 2), (0, 1, 2, 1, 2, 2)])
+
+
 _TAILS: dict[str, tuple[int, ...]] = {
     'mean': (3,), 'offset': (3,), 'information': (3, 3), 'bias': (4,)}
 _COLUMNS = {table: [(item.name, _TAILS.get(item.name, ())) for item in fields(table)]

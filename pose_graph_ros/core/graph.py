@@ -16,7 +16,7 @@ import numpy as np
 import numpy.typing as npt
 
 from pose_graph_ros.core import editing, linearize, se2, tables as tb, undo
-from pose_graph_ros.core.constraints import check, EdgeKind, Edges, ObservedNodes
+from pose_graph_ros.core.constraints import check, EdgeKind, Edges, full, ObservedNodes
 from pose_graph_ros.core.exceptions import GraphUpdateError
 from pose_graph_ros.core.jit import compile_only
 from pose_graph_ros.core.se2 import FloatArray, IntArray
@@ -80,6 +80,19 @@ class Energies(NamedTuple):
         return float(np.sum(self.edges) + np.sum(self.observed))
 
 
+class GraphRows(NamedTuple):
+    """All rows of a graph; nothing in them changes later."""
+
+    poses: FloatArray
+    """Estimates of all hidden nodes, shape (N, 3), biases included."""
+    is_bias: BoolArray
+    """Shape (N,)."""
+    fixed: BoolArray
+    """Shape (N,)."""
+    edges: Edges
+    observed: ObservedNodes
+
+
 class Graph:
     """A pose graph; see the module's docstring."""
 
@@ -138,7 +151,7 @@ class Graph:
         bias[to_bias] = numbers[to_bias[:, None], _BIAS_COLUMNS]
         return Edges(
             integers[:, tb.END_I], integers[:, tb.END_J], numbers[:, tb.MEAN:tb.MEAN + 3].copy(),
-            _unpacked(numbers[:, tb.INFO:tb.INFO + 6]), kind, numbers[:, tb.WEIGHT].copy(), bias)
+            full(numbers[:, tb.INFO:tb.INFO + 6]), kind, numbers[:, tb.WEIGHT].copy(), bias)
 
     @property
     def observed(self) -> ObservedNodes:
@@ -150,7 +163,7 @@ class Graph:
         numbers, integers = self.memory['observed_f'][rows], self.memory['observed_i'][rows]
         return ObservedNodes(
             integers[:, tb.OBS_NODE], numbers[:, tb.OBS_OFFSET:tb.OBS_OFFSET + 3].copy(),
-            numbers[:, tb.MEAN:tb.MEAN + 3].copy(), _unpacked(numbers[:, tb.INFO:tb.INFO + 6]),
+            numbers[:, tb.MEAN:tb.MEAN + 3].copy(), full(numbers[:, tb.INFO:tb.INFO + 6]),
             integers[:, tb.OBS_KIND], numbers[:, tb.WEIGHT].copy())
 
     @property
@@ -270,14 +283,34 @@ class Graph:
         rows[:, tb.POSE:tb.POSE + 3] = se2.wrapped(poses)
         editing.restart(self.memory.head)
 
-    def take_over(self, other: 'Graph', poses: FloatArray) -> None:
-        """Copy all rows of another graph into this empty one, with poses (N, 3) of their own."""
+    def rows(self) -> GraphRows:
+        """Return a copy of all rows."""
+        return GraphRows(
+            self.poses.copy(), self.is_bias, self.fixed,
+            Edges(*(column.copy() for column in self.edges.columns)),
+            ObservedNodes(*(column.copy() for column in self.observed.columns)))
+
+    def fill(self, rows: GraphRows) -> None:
+        """
+        Write all rows of another graph into this empty one.
+
+        Raises
+        ------
+        GraphUpdateError
+            If they are not sound.
+
+        """
+        poses, is_bias, fixed, edges, observed = rows
         self.apply(GraphUpdate(hidden=poses))
         memory, head = self.memory, self.memory.head
-        memory['node_i'][:len(poses), tb.IS_BIAS] = other.is_bias
-        head[tb.NEWEST] = other.newest_pose
+        memory['node_i'][:len(poses), tb.IS_BIAS] = is_bias
+        head[tb.NEWEST] = np.flatnonzero(~is_bias)[-1] if not np.all(is_bias) else -1
         self.apply(GraphUpdate(
-            edges=other.edges, observed=other.observed, fix=np.flatnonzero(other.fixed).tolist()))
+            edges=edges, observed=observed, fix=np.flatnonzero(fixed).tolist()))
+
+    def take_over(self, other: 'Graph', poses: FloatArray) -> None:
+        """Copy all rows of another graph into this empty one, with poses (N, 3) of their own."""
+        self.fill(other.rows()._replace(poses=poses))
 
     def energies(self, poses: FloatArray | None = None) -> Energies:
         """Return the energies of all constraints, at other poses (N, 3) if given."""
@@ -297,13 +330,6 @@ class Graph:
     def undo(self) -> None:
         """Undo the edits and steps since `begin`, bit for bit."""
         undo.undo(self.memory.head)
-
-
-_FULL: IntArray = np.array((0, 1, 2, 1, 3, 4, 2, 4, 5))
-
-
-def _unpacked(upper: FloatArray) -> FloatArray:
-    return upper[:, _FULL].reshape(-1, 3, 3)
 
 
 def _checked_poses(name: str, poses: FloatArray) -> FloatArray:

@@ -34,9 +34,9 @@ import numpy as np
 import numpy.typing as npt
 
 from pose_graph_ros.core import se2
-from pose_graph_ros.core.constraints import EdgeKind, Edges, ObservedKind, ObservedNodes
+from pose_graph_ros.core.constraints import EdgeKind, Edges, ObservedKind, ObservedNodes, upper
 from pose_graph_ros.core.exceptions import FileFormatError, GraphUpdateError
-from pose_graph_ros.core.graph import Graph, GraphUpdate
+from pose_graph_ros.core.graph import Graph, GraphRows, GraphUpdate
 from pose_graph_ros.core.se2 import FloatArray, IntArray
 
 # How the six numbers behind EDGE2 fill a symmetric (TORO) or an upper triangular (iSAM) matrix.
@@ -312,34 +312,56 @@ def write_g2o(graph: Graph, path: Path, ids: IntArray | None = None) -> None:
         Id for each hidden node; their numbers if not given.
 
     """
-    names = (np.arange(graph.n_nodes) if ids is None else ids).tolist()
-    edges, observed, poses, is_pose = graph.edges, graph.observed, graph.poses, ~graph.is_bias
-    lines = [f'VERTEX_SE2 {names[node]} {_text(poses[node])}' for node in np.flatnonzero(is_pose)]
+    path.write_text(g2o_text(graph.rows(), ids), encoding='ascii')
+
+
+def g2o_text(rows: GraphRows, ids: IntArray | None = None) -> str:
+    """
+    Return a graph as text: vertices, FIX, edges and observed nodes, in their order each.
+
+    Parameters
+    ----------
+    rows : GraphRows
+    ids : ndarray, shape (N,), optional
+        Id for each hidden node; their numbers if not given.
+
+    """
+    ids = np.arange(len(rows.poses)) if ids is None else ids
+    edges, observed, is_pose = rows.edges, rows.observed, ~rows.is_bias
+    lines = []
     if not np.all(is_pose):
         edges = edges.rows(edges.kind != EdgeKind.BIAS)
         observed = observed.rows(is_pose[observed.node])
-        lines.insert(0, f'# left out: {np.sum(~is_pose)} biases, {graph.n_edges - len(edges)} '
-                        f'edges to them and {graph.n_observed - len(observed)} observed ones')
-    lines += [f'FIX {names[node]}' for node in np.flatnonzero(graph.fixed & is_pose)]
-    for k in range(len(edges)):
-        lines.append(f'EDGE_SE2 {names[edges.i[k]]} {names[edges.j[k]]} '
-                     f'{_text(edges.mean[k])} {_upper(edges.information[k])}')
-    for k in range(len(observed)):
-        name, mean, info = names[observed.node[k]], observed.mean[k], observed.information[k]
-        if np.any(observed.offset[k] != 0.0):
-            lines.append(f'OBSERVED_SE2_OFFSET {name} {_text(observed.offset[k])} '
-                         f'{_text(mean)} {_upper(info)}')
-        elif np.all(info[2] == 0.0) and mean[2] == 0.0:
-            lines.append(f'EDGE_PRIOR_SE2_XY {name} {_text(mean[:2])} '
-                         f'{_text(info[[0, 0, 1], [0, 1, 1]])}')
-        else:
-            lines.append(f'EDGE_PRIOR_SE2 {name} {_text(mean)} {_upper(info)}')
-    path.write_text('\n'.join(lines) + '\n', encoding='ascii')
+        lines.append(f'# left out: {np.sum(~is_pose)} biases, {len(rows.edges) - len(edges)} '
+                     f'edges to them and {len(rows.observed) - len(observed)} observed ones')
+    lines += [f'VERTEX_SE2 {name} {numbers}' for name, numbers in zip(
+        ids[is_pose].tolist(), _texts(rows.poses[is_pose]), strict=True)]
+    lines += [f'FIX {name}' for name in ids[rows.fixed & is_pose].tolist()]
+    lines += [f'EDGE_SE2 {i} {j} {numbers}' for i, j, numbers in zip(
+        ids[edges.i].tolist(), ids[edges.j].tolist(),
+        _texts(np.hstack((edges.mean, upper(edges.information)))), strict=True)]
+    return '\n'.join([*lines, *_observed_lines(observed, ids)]) + '\n'
 
 
-def _text(numbers: FloatArray) -> str:
-    return ' '.join(repr(number) for number in numbers.tolist())
+def _observed_lines(observed: ObservedNodes, ids: IntArray) -> list[str]:
+    triangles = upper(observed.information)
+    moved = np.any(observed.offset != 0.0, axis=1)
+    placed = np.all(observed.information[:, 2] == 0.0, axis=1) & (observed.mean[:, 2] == 0.0)
+    tags = np.where(moved, 'OBSERVED_SE2_OFFSET',
+                    np.where(placed, 'EDGE_PRIOR_SE2_XY', 'EDGE_PRIOR_SE2'))
+    numbers = {
+        'OBSERVED_SE2_OFFSET': (observed.offset, observed.mean, triangles),
+        'EDGE_PRIOR_SE2': (observed.mean, triangles),
+        'EDGE_PRIOR_SE2_XY': (observed.mean[:, :2], triangles[:, (0, 1, 3)]),
+    }
+    lines = np.empty(len(observed), dtype=object)
+    for tag, columns in numbers.items():
+        rows = np.flatnonzero(tags == tag)
+        lines[rows] = [f'{tag} {name} {text}' for name, text in zip(
+            ids[observed.node[rows]].tolist(), _texts(np.hstack(columns)[rows]), strict=True)]
+    return list(lines)
 
 
-def _upper(matrix: FloatArray) -> str:
-    return _text(matrix[[0, 0, 0, 1, 1, 2], [0, 1, 2, 1, 2, 2]])
+def _texts(rows: FloatArray) -> list[str]:
+    """Return the numbers of each row, as many digits as it takes to read them back."""
+    return [' '.join(map(repr, row)) for row in rows.tolist()]

@@ -14,14 +14,21 @@ NANOSECONDS = 1_000_000_000
 
 def write_tum(trajectory: Trajectory, path: Path) -> None:
     """Write a trajectory; stamps and positions read back bit for bit, headings to rounding."""
-    with path.open('w', encoding='ascii') as file:
-        file.write('# timestamp tx ty tz qx qy qz qw\n')
-        for stamp, (x, y, theta) in zip(
-                trajectory.stamps_ns.tolist(), trajectory.poses.tolist(), strict=True):
-            seconds, nanoseconds = divmod(abs(stamp), NANOSECONDS)
-            sign = '-' if stamp < 0 else ''
-            file.write(f'{sign}{seconds}.{nanoseconds:09d} {x!r} {y!r} 0 0 0 '
-                       f'{float(np.sin(theta / 2))!r} {float(np.cos(theta / 2))!r}\n')
+    path.write_text(tum_text(trajectory), encoding='ascii')
+
+
+def tum_text(trajectory: Trajectory) -> str:
+    """Return a trajectory as text."""
+    lines = ['# timestamp tx ty tz qx qy qz qw']
+    half = trajectory.poses[:, 2] / 2
+    for stamp, (x, y, _), qz, qw in zip(
+            trajectory.stamps_ns.tolist(), trajectory.poses.tolist(), np.sin(half).tolist(),
+            np.cos(half).tolist(), strict=True):
+        seconds, nanoseconds = divmod(abs(stamp), NANOSECONDS)
+        sign = '-' if stamp < 0 else ''
+        lines.append(
+            f'{sign}{seconds}.{nanoseconds:09d} {x!r} {y!r} 0 0 0 {qz!r} {qw!r}')
+    return '\n'.join(lines) + '\n'
 
 
 def read_tum(path: Path) -> Trajectory:
