@@ -25,10 +25,11 @@ CORE = (
     'gauss_newton', 'descent', 'batch', 'starts', 'chain', 'sparse_inverse', 'marginals',
     'rescue', 'incremental',
     # what drives it
-    'timeline', 'odometry_stream', 'trajectory', 'consensus', 'alignment', 'tangent_plane',
-    'binding', 'hidden_nodes', 'pending', 'reweighing', 'closing', 'autocorrelation',
-    'correlated', 'joining', 'springs', 'estimate', 'aligning', 'backend', 'prediction', 'io',
-    'io.g2o', 'io.tum', 'helper_process', 'warm_up',
+    'tangent_plane', 'saved_graph', 'timeline', 'unheard', 'odometry_stream', 'trajectory',
+    'consensus', 'alignment', 'binding', 'hidden_nodes', 'anchoring', 'pending', 'reweighing',
+    'closing', 'autocorrelation', 'correlated', 'joining', 'springs', 'estimate', 'aligning',
+    'saving', 'backend', 'prediction', 'io', 'io.g2o', 'io.tum', 'io.plain', 'io.whole_files',
+    'io.graph_files', 'helper_process', 'warm_up',
 )
 CORE_NEEDS = {'numpy', 'scipy', 'numba', 'pyproj'}
 

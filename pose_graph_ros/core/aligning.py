@@ -7,16 +7,20 @@ The first measurements that tell the angle turn the graph. Each time that twice 
 they are all judged again: the first few may have been wrong.
 """
 
+from collections.abc import Sequence
+from typing import NamedTuple
+
 import numpy as np
 
 from pose_graph_ros.core import alignment, se2
 from pose_graph_ros.core.alignment import ALIGNING_SIGMA, Turn
 from pose_graph_ros.core.config import BackendConfig
 from pose_graph_ros.core.consensus import Lifetime
-from pose_graph_ros.core.constraints import ObservedKind, ObservedNodes
+from pose_graph_ros.core.constraints import full, ObservedKind, ObservedNodes, upper
 from pose_graph_ros.core.estimate import AlignmentState
 from pose_graph_ros.core.hidden_nodes import HiddenNodes
 from pose_graph_ros.core.joining import Bound
+from pose_graph_ros.core.saved_graph import SavedAlignment
 from pose_graph_ros.core.se2 import FloatArray
 from pose_graph_ros.core.sources import MeasurementSource, OdometryNoise
 
@@ -24,6 +28,14 @@ from pose_graph_ros.core.sources import MeasurementSource, OdometryNoise
 LAST_VERDICT = 4096
 # The first verdict over one that has turned the graph comes with so many.
 FIRST_VERDICT = 8
+
+
+class Heard(NamedTuple):
+    """A measurement that has told of the angle."""
+
+    source: str
+    stamp_ns: int
+    observed: ObservedNodes
 
 
 class Aligning:
@@ -41,7 +53,7 @@ class Aligning:
         self.state = AlignmentState.LOCAL
         self.sigma = np.inf
         """Of the angle when it was found [rad]."""
-        self._heard: list[Bound] = []
+        self._heard: list[Heard] = []
         self._next_verdict = FIRST_VERDICT
 
     def configure(self, config: BackendConfig) -> None:
@@ -69,7 +81,7 @@ class Aligning:
             return None  # where the robot is, nobody has said
         turn = alignment.find_turn(
             poses, _table(where), self._config.alignment, self._noise(lead),
-            self._lifetime(where))
+            self._lifetime([_heard(bound) for bound in where]))
         pointed = [bound for bound in waiting if _kind(bound) == ObservedKind.HEADING]
         if len(pointed) > 0:
             by_heading = _turned_by_heading(poses, _table(pointed), _table(where))
@@ -83,7 +95,7 @@ class Aligning:
     def hear(self, joined: list[Bound]) -> None:
         """Remember measurements that have joined the graph, for the next verdict."""
         if self._next_verdict <= LAST_VERDICT:
-            self._heard += placed(joined)
+            self._heard += map(_heard, placed(joined))
 
     def settle(self) -> None:
         """Judge no more: the path is not what odometry alone tells."""
@@ -122,13 +134,13 @@ class Aligning:
     def _noise(self, lead: str) -> OdometryNoise:
         return self._config.odometry_source(lead).noise
 
-    def _lifetime(self, bounds: list[Bound]) -> Lifetime:
+    def _lifetime(self, heard: list[Heard]) -> Lifetime:
         times = {name: source.correlation_time
                  for name, source in self._config.measurements.items()}
         default = MeasurementSource().correlation_time
         return Lifetime(
-            np.array([bound.measurement.stamp_ns for bound in bounds]) * 1e-9,
-            np.array([times.get(bound.source, default) for bound in bounds]))
+            np.array([each.stamp_ns for each in heard]) * 1e-9,
+            np.array([times.get(each.source, default) for each in heard]))
 
     def copy(self) -> tuple[AlignmentState, float]:
         """Return what `restore` takes."""
@@ -137,6 +149,30 @@ class Aligning:
     def restore(self, state: tuple[AlignmentState, float]) -> None:
         """Undo what has been found: the graph could not be turned."""
         self.state, self.sigma = state
+
+    def saved(self) -> SavedAlignment:
+        """Return what is known."""
+        table = _table(self._heard)
+        names = tuple(dict.fromkeys(each.source for each in self._heard))
+        source, stamps = (np.array(numbers, dtype=np.int64) for numbers in (
+            [names.index(each.source) for each in self._heard],
+            [each.stamp_ns for each in self._heard]))
+        return SavedAlignment(
+            self.state.value, float(self.sigma) if np.isfinite(self.sigma) else None,
+            self._next_verdict, names, source, stamps, table.node, table.offset, table.mean,
+            upper(table.information), table.kind.astype(np.int64))
+
+    def load(self, saved: SavedAlignment) -> None:
+        """Take what `saved` has returned."""
+        self.state = AlignmentState(saved.state)
+        self.sigma = np.inf if saved.sigma is None else saved.sigma
+        self._next_verdict = saved.next_verdict
+        table = ObservedNodes(saved.node, saved.offset, saved.mean, full(saved.information),
+                              saved.kind)
+        self._heard = [
+            Heard(saved.sources[source], stamp_ns, table.rows(slice(k, k + 1)))
+            for k, (source, stamp_ns) in enumerate(
+                zip(saved.source.tolist(), saved.stamps_ns.tolist(), strict=True))]
 
 
 def placed(bounds: list[Bound]) -> list[Bound]:
@@ -148,7 +184,11 @@ def _kind(bound: Bound) -> ObservedKind:
     return ObservedKind(int(bound.observed.kind[0]))
 
 
-def _table(bounds: list[Bound]) -> ObservedNodes:
+def _heard(bound: Bound) -> Heard:
+    return Heard(bound.source, bound.measurement.stamp_ns, bound.observed)
+
+
+def _table(bounds: Sequence[Bound | Heard]) -> ObservedNodes:
     return ObservedNodes.joined([bound.observed for bound in bounds])
 
 

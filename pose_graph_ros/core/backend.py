@@ -14,12 +14,14 @@ full optimisation. Stamps are integer nanoseconds; there is no clock in here.
 from collections import Counter
 from dataclasses import replace
 import math
+from typing import Self
 
 import numpy as np
 
 from pose_graph_ros.core import alignment, batch, binding, closing, covariance, se2, springs
 from pose_graph_ros.core.admission import admit
 from pose_graph_ros.core.aligning import Aligning, placed
+from pose_graph_ros.core.anchoring import anchor_at, reference_of
 from pose_graph_ros.core.batch import Status
 from pose_graph_ros.core.config import BackendConfig
 from pose_graph_ros.core.estimate import AlignmentState, Estimate, UpdateReport
@@ -39,8 +41,11 @@ from pose_graph_ros.core.measurements import (
 )
 from pose_graph_ros.core.pending import due_ns, MAX_PENDING, Pending, Seen
 from pose_graph_ros.core.reweighing import Reweighing
+from pose_graph_ros.core.saved_graph import SavedGraph
+from pose_graph_ros.core.saving import capture, Parts, restore
 from pose_graph_ros.core.se2 import FloatArray, IntArray
 from pose_graph_ros.core.starts import Solve
+from pose_graph_ros.core.tangent_plane import MapOrigin
 from pose_graph_ros.core.trajectory import Trajectory
 
 # Measurements that wait for the angle between odometry and map; the oldest make way.
@@ -226,7 +231,7 @@ class PoseGraphBackend:
         if isinstance(admitted, Answer):
             return self._count(source, admitted)
         measurement = admitted.measurement
-        begin, end = self._anchor(pose.stamp_ns), self._anchor(last_ns)
+        begin, end = anchor_at(self._nodes, pose.stamp_ns), anchor_at(self._nodes, last_ns)
         if isinstance(begin, Answer) or isinstance(end, Answer) or not isinstance(
                 measurement, GlobalPose):
             return self._count(source, rejected('no_odometry', 'no odometry at that time'))
@@ -259,7 +264,7 @@ class PoseGraphBackend:
 
     def _bind(self, measurement: Measurement, source: str) -> Answer:
         """Turn a measurement that odometry has reached into a constraint for the next update."""
-        anchor = self._anchor(measurement.stamp_ns)
+        anchor = anchor_at(self._nodes, measurement.stamp_ns)
         if isinstance(anchor, Answer):
             return anchor
         if not isinstance(measurement, LoopClosure):
@@ -270,7 +275,7 @@ class PoseGraphBackend:
                 # where a robot stands for days, unaligned, memory must not run full
                 self.counts[self._queue.observed.pop(0).source, 'dropped_unaligned'] += 1
             return ACCEPTED
-        reference = self._reference(measurement)
+        reference = reference_of(self._nodes, measurement)
         if isinstance(reference, Answer):
             return reference
         if reference.node == anchor.node:
@@ -278,25 +283,6 @@ class PoseGraphBackend:
         self._queue.edges.append(
             (source, binding.loop_closure_constraint(measurement, reference, anchor)))
         return ACCEPTED
-
-    def _anchor(self, stamp_ns: int) -> binding.Anchor | Answer:
-        first_ns = int(self.node_stamps_ns[0])
-        if stamp_ns < first_ns:
-            return rejected('before_odometry',
-                            f'stamp {stamp_ns}, odometry begins at {first_ns}')
-        anchor = self._nodes.anchor(stamp_ns)
-        if anchor is None:
-            return rejected('no_odometry', f'no odometry tells of the motion up to {stamp_ns}')
-        return anchor
-
-    def _reference(self, closure: LoopClosure) -> binding.Anchor | Answer:
-        """Return the earlier end of a loop closure, named by stamp or by hidden node."""
-        if closure.reference_ns is not None:
-            return self._anchor(closure.reference_ns)
-        node = closure.reference_node
-        if node is None or not 0 <= node < len(self._nodes):
-            return rejected('unknown_node', f'there is no hidden node {node}')
-        return binding.Anchor(int(self._nodes.rows[node]), np.zeros(3), np.zeros((3, 3)))
 
     def update(self) -> UpdateReport:
         """Add what has come in to the graph and improve the estimate; for a timer."""
@@ -439,6 +425,24 @@ class PoseGraphBackend:
             n_hidden=len(self._nodes), n_edges=graph.n_edges - self._joins.n_bias_edges,
             n_observed=self._joins.n_measurements, n_biases=graph.n_nodes - len(self._nodes),
             lead=lead, noise=self._config.odometry_source(lead).noise)
+
+    def saved(self, datum: MapOrigin | None = None) -> SavedGraph:
+        """Return all that has joined the graph; `update` first. See `saving.capture`."""
+        return capture(self._parts(), self._newest_node_covariance, self._chi2, datum)
+
+    @classmethod
+    def restored(cls, config: BackendConfig | None, saved: SavedGraph) -> Self:
+        """Return a back end that goes on from a saved graph; see `saving.restore`."""
+        backend = cls(config)
+        restore(backend._parts(), saved)
+        backend._newest_node_covariance = np.array(saved.newest_covariance)
+        backend._chi2 = saved.chi2
+        backend._settled = False    # the next update eliminates everything
+        return backend
+
+    def _parts(self) -> Parts:
+        return Parts(self.graph, self._nodes, self._joins, self._reweighing, self._aligning,
+                     self._seen, self._pending, self._queue, self._quarantine)
 
     def _count(self, source: str, answer: Answer) -> Answer:
         if answer.verdict is Verdict.ACCEPTED:

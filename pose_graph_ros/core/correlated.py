@@ -29,7 +29,8 @@ from pose_graph_ros.core import covariance, se2
 from pose_graph_ros.core.binding import Anchor, swept_variance
 from pose_graph_ros.core.constraints import EdgeKind, Edges, ObservedKind, ObservedNodes
 from pose_graph_ros.core.measurements import Absolute, HeadingOnly, Position
-from pose_graph_ros.core.se2 import FloatArray
+from pose_graph_ros.core.saved_graph import SavedBins
+from pose_graph_ros.core.se2 import FloatArray, IntArray
 from pose_graph_ros.core.sources import MeasurementSource
 
 # Bins in a time constant.
@@ -120,6 +121,23 @@ class BiasChain:
                 self._bins[after].tie = tie
         self._journal.clear()
 
+    def saved(self) -> SavedBins:
+        """Return the bins that there are."""
+        bins = [self._bins[number] for number in self._numbers]
+        numbers, rows, ties = (np.array(column, dtype=np.int64) for column in (
+            self._numbers, [each.row for each in bins], [each.tie for each in bins]))
+        return SavedBins(self._width_ns, numbers, rows, ties)
+
+    def restore(self, saved: SavedBins) -> bool:
+        """Go on with saved bins; tell if that can be, as they are as wide as those here."""
+        if saved.width_ns != self._width_ns:
+            return False
+        self._numbers = saved.numbers.tolist()
+        for number, row, tie in zip(
+                self._numbers, saved.rows.tolist(), saved.ties.tolist(), strict=True):
+            self._bins[number] = _Bin(row, tie)
+        return True
+
     def add(self, measurement: Absolute, anchor: Anchor, additions: Additions) -> int:
         """Add a measurement with the state of its error; return the row of its edge."""
         number, rest_ns = divmod(measurement.stamp_ns, self._width_ns)
@@ -193,6 +211,11 @@ class Shares:
         for number in reversed(self._journal):
             self._bins[number].pop()
         self._journal.clear()
+
+    def restore(self, rows: IntArray) -> None:
+        """Take measurements that are in a graph, by stamp and row, shape (K, 2)."""
+        for stamp_ns, row in rows.tolist():
+            self._bins.setdefault(stamp_ns // self._width_ns, []).append(row)
 
     def add(self, stamp_ns: int, observed: ObservedNodes, additions: Additions) -> int:
         """Add a measurement, and weigh those of its time anew; return its row."""

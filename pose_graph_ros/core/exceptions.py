@@ -21,3 +21,11 @@ class FileFormatError(PoseGraphError, ValueError):
 
 class LinearSolveError(PoseGraphError):
     """The linear system has no unique solution (H is singular or not positive definite)."""
+
+
+class NothingToSaveError(PoseGraphError):
+    """There is no graph yet that could be saved."""
+
+
+class FileWriteError(PoseGraphError):
+    """Files cannot be written; what was there before is as it was."""

@@ -26,15 +26,13 @@ from pose_graph_ros.core.config import BackendConfig
 from pose_graph_ros.core.constraints import EdgeKind, Edges
 from pose_graph_ros.core.measurements import Answer, OdometrySample
 from pose_graph_ros.core.motion import Pose, wrap_one
-from pose_graph_ros.core.odometry_stream import LOOSE, MEMORY_TIME, OdometryStream
+from pose_graph_ros.core.odometry_stream import OdometryStream
+from pose_graph_ros.core.saved_graph import as_matrix, as_pose, SavedBridge, SavedNodes
 from pose_graph_ros.core.se2 import FloatArray, IntArray
-from pose_graph_ros.core.timeline import OdometryTimeline
+from pose_graph_ros.core.unheard import unheard_motion
 
 MakeNode = Callable[[FloatArray, FloatArray | None, str], int]
 """Takes the pose of the first node, or pose and information of an edge; returns the row or -1."""
-
-# The speed of a robot is looked at over so long [ns].
-SPEED_TIME_NS = 500_000_000
 
 
 class HiddenNodes:
@@ -126,14 +124,16 @@ class HiddenNodes:
 
     def take(self, sample: OdometrySample, source: str) -> Answer:
         """Take an odometry sample, and make what nodes and edges are due."""
-        stream = self.streams.get(source)
-        if stream is None:
-            stream = OdometryStream(self._config.odometry_source(source))
-            self.streams[source] = stream
-            self._tied[source] = -1, 0
+        stream = self.streams.get(source) or self._make_stream(source)
         answer = stream.add(sample)
         self._go_on(source, stream.settle())
         return answer
+
+    def _make_stream(self, source: str) -> OdometryStream:
+        stream = OdometryStream(self._config.odometry_source(source))
+        self.streams[source] = stream
+        self._tied[source] = -1, 0
+        return stream
 
     def finish(self) -> None:
         """Settle all samples: no older ones are expected any more."""
@@ -240,7 +240,8 @@ class HiddenNodes:
             self._bridge = self._moved(old, min(begin_ns, last_ns))
             self._base_ns = begin_ns
             if begin_ns > last_ns:
-                self._bridge = self._bridged(*_blind(old.timeline, last_ns, begin_ns))
+                self._bridge = self._bridged(
+                    *unheard_motion(old.timeline, last_ns, begin_ns, old.saved_ns))
         x, y, theta = timeline.pose(self._base_ns).tolist()
         self._base, self._lead_ns = (x, y, theta), last_ns
         self._catch_up()
@@ -337,7 +338,7 @@ class HiddenNodes:
             last, node = self._tied[source]
             while node < len(stamps) and stamps[node] <= stream.settled_ns:
                 if stream.timeline.covers(int(stamps[node]), closely=True):
-                    if last >= 0:
+                    if last >= 0 and not stamps[last] < stream.restarted_ns <= stamps[node]:
                         motion = stream.timeline.motion(int(stamps[last]), int(stamps[node]))
                         self.edges.append((source, Edges(
                             [self.rows[last]], [self.rows[node]], [motion.increment],
@@ -373,15 +374,26 @@ class HiddenNodes:
         return *self._bridged(motion.increment, stream.covariance(motion, floor=False)), raw
 
 
-def _blind(
-    timeline: OdometryTimeline, last_ns: int, until_ns: int,
-) -> tuple[FloatArray, FloatArray]:
-    """Guess the motion after the last sample before a silence, and its covariance."""
-    begin_ns = max(int(timeline.stamps_ns[0]), last_ns - SPEED_TIME_NS)
-    motion, time = timeline.motion(begin_ns, last_ns), (last_ns - begin_ns) * 1e-9
-    elapsed = (until_ns - last_ns) * 1e-9
-    share = elapsed / time if time > 0.0 else 0.0
-    sigma = np.array((LOOSE[0] + motion.distance * share, LOOSE[0] + motion.distance * share,
-                      LOOSE[1] + motion.turn * share))
-    mean = motion.increment * min(share, MEMORY_TIME / time if time > 0.0 else 0.0)
-    return se2.wrapped(mean), np.diag(sigma**2)
+    def saved(self) -> SavedNodes:
+        """Return everything but the samples away from the nodes; there is at least one node."""
+        bridge = None if self._bridge is None else SavedBridge(
+            as_pose(self._bridge[0]), as_matrix(self._bridge[1]))
+        after_ns, leads = zip(*self._leads, strict=True)
+        return SavedNodes(
+            self.stamps_ns.copy(), self.rows.copy(), self.odometry.copy(),
+            leads, np.array(after_ns), self._lead_ns, self._base_ns, self._base, bridge,
+            {name: stream.saved(self.stamps_ns, self._tied[name])
+             for name, stream in self.streams.items()})
+
+    def restore(self, saved: SavedNodes) -> None:
+        """Go on, without any nodes yet, from where saved ones were."""
+        self._stamps.append(saved.stamps_ns)
+        self._rows.append(saved.rows)
+        self._odometry.append(saved.odometry)
+        self._leads = list(zip(saved.leads_after_ns.tolist(), saved.leads, strict=True))
+        self._lead_ns, self._base_ns, self._base = saved.lead_ns, saved.base_ns, saved.base
+        if saved.bridge is not None:
+            self._bridge = np.array(saved.bridge.mean), np.array(saved.bridge.covariance)
+        for name, stream in saved.streams.items():
+            self._make_stream(name).restore(stream)
+            self._tied[name] = stream.tied, stream.next_to_tie

@@ -9,7 +9,7 @@ every source it is remembered which constraints are its own.
 """
 
 from dataclasses import dataclass, field
-from typing import NamedTuple
+from typing import cast, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
@@ -18,12 +18,13 @@ from pose_graph_ros.core import autocorrelation, linearize, se2
 from pose_graph_ros.core.arrays import GrowingArray
 from pose_graph_ros.core.binding import Anchor
 from pose_graph_ros.core.config import BackendConfig
-from pose_graph_ros.core.constraints import Edges, ObservedNodes
+from pose_graph_ros.core.constraints import EdgeKind, Edges, ObservedNodes
 from pose_graph_ros.core.correlated import Additions, BiasChain, GraphSizes, Shares
 from pose_graph_ros.core.graph import Graph, GraphUpdate
 from pose_graph_ros.core.measurements import Absolute
 from pose_graph_ros.core.reweighing import Reweighing
-from pose_graph_ros.core.se2 import FloatArray
+from pose_graph_ros.core.saved_graph import SavedSource
+from pose_graph_ros.core.se2 import FloatArray, IntArray
 from pose_graph_ros.core.sources import (
     Correlation,
     LOOP_CLOSURES,
@@ -97,6 +98,8 @@ class _Own:
         """Stamp and row in the graph."""
         self.report: SourceReport | None = None
         """The newest."""
+        self.n_otherwise = 0
+        """Constraints that joined a graph that was loaded, by other settings than now."""
 
 
 class Joining:
@@ -135,7 +138,7 @@ class Joining:
     @property
     def n_measurements(self) -> int:
         """Number of measurements in the map that have joined the graph."""
-        return sum(len(own.rows) for own in self._own.values())
+        return sum(len(own.rows) + own.n_otherwise for own in self._own.values())
 
     def begin(self, queue: Queue, graph: Graph) -> GraphUpdate:
         """Return the update that adds all of a queue; `finish` or `undo` comes next."""
@@ -215,10 +218,50 @@ class Joining:
                 return Origin(source, begin_ns)
         return None
 
+    def saved(self) -> dict[str, SavedSource]:
+        """Return what there is of each source; which measurements were seen is not known here."""
+        result, none = {}, np.empty(0, dtype=np.int64)
+        for source in dict.fromkeys((*self._own, *self._ties)):
+            chain, own = self._correlated.get(source), self._own.get(source, _Own())
+            ties = self._ties.get(source, GrowingArray((), np.int64))
+            result[source] = SavedSource(
+                none, none, cast('IntArray', own.rows.values).copy(), own.n_otherwise,
+                cast('IntArray', ties.values).copy(),
+                chain.saved() if isinstance(chain, BiasChain) else None)
+        return result
+
+    def restore(self, source: str, saved: SavedSource) -> None:
+        """
+        Take what `saved` has returned for a source.
+
+        If its errors are now treated in another way, what is in the graph stays as it is, and
+        what comes begins anew.
+        """
+        if len(saved.ties) > 0:
+            self._ties[source] = GrowingArray((), np.int64)
+            self._ties[source].append(saved.ties)
+        if len(saved.rows) + saved.n_otherwise == 0:
+            return
+        self._own[source] = own = _Own()
+        chain = self._chain(source)
+        if isinstance(chain, BiasChain):
+            same = saved.bins is not None and chain.restore(saved.bins)
+        else:
+            same = saved.bins is None
+            if isinstance(chain, Shares) and same:
+                chain.restore(saved.rows)
+        own.rows.append(saved.rows if same else saved.rows[:0])
+        own.n_otherwise = saved.n_otherwise + len(saved.rows) - len(own.rows)
+
+    def count_bias_edges(self, graph: Graph) -> None:
+        """Count the edges to states of an error in a graph that was loaded."""
+        self.n_bias_edges = int(np.sum(graph.edges.kind == EdgeKind.BIAS))
+
     def reports(self, graph: Graph) -> dict[str, SourceReport]:
         """Return how well each source fits, by its newest measurements."""
         for source, own in self._own.items():
-            if own.report is None or len(own.rows) > MORE_RESIDUALS * own.report.n:
+            n = len(own.rows)
+            if n > 0 and (own.report is None or n > MORE_RESIDUALS * own.report.n):
                 own.report = self._report(graph, source, own)
         # a source of headings alone has no residuals of positions
         return {source: own.report for source, own in self._own.items()

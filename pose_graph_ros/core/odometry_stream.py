@@ -27,9 +27,11 @@ from pose_graph_ros.core.measurements import (
     value_defect,
 )
 from pose_graph_ros.core.motion import between_one, compose_one, Motion, Pose, wrap_one
-from pose_graph_ros.core.se2 import FloatArray
+from pose_graph_ros.core.saved_graph import SavedInstant, SavedStream
+from pose_graph_ros.core.se2 import FloatArray, IntArray
 from pose_graph_ros.core.sources import NoiseFrom, OdometrySource
 from pose_graph_ros.core.timeline import next_row, NOTHING, OdometryTimeline, Row, Variances
+from pose_graph_ros.core.unheard import LOOSE, MEMORY_TIME, restart_variance, RESUMED_WITHIN
 
 # A motion within the first of these is no jump, whatever the time [m, rad].
 SLACK = (0.25, 0.5)
@@ -39,15 +41,13 @@ ACCELERATION = (10.0, 20.0)
 MORE_SPEED = (3.0, 2.0)
 # Stamps lie unevenly, by so much: a speed is not taken over less than this [s].
 LEAST_TIME = 0.05
-# The fastest motion of late is forgotten within about this time [s].
-MEMORY_TIME = 2.0
-# Standard deviations of the motion at a jump: at least, and of the speed before [m, rad].
-LOOSE = (0.5, 0.1)
 # A variance of a twist beyond this, or one of zero, says nothing [m^2/s^2, rad^2/s^2].
 LARGEST_TWIST_VARIANCE = 1e4
 # A sample whose stamp lies so far ahead of this many that come after it is a mistake [ns].
 FAR_AHEAD_NS = 10_000_000_000
 MANY_BEHIND = 5
+# All samples of so long are saved with a graph: measurements may come late by that [ns].
+RECENT_NS = 60_000_000_000
 
 
 class _Sample(NamedTuple):
@@ -91,6 +91,8 @@ class _Instant(NamedTuple):
     """... and the path length and turns since."""
     jumped: bool
     """Whether odometry jumped to here."""
+    restarted: bool = False
+    """Whether it began anew here, after a graph was loaded."""
 
 
 class OdometryStream:
@@ -117,6 +119,10 @@ class OdometryStream:
         self._last: _Instant | None = None
         self._n_behind = 0
         """How many have come since that are far behind the newest."""
+        self.saved_ns = -1
+        """Stamp of the newest sample of a graph that was loaded [ns]."""
+        self.restarted_ns = -1
+        """Stamp of the settled sample with which it began anew after that [ns]: no tie across."""
         self.configure(source)
 
     def configure(self, source: OdometrySource) -> None:
@@ -212,6 +218,8 @@ class OdometryStream:
             del self._waiting[0]
             self._last = self._ahead.pop(0)
             self.n_jumps += self._last.jumped
+            if self._last.restarted:
+                self.restarted_ns = self._last.row.stamp_ns
             self.timeline.append_row(self._last.row)
             yield self._last.row.stamp_ns, self._last.row.pose
 
@@ -224,6 +232,32 @@ class OdometryStream:
             return stamp_ns + 1 if self.timeline.dense(at) and at > 0 else int(stamps[at])
         at = bisect.bisect_right(self._waiting, stamp_ns, key=_stamp)
         return self._waiting[at].stamp_ns if at < len(self._waiting) else None
+
+    def saved(self, nodes_ns: IntArray, tied: tuple[int, int]) -> SavedStream:
+        """Return all but the samples away from the hidden nodes, by the stamps of the nodes."""
+        stamps, rows, dense = self.timeline.thinned(
+            nodes_ns, min(int(nodes_ns[-1]), self.settled_ns - RECENT_NS))
+        waiting = np.array([(*sample.pose, sample.speed, *(sample.variance or NOTHING))
+                            for sample in self._waiting]).reshape(-1, 7)
+        waiting[~np.isfinite(waiting)] = 0.0    # which says as little
+        return SavedStream(
+            stamps, rows, dense, self.timeline.resting,
+            None if self._last is None else _saved_instant(self._last),
+            np.array([sample.stamp_ns for sample in self._waiting], dtype=np.int64), waiting,
+            self.restarted_ns, *tied)
+
+    def restore(self, saved: SavedStream) -> None:
+        """Go on, as an empty stream, from where a saved one was."""
+        if saved.last is not None:
+            self._last = _restored_instant(saved, saved.last)
+            self.timeline.restore(
+                saved.stamps_ns, saved.samples, saved.dense, self._last.row,
+                resting=saved.resting)
+        for stamp_ns, (x, y, theta, speed, *variance) in zip(
+                saved.waiting_ns.tolist(), saved.waiting.tolist(), strict=True):
+            self._waiting.append(_Sample(stamp_ns, (x, y, theta), speed, tuple(variance)))
+        self.restarted_ns = saved.restarted_ns
+        self.saved_ns = self.newest_ns
 
     def covariance(self, motion: Motion, *, floor: bool = True) -> FloatArray:
         """Return the covariance, shape (3, 3), of a motion by this odometry, at its end."""
@@ -253,7 +287,10 @@ class OdometryStream:
         step = between_one(before.raw, raw)
         elapsed = (stamp_ns - before.row.stamp_ns) * 1e-9
         moved = math.hypot(step[0], step[1]), abs(step[2])
-        if self._is_jump(before.rate, moved, elapsed, sample.speed):
+        jump = self._is_jump(before.rate, moved, elapsed, sample.speed)
+        if before.row.stamp_ns <= self.saved_ns < stamp_ns and (jump or elapsed > RESUMED_WITHIN):
+            return _after_restart(before, stamp_ns, raw)
+        if jump:
             return _after_jump(before, stamp_ns, raw, elapsed)
         offset, rate = before.offset, before.rate
         pose = raw if offset is None else compose_one(offset, raw)
@@ -320,7 +357,39 @@ def _after_jump(before: _Instant, stamp_ns: int, raw: Pose, elapsed: float) -> _
     row = next_row(before.row, stamp_ns, pose, loose=(position, position, heading))
     offset = compose_one(pose, between_one(raw, (0.0, 0.0, 0.0)))
     return before._replace(raw=raw, row=row, offset=offset, since_ns=stamp_ns, since=pose,
-                           way=(0.0, 0.0), jumped=True)
+                           way=(0.0, 0.0), jumped=True, restarted=False)
+
+
+def _after_restart(before: _Instant, stamp_ns: int, raw: Pose) -> _Instant:
+    """Return the state at a sample with which odometry begins anew, after a graph was loaded."""
+    pose = before.row.pose
+    row = next_row(before.row, stamp_ns, pose, loose=restart_variance())
+    offset = compose_one(pose, between_one(raw, (0.0, 0.0, 0.0)))
+    return _Instant(raw, row, offset, _UNKNOWN, stamp_ns, pose, (0.0, 0.0), jumped=True,
+                    restarted=True)
+
+
+def _saved_instant(last: _Instant) -> SavedInstant:
+    rate = None if last.rate is _UNKNOWN else (
+        *last.rate.velocity, *last.rate.recent, *last.rate.ever)
+    return SavedInstant(
+        last.raw, last.offset, last.row.counted, last.row.counted_ns, last.row.held, rate,
+        last.since_ns, last.since, last.way, last.jumped)
+
+
+def _restored_instant(saved: SavedStream, last: SavedInstant) -> _Instant:
+    x, y, theta, distance, turn, *variance = saved.samples[-1].tolist()
+    row = Row(int(saved.stamps_ns[-1]), (x, y, theta), distance, turn, _nothing(tuple(variance)),
+              last.counted, last.counted_ns, _nothing(last.held))
+    rate = _UNKNOWN if last.rate is None else _Rate(
+        last.rate[:3], last.rate[3:5], last.rate[5:])
+    return _Instant(last.raw, row, last.offset, rate, last.since_ns, last.since, last.way,
+                    last.jumped)
+
+
+def _nothing(variance: Variances) -> Variances:
+    """Return the one object that stands for no variance where there is none."""
+    return variance if any(variance) else NOTHING
 
 
 def _stamp(sample: _Sample) -> int:

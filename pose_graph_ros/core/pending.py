@@ -7,7 +7,10 @@ import bisect
 import itertools
 from typing import NamedTuple
 
+import numpy as np
+
 from pose_graph_ros.core.measurements import LoopClosure, Measurement
+from pose_graph_ros.core.se2 import IntArray
 
 # A sender whose clock is ahead must not fill the memory.
 MAX_PENDING = 10_000
@@ -48,6 +51,11 @@ class Pending:
         waiting = Waiting(due_ns(measurement), next(self._arrival), source, measurement)
         bisect.insort(self._waiting, waiting, key=_last_first)
         return self._waiting.pop(0) if len(self) > MAX_PENDING else None
+
+    @property
+    def measurements(self) -> list[tuple[str, Measurement]]:
+        """All that wait, with their sources."""
+        return [(waiting.source, waiting.measurement) for waiting in self._waiting]
 
     def pop_due(self, covered_ns: int) -> list[Waiting]:
         """Hand out what is due, the oldest first."""
@@ -95,6 +103,25 @@ class Seen:
         at = self._find(source, measurement)
         if at >= 0:
             del self._stamps[source][at], self._references[source][at]
+
+    def saved(
+        self, without: list[tuple[str, Measurement]],
+    ) -> dict[str, tuple[IntArray, IntArray]]:
+        """Return stamps and references, shape (M,) each, of each source but for some of them."""
+        left_out: dict[str, list[int]] = {}
+        for source, measurement in without:
+            left_out.setdefault(source, []).append(self._find(source, measurement))
+        result = {}
+        for source, stamps in self._stamps.items():
+            rows = [at for at in left_out.get(source, ()) if at >= 0]
+            result[source] = (np.delete(np.array(stamps), rows),
+                              np.delete(np.array(self._references[source]), rows))
+        return result
+
+    def restore(self, source: str, stamps_ns: IntArray, references: IntArray) -> None:
+        """Take what `saved` has returned for a source."""
+        self._stamps[source] = array('q', stamps_ns.tolist())
+        self._references[source] = array('q', references.tolist())
 
     def _find(self, source: str, measurement: Measurement) -> int:
         stamps = self._stamps.get(source)

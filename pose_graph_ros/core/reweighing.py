@@ -17,6 +17,7 @@ import numpy as np
 from pose_graph_ros.core import linearize, robust
 from pose_graph_ros.core.arrays import GrowingArray
 from pose_graph_ros.core.graph import Graph
+from pose_graph_ros.core.saved_graph import SavedLosses
 from pose_graph_ros.core.se2 import FloatArray, IntArray
 from pose_graph_ros.core.sources import Loss
 
@@ -58,6 +59,18 @@ class _Rows:
         shares = cast('FloatArray', self.shares.values)
         return dict(zip(self.numbers.tolist(), (weight * shares).tolist(), strict=True))
 
+    def saved(self) -> SavedLosses:
+        losses = cast('FloatArray', self.losses.values)
+        return SavedLosses(
+            self.numbers.copy(), losses[:, 0].astype(np.int64), losses[:, 1].copy(),
+            cast('FloatArray', self.shares.values).copy(), self.cursor)
+
+    def restore(self, saved: SavedLosses) -> None:
+        self.rows.append(saved.rows)
+        self.losses.append(np.column_stack((saved.losses, saved.thresholds)))
+        self.shares.append(saved.shares)
+        self.cursor = saved.cursor
+
     def some(self) -> IntArray:
         """Return the newest ones, and others in turn, as indices."""
         size = len(self.rows)
@@ -91,6 +104,15 @@ class Reweighing:
     def share(self, row: int, share: float) -> None:
         """Let an observed node weigh so much without its loss; by its row, if it was added."""
         self._observed.share(row, share)
+
+    def saved(self) -> tuple[SavedLosses, SavedLosses]:
+        """Return the edges and the observed nodes that have a loss."""
+        return self._edges.saved(), self._observed.saved()
+
+    def restore(self, edges: SavedLosses, observed: SavedLosses) -> None:
+        """Take what `saved` has returned, where there is nothing yet."""
+        self._edges.restore(edges)
+        self._observed.restore(observed)
 
     def changes(self, graph: Graph) -> tuple[Mapping[int, float], Mapping[int, float]]:
         """Return new weights of edges and of observed nodes, of a bounded number of them."""

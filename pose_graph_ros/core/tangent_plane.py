@@ -8,6 +8,8 @@ has one). PROJ's geocentric and topocentric conversions do the work on WGS 84: e
 latitude, without zones and without convergence of a grid.
 """
 
+from typing import NamedTuple
+
 import numpy as np
 import numpy.typing as npt
 import pyproj
@@ -18,6 +20,23 @@ from pose_graph_ros.core.se2 import FloatArray
 # So often a point is lifted to an altitude; each time what is missing shrinks by the angle
 # between the verticals there and at the datum, squared.
 LIFTS = 4
+
+
+class MapOrigin(NamedTuple):
+    """Where the origin of a map lies on the Earth, and which way its x axis points."""
+
+    latitude: float
+    """WGS 84 [degrees]."""
+    longitude: float
+    """[degrees]"""
+    altitude: float = 0.0
+    """Above the ellipsoid [m]."""
+    yaw: float = 0.0
+    """Angle of the x axis from east, counter-clockwise [rad]."""
+
+    def __str__(self) -> str:
+        return (f'[{self.latitude:.9f}, {self.longitude:.9f}] at {self.altitude:.2f} m '
+                f'with yaw {self.yaw:.6f}')
 
 
 class TangentPlane:
@@ -56,6 +75,11 @@ class TangentPlane:
             f'+lat_0={self.latitude!r} +lon_0={self.longitude!r} +h_0={self.altitude!r}')
         self._map = np.array([0.0, 0.0, yaw])
 
+    @property
+    def origin(self) -> MapOrigin:
+        """The datum."""
+        return MapOrigin(self.latitude, self.longitude, self.altitude, self.yaw)
+
     def to_map(
         self, latitude: npt.ArrayLike, longitude: npt.ArrayLike, altitude: npt.ArrayLike,
     ) -> FloatArray:
@@ -84,3 +108,13 @@ class TangentPlane:
             if altitude is not None:
                 up = up + altitude - height
         return np.stack((latitude, longitude, height), axis=-1)
+
+
+def distances(point: MapOrigin, latitude: npt.ArrayLike, longitude: npt.ArrayLike) -> FloatArray:
+    """Return how far points, shape (N,) [degrees], are from one along the Earth [m]."""
+    latitude, longitude = (
+        np.atleast_1d(np.asarray(numbers, dtype=np.float64)) for numbers in (latitude, longitude))
+    _, _, metres = pyproj.Geod(ellps='WGS84').inv(
+        np.full(longitude.shape, point.longitude), np.full(latitude.shape, point.latitude),
+        longitude, latitude)
+    return np.asarray(metres)

@@ -173,6 +173,43 @@ class OdometryTimeline:
         """Tell whether samples like it and the one before were left out between the two."""
         return bool(cast('npt.NDArray[np.bool_]', self._dense.values)[sample])
 
+    def thinned(
+        self, instants_ns: IntArray, since_ns: int,
+    ) -> tuple[IntArray, FloatArray, npt.NDArray[np.bool_]]:
+        """
+        Return stamps (T,), rows (T, 8) and whether each is dense, of the samples that matter.
+
+        Those are the first one, those at some instants or else on both sides of them, and all
+        from another instant on. At these instants nothing changes by leaving out the others.
+        """
+        stamps = self.stamps_ns
+        keep = np.zeros(len(stamps), dtype=bool)
+        keep[:1] = True
+        keep[np.searchsorted(stamps, since_ns):] = True
+        after = np.searchsorted(stamps, instants_ns)
+        inside = after < len(stamps)
+        keep[after[inside]] = True
+        inside[inside] = stamps[after[inside]] != instants_ns[inside]
+        keep[after[inside] - 1] = True  # (the last sample, if it is before the first instant)
+        dense = cast('npt.NDArray[np.bool_]', self._dense.values)
+        return (stamps[keep], cast('FloatArray', self._samples.values)[keep],
+                (dense & np.append(False, keep[:-1]))[keep])
+
+    @property
+    def resting(self) -> bool:
+        """Whether the next sample takes the place of the last one if it is the same."""
+        return self._resting
+
+    def restore(
+        self, stamps_ns: IntArray, rows: FloatArray, dense: npt.NDArray[np.bool_], last: Row, *,
+        resting: bool,
+    ) -> None:
+        """Fill this empty timeline with what `thinned` has returned, and the newest row."""
+        self._stamps.append(stamps_ns)
+        self._samples.append(rows)
+        self._dense.append(dense)
+        self._last, self._resting = last, resting
+
     def motion(self, start_ns: int, end_ns: int) -> Motion:
         """
         Return the motion between two instants that are covered, start not after end.

@@ -12,9 +12,10 @@ import pytest
 
 from pose_graph_ros.core import se2
 from pose_graph_ros.core.measurements import OdometrySample, Verdict
-from pose_graph_ros.core.odometry_stream import LOOSE, MANY_BEHIND, OdometryStream
+from pose_graph_ros.core.odometry_stream import MANY_BEHIND, OdometryStream
 from pose_graph_ros.core.se2 import FloatArray
 from pose_graph_ros.core.sources import NoiseFrom, OdometryNoise, OdometrySource
+from pose_graph_ros.core.unheard import LOOSE
 
 SECOND = 1_000_000_000
 # The Unix time of 2026 in nanoseconds: a double does not hold it.

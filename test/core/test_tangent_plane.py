@@ -7,7 +7,7 @@ import numpy as np
 import pyproj
 import pytest
 
-from pose_graph_ros.core.tangent_plane import TangentPlane
+from pose_graph_ros.core.tangent_plane import distances, MapOrigin, TangentPlane
 
 # Of a position there and back.
 ROUND_TRIP = 1e-6
@@ -129,3 +129,20 @@ def test_single_points_and_batches_agree() -> None:
         one = plane.to_map(float(latitude[k]), float(longitude[k]), 0.0)
         assert one.shape == (2,)
         np.testing.assert_allclose(one, together[k], atol=ROUND_TRIP)
+
+
+def test_distances_go_along_the_earth_the_short_way_round() -> None:
+    degree = 111_319.491
+    for point, there, degrees in (
+            (MapOrigin(0.0, 0.0), (0.0, 1.0), 1.0), (MapOrigin(0.0, 179.5), (0.0, -179.5), 1.0),
+            (MapOrigin(0.0, 10.0), (0.0, 370.0), 0.0)):
+        np.testing.assert_allclose(distances(point, *there), [degrees * degree], atol=1e-3)
+    np.testing.assert_allclose(
+        distances(MapOrigin(48.0, 11.0), [48.0, -48.0], [11.0, -169.0]), [0.0, 20_003_931.459],
+        atol=1e-3)
+
+
+def test_a_plane_knows_its_origin() -> None:
+    origin = MapOrigin(48.1, 11.6, 500.0, 0.25)
+    assert TangentPlane(*origin).origin == origin
+    assert str(origin) == '[48.100000000, 11.600000000] at 500.00 m with yaw 0.250000'

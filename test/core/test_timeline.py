@@ -231,3 +231,64 @@ def test_one_pose_at_a_time_is_the_same_as_arrays(x: float, a: float, b: float) 
     one, two = tuple(first.tolist()), tuple(second.tolist())
     np.testing.assert_allclose(compose_one(one, two), se2.compose(first, second), atol=1e-11)
     np.testing.assert_allclose(between_one(one, two), se2.between(first, second), atol=1e-11)
+
+
+@given(st.lists(st.tuples(st.integers(1, 2_000_000_000), st.sampled_from((0, 0, 1))),
+                min_size=1, max_size=40), st.data())
+def test_thinning_changes_nothing_at_the_instants_that_matter_and_after(
+    steps: list[tuple[int, int]], data: st.DataObject,
+) -> None:
+    whole, stamp, pose, row = OdometryTimeline(), EPOCH, np.zeros(3), None
+    rows = []
+    for wait, moves in steps:
+        stamp += wait
+        pose = se2.compose(pose, moves * np.array([0.7, 0.1, 0.3]))
+        row = next_row(row, stamp, tuple(pose.tolist()), (0.01, 0.02, 0.03))
+        rows.append(row)
+    n_before = data.draw(st.integers(1, len(rows)))
+    for row in rows[:n_before]:
+        whole.append_row(row)
+    first, last = rows[0].stamp_ns, rows[n_before - 1].stamp_ns
+    instants = np.array(sorted(data.draw(
+        st.lists(st.integers(first, last), min_size=1, max_size=5, unique=True))))
+    since = data.draw(st.integers(int(instants[-1]), last + 5))
+    thinned = OdometryTimeline()
+    thinned.restore(*whole.thinned(instants, since), rows[n_before - 1], resting=whole.resting)
+    for row in rows[n_before:]:     # both go on
+        whole.append_row(row)
+        thinned.append_row(row)
+    assert len(thinned) <= len(whole)
+    after = [stamp for stamp in whole.stamps_ns.tolist() if stamp >= since]
+    exact = [*instants.tolist(), *after, *[stamp - 1 for stamp in after[1:]]]
+    for start in exact:
+        assert thinned.covers(start, closely=True) == whole.covers(start, closely=True)
+        for end in exact:
+            if start <= end:
+                for one, other in zip(
+                        thinned.motion(start, end), whole.motion(start, end), strict=True):
+                    np.testing.assert_array_equal(one, other)
+    np.testing.assert_array_equal(thinned.poses[0], whole.poses[0])
+
+
+def test_thinning_leaves_out_the_samples_between() -> None:
+    stamps = [EPOCH + k * SECOND // 10 for k in range(1000)]
+    timeline = filled(stamps, np.column_stack((0.1 * np.arange(1000), np.zeros((1000, 2)))))
+    kept, rows, dense = timeline.thinned(
+        np.array([stamps[50], stamps[100] + 1]), stamps[990])
+    np.testing.assert_array_equal(kept, [stamps[k] for k in (0, 50, 100, 101, *range(990, 1000))])
+    assert rows.shape == (14, 8)
+    assert not np.any(dense)
+
+
+def test_thinning_does_not_take_what_is_left_out_for_rest() -> None:
+    # moves, rests for 9 s, moves on
+    x = [0.0, 1.0, *[2.0] * 91, 3.0, 4.0]
+    stamps = [EPOCH + k * SECOND // 10 for k in range(len(x))]
+    timeline = filled(stamps, np.column_stack((x, np.zeros((len(x), 2)))))
+    assert timeline.covers(stamps[50], closely=True)
+    thinned = OdometryTimeline()
+    thinned.restore(*timeline.thinned(np.array([stamps[0], stamps[92]]), stamps[93]),
+                    next_row(None, stamps[-1], (4.0, 0.0, 0.0)), resting=False)
+    assert thinned.covers(stamps[92])
+    assert thinned.covers(stamps[50])
+    assert not thinned.covers(stamps[50], closely=True)

@@ -1,0 +1,301 @@
+# Copyright 2026 The pose_graph_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""
+A saved graph as three files of plain text: `map.g2o`, `map.json` and `map.tum`.
+
+The g2o file holds the hidden nodes, edges and observed nodes that other programs understand; the
+JSON file all the rest, with the SHA-256 of the g2o file; the TUM file the path, for other programs
+alone. The first member of the JSON file is the SHA-256 of all that follows it in the file. Both
+files are read back to the bit, or refused. See docs/design.md, "Saved graphs".
+"""
+
+from collections.abc import Iterator
+from dataclasses import dataclass, fields
+import hashlib
+import json
+import os
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from pose_graph_ros import __version__
+from pose_graph_ros.core.constraints import EdgeKind, Edges, full, KindArray, ObservedNodes, upper
+from pose_graph_ros.core.exceptions import FileFormatError, FileWriteError
+from pose_graph_ros.core.graph import GraphRows
+from pose_graph_ros.core.io.g2o import g2o_text
+from pose_graph_ros.core.io.plain import annotations, decoded, encoded
+from pose_graph_ros.core.io.tum import tum_text
+from pose_graph_ros.core.io.whole_files import write_files
+from pose_graph_ros.core.saved_graph import (
+    Integers,
+    Numbers,
+    Rows3,
+    Rows4,
+    Rows6,
+    SavedGraph,
+)
+from pose_graph_ros.core.se2 import FloatArray, IntArray
+from pose_graph_ros.core.trajectory import Trajectory
+
+FORMAT = 'pose_graph_ros graph'
+VERSION = 1
+
+SUFFIXES = ('.g2o', '.json', '.tum')
+_OPENING, _MIDDLE = b'{\n"sha256": "', b'",\n'
+_DIGITS = 64
+# Ids and numbers behind each tag ...
+_NUMBERS = {'VERTEX_SE2': 4, 'EDGE_SE2': 11, 'OBSERVED_SE2_OFFSET': 13, 'EDGE_PRIOR_SE2': 10,
+            'EDGE_PRIOR_SE2_XY': 6}
+# ... and where those of an observed node belong among node, offset, mean and information.
+_OBSERVED = {'OBSERVED_SE2_OFFSET': range(13), 'EDGE_PRIOR_SE2': (0, *range(4, 13)),
+             'EDGE_PRIOR_SE2_XY': (0, 4, 5, 7, 8, 10)}
+
+
+@dataclass(frozen=True, slots=True)
+class SavedRows:
+    """What the g2o file does not tell of the rows of a graph."""
+
+    fixed: Integers
+    biases: Integers
+    """Rows of the hidden nodes that are biases ..."""
+    bias_values: Rows3
+    """... and their values; the others are the vertices of the g2o file."""
+    edge_kind: Integers
+    """Of all edges; those that lead to biases, of kind 2, are here, the others there."""
+    edge_weight: Numbers
+    bias_edge_i: Integers
+    bias_edge_j: Integers
+    bias_edge_mean: Rows3
+    bias_edge_information: Rows6
+    bias_edge_bias: Rows4
+    observed_kind: Integers
+    """Of all observed nodes; those on biases are here, the others there."""
+    observed_weight: Numbers
+    observed_on_bias: Integers
+    """Their numbers."""
+    bias_observed_node: Integers
+    bias_observed_offset: Rows3
+    bias_observed_mean: Rows3
+    bias_observed_information: Rows6
+
+
+def graph_paths(path: Path) -> tuple[Path, Path, Path]:
+    """Return the g2o, the JSON and the TUM file of a graph; a suffix of theirs does not count."""
+    name = path.name.removesuffix(path.suffix) if path.suffix in SUFFIXES else path.name
+    g2o, side, tum = (path.with_name(name + suffix) for suffix in SUFFIXES)
+    return g2o, side, tum
+
+
+def write_graph(saved: SavedGraph, path: Path) -> tuple[Path, Path, Path]:
+    """
+    Write a saved graph, all of its files or none; folders that are missing are made.
+
+    Parameters
+    ----------
+    saved : SavedGraph
+    path : Path
+        Of the g2o file, the suffix may be missing; the others lie beside it.
+
+    Returns
+    -------
+    tuple of Path
+        The files that were written: g2o, JSON, TUM.
+
+    Raises
+    ------
+    FileWriteError
+        If that fails, or the path is a folder; files that were there are as they were.
+
+    """
+    if path.name == '' or os.path.isdir(path):
+        raise FileWriteError(f'{path}: is a folder, expected the name of a file')
+    paths = graph_paths(path)
+    g2o = g2o_text(saved.rows).encode('ascii')
+    nodes = saved.nodes
+    tum = tum_text(Trajectory(nodes.stamps_ns, saved.rows.poses[nodes.rows])).encode('ascii')
+    members = {
+        'format': FORMAT, 'version': VERSION, 'created_by': f'pose_graph_ros {__version__}',
+        'g2o_sha256': hashlib.sha256(g2o).hexdigest(), 'graph': encoded(_saved_rows(saved.rows)),
+        **{name: encoded(getattr(saved, name)) for name in _members()}}
+    body = (',\n'.join(_lines(members)) + '\n}\n').encode('ascii')
+    digest = hashlib.sha256(body).hexdigest().encode('ascii')
+    side = _OPENING + digest + _MIDDLE + body
+    g2o_path, side_path, tum_path = paths
+    write_files({g2o_path: g2o, tum_path: tum, side_path: side})
+    return paths
+
+
+def read_graph(path: Path) -> SavedGraph:
+    """
+    Read a saved graph.
+
+    Parameters
+    ----------
+    path : Path
+        As for `write_graph`.
+
+    Raises
+    ------
+    FileFormatError
+        Names the file, what was expected and what came: if a file is missing, damaged, cut off,
+        of another version or of another graph than the one beside it.
+
+    """
+    if path.name == '':
+        raise FileFormatError(f'{path}: expected the name of a file')
+    g2o_path, path, _ = graph_paths(path)
+    members = _checked_members(path, _content(path))
+    g2o = _content(g2o_path)
+    if hashlib.sha256(g2o).hexdigest() != members.pop('g2o_sha256', None):
+        raise FileFormatError(
+            f'{g2o_path}: is damaged, or not the file that {path} was written with')
+    try:
+        hints = annotations(SavedGraph)
+        rest = {name: decoded(hints[name], members.pop(name), name) for name in _members()}
+        rows = decoded(SavedRows, members.pop('graph'), 'graph')
+        saved = SavedGraph(rows=_graph_rows(rows, g2o.decode('ascii')), **rest)
+        saved.check()
+    except KeyError as error:
+        raise FileFormatError(f'{path}: expected a member {error}') from error
+    except ValueError as error:
+        raise FileFormatError(f'{path}, with {g2o_path.name}: {error}') from error
+    return saved
+
+
+def _members() -> list[str]:
+    return [item.name for item in fields(SavedGraph) if item.name != 'rows']
+
+
+def _lines(members: dict[str, Any], indent: str = '') -> Iterator[str]:
+    """Yield each member of an object on a line, those of objects in it on lines of their own."""
+    for name, value in members.items():
+        if isinstance(value, dict) and len(value) > 0:
+            inner = ',\n'.join(_lines(value, indent + '  '))
+            yield f'{indent}{json.dumps(name)}: {{\n{inner}\n{indent}}}'
+        else:
+            text = json.dumps(value, separators=(',', ':'), allow_nan=False)
+            yield f'{indent}{json.dumps(name)}: {text}'
+
+
+def _content(path: Path) -> bytes:
+    try:
+        return path.read_bytes()
+    except (OSError, ValueError) as error:
+        raise FileFormatError(f'{path}: cannot be read ({error})') from error
+
+
+def _checked_members(path: Path, content: bytes) -> dict[str, Any]:
+    """Return the members of a JSON file behind the sum that vouches for them."""
+    begin = len(_OPENING) + _DIGITS
+    body = content[begin + len(_MIDDLE):]
+    if not content.startswith(_OPENING) or content[begin:begin + len(_MIDDLE)] != _MIDDLE:
+        raise FileFormatError(f'{path}: does not begin as a saved graph does, with its SHA-256')
+    if hashlib.sha256(body).hexdigest().encode('ascii') != content[len(_OPENING):begin]:
+        raise FileFormatError(f'{path}: is damaged, cut off or was edited: its SHA-256 is not '
+                              'the one that it begins with')
+    try:
+        members = json.loads(b'{' + body)
+    except (ValueError, RecursionError) as error:
+        raise FileFormatError(f'{path}: expected JSON ({error})') from error
+    if (members.pop('format', None), members.pop('version', None)) != (FORMAT, VERSION):
+        raise FileFormatError(f'{path}: expected a {FORMAT} of version {VERSION}, created by '
+                              f'pose_graph_ros; this one was by {members.get("created_by")!r}')
+    return dict(members)
+
+
+def _saved_rows(rows: GraphRows) -> SavedRows:
+    edges = rows.edges.rows(rows.edges.kind == EdgeKind.BIAS)
+    on_bias = np.flatnonzero(rows.is_bias[rows.observed.node])
+    observed, biases = rows.observed.rows(on_bias), np.flatnonzero(rows.is_bias)
+    return SavedRows(
+        np.flatnonzero(rows.fixed), biases, rows.poses[biases],
+        rows.edges.kind.astype(np.int64), rows.edges.weight, edges.i, edges.j, edges.mean,
+        upper(edges.information), edges.bias, rows.observed.kind.astype(np.int64),
+        rows.observed.weight, on_bias, observed.node, observed.offset, observed.mean,
+        upper(observed.information))
+
+
+def _graph_rows(rows: SavedRows, text: str) -> GraphRows:
+    """Return the rows of a graph from both files; raise ValueError where they do not agree."""
+    lines = text.split('\n')
+    vertices = _numbers(lines, 'VERTEX_SE2')
+    n = len(vertices) + len(rows.biases)
+    is_bias, fixed = np.zeros(n, dtype=bool), np.zeros(n, dtype=bool)
+    poses = np.zeros((n, 3))
+    for name, chosen in (('fixed', rows.fixed), ('biases', rows.biases)):
+        if np.any((chosen < 0) | (chosen >= n)):
+            raise ValueError(f'graph.{name}: expected hidden nodes in 0..{n - 1}')
+    fixed[rows.fixed] = is_bias[rows.biases] = True
+    if not np.array_equal(vertices[:, 0], np.flatnonzero(~is_bias)):
+        raise ValueError('expected the hidden nodes that are no biases as vertices, in order')
+    poses[~is_bias] = vertices[:, 1:]
+    _place(poses, rows.biases, rows.bias_values, 'biases')
+    return GraphRows(poses, is_bias, fixed, _edges(rows, _numbers(lines, 'EDGE_SE2')),
+                     _observed(rows, lines))
+
+
+def _edges(rows: SavedRows, numbers: FloatArray) -> Edges:
+    to_bias = rows.edge_kind == EdgeKind.BIAS
+    there, here = np.flatnonzero(~to_bias), np.flatnonzero(to_bias)
+    bias = np.zeros((len(to_bias), 4))
+    _place(bias, here, rows.bias_edge_bias, 'edges to biases')
+    both = np.zeros((len(to_bias), 11))
+    _place(both, there, numbers, 'edges')
+    _place(both, here, np.column_stack(
+        (rows.bias_edge_i, rows.bias_edge_j, rows.bias_edge_mean, rows.bias_edge_information)),
+        'edges to biases')
+    return Edges(
+        both[:, 0].astype(np.int64), both[:, 1].astype(np.int64), both[:, 2:5].copy(),
+        full(both[:, 5:]), _kinds(rows.edge_kind), _weights(rows.edge_weight, len(both)), bias)
+
+
+def _observed(rows: SavedRows, lines: list[str]) -> ObservedNodes:
+    size = len(rows.observed_kind)
+    if np.any((rows.observed_on_bias < 0) | (rows.observed_on_bias >= size)):
+        raise ValueError(f'graph.observed_on_bias: expected numbers in 0..{size - 1}')
+    is_here = np.zeros(size, dtype=bool)
+    is_here[rows.observed_on_bias] = True
+    lines = [line for line in lines if line.startswith(tuple(_OBSERVED))]
+    tags = np.array([line.partition(' ')[0] for line in lines], dtype=np.str_)
+    numbers = np.zeros((len(lines), 13))
+    for tag, columns in _OBSERVED.items():
+        chosen = np.flatnonzero(tags == tag)
+        numbers[chosen[:, None], list(columns)] = _numbers(lines, tag)
+    both = np.zeros((size, 13))
+    _place(both, np.flatnonzero(~is_here), numbers, 'observed nodes')
+    _place(both, rows.observed_on_bias, np.column_stack((
+        rows.bias_observed_node, rows.bias_observed_offset, rows.bias_observed_mean,
+        rows.bias_observed_information)), 'observed nodes on biases')
+    return ObservedNodes(
+        both[:, 0].astype(np.int64), both[:, 1:4].copy(), both[:, 4:7].copy(), full(both[:, 7:]),
+        _kinds(rows.observed_kind), _weights(rows.observed_weight, size))
+
+
+def _numbers(lines: list[str], tag: str) -> FloatArray:
+    """Return what follows a tag in the lines that have it, shape (M, n)."""
+    n = _NUMBERS[tag]
+    begin = f'{tag} '
+    words = ' '.join(line[len(begin):] for line in lines if line.startswith(begin)).split(' ')
+    numbers = np.array([float(word) for word in words if word != ''])
+    if len(numbers) % n != 0 or not np.all(np.isfinite(numbers)):
+        raise ValueError(f'expected {n} finite numbers after each {tag}')
+    return numbers.reshape(-1, n)
+
+
+def _place(table: FloatArray, rows: IntArray, numbers: FloatArray, name: str) -> None:
+    if len(rows) != len(numbers):
+        raise ValueError(f'graph: expected {len(rows)} {name}, got {len(numbers)}')
+    table[rows] = numbers
+
+
+def _kinds(kind: IntArray) -> KindArray:
+    if np.any((kind < 0) | (kind > 255)):
+        raise ValueError('graph: expected kinds of edges and observed nodes')
+    return kind.astype(np.uint8)
+
+
+def _weights(weight: FloatArray, size: int) -> FloatArray:
+    if len(weight) != size:
+        raise ValueError(f'graph: expected {size} weights, got {len(weight)}')
+    return weight
