@@ -48,7 +48,7 @@ MEMORY = 250.0
 PATH_TIME, START_TIME = 10.0, 3.0
 """[ms] and [s]."""
 LADDER = (1000.0, 1500.0, 2000.0, 3000.0, 4000.0, 6000.0, 8000.0)
-STARTS = 3
+STARTS = 5
 MB = 1e6
 
 

@@ -399,32 +399,49 @@ class PoseGraphBackend:
         self._newest_node_covariance = self._smoother.newest_covariance()
         return UpdateReport(result.status, '', 0, result.iterations, result.chi2)
 
-    def estimate(self) -> Estimate | None:
-        """Return the present estimate; None before the first odometry."""
+    def estimate(self, *, with_path: bool = True) -> Estimate | None:
+        """
+        Return the present estimate; None before the first odometry.
+
+        Parameters
+        ----------
+        with_path : bool
+            Whether it has its path. That alone takes time in proportion to the graph, and memory.
+
+        """
         graph = self.graph
         if graph.n_nodes == 0:
             return None
-        poses, stamps = graph.poses[self._nodes.rows], self.node_stamps_ns
+        node = graph.poses[self._nodes.rows[-1]]
         motion, noise, odometry = self._nodes.newest()
-        newest_ns, newest = self._nodes.newest_ns, se2.compose(poses[-1], motion)
-        cov = covariance.propagated(poses[-1], self._newest_node_covariance, motion, noise)
+        newest = se2.compose(node, motion)
+        cov = covariance.propagated(node, self._newest_node_covariance, motion, noise)
         state, sigma = self._aligning.copy()
+        shift = np.zeros(3)
         if state is AlignmentState.UNALIGNED:
             # those that turned the graph in an update that failed are set aside
             shift, cov = alignment.guess(graph.poses, newest, Queue(observed=placed(
                 self._queue.observed + self._quarantine.observed)).all_observed())
-            poses, newest = poses + shift, newest + shift
-        if newest_ns > stamps[-1]:
-            stamps, poses = np.append(stamps, newest_ns), np.vstack((poses, newest))
+            newest = newest + shift
+        stamp_ns = max(self._nodes.newest_ns, int(self.node_stamps_ns[-1]))
         lead = self._nodes.lead
         return Estimate(
-            path=Trajectory(stamps, poses), T_odom_base=odometry, T_map_base=newest,
+            stamp_ns=stamp_ns, T_odom_base=odometry, T_map_base=newest,
             T_map_odom=se2.compose(newest, se2.inverse(odometry)), covariance=cov,
             alignment=state, chi2=self._chi2, alignment_sigma=(
                 math.sqrt(cov[2, 2]) if state is AlignmentState.ALIGNED else sigma),
             n_hidden=len(self._nodes), n_edges=graph.n_edges - self._joins.n_bias_edges,
             n_observed=self._joins.n_measurements, n_biases=graph.n_nodes - len(self._nodes),
-            lead=lead, noise=self._config.odometry_source(lead).noise)
+            lead=lead, noise=self._config.odometry_source(lead).noise,
+            trajectory=self._path(stamp_ns, newest, shift) if with_path else None)
+
+    def _path(self, stamp_ns: int, newest: FloatArray, shift: FloatArray) -> Trajectory:
+        """Return the path over all hidden nodes, moved by a shift, to the newest odometry."""
+        stamps, poses = self.node_stamps_ns, self.graph.poses[self._nodes.rows]
+        poses += shift
+        if stamp_ns > stamps[-1]:
+            stamps, poses = np.append(stamps, stamp_ns), np.vstack((poses, newest))
+        return Trajectory(stamps, poses)
 
     def saved(self, datum: MapOrigin | None = None) -> SavedGraph:
         """Return all that has joined the graph; `update` first. See `saving.capture`."""

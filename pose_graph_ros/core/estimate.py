@@ -51,8 +51,8 @@ class UpdateReport:
 class Estimate:
     """A snapshot for publishing; nothing in it changes later."""
 
-    path: Trajectory
-    """`T_map_base` at the hidden nodes, and last at the newest odometry."""
+    stamp_ns: int
+    """Of the newest odometry [ns]."""
     T_odom_base: FloatArray
     """Newest odometry, shape (3,)."""
     T_map_base: FloatArray
@@ -76,6 +76,23 @@ class Estimate:
     """Source of the odometry in `T_odom_base`."""
     noise: OdometryNoise
     """Of that odometry."""
+    trajectory: Trajectory | None = None
+    """What `path` returns."""
+
+    @property
+    def path(self) -> Trajectory:
+        """
+        `T_map_base` at the hidden nodes, and last at the newest odometry.
+
+        Raises
+        ------
+        ValueError
+            If the estimate was made without it.
+
+        """
+        if self.trajectory is None:
+            raise ValueError('the estimate was made without its path')
+        return self.trajectory
 
     def __post_init__(self) -> None:
         for array in (self.T_odom_base, self.T_map_base, self.T_map_odom, self.covariance):

@@ -49,7 +49,7 @@ class Continuity:
         elif sample.stamp_ns < self._stamp_ns - FAR_NS:
             # a stamp from the future had come before
             self._stamp_ns, self._pose, self._jump_ns = sample.stamp_ns, sample.pose, 0
-        return estimate is not None and int(estimate.path.stamps_ns[-1]) >= self._jump_ns
+        return estimate is not None and estimate.stamp_ns >= self._jump_ns
 
     def _take(self, sample: OdometrySample) -> None:
         elapsed_ns, first = sample.stamp_ns - self._stamp_ns, self._stamp_ns == 0

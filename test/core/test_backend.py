@@ -3,7 +3,8 @@
 """The facade: the order of arrival changes nothing, nothing is half done or believed blindly."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
+import tracemalloc
 
 from hypothesis import given, settings, strategies as st
 import numpy as np
@@ -787,6 +788,33 @@ def test_snapshots_do_not_change_afterwards() -> None:
     backend.optimize()
     assert [array.tobytes() for array in arrays] == before
     assert not np.array_equal(backend.estimate().path.poses[:20], estimate.path.poses[:20])
+
+
+def test_an_estimate_without_its_path_is_the_same_otherwise() -> None:
+    for backend in (REFERENCE, run(ALL[:8])):
+        whole, light = backend.estimate(), backend.estimate(with_path=False)
+        assert light.stamp_ns == whole.stamp_ns == whole.path.stamps_ns[-1]
+        with pytest.raises(ValueError, match='without its path'):
+            _ = light.path
+        for field in fields(whole):
+            if field.name != 'trajectory':
+                np.testing.assert_array_equal(
+                    getattr(light, field.name), getattr(whole, field.name))
+
+
+def test_an_estimate_without_its_path_does_not_grow_with_the_graph() -> None:
+    backend = PoseGraphBackend()
+    for k in range(1, 2001):
+        backend.add_odometry(OdometrySample(k * SECOND, np.array([1.5 * k, 0.0, 0.0])))
+    backend.estimate(with_path=False)
+    peaks = []
+    for with_path in (False, True):
+        tracemalloc.start()
+        backend.estimate(with_path=with_path)
+        peaks.append(tracemalloc.get_traced_memory()[1])
+        tracemalloc.stop()
+    assert peaks[0] < 20_000
+    assert peaks[1] > 60_000
 
 
 def test_the_estimate_reaches_to_the_newest_odometry() -> None:
