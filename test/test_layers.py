@@ -27,9 +27,9 @@ CORE = (
     # what drives it
     'tangent_plane', 'saved_graph', 'timeline', 'unheard', 'odometry_stream', 'trajectory',
     'consensus', 'alignment', 'binding', 'hidden_nodes', 'anchoring', 'pending', 'reweighing',
-    'closing', 'autocorrelation', 'correlated', 'joining', 'springs', 'estimate', 'aligning',
-    'saving', 'backend', 'prediction', 'io', 'io.g2o', 'io.tum', 'io.plain', 'io.whole_files',
-    'io.graph_files', 'helper_process', 'warm_up',
+    'closing', 'autocorrelation', 'correlated', 'joining', 'arrivals', 'springs', 'estimate',
+    'aligning', 'saving', 'backend', 'prediction', 'io', 'io.g2o', 'io.tum', 'io.plain',
+    'io.whole_files', 'io.graph_files', 'helper_process', 'warm_up',
 )
 CORE_NEEDS = {'numpy', 'scipy', 'numba', 'pyproj'}
 

@@ -18,28 +18,26 @@ from typing import Self
 
 import numpy as np
 
-from pose_graph_ros.core import alignment, batch, binding, closing, covariance, se2, springs
+from pose_graph_ros.core import alignment, batch, closing, covariance, se2, springs
 from pose_graph_ros.core.admission import admit
 from pose_graph_ros.core.aligning import Aligning, placed
-from pose_graph_ros.core.anchoring import anchor_at, reference_of
+from pose_graph_ros.core.anchoring import anchor_at
+from pose_graph_ros.core.arrivals import Arrivals
 from pose_graph_ros.core.batch import Status
 from pose_graph_ros.core.config import BackendConfig
 from pose_graph_ros.core.estimate import AlignmentState, Estimate, UpdateReport
 from pose_graph_ros.core.graph import Energies, Graph, GraphUpdate
 from pose_graph_ros.core.hidden_nodes import HiddenNodes
 from pose_graph_ros.core.incremental import IncrementalSmoother, UpdateResult
-from pose_graph_ros.core.joining import Bound, Joining, Queue, SourceReport
+from pose_graph_ros.core.joining import Joining, Queue, SourceReport
 from pose_graph_ros.core.measurements import (
     ACCEPTED,
     Answer,
     GlobalPose,
-    LoopClosure,
     Measurement,
     OdometrySample,
     rejected,
-    Verdict,
 )
-from pose_graph_ros.core.pending import due_ns, MAX_PENDING, Pending, Seen
 from pose_graph_ros.core.reweighing import Reweighing
 from pose_graph_ros.core.saved_graph import SavedGraph
 from pose_graph_ros.core.saving import capture, Parts, restore
@@ -48,8 +46,6 @@ from pose_graph_ros.core.starts import Solve
 from pose_graph_ros.core.tangent_plane import MapOrigin
 from pose_graph_ros.core.trajectory import Trajectory
 
-# Measurements that wait for the angle between odometry and map; the oldest make way.
-MOST_UNALIGNED = 5000
 # A robot that was put elsewhere may have come from anywhere: sigmas [m, m, rad].
 ELSEWHERE = (1000.0, 1000.0, 3.0)
 # So often the weights of robust losses follow the estimate within one update.
@@ -81,17 +77,13 @@ class PoseGraphBackend:
         self._nodes = HiddenNodes(self._config, self._make_node)
         self._newest_node_covariance = np.zeros((3, 3))
         """In map axes."""
-        self._pending = Pending()
-        self._seen = Seen()
-        self._queue = Queue()
-        self._quarantine = Queue()
         self._reweighing = Reweighing()
         self._joins = Joining(self._config, self._reweighing)
+        self._arrivals = Arrivals(self._nodes, self._joins)
+        self._quarantine = Queue()
         self._settled = True
         self._aligning = Aligning(self._config)
         self._chi2 = 0.0
-        self.counts: Counter[tuple[str, str]] = Counter()
-        """How often each source got each answer: (source, 'accepted' or the reason)."""
 
     def configure(self, config: BackendConfig) -> None:
         """Take other settings for what comes from now on; ConfigError for what must stay."""
@@ -106,6 +98,11 @@ class PoseGraphBackend:
         return self._smoother.graph
 
     @property
+    def counts(self) -> Counter[tuple[str, str]]:
+        """How often each source got each answer: (source, 'accepted' or the reason)."""
+        return self._arrivals.counts
+
+    @property
     def node_stamps_ns(self) -> IntArray:
         """Stamps of the hidden nodes [ns], a read-only view."""
         return self._nodes.stamps_ns
@@ -113,7 +110,7 @@ class PoseGraphBackend:
     @property
     def n_pending(self) -> int:
         """Number of measurements that wait for odometry to reach their stamps."""
-        return len(self._pending)
+        return len(self._arrivals.pending)
 
     @property
     def n_quarantined(self) -> int:
@@ -144,20 +141,20 @@ class PoseGraphBackend:
 
     def add_odometry(self, sample: OdometrySample, source: str = 'odom') -> Answer:
         """Take an odometry sample; make a hidden node and its edge if the policy says so."""
-        answer = self._count(source, self._nodes.take(sample, source))
+        answer = self._arrivals.count(source, self._nodes.take(sample, source))
         self._collect()
         return answer
 
     def _collect(self) -> None:
         """Take what odometry has led to: edges, counts, and measurements that are due."""
-        self._queue.edges += self._nodes.edges
+        self._arrivals.queue.edges += self._nodes.edges
         self._nodes.edges.clear()
         for source, stream in self._nodes.streams.items():
             if stream.n_jumps > 0:
                 self.counts[source, 'jump'] = stream.n_jumps
             if stream.n_dropped > 0:
                 self.counts[source, 'stamp_ahead'] = stream.n_dropped
-        self._bind_due()
+        self._arrivals.bind_due()
 
     def _make_node(self, mean: FloatArray, information: FloatArray | None, source: str) -> int:
         """Append a hidden node to the graph; return its row, or -1 if that failed."""
@@ -176,12 +173,6 @@ class PoseGraphBackend:
             self.graph.n_edges - 1, settings.loss, settings.rejection_threshold)
         return self.graph.newest_pose
 
-    def _bind_due(self) -> None:
-        if len(self._pending) == 0:
-            return
-        for waiting in self._pending.pop_due(self._nodes.covered_ns):
-            self._count(waiting.source, self._bind(waiting.measurement, waiting.source))
-
     def add_measurement(self, measurement: Measurement, source: str) -> Answer:
         """
         Take a global pose, a position, a heading or a loop closure, in any order of stamps.
@@ -189,28 +180,7 @@ class PoseGraphBackend:
         The answer is pending if odometry has not reached its stamp yet; what becomes of it later
         is in `counts`.
         """
-        return self._count(source, self._add_measurement(measurement, source))
-
-    def _add_measurement(self, measurement: Measurement, source: str) -> Answer:
-        settings = self._joins.settings(source, closure=isinstance(measurement, LoopClosure))
-        admitted = admit(measurement, settings.covariance)
-        if isinstance(admitted, Answer):
-            return admitted
-        checked = admitted.measurement
-        if self._seen.has(source, checked):
-            return rejected('duplicate_stamp', f'{source} at {checked.stamp_ns} came before')
-        if settings.minimum_period > 0.0 and self._seen.near(
-                source, checked.stamp_ns, round(settings.minimum_period * 1e9)):
-            return rejected('thinned', f'less than {settings.minimum_period} s from another one')
-        if due_ns(checked) <= self._nodes.covered_ns:
-            answer = self._bind(checked, source)
-        else:
-            answer = self._let_wait(checked, source)
-        if answer.verdict is not Verdict.REJECTED:
-            self._seen.add(source, checked)
-            for repair in admitted.repairs:
-                self.counts[source, repair] += 1
-        return answer
+        return self._arrivals.take(measurement, source)
 
     def set_pose(self, pose: GlobalPose, source: str) -> Answer:
         """
@@ -222,19 +192,19 @@ class PoseGraphBackend:
         """
         self.finish()
         if self.graph.n_nodes == 0:
-            return self._count(source, rejected('before_odometry', 'there is no odometry yet'))
+            return self._arrivals.count(source, rejected('before_odometry', 'no odometry yet'))
         first_ns, last_ns = int(self.node_stamps_ns[0]), self._nodes.covered_ns
         pose = replace(pose, stamp_ns=min(max(pose.stamp_ns, first_ns), last_ns))
         if self._aligning.state is not AlignmentState.ALIGNED:
             return self.add_measurement(pose, source)
         admitted = admit(pose, self._joins.settings(source).covariance)
         if isinstance(admitted, Answer):
-            return self._count(source, admitted)
+            return self._arrivals.count(source, admitted)
         measurement = admitted.measurement
         begin, end = anchor_at(self._nodes, pose.stamp_ns), anchor_at(self._nodes, last_ns)
         if isinstance(begin, Answer) or isinstance(end, Answer) or not isinstance(
                 measurement, GlobalPose):
-            return self._count(source, rejected('no_odometry', 'no odometry at that time'))
+            return self._arrivals.count(source, rejected('no_odometry', 'none at that time'))
         poses = self.graph.poses
         moved = se2.between(se2.compose(poses[begin.node], begin.motion),
                             se2.compose(poses[end.node], end.motion))
@@ -242,47 +212,11 @@ class PoseGraphBackend:
         row = self._nodes.put_elsewhere(
             se2.between(poses[self._nodes.rows[-1]], now), np.diag(ELSEWHERE) ** 2)
         if row < 0:
-            return self._count(source, rejected('failed', 'the solver failed'))
+            return self._arrivals.count(source, rejected('failed', 'the solver failed'))
         self._collect()
         self._aligning.settle()
-        here = binding.Anchor(row, np.zeros(3), np.zeros((3, 3)))
-        measurement = replace(measurement, stamp_ns=last_ns + 1, pose=now)
-        self._queue.observed.append(Bound(
-            source, binding.absolute_constraint(measurement, here), measurement, here))
-        return self._count(source, ACCEPTED)
-
-    def _let_wait(self, measurement: Measurement, source: str) -> Answer:
-        """Let a measurement wait for odometry, in the place of the one that waits longest."""
-        excess = self._pending.push(source, measurement)
-        if excess is not None:
-            answer = rejected('too_many_pending', f'{MAX_PENDING} measurements wait for odometry')
-            if excess.measurement is measurement:
-                return answer
-            self._count(excess.source, answer)
-            self._seen.remove(excess.source, excess.measurement)
-        return Answer(Verdict.PENDING, 'pending', 'waits for odometry to reach its stamp')
-
-    def _bind(self, measurement: Measurement, source: str) -> Answer:
-        """Turn a measurement that odometry has reached into a constraint for the next update."""
-        anchor = anchor_at(self._nodes, measurement.stamp_ns)
-        if isinstance(anchor, Answer):
-            return anchor
-        if not isinstance(measurement, LoopClosure):
-            self._queue.observed.append(Bound(
-                source, binding.absolute_constraint(measurement, anchor), measurement, anchor))
-            if (len(self._queue.observed) > MOST_UNALIGNED
-                    and self._aligning.state is not AlignmentState.ALIGNED):
-                # where a robot stands for days, unaligned, memory must not run full
-                self.counts[self._queue.observed.pop(0).source, 'dropped_unaligned'] += 1
-            return ACCEPTED
-        reference = reference_of(self._nodes, measurement)
-        if isinstance(reference, Answer):
-            return reference
-        if reference.node == anchor.node:
-            return rejected('same_node', f'both ends fall to hidden node {anchor.node}')
-        self._queue.edges.append(
-            (source, binding.loop_closure_constraint(measurement, reference, anchor)))
-        return ACCEPTED
+        self._arrivals.put(replace(measurement, stamp_ns=last_ns + 1, pose=now), source, row)
+        return self._arrivals.count(source, ACCEPTED)
 
     def update(self) -> UpdateReport:
         """Add what has come in to the graph and improve the estimate; for a timer."""
@@ -290,7 +224,7 @@ class PoseGraphBackend:
             return UpdateReport(Status.CONVERGED, '', 0, 0, 0.0)
         state = self._aligning.copy()
         T_map_graph = self._aligning.find(
-            self.graph.poses, self._queue.observed, self._nodes.lead)
+            self.graph.poses, self._arrivals.queue.observed, self._nodes.lead)
         joining = self._joining()
         if len(joining) == 0 and self._settled:
             return UpdateReport(Status.CONVERGED, '', 0, 0, self._chi2)
@@ -346,10 +280,12 @@ class PoseGraphBackend:
 
     def _joining(self) -> Queue:
         """Take what can join the graph out of the queue; observed nodes wait for alignment."""
-        joining = Queue(edges=self._queue.edges)
-        self._queue.edges = []
+        queue = self._arrivals.queue
+        joining, queue.edges = Queue(edges=queue.edges), []
         if self._aligning.state is AlignmentState.ALIGNED:
-            joining.observed, self._queue.observed = self._queue.observed, []
+            joining.observed, queue.observed = queue.observed, []
+        else:
+            self._arrivals.thin_unaligned()
         return joining
 
     def _realign(self) -> None:
@@ -377,8 +313,8 @@ class PoseGraphBackend:
         self.finish()
         report = self.update()
         if len(self._quarantine) > 0:
-            self._queue.edges += self._quarantine.edges
-            self._queue.observed += self._quarantine.observed
+            self._arrivals.queue.edges += self._quarantine.edges
+            self._arrivals.queue.observed += self._quarantine.observed
             self._quarantine = Queue()
             again = self.update()
             report = replace(again, new_constraints=report.new_constraints + again.new_constraints)
@@ -421,7 +357,7 @@ class PoseGraphBackend:
         if state is AlignmentState.UNALIGNED:
             # those that turned the graph in an update that failed are set aside
             shift, cov = alignment.guess(graph.poses, newest, Queue(observed=placed(
-                self._queue.observed + self._quarantine.observed)).all_observed())
+                self._arrivals.queue.observed + self._quarantine.observed)).all_observed())
             newest = newest + shift
         stamp_ns = max(self._nodes.newest_ns, int(self.node_stamps_ns[-1]))
         lead = self._nodes.lead
@@ -459,11 +395,4 @@ class PoseGraphBackend:
 
     def _parts(self) -> Parts:
         return Parts(self.graph, self._nodes, self._joins, self._reweighing, self._aligning,
-                     self._seen, self._pending, self._queue, self._quarantine)
-
-    def _count(self, source: str, answer: Answer) -> Answer:
-        if answer.verdict is Verdict.ACCEPTED:
-            self.counts[source, 'accepted'] += 1
-        elif answer.verdict is Verdict.REJECTED:
-            self.counts[source, answer.reason] += 1
-        return answer
+                     self._arrivals, self._quarantine)

@@ -14,12 +14,12 @@ from typing import NamedTuple
 import numpy as np
 
 from pose_graph_ros.core.aligning import Aligning
+from pose_graph_ros.core.arrivals import Arrivals
 from pose_graph_ros.core.constraints import Edges, full, upper
 from pose_graph_ros.core.exceptions import NothingToSaveError
 from pose_graph_ros.core.graph import Graph
 from pose_graph_ros.core.hidden_nodes import HiddenNodes
 from pose_graph_ros.core.joining import Joining, Queue
-from pose_graph_ros.core.pending import Pending, Seen
 from pose_graph_ros.core.reweighing import Reweighing
 from pose_graph_ros.core.saved_graph import as_matrix, SavedEdges, SavedGraph, SavedSource
 from pose_graph_ros.core.se2 import FloatArray, IntArray
@@ -37,9 +37,7 @@ class Parts(NamedTuple):
     joins: Joining
     reweighing: Reweighing
     aligning: Aligning
-    seen: Seen
-    pending: Pending
-    queue: Queue
+    arrivals: Arrivals
     quarantine: Queue
 
 
@@ -60,9 +58,10 @@ def capture(
     """
     if len(parts.nodes) == 0:
         raise NothingToSaveError('there is no hidden node yet, and so no graph to save')
-    bound = parts.queue.observed + parts.quarantine.observed
-    left_out = parts.pending.measurements + [(each.source, each.measurement) for each in bound]
-    seen, joined = parts.seen.saved(left_out), parts.joins.saved()
+    bound = parts.arrivals.queue.observed + parts.quarantine.observed
+    left_out = parts.arrivals.pending.measurements + [
+        (each.source, each.measurement) for each in bound]
+    seen, joined = parts.arrivals.seen.saved(left_out), parts.joins.saved()
     sources = dict(joined)
     for name, (stamps, references) in seen.items():
         sources[name] = replace(
@@ -71,7 +70,7 @@ def capture(
     return SavedGraph(
         rows=parts.graph.rows(), nodes=parts.nodes.saved(), sources=sources,
         edge_losses=edge_losses, observed_losses=observed_losses,
-        alignment=parts.aligning.saved(), waiting=_saved_edges(parts.queue),
+        alignment=parts.aligning.saved(), waiting=_saved_edges(parts.arrivals.queue),
         set_aside=_saved_edges(parts.quarantine), newest_covariance=as_matrix(newest_covariance),
         chi2=chi2, n_left_out=len(left_out), datum=datum)
 
@@ -92,12 +91,13 @@ def restore(parts: Parts, saved: SavedGraph) -> None:
     parts.graph.fill(saved.rows)
     parts.nodes.restore(saved.nodes)
     for name, source in saved.sources.items():
-        parts.seen.restore(name, source.seen_ns, source.seen_references)
+        parts.arrivals.seen.restore(name, source.seen_ns, source.seen_references)
         parts.joins.restore(name, source)
     parts.joins.count_bias_edges(parts.graph)
     parts.reweighing.restore(saved.edge_losses, saved.observed_losses)
     parts.aligning.load(saved.alignment)
-    for queue, edges in ((parts.queue, saved.waiting), (parts.quarantine, saved.set_aside)):
+    for queue, edges in (
+            (parts.arrivals.queue, saved.waiting), (parts.quarantine, saved.set_aside)):
         table = Edges(edges.i, edges.j, edges.mean, full(edges.information), edges.kind)
         queue.edges += [(name, table.rows(slice(k, k + 1)))
                         for k, name in enumerate(edges.sources)]

@@ -5,7 +5,7 @@
 import numpy as np
 import pytest
 
-from pose_graph_ros.core import backend as backend_module
+from pose_graph_ros.core import arrivals
 from pose_graph_ros.core.backend import PoseGraphBackend
 from pose_graph_ros.core.config import BackendConfig
 from pose_graph_ros.core.estimate import AlignmentState
@@ -34,7 +34,7 @@ def test_a_source_can_be_thinned_by_stamps() -> None:
 
 
 def test_while_unaligned_the_oldest_positions_make_way(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(backend_module, 'MOST_UNALIGNED', 50)
+    monkeypatch.setattr(arrivals, 'MOST_UNALIGNED', 50)
     backend, rng = PoseGraphBackend(), np.random.default_rng(0)
 
     def drive(seconds: range, speed: float, x: float) -> float:
