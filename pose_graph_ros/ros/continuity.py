@@ -31,12 +31,16 @@ class Continuity:
     ----------
     maximum_speed : float
         No robot is faster [m/s].
+    goes_on : bool
+        Whether there is an estimate of a time before: only the engine can tell whether the first
+        sample goes on from there.
 
     """
 
-    def __init__(self, maximum_speed: float) -> None:
+    def __init__(self, maximum_speed: float, *, goes_on: bool = False) -> None:
         self.maximum_speed = maximum_speed
         """No robot is faster [m/s]; can be changed, for steps from then on."""
+        self._goes_on = goes_on
         self._stamp_ns = 0
         self._pose: FloatArray = np.zeros(3)
         self._speed = math.inf
@@ -56,7 +60,8 @@ class Continuity:
         moved = math.hypot(*(sample.pose - self._pose)[:2])
         time = max(elapsed_ns * 1e-9, LEAST_TIME)
         allowed = min(2.0 * max(self._speed, abs(sample.speed)) + MORE_SPEED, self.maximum_speed)
-        if not first and (moved > SLACK + allowed * time or elapsed_ns > FAR_NS):
+        jumped = moved > SLACK + allowed * time or elapsed_ns > FAR_NS
+        if self._goes_on if first else jumped:
             self._jump_ns = sample.stamp_ns
         elif not first:
             self._speed = moved / time

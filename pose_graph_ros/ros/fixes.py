@@ -15,7 +15,7 @@ import numpy as np
 from pose_graph_ros.core import covariance
 from pose_graph_ros.core.measurements import Answer, Position, rejected
 from pose_graph_ros.core.se2 import FloatArray
-from pose_graph_ros.core.tangent_plane import TangentPlane
+from pose_graph_ros.core.tangent_plane import MapOrigin, TangentPlane
 from pose_graph_ros.ros.conversions import frame, Message, stamp_ns
 from pose_graph_ros.ros.sources import Source
 from pose_graph_ros.ros.static_frames import StaticFrames
@@ -53,6 +53,10 @@ class Datum:
         """Angle of the map's x axis from east [rad]."""
         self.plane: TangentPlane | None = None
         """The map's plane; None before there is a datum."""
+        self.is_given = len(given) > 0
+        """Whether a parameter tells it."""
+        self.is_of_graph = False
+        """Whether a graph that was loaded refers to it."""
         self.altitude = 0.0
         """Of the newest fix that tells one [m]."""
         if len(given) > 0:
@@ -60,6 +64,12 @@ class Datum:
         self._waits = wait
         # the altitude is that of the first fix; where east and north are does not depend on it
         self._to_lift = self.plane is not None
+
+    def keep(self, origin: MapOrigin) -> None:
+        """Take the datum of a graph that was loaded, for good."""
+        self.plane, self.yaw, self.altitude = TangentPlane(*origin), origin.yaw, origin.altitude
+        self._waits = self._to_lift = False
+        self.is_of_graph = True
 
     def renew(self) -> None:
         """Let the next good fix be the datum."""

@@ -28,6 +28,7 @@ from pose_graph_ros.core.estimate import AlignmentState, Estimate
 from pose_graph_ros.core.measurements import OdometrySample
 from pose_graph_ros.core.prediction import predict
 from pose_graph_ros.core.springs import GraphView
+from pose_graph_ros.core.trajectory import Trajectory
 from pose_graph_ros.ros import messages
 from pose_graph_ros.ros.conversions import frame
 from pose_graph_ros.ros.fixes import Datum
@@ -141,26 +142,21 @@ class Publishers:
         """Let the next transform be published as it is: the robot was put elsewhere."""
         self._slew.forget()
 
-    def publish_path(self, estimate: Estimate, graph: int, *, at_once: bool = False) -> None:
-        """
-        Publish the path of an estimate that was not shown yet.
+    def path_is_due(self, estimate: Estimate) -> bool:
+        """Tell whether someone wants a path, of an estimate not shown yet, and it is time."""
+        return (estimate is not self._path_shown
+                and time.monotonic() - self._path_at >= self._path_period
+                and self._path.get_subscription_count() > 0)
 
-        That is done at most once in the period, except `at_once`, and only while the graph is
-        the present one.
-        """
-        now = time.monotonic()
-        early = now - self._path_at < self._path_period and not at_once
-        if (estimate is self._path_shown or early
-                or self._path.get_subscription_count() == 0):
-            return
+    def publish_path(self, estimate: Estimate, path: Trajectory, graph: int) -> None:
+        """Publish the path of an estimate, if it is of the present graph."""
         with self._lock:
             if graph != self.graph:
                 return
-            self._path_shown, self._path_at = estimate, now
+            self._path_shown, self._path_at = estimate, time.monotonic()
             # the same newest odometry with better poses: a nanosecond keeps the stamps increasing
-            self._path_stamp_ns = max(int(estimate.path.stamps_ns[-1]), self._path_stamp_ns + 1)
-            self._path.publish(
-                messages.path_cdr(estimate.path, self._path_stamp_ns, self.map_frame))
+            self._path_stamp_ns = max(estimate.stamp_ns, self._path_stamp_ns + 1)
+            self._path.publish(messages.path_cdr(path, self._path_stamp_ns, self.map_frame))
 
     def graph_is_due(self) -> bool:
         """Tell whether someone wants to see the graph, and the last time is long enough ago."""

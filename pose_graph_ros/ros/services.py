@@ -2,8 +2,10 @@
 # SPDX-License-Identifier: Apache-2.0
 """The services of the node: each answers what was done, or why not."""
 
-from concurrent.futures import CancelledError, Future as DoneFuture
+from collections.abc import Awaitable, Callable
+from concurrent.futures import CancelledError, Future as DoneFuture, ThreadPoolExecutor
 import logging
+from pathlib import Path
 from typing import Any
 
 from rclpy.callback_groups import MutuallyExclusiveCallbackGroup
@@ -12,8 +14,13 @@ from rclpy.service import Service
 from rclpy.task import Future
 from std_srvs.srv import SetBool, Trigger
 
+from pose_graph_ros.core.backend import PoseGraphBackend
 from pose_graph_ros.core.batch import Status
+from pose_graph_ros.core.exceptions import FileFormatError, PoseGraphError
+from pose_graph_ros.core.io.graph_files import read_graph, write_graph
+from pose_graph_ros.core.saved_graph import SavedGraph, site_refusal
 from pose_graph_ros.ros.session import Session
+from pose_graph_ros.ros.sources import backend_config
 
 logger = logging.getLogger(__name__)
 
@@ -32,9 +39,13 @@ class Services:
     def __init__(self, node: Node, session: Session) -> None:
         self._node, self._session = node, session
         self._offered: list[Service] = []
+        # text of a large graph takes seconds, which neither worker nor executor should wait for
+        self._files = ThreadPoolExecutor(1, 'graph files')
         for name, kind, answer in (
                 ('optimize', Trigger, self._optimize), ('reset', Trigger, self._reset),
-                ('pause', SetBool, self._pause), ('set_datum', Trigger, self._set_datum)):
+                ('pause', SetBool, self._pause), ('set_datum', Trigger, self._set_datum),
+                ('save_graph', Trigger, self._save_graph),
+                ('load_graph', Trigger, self._load_graph)):
             # each in a group of its own: one that awaits holds up all others in its group
             self._offered.append(node.create_service(
                 kind, f'~/{name}', answer, callback_group=MutuallyExclusiveCallbackGroup()))
@@ -43,6 +54,7 @@ class Services:
         """Offer them no more."""
         for service in self._offered:
             self._node.destroy_service(service)
+        self._files.shutdown(cancel_futures=True)
 
     async def _done(self, future: 'DoneFuture[Any]') -> Any:
         """Await what the worker does, while other callbacks go on."""
@@ -98,7 +110,9 @@ class Services:
         session = self._session
         status, datum = session.worker.status, session.intake.reader.datum
         used = sum(status.counts[name, 'accepted'] for name in session.intake.reader.fixes)
-        if datum.plane is not None and used > 0:
+        if datum.is_of_graph:
+            response.message = 'refused: the graph that was loaded refers to the present datum'
+        elif datum.plane is not None and used > 0:
             response.message = (f'refused: {used} fixes in the graph refer to the datum '
                                 f'[{datum.plane.latitude:.9f}, {datum.plane.longitude:.9f}]')
         elif datum.plane is not None and (
@@ -108,4 +122,70 @@ class Services:
         else:
             datum.renew()
             response.success, response.message = True, 'the next good fix will be the datum'
+        return response
+
+    async def _save_graph(
+        self, _: Trigger.Request, response: Trigger.Response,
+    ) -> Trigger.Response:
+        """Write the graph to `graph_file`, all or nothing."""
+        plane = self._session.intake.reader.datum.plane
+
+        def capture(backend: PoseGraphBackend) -> SavedGraph:
+            backend.update()
+            return backend.saved(None if plane is None else plane.origin)
+
+        async def save(path: Path) -> str:
+            saved = await self._done(self._session.worker.call(capture))
+            files = await self._done(self._files.submit(write_graph, saved, path))
+            left_out = '' if saved.n_left_out == 0 else (
+                f'; {saved.n_left_out} measurements that wait are left out')
+            return (f'{len(saved.nodes.rows)} hidden nodes in {files[0]}, with '
+                    f'{files[1].name} and {files[2].name}{left_out}')
+        return await self._file_answer(save, response)
+
+    async def _load_graph(
+        self, _: Trigger.Request, response: Trigger.Response,
+    ) -> Trigger.Response:
+        """Go on with the graph in `graph_file`, if it is of the present site."""
+        session = self._session
+
+        def restore(path: Path) -> tuple[SavedGraph, PoseGraphBackend]:
+            saved, datum = read_graph(path), session.intake.reader.datum
+            origin = None if datum.plane is None else datum.plane.origin
+            refusal = site_refusal(
+                saved, *((origin, None) if datum.is_given else (None, origin)))
+            if refusal is not None:
+                raise FileFormatError(refusal)
+            backend = PoseGraphBackend.restored(backend_config(session.values), saved)
+            backend.update()
+            return saved, backend
+
+        async def load(path: Path) -> str:
+            # kernels are there only when the worker has prepared them
+            await self._done(session.worker.call(lambda _: None))
+            saved, backend = await self._done(self._files.submit(restore, path))
+            session.load(saved, backend, str(path))
+            return (f'{len(saved.nodes.rows)} hidden nodes from {path}, datum '
+                    f'{"none" if saved.datum is None else saved.datum}')
+        return await self._file_answer(load, response)
+
+    async def _file_answer(
+        self, act: Callable[[Path], Awaitable[str]], response: Trigger.Response,
+    ) -> Trigger.Response:
+        """Do something with the graph's file, and answer what became of it."""
+        name = self._session.values['graph_file']
+        if name == '':
+            response.message = (
+                'refused: set the parameter graph_file first, such as to /tmp/map.g2o')
+            return response
+        try:
+            response.message = await act(Path(name).expanduser())
+            response.success = True
+        except CancelledError:
+            response.message = 'the graph was given up meanwhile'
+        except PoseGraphError as error:
+            response.message = f'refused: {error}'
+        except Exception as error:
+            logger.exception('a file of the graph')
+            response.message = f'failed: {type(error).__name__}: {error}'
         return response

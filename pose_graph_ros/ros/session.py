@@ -32,8 +32,9 @@ from rclpy.timer import Timer
 from sensor_msgs.msg import Imu, NavSatFix
 
 from pose_graph_ros.core.backend import PoseGraphBackend
-from pose_graph_ros.core.estimate import Estimate
+from pose_graph_ros.core.estimate import UpdateReport
 from pose_graph_ros.core.measurements import OdometrySample
+from pose_graph_ros.core.saved_graph import SavedGraph
 from pose_graph_ros.ros import diagnostics
 from pose_graph_ros.ros.continuity import Continuity
 from pose_graph_ros.ros.conversions import frame, Message
@@ -105,9 +106,9 @@ class Session:
         self.worker = self._begin(PoseGraphBackend(self._config), self._warm_up)
         self._set_timer('diagnostics', values['diagnostics_period'], self.publish_diagnostics)
 
-    def _clear(self) -> None:
+    def _clear(self, *, goes_on: bool = False) -> None:
         self._continuity = {
-            name: Continuity(source.maximum_speed)
+            name: Continuity(source.maximum_speed, goes_on=goes_on)
             for name, source in self._config.odometry.items()}
         self.silent: list[str] = []
         """Sources that have ended while others go on."""
@@ -120,7 +121,7 @@ class Session:
         prepare: Callable[[Callable[[], bool]], None] | None = None,
     ) -> Worker:
         """Start the thread that owns a graph."""
-        worker = Worker(backend, partial(self._on_estimate, self.out.graph), prepare)
+        worker = Worker(backend, partial(self._show, self.out.graph), prepare)
         worker.start()
         return worker
 
@@ -298,20 +299,28 @@ class Session:
 
     def begin_anew(self, reason: str, messages: Sequence[Heard] = ()) -> None:
         """Begin a new graph; a datum that was given, and what /tf_static told, stay."""
-        self.replace(PoseGraphBackend(self._config), reason)
+        self._replace(PoseGraphBackend(self._config), reason)
         for heard in messages:
             self.intake.received[heard.source] += 1
             self._use(heard)
 
-    def replace(self, backend: PoseGraphBackend, reason: str) -> None:
-        """Go on with another graph."""
+    def load(self, saved: SavedGraph, backend: PoseGraphBackend, name: str) -> None:
+        """Go on with a graph that was loaded."""
+        self._replace(backend, f'the graph in {name} was loaded', goes_on=True)
+        if saved.datum is not None:
+            self.intake.reader.datum.keep(saved.datum)
+        self.worker.request_update()
+
+    def _replace(
+        self, backend: PoseGraphBackend, reason: str, *, goes_on: bool = False,
+    ) -> None:
         self.node.get_logger().warning(f'beginning anew: {reason}')
         prepare = None if self.worker.prepared else self._warm_up
         self.worker.stop(0.0)  # a solve that is under way ends in vain
         self.out.begin_anew()
         self.intake.begin_anew(self.values)
         self._setting.forget()
-        self._clear()
+        self._clear(goes_on=goes_on)
         self.n_resets, self.reset_reason = self.n_resets + 1, reason
         self.worker = self._begin(backend, prepare)
 
@@ -337,25 +346,24 @@ class Session:
         if self.worker.estimate is not None and self.worker.prepared:
             self.worker.call(partial(self._show, self.out.graph))
 
-    def _show(self, graph: int, backend: PoseGraphBackend) -> None:
+    def _show(self, graph: int, backend: PoseGraphBackend, *, at_once: bool = False) -> None:
+        """Publish path and markers that are due, in the worker's thread."""
         estimate = self.worker.estimate
         if estimate is None:
             return
-        self.out.publish_path(estimate, graph)
+        if self.out.path_is_due(estimate) or at_once:
+            newest = backend.estimate()
+            assert newest is not None
+            self.out.publish_path(estimate, newest.path, graph)
         if self.out.graph_is_due() and (view := backend.view()) is not None:
-            self.out.publish_graph(view, int(estimate.path.stamps_ns[-1]), graph)
+            self.out.publish_graph(view, estimate.stamp_ns, graph)
 
-    def _on_estimate(self, graph: int, estimate: Estimate) -> None:
-        """Publish the path, in the worker's thread."""
-        self.out.publish_path(estimate, graph)
-
-    def optimize(self) -> 'Future[Any]':
+    def optimize(self) -> 'Future[UpdateReport]':
         """Have the whole graph optimised, and its path published at once."""
-        def job(graph: int, backend: PoseGraphBackend) -> Any:
+        def job(graph: int, backend: PoseGraphBackend) -> UpdateReport:
             report = self.worker.close(backend)
             # who has the answer must not have to guess which path is the optimised one
-            if self.worker.estimate is not None:
-                self.out.publish_path(self.worker.estimate, graph, at_once=True)
+            self._show(graph, backend, at_once=True)
             return report
         return self.worker.call(partial(job, self.out.graph))
 

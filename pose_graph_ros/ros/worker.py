@@ -61,7 +61,7 @@ class Worker:
     ----------
     backend : PoseGraphBackend
     on_estimate : callable
-        Called in the worker's thread after each new estimate.
+        Called in the worker's thread after each new estimate, with the backend.
     prepare : callable
         Called in the worker's thread before its first work, while what is posted waits; gets a
         function that tells whether the worker is to end.
@@ -69,7 +69,7 @@ class Worker:
     """
 
     def __init__(
-        self, backend: PoseGraphBackend, on_estimate: Callable[[Estimate], None],
+        self, backend: PoseGraphBackend, on_estimate: Callable[[PoseGraphBackend], None],
         prepare: Callable[[Callable[[], bool]], None] | None = None,
     ) -> None:
         self._backend = backend
@@ -86,7 +86,7 @@ class Worker:
         self._solves, self._solve_total, self._solve_max = 0, 0.0, 0.0
         self._said: set[tuple[str, str]] = set()
         self.estimate: Estimate | None = None
-        """The newest estimate; replaced as a whole."""
+        """The newest estimate, without its path; replaced as a whole."""
         self.status = WorkerStatus()
         """The newest status; replaced as a whole."""
         self._thread = threading.Thread(target=self._run, name='pose graph', daemon=True)
@@ -228,9 +228,9 @@ class Worker:
 
     def _publish(self) -> None:
         self._revision = self._backend.revision
-        self.estimate = self._backend.estimate()
+        self.estimate = self._backend.estimate(with_path=False)
         if self.estimate is not None and not self._stopping:
-            self._on_estimate(self.estimate)
+            self._on_estimate(self._backend)
 
     def _report(self, report: UpdateReport | None, processed: int) -> None:
         """Swap in a new status, whole; the report of the last update stays if there is none."""

@@ -730,7 +730,7 @@ def test_the_path_is_current_after_every_update() -> None:
         feed(backend, event)
         if k % 7 == 6 and len(late) > 0:
             feed(backend, late.pop(0))
-        n_waiting = len(backend._queue)
+        n_waiting = len(backend._arrivals.queue)
         report = backend.update()
         assert report.status is not Status.FAILED
         estimate = backend.estimate()

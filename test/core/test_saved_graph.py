@@ -55,8 +55,8 @@ def events(kind: str) -> list[Event]:
 
 
 def left_out(backend: PoseGraphBackend) -> list[tuple[str, Measurement]]:
-    bound = backend._queue.observed + backend._quarantine.observed
-    return (backend._pending.measurements
+    bound = backend._arrivals.queue.observed + backend._quarantine.observed
+    return (backend._arrivals.pending.measurements
             + [(each.source, each.measurement) for each in bound])
 
 
@@ -185,14 +185,14 @@ def test_what_was_seen_is_refused_again_and_what_was_left_out_is_not() -> None:
 
 def test_edges_that_wait_and_those_set_aside_are_saved() -> None:
     backend = straight_line()
-    for source, queue in (('waits', backend._queue), ('failed', backend._quarantine)):
+    for source, queue in (('waits', backend._arrivals.queue), ('failed', backend._quarantine)):
         assert backend.add_measurement(LoopClosure(
             10 * SECOND, np.array([5.0, 0.01, 0.0]), np.diag([0.01, 0.01, 0.001]),
             reference_node=5), source).verdict is Verdict.ACCEPTED
         if queue is backend._quarantine:
-            queue.edges.append(backend._queue.edges.pop())
+            queue.edges.append(backend._arrivals.queue.edges.pop())
     restored = PoseGraphBackend.restored(LINE_ODOMETRY, through_files(backend.saved()))
-    assert ([name for name, _ in restored._queue.edges],
+    assert ([name for name, _ in restored._arrivals.queue.edges],
             [name for name, _ in restored._quarantine.edges]) == (['waits'], ['failed'])
     assert_same_estimate(closed(restored), closed(backend), SAME_PATH)
     assert restored.graph.n_edges == backend.graph.n_edges == len(backend.node_stamps_ns) - 1 + 2
@@ -368,7 +368,7 @@ def test_a_closure_names_a_node_of_the_past_or_an_instant_of_it() -> None:
         answer = restored.add_measurement(LoopClosure(
             int(stamps[-1]), np.zeros(3), np.eye(3), **name), f'closure {k}')
         assert answer.verdict is Verdict.ACCEPTED
-    means = [edge.mean[0] for _, edge in restored._queue.edges]
+    means = [edge.mean[0] for _, edge in restored._arrivals.queue.edges]
     np.testing.assert_array_equal(means[0], means[1])
     # between nodes odometry is coarse, and is said to be so
     farthest = 0.0

@@ -3,6 +3,7 @@
 """Services and poses that are set: the real node over DDS."""
 
 import math
+from pathlib import Path
 
 from circle import drive, odometry_at, odometry_pose, path_error, START, true_pose
 from geometry_msgs.msg import PoseWithCovarianceStamped
@@ -147,3 +148,73 @@ def test_the_markers_show_the_graph_while_someone_looks(
         assert abs(math.hypot(point.x, point.y - 20.0) - 20.0) < 1e-2
     client.trigger('reset')
     client.spin_until(lambda: len(arrays[-1].markers) == 1, 'they are taken back')
+
+
+def test_a_graph_is_saved_and_another_node_goes_on_with_it(tmp_path: Path) -> None:
+    """The second node takes the file, hears the rest of the drive, and has all of the path."""
+    (tmp_path / 'b').mkdir()
+    file = tmp_path / 'maps' / 'yard.g2o'
+    arguments = ('-p', f'graph_file:={file}')
+    with NodeProcess(tmp_path, arguments) as node, \
+            Client(int(node.env['ROS_DOMAIN_ID'])) as client:
+        assert 'no graph to save' in client.trigger('save_graph').message
+        drive(client, 20.0)
+        answer = client.trigger('save_graph')
+        assert answer.success, answer.message
+        assert 'yard.g2o' in answer.message
+        nodes = int(client.values['hidden_nodes'])
+        assert {path.name for path in file.parent.iterdir()} == {
+            'yard.g2o', 'yard.json', 'yard.tum'}
+        assert file.read_text().count('VERTEX_SE2') == nodes
+        assert client.set_parameter('graph_file', str(tmp_path)) == (True, '')
+        answer = client.trigger('save_graph')
+        assert not answer.success
+        assert 'folder' in answer.message
+    with NodeProcess(tmp_path / 'b', arguments) as node, \
+            Client(int(node.env['ROS_DOMAIN_ID'])) as client:
+        answer = client.trigger('load_graph')
+        assert answer.success, answer.message
+        client.spin_until(lambda: client.values.get('hidden_nodes') == str(nodes), 'it is there')
+        client.spin_until(lambda: len(client.paths) > 0 and len(client.paths[-1].poses) >= nodes,
+                          'its path comes')
+        assert client.values['alignment'] == 'aligned'
+        assert client.values['datum'].startswith('[48.1')
+        assert not client.trigger('set_datum').success
+        drive(client, 40.0, begin=20.0)
+        assert client.optimize().success
+        assert path_error(client) < 1e-3
+        assert len(client.paths[-1].poses) > 1.9 * nodes
+        assert 'odom.jump' not in client.values
+
+
+def test_a_graph_that_cannot_be_loaded_is_refused_and_the_present_one_stays(
+    tmp_path: Path,
+) -> None:
+    file = tmp_path / 'map.g2o'
+    arguments = ('-p', f'graph_file:={file}', '-p', 'datum:=[48.1, 11.6]')
+    with NodeProcess(tmp_path, arguments) as node, \
+            Client(int(node.env['ROS_DOMAIN_ID'])) as client:
+        drive(client, 10.0)
+        assert client.trigger('save_graph').success
+        nodes = client.values['hidden_nodes']
+        side = file.with_suffix('.json')
+        content = side.read_text()
+        side.write_text(content[:-100])
+        answer = client.trigger('load_graph')
+        assert not answer.success
+        assert 'map.json' in answer.message
+        side.unlink()
+        assert not client.trigger('load_graph').success
+        assert client.set_parameter('graph_file', '') == (True, '')
+        assert 'graph_file' in client.trigger('load_graph').message
+        assert client.values['hidden_nodes'] == nodes
+        assert client.values['resets'] == '0'
+        side.write_text(content)
+    (tmp_path / 'b').mkdir()
+    arguments = ('-p', f'graph_file:={file}', '-p', 'datum:=[40.0, 11.6]')
+    with NodeProcess(tmp_path / 'b', arguments) as node, \
+            Client(int(node.env['ROS_DOMAIN_ID'])) as client:
+        answer = client.trigger('load_graph')
+        assert not answer.success
+        assert 'another site' in answer.message
+        assert client.values['resets'] == '0'
