@@ -36,7 +36,7 @@ CORE_NEEDS = {'numpy', 'scipy', 'numba', 'pyproj'}
 # Modules of ros that the offline tools share: they know messages by their fields alone.
 WITHOUT_RCLPY = {
     'bag_writer', 'bags', 'continuity', 'conversions', 'fixes', 'hearing', 'inputs', 'intake',
-    'markers', 'parameter_changes', 'parameter_texts', 'parameters', 'reader', 'rewind',
+    'markers', 'memory', 'parameter_changes', 'parameter_texts', 'parameters', 'reader', 'rewind',
     'setting', 'slew', 'sources', 'static_frames'}
 ROS = {'rclpy', 'rosidl_runtime_py', 'ament_index_python', 'launch', 'launch_ros'}
 

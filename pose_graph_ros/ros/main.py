@@ -13,6 +13,9 @@ import sys
 import traceback
 from types import FrameType
 
+# How long a thread may go on while another one waits [s].
+SWITCH_INTERVAL = 0.0005
+
 
 class StopSignals:
     """Takes SIGINT and SIGTERM from its construction on."""
@@ -36,8 +39,12 @@ def main(args: list[str] | None = None) -> int:
     from rclpy.signals import SignalHandlerOptions
 
     from pose_graph_ros.core.exceptions import ConfigError
+    from pose_graph_ros.ros import memory
     from pose_graph_ros.ros.node import PoseGraphNode
 
+    memory.give_back_large_arrays()
+    # a thread that runs Python, the engine's, would hold up messages for 5 ms at a time
+    sys.setswitchinterval(SWITCH_INTERVAL)
     logging.basicConfig(level=logging.WARNING, format='[%(levelname)s] [%(name)s] %(message)s')
     try:
         rclpy.init(args=args, signal_handler_options=SignalHandlerOptions.NO)

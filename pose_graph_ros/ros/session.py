@@ -35,7 +35,7 @@ from pose_graph_ros.core.backend import PoseGraphBackend
 from pose_graph_ros.core.estimate import UpdateReport
 from pose_graph_ros.core.measurements import OdometrySample
 from pose_graph_ros.core.saved_graph import SavedGraph
-from pose_graph_ros.ros import diagnostics
+from pose_graph_ros.ros import diagnostics, memory
 from pose_graph_ros.ros.continuity import Continuity
 from pose_graph_ros.ros.conversions import frame, Message
 from pose_graph_ros.ros.intake import Intake
@@ -135,6 +135,7 @@ class Session:
             self.node.get_logger().info(
                 'compiling kernels, 20 s to a minute on the first start; what comes in waits')
         seconds = warm_up(stopped)
+        memory.let_go()
         if not stopped():
             self.node.get_logger().info(f'kernels ready after {seconds:.1f} s')
 
