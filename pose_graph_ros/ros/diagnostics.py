@@ -48,6 +48,7 @@ def _state(session: 'Session') -> dict[str, object]:
         found.update({
             'odometry': estimate.lead,
             'alignment': estimate.alignment.value,
+            'alignment_yaw_deg': f'{math.degrees(estimate.T_map_odom[2]):.3f}',
             'alignment_sigma_deg': f'{math.degrees(estimate.alignment_sigma):.3f}',
             'hidden_nodes': estimate.n_hidden, 'edges': estimate.n_edges,
             'observed_nodes': estimate.n_observed, 'biases': estimate.n_biases,

@@ -2,6 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """The managed node: its parameters, and its transitions from unconfigured to active and back."""
 
+from array import array
 from collections.abc import Callable, Mapping, Sequence
 import traceback
 from typing import Any
@@ -173,11 +174,11 @@ class PoseGraphNode(LifecycleNode):
                 unset = parameter.default == []
                 self.declare_parameter(
                     parameter.name, None if unset else parameter.default, _descriptor(parameter))
-            declared = self.get_parameter(parameter.name)
-            if declared.type_ is not RosParameter.Type.NOT_SET:
+            value = self.get_parameter(parameter.name).value
+            # a file that `ros2 param dump` wrote has null for what is not set, read as a text
+            if value is not None and not (value == 'null' and isinstance(parameter.default, list)):
                 given[parameter.name] = (
-                    list(declared.value) if isinstance(parameter.default, list)
-                    else declared.value)
+                    list(value) if isinstance(value, array | tuple) else value)
         return given
 
     def _warn_of_unknown(self) -> None:

@@ -48,13 +48,14 @@ class NodeProcess:
 
     def __init__(
         self, log: Path, arguments: Sequence[str] = (), domain: int | None = None,
+        program: Sequence[str] = ('-m', 'pose_graph_ros.ros.main'),
     ) -> None:
         self.env = isolated_environment(log)
         if domain is not None:
             self.env['ROS_DOMAIN_ID'] = str(domain)
         self._stderr = (log / 'stderr').open('w+')
         self.process = subprocess.Popen(
-            [sys.executable, '-m', 'pose_graph_ros.ros.main', '--ros-args',
+            [sys.executable, *program, '--ros-args',
              '-p', 'diagnostics_period:=0.1', '-p', 'frequency:=10.0', '-p', 'path_period:=0.1',
              *arguments],
             env=self.env, stderr=self._stderr)

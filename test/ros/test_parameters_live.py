@@ -2,13 +2,16 @@
 # SPDX-License-Identifier: Apache-2.0
 """`ros2 param`, quality of service, and two robots on one machine: the real node over DDS."""
 
+from array import array
 from pathlib import Path
 
 from circle import drive, fix_at, odometry_at, path_error
 from harness import Client, NodeProcess
 import pytest
-from rcl_interfaces.srv import DescribeParameters, ListParameters
+from rcl_interfaces.srv import DescribeParameters, GetParameters, ListParameters
+from rclpy.parameter import parameter_value_to_python
 from rclpy.qos import QoSHistoryPolicy, QoSReliabilityPolicy
+import yaml
 
 from pose_graph_ros.ros.parameters import all_parameters, Change
 
@@ -119,3 +122,28 @@ def test_two_robots_on_one_machine(tmp_path: Path) -> None:
 def test_it_can_have_another_name(node: NodeProcess) -> None:
     with Client(int(node.env['ROS_DOMAIN_ID']), name='back_end') as client:
         assert client.trigger('reset').success
+
+
+def test_a_file_that_param_dump_wrote_can_be_given_again(tmp_path: Path) -> None:
+    """What is not set is null there; `ros2 param dump` writes the values that it gets."""
+    file = tmp_path / 'dumped.yaml'
+    with NodeProcess(tmp_path) as node, Client(int(node.env['ROS_DOMAIN_ID'])) as client:
+        names = [parameter.name for parameter in all_parameters({})]
+        values = client.call(
+            client.node.create_client(GetParameters, 'pose_graph/get_parameters'),
+            GetParameters.Request(names=names)).values
+        nested: dict[str, object] = {}
+        for name, value in zip(names, values, strict=True):
+            *groups, leaf = name.split('.')
+            place = nested
+            for group in groups:
+                place = place.setdefault(group, {})
+            plain = parameter_value_to_python(value)
+            place[leaf] = list(plain) if isinstance(plain, array) else plain
+        file.write_text(yaml.safe_dump({'/pose_graph': {'ros__parameters': nested}}))
+        assert 'datum: null' in file.read_text()
+    (tmp_path / 'b').mkdir()
+    with NodeProcess(tmp_path / 'b', ('--params-file', str(file))) as node, \
+            Client(int(node.env['ROS_DOMAIN_ID'])) as client:
+        drive(client, 3.0)
+        assert client.optimize().success

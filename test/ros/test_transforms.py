@@ -3,6 +3,7 @@
 """`map -> odom` over DDS: its stamps, its speed, and who else publishes it."""
 
 from pathlib import Path
+import signal
 
 from circle import drive, odometry_at, odometry_pose, START, true_pose
 from harness import Client, NodeProcess, odometry, pose, RELIABLE, stamp_ns, TFMessage, yaw
@@ -124,3 +125,18 @@ def test_somebody_else_who_publishes_it_is_warned_of(node: NodeProcess, client: 
         return 'omebody else publishes map -> odom' in client.diagnostics[-1].status[0].message
     client.spin_until(warned, 'it warns')
     assert client.diagnostics[-1].status[0].level == b'\x01'
+
+
+def test_without_tf2_msgs_it_warns_once_and_all_else_runs(tmp_path: Path) -> None:
+    program = ("import sys; sys.modules['tf2_msgs'] = None\n"
+               'from pose_graph_ros.ros.main import main; sys.exit(main())')
+    with NodeProcess(tmp_path, program=('-c', program)) as node:
+        with Client(int(node.env['ROS_DOMAIN_ID'])) as client:
+            drive(client, 6.0)
+            assert client.optimize().success
+            assert len(client.poses) > 50
+            assert client.transforms == []
+            assert client.set_parameter('publish_tf', value=False) == (True, '')
+        assert node.signal_and_wait(signal.SIGINT) == 0
+        assert node.stderr().count('tf2_msgs is not installed') == 1
+        assert 'Traceback' not in node.stderr()
