@@ -55,6 +55,8 @@ SPEED, FIX_RATE = 2.0, 10.0
 """While it is measured [m/s, Hz]."""
 STRAGGLERS = 0.5
 """How long outputs are waited for after the last message [s]."""
+STANDSTILL = 10.0
+"""A node that has processed nothing for so long will not go on [s]."""
 
 
 def truth(way: FloatArray | float) -> tuple[Any, Any]:
@@ -284,11 +286,17 @@ class Feeder:
 
     def settle(self) -> None:
         """Wait until the node has processed all that was sent and not lost, and has said so."""
-        seen, end = self._n_diagnostics, time.monotonic() + 5.0
-        self.wait_until(
-            lambda: self._n_diagnostics >= seen + 2 and (
-                int(self.values['processed']) >= self._n_sent or time.monotonic() > end),
-            'the node has processed everything')
+        seen, processed, since = self._n_diagnostics, -1, time.monotonic()
+
+        def done() -> bool:
+            nonlocal processed, since
+            if self.count('processed') > processed:
+                processed, since = self.count('processed'), time.monotonic()
+            # what is lost is never processed
+            return self._n_diagnostics >= seen + 2 and (
+                processed >= self._n_sent or time.monotonic() > since + STANDSTILL)
+
+        self.wait_until(done, 'the node has processed everything', 300.0)
 
     def count(self, name: str) -> int:
         """Return a count of the node's newest diagnostics."""
