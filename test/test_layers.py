@@ -21,7 +21,7 @@ CORE = (
     # the engine
     'tables', 'vectors', 'cholesky', 'factors', 'undo', 'rows', 'ordering', 'frames', 'fronts',
     'structure', 'assembly', 'elimination', 'editing', 'graph', 'symbolic', 'complex_system',
-    'initialization', 'carrying', 'back_substitution', 'relinearization', 'step',
+    'initialization', 'joint_start', 'carrying', 'back_substitution', 'relinearization', 'step',
     'gauss_newton', 'descent', 'batch', 'starts', 'chain', 'sparse_inverse', 'marginals',
     'rescue', 'incremental',
     # what drives it

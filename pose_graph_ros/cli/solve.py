@@ -11,6 +11,7 @@ import numpy as np
 from pose_graph_ros.core import batch, initialization
 from pose_graph_ros.core.config import SolverConfig
 from pose_graph_ros.core.io.g2o import EDGE2_ORDERS, read_g2o, write_g2o
+from pose_graph_ros.core.joint_start import joint
 
 MOST_STRETCHED = 5
 
@@ -37,7 +38,7 @@ def execute(options: argparse.Namespace) -> int:
     start = time.monotonic()
     if options.start == 'chordal':
         held_by_positions = len(graph.observed) > 0 and not np.any(graph.fixed)
-        start_of = initialization.joint if held_by_positions else initialization.chordal
+        start_of = joint if held_by_positions else initialization.chordal
         graph.set_poses(start_of(graph))
     result = batch.optimize(graph, SolverConfig(max_iterations=200))
     print(f'chi2 {result.chi2:.9g}, {result.status.value} after {result.iterations} iterations, '

@@ -88,7 +88,9 @@ def optimize_from_nothing(graph: Graph, config: SolverConfig) -> BatchResult:
         try:
             start = initialization.chordal_poses(head, cliques)
         except LinearSolveError:
-            start = initialization.joint(graph)
+            from pose_graph_ros.core.joint_start import joint  # noqa: PLC0415  (it needs SciPy)
+
+            start = joint(graph)
         gauss_newton.put_poses(head, start)
         result = _descend(graph, config, cliques, _chi2(graph))
     if result is None or result.status is Status.FAILED or not result.chi2 <= chi2:

@@ -9,7 +9,6 @@ wind it the wrong way round, and it shows by not converging soon.
 
 from collections.abc import Callable
 
-from pose_graph_ros.core import initialization
 from pose_graph_ros.core.batch import BatchResult, Status
 from pose_graph_ros.core.config import SolverConfig
 from pose_graph_ros.core.exceptions import LinearSolveError
@@ -43,8 +42,10 @@ def solve_from_two_starts(
     if len(graph.observed) == 0 or not (unsure or closing):
         return result
     poses = graph.poses.copy()
+    from pose_graph_ros.core.joint_start import joint  # noqa: PLC0415  (it needs SciPy)
+
     try:
-        graph.set_poses(initialization.joint(graph))
+        graph.set_poses(joint(graph))
         other = solve(graph, config)
     except LinearSolveError:
         other = None

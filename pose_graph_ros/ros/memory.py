@@ -13,8 +13,11 @@ from pathlib import Path
 # As <sys/mman.h> and <malloc.h> of Linux have them.
 MADV_DONTNEED = 4
 M_MMAP_THRESHOLD = -3
+M_ARENA_MAX = -8
 # Arrays beyond this get pages of their own, which go back when they are freed [bytes].
 LARGE = 256 * 1024
+# The middleware has a dozen threads; each would have a heap of its own, mostly empty.
+ARENAS = 2
 
 SMAPS = Path('/proc/self/smaps')
 
@@ -28,6 +31,7 @@ def give_back_large_arrays() -> None:
     mallopt = getattr(ctypes.CDLL(None), 'mallopt', None)
     if mallopt is not None:
         mallopt(M_MMAP_THRESHOLD, LARGE)
+        mallopt(M_ARENA_MAX, ARENAS)
 
 
 def let_go() -> None:

@@ -34,6 +34,7 @@ from pose_graph_ros.core.exceptions import LinearSolveError
 from pose_graph_ros.core.graph import Graph, GraphUpdate
 from pose_graph_ros.core.incremental import IncrementalSmoother
 from pose_graph_ros.core.io.g2o import read_g2o, write_g2o
+from pose_graph_ros.core.joint_start import joint
 from pose_graph_ros.core.se2 import FloatArray
 
 seeds = st.integers(0, 2**32 - 1)
@@ -402,7 +403,7 @@ def test_without_a_guess_the_joint_start_is_taken(seed: int) -> None:
     with pytest.raises(LinearSolveError, match='bias'):
         initialization.chordal(graph)
     graph.set_poses(random_poses(np.random.default_rng(seed), graph.n_nodes))
-    start = initialization.joint(graph)
+    start = joint(graph)
     np.testing.assert_allclose(start[:, :2], truth[:, :2], atol=1e-9)
     np.testing.assert_allclose(se2.wrap(start[:, 2] - truth[:, 2]), 0.0, atol=1e-9)
     result = batch.optimize_from_nothing(graph, THOROUGH)
@@ -421,7 +422,7 @@ def test_the_joint_start_weighs_positions_by_both_variances() -> None:
             Edges([0], [1], [[2.0, 0.0, 0.0]], [np.diag([1.0, 1.0, 1e6])], [EdgeKind.ODOMETRY]),
             fix(1, 2, bad, np.zeros(2), np.array([1.0, np.sqrt(3.0)]))])))
     # information 1 against 1 / (1 + 3); the heading, which is known, leaves the rest to sway
-    start = initialization.joint(graph)
+    start = joint(graph)
     np.testing.assert_allclose(start[1, :2], 0.8 * np.array([2.0, 0.0]) + 0.2 * bad, atol=1e-4)
     np.testing.assert_array_equal(start[2:], [[0.0, 0.0, 0.0], [5.0, 5.0, 0.1]])
 

@@ -13,6 +13,7 @@ from pose_graph_ros.core.config import SolverConfig
 from pose_graph_ros.core.constraints import ObservedKind, ObservedNodes
 from pose_graph_ros.core.exceptions import LinearSolveError
 from pose_graph_ros.core.graph import Graph, GraphUpdate
+from pose_graph_ros.core.joint_start import joint
 from pose_graph_ros.core.se2 import FloatArray
 
 # Two linear problems with condition numbers of some 1e3.
@@ -179,7 +180,7 @@ def test_joint_is_exact_without_noise_from_positions_alone(seed: int) -> None:
                                np.full(graph.n_nodes, ObservedKind.POSITION)),
         free=np.flatnonzero(graph.fixed).tolist()))
     graph.set_poses(random_poses(rng, graph.n_nodes))
-    assert_poses_equal(initialization.joint(graph), expected)
+    assert_poses_equal(joint(graph), expected)
 
 
 def test_joint_says_so_where_nothing_holds_the_graph() -> None:
@@ -187,7 +188,7 @@ def test_joint_says_so_where_nothing_holds_the_graph() -> None:
     graph.apply(GraphUpdate(free=np.flatnonzero(graph.fixed).tolist()))
     graph.set_poses(np.ones((graph.n_nodes, 3)))
     try:
-        poses = initialization.joint(graph)
+        poses = joint(graph)
     except LinearSolveError:
         return
     # or rounding made up a solution: then it is none that the engine would take for better

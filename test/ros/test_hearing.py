@@ -68,7 +68,7 @@ def test_a_silence_does_not_make_a_source_slow() -> None:
 
 def drive(continuity: Continuity, *places: tuple[float, float], newest: float = 1e9) -> list[bool]:
     """Return whether an estimate is carried to places (seconds, x), along a line."""
-    estimate = SimpleNamespace(path=SimpleNamespace(stamps_ns=np.array([newest * 1e9])))
+    estimate = SimpleNamespace(stamp_ns=newest * 1e9)
     return [continuity.carries(estimate, OdometrySample(round(1e9 * at), np.array([x, 0.0, 0.0])))
             for at, x in places]
 
