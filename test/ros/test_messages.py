@@ -45,7 +45,10 @@ def path_message(path: Trajectory, stamp_ns: int, frame: str) -> Path:
 @pytest.mark.parametrize('frame', ['', 'm', 'ma', 'map', 'map1', 'world', 'robot1', 'robot/1',
                                    'robot/map', 'kürzel'])
 @pytest.mark.parametrize('count', [0, 1, 2, 3, 50])
-def test_the_path_is_byte_for_byte_what_rclpy_makes(frame: str, count: int) -> None:
+def test_the_path_is_byte_for_byte_what_rclpy_makes(
+    frame: str, count: int, monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr(messages, 'PATH_CHUNK', 7)
     generator = np.random.default_rng(count)
     stamps = 1_700_000_000_123_456_789 + np.cumsum(generator.integers(1, 2**31, count))
     path = Trajectory(stamps, generator.normal(0.0, 100.0, (count, 3)))
