@@ -19,6 +19,7 @@ from pose_graph_ros.ros.reader import MessageReader
 from pose_graph_ros.ros.rewind import Heard, Rewind, Taken
 from pose_graph_ros.ros.sources import Kind, NANOSECONDS, Source
 
+PAUSED = rejected('paused', 'call ~/pause with false to go on')
 # So long a message is held back while nothing else comes that would tell what it is [s].
 LONGEST_DOUBT = 1.0
 
@@ -122,7 +123,7 @@ class Intake:
     ) -> None:
         """Hand a measurement to the engine, unless that is paused."""
         if self.paused:
-            self.refuse(source, rejected('paused', 'call ~/pause with false to go on'))
+            self.refuse(source, PAUSED)
         elif not post(source, measurement):
             self.refuse(source, rejected('inbox_full', 'the solver does not keep up'))
         else:

@@ -141,15 +141,16 @@ def path_cdr(path: Trajectory, stamp_ns: int, frame_id: str) -> bytes:
     numbers.view(np.uint8)[:, 12:12 + len(name)] = np.frombuffer(name, np.uint8)
     parts = [CDR, head]
     for begin in range(0, len(path), PATH_CHUNK):
-        stamps, poses = (all_of[begin:begin + PATH_CHUNK] for all_of in (path.stamps_ns, path.poses))
+        chunk = slice(begin, begin + PATH_CHUNK)
+        stamps, poses = path.stamps_ns[chunk], path.poses[chunk]
         n, half = len(stamps), poses[:, 2] / 2.0
         integers[:n, 0], integers[:n, 1] = np.divmod(stamps, NANOSECONDS)
         pose[:n, :2] = poses[:, :2]
         pose[:n, 5], pose[:n, 6] = np.sin(half), np.cos(half)
         if begin == 0:
             # it begins where the head ends, the others at a multiple of 8
-            first = numbers[0].tobytes()
-            parts += (first[:12 + len(name)], bytes(-(len(head) + 12 + len(name)) % 8), first[-56:])
+            first, names_end = numbers[0].tobytes(), 12 + len(name)
+            parts += (first[:names_end], bytes(-(len(head) + names_end) % 8), first[-56:])
         parts.append(numbers[begin == 0:n].tobytes())
     return b''.join(parts)
 

@@ -61,7 +61,6 @@ class Publishers:
         self, node: Node, values: Mapping[str, Any], on_other: Callable[[str], None],
     ) -> None:
         self._node = node
-        self._publishers: list[Publisher] = []
         self.map_frame = frame(values['map_frame'])
         self.odom_frame = frame(values['odom_frame'])
         self.base_frame = frame(values['base_link_frame'])
@@ -71,15 +70,11 @@ class Publishers:
         self._path = self._publisher(Path, 'path', LATCHED_QOS)
         self._graph = self._publisher(MarkerArray, 'graph', LATCHED_QOS)
         self._diagnostics = self._publisher(DiagnosticArray, '/diagnostics', OUTPUT_QOS)
+        self._publishers = (self._pose, self._odometry, self._fix, self._path, self._graph,
+                            self._diagnostics)
         self.transforms: TransformPublisher | None = None
-        """None without tf2_msgs."""
-        if TFMessage is None:
-            node.get_logger().warning(
-                'tf2_msgs is not installed: the transform from map to odom is not published')
-        else:
-            self.transforms = TransformPublisher(
-                node, self._publisher(TFMessage, TOPIC, TF_QOS), self.map_frame, self.odom_frame,
-                on_other)
+        """None if they are not wanted, or cannot be had without tf2_msgs."""
+        self._on_other = on_other
         self._slew = Slew()
         self._aligned = False
         self._newest_ns = 0
@@ -93,18 +88,31 @@ class Publishers:
         self.configure(values)
 
     def _publisher(self, message_type: type, topic: str, qos: QoSProfile) -> Publisher:
-        publisher = self._node.create_publisher(
+        return self._node.create_publisher(
             message_type, topic, copy(qos),  # rclpy writes the overrides into it
             qos_overriding_options=QoSOverridingOptions.with_default_policies())
-        self._publishers.append(publisher)
-        return publisher
 
     def configure(self, values: Mapping[str, Any]) -> None:
         """Take the parameters that can change while the node runs."""
-        self._publish_tf = values['publish_tf']
+        if values['publish_tf'] and self.transforms is None:
+            self._begin_transforms()
+        elif not values['publish_tf'] and self.transforms is not None:
+            self.transforms.close()
+            self.transforms = None
         self._tf_offset_ns = round(values['transform_time_offset'] * NANOSECONDS)
         self._slew_limits = values['transform_slew_linear'], values['transform_slew_angular']
         self._path_period, self._graph_period = values['path_period'], values['graph_period']
+
+    def _begin_transforms(self) -> None:
+        if TFMessage is None:
+            self._node.get_logger().warning(
+                'tf2_msgs is not installed: the transform from map to odom is not published',
+                once=True)
+            return
+        self.transforms = TransformPublisher(
+            self._node, self._publisher(TFMessage, TOPIC, TF_QOS), self.map_frame,
+            self.odom_frame, self._on_other)
+        self._slew.forget()
 
     def publish_pose(
         self, estimate: Estimate, odometry: Odometry, sample: OdometrySample, datum: Datum,
@@ -114,7 +122,7 @@ class Publishers:
         if stamp <= self._newest_ns:
             return
         self._newest_ns = stamp
-        if (self.transforms is not None and self._publish_tf
+        if (self.transforms is not None
                 and frame(odometry.header.frame_id) in ('', self.odom_frame)):
             if (estimate.alignment is AlignmentState.ALIGNED) != self._aligned:
                 # the map was not where it is: that is no correction

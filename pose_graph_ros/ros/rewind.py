@@ -56,6 +56,7 @@ class Rewind:
         self.threshold_ns = threshold_ns
         self.newest_ns = 0
         """Newest stamp of odometry that does not stand alone, or the first [ns]; 0 for none."""
+        self._teller = ''
         self._n_ahead = 0
         self._held: list[Heard] = []
         self._behind: list[int] = []
@@ -67,6 +68,10 @@ class Rewind:
         """Take a message; say what can be used now."""
         if self._is_old(heard):
             return Taken([], is_old=True)
+        if heard.tells_time and heard.source != self._teller:
+            # another odometry may have another clock
+            self._teller = heard.source
+            self.forget()
         if not heard.tells_time or heard.stamp_ns <= 0:
             return self._release_unless_in_doubt(heard)
         if self.newest_ns == 0 or heard.stamp_ns > self.newest_ns - self.threshold_ns:

@@ -38,7 +38,7 @@ from pose_graph_ros.core.saved_graph import SavedGraph
 from pose_graph_ros.ros import diagnostics, memory
 from pose_graph_ros.ros.continuity import Continuity
 from pose_graph_ros.ros.conversions import frame, Message
-from pose_graph_ros.ros.intake import Intake
+from pose_graph_ros.ros.intake import Intake, PAUSED
 from pose_graph_ros.ros.publishers import Publishers
 from pose_graph_ros.ros.rewind import Heard
 from pose_graph_ros.ros.setting import PoseSetting
@@ -263,7 +263,7 @@ class Session:
 
     def _on_set_pose(self, message: Message) -> None:
         """Take where the robot is from somebody who knows."""
-        answer = self._setting.take(message)
+        answer = PAUSED if self.intake.paused else self._setting.take(message)
         if answer is not None:
             self.intake.refuse('set_pose', answer)
         self._set_pose()
@@ -300,7 +300,7 @@ class Session:
 
     def begin_anew(self, reason: str, messages: Sequence[Heard] = ()) -> None:
         """Begin a new graph; a datum that was given, and what /tf_static told, stay."""
-        self._replace(PoseGraphBackend(self._config), reason)
+        self._replace(PoseGraphBackend(self._config), f'the graph begins anew: {reason}')
         for heard in messages:
             self.intake.received[heard.source] += 1
             self._use(heard)
@@ -315,7 +315,7 @@ class Session:
     def _replace(
         self, backend: PoseGraphBackend, reason: str, *, goes_on: bool = False,
     ) -> None:
-        self.node.get_logger().warning(f'beginning anew: {reason}')
+        self.node.get_logger().warning(reason)
         prepare = None if self.worker.prepared else self._warm_up
         self.worker.stop(0.0)  # a solve that is under way ends in vain
         self.out.begin_anew()
@@ -361,12 +361,14 @@ class Session:
 
     def optimize(self) -> 'Future[UpdateReport]':
         """Have the whole graph optimised, and its path published at once."""
-        def job(graph: int, backend: PoseGraphBackend) -> UpdateReport:
-            report = self.worker.close(backend)
+        worker, graph = self.worker, self.out.graph
+
+        def job(backend: PoseGraphBackend) -> UpdateReport:
+            report = worker.close(backend)
             # who has the answer must not have to guess which path is the optimised one
             self._show(graph, backend, at_once=True)
             return report
-        return self.worker.call(partial(job, self.out.graph))
+        return worker.call(job)
 
     @property
     def odometry_topics(self) -> list[str]:
@@ -382,7 +384,7 @@ class Session:
             self.intake.hearing.silent(now) if self.active else [])
         for name in sorted(set(self.silent) - set(before)):
             self.node.get_logger().warning(f'{name} is silent, other sources go on')
-        if self.out.transforms is not None and self.active and self.values['publish_tf']:
+        if self.out.transforms is not None and self.active:
             self.out.transforms.look_for_others()
         if now - self._strain_at > STRAIN_PERIOD and self.worker.prepared:
             self._strain_at = now

@@ -82,7 +82,7 @@ class TransformPublisher:
         now = time.monotonic()
         if self._subscription is not None:
             if now - self._since > LISTENING:
-                self.close()
+                self._listen_no_more()
             return
         # another instance of this node, by mistake, has its name as well
         everyone = {bytes(info.endpoint_gid)
@@ -93,7 +93,11 @@ class TransformPublisher:
                 TFMessage, TOPIC, self._hear, TF_QOS, raw=True)
 
     def close(self) -> None:
-        """Listen no more."""
+        """Publish and listen no more."""
+        self._listen_no_more()
+        self._node.destroy_publisher(self._publisher)
+
+    def _listen_no_more(self) -> None:
         if self._subscription is not None:
             self._node.destroy_subscription(self._subscription)
             self._subscription = None

@@ -19,6 +19,9 @@ def _on_this_machine_alone(
 ) -> None:
     """The client of a test must not be heard outside, nor write into the home folder."""
     monkeypatch.setenv('ROS_AUTOMATIC_DISCOVERY_RANGE', 'LOCALHOST')
+    # the name that Fast DDS has for it in Jazzy, and a later one
+    for name in ('FASTRTPS_DEFAULT_PROFILES_FILE', 'FASTDDS_DEFAULT_PROFILES_FILE'):
+        monkeypatch.setenv(name, str(Path(__file__).parent / 'discovery.xml'))
     monkeypatch.setenv('ROS_LOG_DIR', str(tmp_path_factory.mktemp('ros_log')))
     assert 'ROS_LOCALHOST_ONLY' not in os.environ, 'unset it: it overrides the discovery range'
 

@@ -118,6 +118,7 @@ class Client:
                       RELIABLE)
         self._optimize = self.node.create_client(Trigger, f'{name}/optimize')
         self._services = {'optimize': self._optimize}
+        self._matched: list[object] = []
 
     def __enter__(self) -> 'Client':
         self.wait_for_the_node()
@@ -170,6 +171,10 @@ class Client:
     def call(self, service: object, request: object) -> object:
         """Call a service and return its answer."""
         self.spin_until(service.service_is_ready, 'the service is there')
+        if service not in self._matched:
+            # an answer is lost if the other side does not know yet where to send it
+            self.spin_for(0.3)
+            self._matched.append(service)
         future = service.call_async(request)
         self.spin_until(future.done, 'the service answers')
         return future.result()

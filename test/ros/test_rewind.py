@@ -123,3 +123,13 @@ def test_a_doubt_without_an_end_holds_nothing_back_for_ever() -> None:
     released, jumps = taken(rewind, messages)
     assert jumps == []
     assert len(released) == len(messages)
+
+
+def test_another_odometry_that_tells_the_time_may_have_another_clock() -> None:
+    rewind = Rewind(SECOND)
+    other = [heard._replace(source='visual') for heard in lap(50.0, 5.0)]
+    messages = [*lap(100.0, 5.0), *other, *(heard._replace(source='visual')
+                                            for heard in lap(50.0, 2.0))]
+    released, jumps = taken(rewind, messages)
+    assert released == messages
+    assert jumps == [100]

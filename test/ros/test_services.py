@@ -133,6 +133,7 @@ def test_the_markers_show_the_graph_while_someone_looks(
     node: NodeProcess, client: Client,
 ) -> None:
     drive(client, 10.0)
+    assert client.optimize().success
     arrays: list[MarkerArray] = []
     client.node.create_subscription(MarkerArray, 'graph', arrays.append, LATCHED)
     client.spin_until(lambda: len(arrays) > 0 and len(arrays[-1].markers) > 1, 'they come')
@@ -159,6 +160,7 @@ def test_a_graph_is_saved_and_another_node_goes_on_with_it(tmp_path: Path) -> No
             Client(int(node.env['ROS_DOMAIN_ID'])) as client:
         assert 'no graph to save' in client.trigger('save_graph').message
         drive(client, 20.0)
+        assert client.optimize().success
         answer = client.trigger('save_graph')
         assert answer.success, answer.message
         assert 'yard.g2o' in answer.message
