@@ -263,7 +263,8 @@ class Session:
 
     def _on_set_pose(self, message: Message) -> None:
         """Take where the robot is from somebody who knows."""
-        answer = PAUSED if self.intake.paused else self._setting.take(message)
+        answer = PAUSED if self.intake.paused else self._setting.take(
+            message, early=self.worker.estimate is None)
         if answer is not None:
             self.intake.refuse('set_pose', answer)
         self._set_pose()

@@ -11,8 +11,9 @@ from pose_graph_ros.ros.conversions import frame, Message, PLANAR, planar_pose, 
 
 # Taken where no covariance is given: what RViz says [m, m, rad].
 DEFAULT_SIGMA = (0.5, 0.5, 0.26)
-# Takes the place of a stamp that is not set: the newest odometry [ns].
-NEWEST = 2**62
+# For a stamp that is not set: that of the newest odometry; for one before there was any: its first
+# [ns].
+NEWEST, FIRST = 2**62, 1
 
 
 class PoseSetting:
@@ -29,9 +30,24 @@ class PoseSetting:
     def __init__(self, map_frame: str, odom_frame: str, base_frame: str) -> None:
         self._frames = (map_frame, odom_frame, base_frame)
         self._waiting: Message | None = None
+        self._early = False
 
-    def take(self, message: Message) -> Answer | None:
-        """Keep a message for `pop`; return why it cannot be used, or None."""
+    def take(self, message: Message, *, early: bool = False) -> Answer | None:
+        """
+        Keep a message for `pop`.
+
+        Parameters
+        ----------
+        message : geometry_msgs/PoseWithCovarianceStamped
+        early : bool
+            Whether there is no odometry yet: it is then for where that begins.
+
+        Returns
+        -------
+        answer : Answer, optional
+            Why it cannot be used.
+
+        """
         named = frame(message.header.frame_id)
         if named not in ('', *self._frames):
             return rejected('wrong_frame', f'expected {", ".join(self._frames)}, got {named!r}')
@@ -40,7 +56,7 @@ class PoseSetting:
             return rejected('not_finite', 'a position or an orientation that is none')
         if (broken := value_defect(pose)) is not None:
             return rejected(broken, f'pose {pose.tolist()}')
-        self._waiting = message
+        self._waiting, self._early = message, early
         return None
 
     def pop(self, estimate: Estimate) -> GlobalPose | None:
@@ -63,7 +79,7 @@ class PoseSetting:
             turn = np.eye(3)
             turn[:2, :2] = se2.rotation(float(T_map_frame[2]))
             cov = turn @ cov @ turn.T
-        stamp = stamp_ns(message)
+        stamp = FIRST if self._early else stamp_ns(message)
         return GlobalPose(stamp if stamp > 0 else NEWEST, pose, cov)
 
     def forget(self) -> None:

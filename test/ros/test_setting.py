@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from pose_graph_ros.core import se2
-from pose_graph_ros.ros.setting import NEWEST, PoseSetting
+from pose_graph_ros.ros.setting import FIRST, NEWEST, PoseSetting
 
 ESTIMATE = Space(T_map_odom=np.array([10.0, 5.0, 1.0]), T_map_base=np.array([20.0, -3.0, -2.0]))
 
@@ -64,6 +64,14 @@ def test_what_cannot_be_read_is_refused(frame: str, x: float, reason: str) -> No
     assert answer is not None
     assert answer.reason == reason
     assert setting.pop(ESTIMATE) is None
+
+
+def test_what_was_set_before_there_was_odometry_is_for_its_beginning() -> None:
+    setting = PoseSetting('map', 'odom', 'base_link')
+    setting.take(message('map', 1.0, 2.0, 0.5, variances=(1.0, 1.0, 1.0), sec=7), early=True)
+    pose = setting.pop(ESTIMATE)
+    assert pose is not None
+    assert pose.stamp_ns == FIRST
 
 
 def test_the_newest_counts_and_forgotten_ones_do_not() -> None:
