@@ -150,10 +150,10 @@ class PoseGraphBackend:
         self._arrivals.queue.edges += self._nodes.edges
         self._nodes.edges.clear()
         for source, stream in self._nodes.streams.items():
-            if stream.n_jumps > 0:
-                self.counts[source, 'jump'] = stream.n_jumps
-            if stream.n_dropped > 0:
-                self.counts[source, 'stamp_ahead'] = stream.n_dropped
+            for reason, count in (('jump', stream.n_jumps), ('sorted', stream.n_sorted),
+                                  ('stamp_ahead', stream.n_dropped)):
+                if count > 0:
+                    self.counts[source, reason] = count
         self._arrivals.bind_due()
 
     def _make_node(self, mean: FloatArray, information: FloatArray | None, source: str) -> int:

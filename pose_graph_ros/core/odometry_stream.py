@@ -110,6 +110,8 @@ class OdometryStream:
         """Samples that are settled, in a frame without jumps."""
         self.n_jumps = 0
         """Jumps among the settled samples."""
+        self.n_sorted = 0
+        """Samples that came after newer ones and were sorted in."""
         self.n_dropped = 0
         """Samples that were taken, but whose stamps turned out to be far ahead of their time."""
         self._waiting: list[_Sample] = []
@@ -174,6 +176,7 @@ class OdometryStream:
             if self._waiting[at].stamp_ns == sample.stamp_ns:
                 return rejected('duplicate_stamp', f'odometry at {sample.stamp_ns} came before')
             del self._ahead[at:]
+            self.n_sorted += 1
         variance = sample.twist_variance
         self._waiting.insert(at, _Sample(
             sample.stamp_ns, (x, y, wrap_one(theta)), sample.speed,

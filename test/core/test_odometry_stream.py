@@ -99,6 +99,13 @@ def test_a_sample_waits_for_the_window_and_no_longer() -> None:
             [EPOCH + (k - 2) * SECOND // 10] if k >= 2 else [])
 
 
+def test_what_is_sorted_in_is_counted() -> None:
+    stream = OdometryStream(OdometrySource(reorder_window=0.5))
+    for k in (0, 1, 3, 2, 5, 4, 6):
+        stream.add(OdometrySample(EPOCH + k * SECOND // 10, np.array([0.1 * k, 0.0, 0.0])))
+    assert stream.n_sorted == 2
+
+
 def test_what_comes_too_late_is_told_from_what_comes_twice() -> None:
     stream = settled(WIGGLE)
     assert stream.add(WIGGLE[7]).reason == 'duplicate_stamp'
