@@ -176,7 +176,7 @@ class Services:
         name = self._session.values['graph_file']
         if name == '':
             response.message = (
-                'refused: set the parameter graph_file first, such as to /tmp/map.g2o')
+                'refused: set the parameter graph_file first, such as to ~/map.g2o')
             return response
         try:
             response.message = await act(Path(name).expanduser())
