@@ -75,7 +75,7 @@ def _inputs(session: 'Session') -> dict[str, object]:
         silence, rate = hearing.silence(name, now), hearing.rate(name)
         found[f'{name}.silence_s'] = 'never heard' if silence is None else f'{silence:.1f}'
         if rate > 0.0:
-            found[f'{name}.rate_hz'] = f'{rate:.4g}'
+            found[f'{name}.rate_hz'] = f'{rate:.1f}'
     for name, fixes in reader.fixes.items():
         if fixes.antenna is not None:
             x, y = fixes.antenna.lever_arm
