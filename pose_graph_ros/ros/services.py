@@ -85,7 +85,7 @@ class Services:
 
     def _reset(self, _: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
         estimate = self._session.worker.estimate
-        self._session.begin_anew('a call of ~/reset')
+        self._session.reset()
         response.success = True
         plane = self._session.intake.reader.datum.plane
         response.message = (

@@ -152,11 +152,7 @@ class Session:
         for source in sources:
             message_type, qos = CLASSES[source.kind]
             self._subscribe(source.topic, message_type, partial(self._on_message, source), qos)
-        self._set_timer('update', 1.0 / self.values['frequency'], self._on_update_timer)
-        self._set_timer('silence', SILENCE_PERIOD, self._on_silence_timer)
-        self._set_timer('views', max(min(self.values['path_period'], 0.5), 0.1),
-                        self._on_views_timer)
-        self._watch_clock()
+        self._watch_time()
         self.active = True
         topics = ', '.join(self.node.resolve_topic_name(source.topic) for source in sources)
         self.node.get_logger().info(f'ready, listening to {topics}')
@@ -185,25 +181,16 @@ class Session:
 
     def configure(self, values: Mapping[str, Any]) -> None:
         """Take parameters that can be changed now."""
-        before, self.values = self.values, dict(values)
-        self._config = backend_config(values)
+        self.values = dict(values)
+        self._config = config = backend_config(values)
         self.intake.configure(values)
         self.out.configure(values)
-        for name, source in self._config.odometry.items():
+        for name, source in config.odometry.items():
             self._continuity[name].maximum_speed = source.maximum_speed
-        config = self._config
         self.worker.call(lambda backend: backend.configure(config))
-        if values['diagnostics_period'] != before['diagnostics_period']:
-            self._set_timer('diagnostics', values['diagnostics_period'], self.publish_diagnostics)
-        if not self.active:
-            return
-        if values['frequency'] != before['frequency']:
-            self._set_timer('update', 1.0 / values['frequency'], self._on_update_timer)
-        if values['path_period'] != before['path_period']:
-            self._set_timer('views', max(min(values['path_period'], 0.5), 0.1),
-                            self._on_views_timer)
-        if values['clock_jump_threshold'] != before['clock_jump_threshold']:
-            self._watch_clock()
+        self._set_timer('diagnostics', values['diagnostics_period'], self.publish_diagnostics)
+        if self.active:
+            self._watch_time()
 
     def _subscribe(
         self, topic: str, message_type: type, take: Callable[[Any], None], qos: QoSProfile,
@@ -283,13 +270,17 @@ class Session:
 
     # ---- time
 
-    def _watch_clock(self) -> None:
-        """Have jumps of the node's clock reported, backward by more than the threshold."""
+    def _watch_time(self) -> None:
+        """Start the timers, and have jumps of the clock backward beyond the threshold told."""
+        values = self.values
+        self._set_timer('update', 1.0 / values['frequency'], self._on_update_timer)
+        self._set_timer('silence', SILENCE_PERIOD, self._on_silence_timer)
+        self._set_timer('views', max(min(values['path_period'], 0.5), 0.1), self._on_views_timer)
         if self._jump_handle is not None:
             self._jump_handle.unregister()
         threshold = JumpThreshold(
             min_forward=None, on_clock_change=False,
-            min_backward=Duration(seconds=-self.values['clock_jump_threshold']))
+            min_backward=Duration(seconds=-values['clock_jump_threshold']))
         self._jump_handle = self.node.get_clock().create_jump_callback(
             threshold, post_callback=self._on_clock_jump)
 
@@ -298,6 +289,11 @@ class Session:
         self.intake.rewind.clock_jumped(back_ns)
         self.begin_anew(f'the clock jumped back by {back_ns * 1e-9:.3f} s',
                         self.intake.rewind.release())
+
+    def reset(self) -> None:
+        """Begin a new graph as somebody asks for it; what comes next may be of any time."""
+        self.intake.rewind.forget()
+        self.begin_anew('a call of ~/reset')
 
     def begin_anew(self, reason: str, messages: Sequence[Heard] = ()) -> None:
         """Begin a new graph; a datum that was given, and what /tf_static told, stay."""
@@ -308,6 +304,7 @@ class Session:
 
     def load(self, saved: SavedGraph, backend: PoseGraphBackend, name: str) -> None:
         """Go on with a graph that was loaded."""
+        self.intake.rewind.forget()
         self._replace(backend, f'the graph in {name} was loaded', goes_on=True)
         if saved.datum is not None:
             self.intake.reader.datum.keep(saved.datum)

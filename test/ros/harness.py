@@ -199,6 +199,14 @@ class Client:
             self._services[name] = self.node.create_client(kind, f'{self._name}/{name}')
         return self._services[name]
 
+    def begin_anew(self) -> None:
+        """Have the node begin a new graph, and forget what it has published."""
+        before = int(self.values['resets'])
+        assert self.trigger('reset').success
+        self.spin_until(lambda: int(self.values['resets']) > before, 'it begins anew')
+        for kept in (self.poses, self.filtered, self.fixes, self.paths, self.transforms):
+            kept.clear()
+
     def set_datum(self) -> Trigger.Response:
         return self.trigger('set_datum')
 

@@ -2,6 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """The real node, driven over DDS by an independent process: this one."""
 
+from contextlib import ExitStack
 import math
 from pathlib import Path
 import random
@@ -252,20 +253,29 @@ def test_signals_end_the_node_without_a_traceback(
     assert 'Traceback' not in node.stderr()
 
 
-@pytest.mark.parametrize(('parameter', 'expected'), [
+BAD = (
     ('frequency:=1000.0', 'frequency'), ('datum:=[95.0, 10.0]', 'latitude'),
     ('map_frame:=3', 'map_frame'), ('odom_frame:=map', 'different'),
     ('fix.lever_arm:=[1.0]', 'fix.lever_arm'),
     ('sources:=[odom, wheels]', 'wheels.type'), ('sources:=[fix]', 'odometry'),
-    ('odom.robust_loss:=l1', 'none, huber, cauchy'), ('fix.sigma_ceiling:=0.001', 'ceiling')])
+    ('odom.robust_loss:=l1', 'none, huber, cauchy'), ('fix.sigma_ceiling:=0.001', 'ceiling'))
+
+
+@pytest.mark.parametrize('some', [BAD[:3], BAD[3:6], BAD[6:]])
 def test_a_bad_parameter_is_one_line_and_no_traceback(
-    tmp_path: Path, parameter: str, expected: str,
+    tmp_path: Path, some: tuple[tuple[str, str], ...],
 ) -> None:
-    with NodeProcess(tmp_path, ('-p', parameter)) as node:
-        assert node.process.wait(20.0) == 2
-        lines = node.stderr().splitlines()
-        assert len(lines) == 1, lines
-        assert expected in lines[0]
+    with ExitStack() as stack:
+        nodes = []
+        for k, (parameter, _) in enumerate(some):
+            (tmp_path / str(k)).mkdir()
+            nodes.append(stack.enter_context(
+                NodeProcess(tmp_path / str(k), ('-p', parameter))))
+        for node, (_, expected) in zip(nodes, some, strict=True):
+            assert node.process.wait(20.0) == 2
+            lines = node.stderr().splitlines()
+            assert len(lines) == 1, lines
+            assert expected in lines[0]
 
 
 def test_whole_numbers_are_numbers_and_optimizing_nothing_says_so(tmp_path: Path) -> None:
