@@ -53,8 +53,10 @@ def _state(session: 'Session') -> dict[str, object]:
             'hidden_nodes': estimate.n_hidden, 'edges': estimate.n_edges,
             'observed_nodes': estimate.n_observed, 'biases': estimate.n_biases,
             'chi2': f'{estimate.chi2:.6g}'})
-    for rank, strain in enumerate(session.strained, 1):
-        found[f'largest_energy.{rank}'] = str(strain)
+    for rank, spring in enumerate(session.strained, 1):
+        found[f'largest_energy.{rank}'] = f'{spring.name}: {spring.energy:.4g}' + (
+            '' if spring.unweighted == spring.energy else
+            f', without its loss {spring.unweighted:.4g}')
     return found
 
 

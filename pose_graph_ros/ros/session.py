@@ -35,6 +35,7 @@ from pose_graph_ros.core.backend import PoseGraphBackend
 from pose_graph_ros.core.estimate import UpdateReport
 from pose_graph_ros.core.measurements import OdometrySample
 from pose_graph_ros.core.saved_graph import SavedGraph
+from pose_graph_ros.core.springs import Spring
 from pose_graph_ros.ros import diagnostics, memory
 from pose_graph_ros.ros.continuity import Continuity
 from pose_graph_ros.ros.conversions import frame, Message
@@ -112,7 +113,7 @@ class Session:
             for name, source in self._config.odometry.items()}
         self.silent: list[str] = []
         """Sources that have ended while others go on."""
-        self.strained: Sequence[object] = []
+        self.strained: Sequence[Spring] = []
         """The constraints with the largest energies."""
         self._strain_at = -math.inf
 

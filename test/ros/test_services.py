@@ -4,6 +4,7 @@
 
 import math
 from pathlib import Path
+import re
 
 from circle import drive, odometry_at, odometry_pose, path_error, START, true_pose
 from geometry_msgs.msg import PoseWithCovarianceStamped
@@ -151,6 +152,9 @@ def test_the_markers_show_the_graph_while_someone_looks(
     assert len(by_name['hidden_nodes'].points) == nodes
     assert len(by_name['odometry'].points) == 2 * (nodes - 1)
     assert len(by_name['observed_nodes'].points) > 10
+    client.spin_until(lambda: 'largest_energy.1' in client.values, 'they are named')
+    assert re.fullmatch(r'(fix at \d+\.\d{3} s near x\d+|odom x\d+ - x\d+): [\d.e-]+'
+                        r'(, without its loss [\d.e-]+)?', client.values['largest_energy.1'])
     for point in by_name['observed_nodes'].points:
         assert abs(math.hypot(point.x, point.y - 20.0) - 20.0) < 1e-2
     client.trigger('reset')
