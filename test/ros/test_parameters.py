@@ -238,7 +238,7 @@ TABLE = {parameter.name: parameter for parameter in all_parameters(PRESENT)}
     ('frequency', 5, 5.0), ('frequency', 0.5, 0.5), ('publish_tf', False, False),
     ('fix.lever_arm', array('d', [1.0, 0.5]), [1.0, 0.5]), ('fix.lever_arm', (1, 2), [1.0, 2.0]),
     ('fix.covariance_override', [1.0], [1.0]), ('fix.robust_loss', 'cauchy', 'cauchy'),
-    ('graph_file', '/tmp/graph.g2o', '/tmp/graph.g2o')])
+    ('graph_file', 'maps/graph.g2o', 'maps/graph.g2o')])
 @pytest.mark.parametrize('configured', [False, True])
 def test_a_change_is_taken_as_the_table_has_it(
     name: str, came: object, taken: object, configured: bool,
