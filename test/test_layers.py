@@ -20,10 +20,13 @@ CORE = (
     'covariance', 'measurements', 'admission', 'constraints', 'linearize', 'robust',
     # the engine
     'tables', 'vectors', 'cholesky', 'factors', 'undo', 'rows', 'ordering', 'frames', 'fronts',
-    'structure', 'assembly', 'elimination', 'editing', 'graph', 'symbolic', 'complex_system',
-    'initialization', 'joint_start', 'carrying', 'back_substitution', 'relinearization', 'step',
-    'gauss_newton', 'descent', 'batch', 'starts', 'chain', 'sparse_inverse', 'marginals',
-    'rescue', 'incremental',
+    'structure', 'assembly', 'elimination', 'editing', 'graph',
+    # the batch optimiser, which knows nothing of the smoother
+    'symbolic', 'complex_system', 'initialization', 'joint_start', 'gauss_newton', 'descent',
+    'batch', 'starts',
+    # the incremental smoother
+    'carrying', 'back_substitution', 'relinearization', 'step', 'chain', 'sparse_inverse',
+    'marginals', 'rescue', 'incremental',
     # what drives it
     'tangent_plane', 'saved_graph', 'timeline', 'unheard', 'odometry_stream', 'trajectory',
     'consensus', 'alignment', 'binding', 'hidden_nodes', 'anchoring', 'pending', 'reweighing',

@@ -44,6 +44,8 @@ BIAS = int(EdgeKind.BIAS)
 
 # Square of the fraction from which on a change of the arm counts by itself.
 MUCH_LONGER = 1e-4
+# A constraint is worth linearizing again from this fraction of its share of the budget on.
+LEAST_SHARE = 0.01
 
 
 @kernel

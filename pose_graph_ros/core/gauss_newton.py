@@ -18,7 +18,6 @@ from pose_graph_ros.core import factors, tables as tb
 from pose_graph_ros.core.assembly import eliminate_clique
 from pose_graph_ros.core.cholesky import backward_rows, forward_rows, solve_rows
 from pose_graph_ros.core.jit import kernel
-from pose_graph_ros.core.relinearization import LEAST_SHARE
 
 # Relative rounding of a sum of many numbers and of a coordinate.
 SUM_ROUNDING = 1e-12
@@ -320,7 +319,7 @@ def settle(head):  # type: ignore[no-untyped-def]
     head[tb.N_WAITING] = head[tb.N_TURNED] = 0
     if not 0.0 < scalars[tb.SETTING_BUDGET] < error2:
         return
-    worth_it = LEAST_SHARE * scalars[tb.SETTING_SHARE]
+    worth_it = factors.LEAST_SHARE * scalars[tb.SETTING_SHARE]
     for e in range(head[tb.N_EDGES]):
         if edge_f[e, tb.ERROR2] > worth_it:
             edge_i[e, tb.EDGE_WAITS] = 1

@@ -16,8 +16,6 @@ from pose_graph_ros.core.back_substitution import back_substitute
 from pose_graph_ros.core.elimination import add_seed
 from pose_graph_ros.core.jit import kernel
 
-# A constraint is worth linearizing again from this fraction of its share of the budget on.
-LEAST_SHARE = 0.01
 # What linearizing again leaves of the budget.
 LEFT_OVER = 0.4
 
@@ -39,7 +37,8 @@ def _look_at_edge(head, e):  # type: ignore[no-untyped-def]
     factors.check_edge(head, e, frames.present_turn(head, edge_i[e, tb.OWNER]))
     scalars[tb.CHI2] += f[tb.ENERGY]
     scalars[tb.ERROR2_SUM] += f[tb.ERROR2]
-    if f[tb.ERROR2] > LEAST_SHARE * scalars[tb.SETTING_SHARE] and edge_i[e, tb.EDGE_WAITS] == 0:
+    if (f[tb.ERROR2] > factors.LEAST_SHARE * scalars[tb.SETTING_SHARE]
+            and edge_i[e, tb.EDGE_WAITS] == 0):
         edge_i[e, tb.EDGE_WAITS] = 1
         _wait(head, e)
 
@@ -54,7 +53,7 @@ def _look_at_observed(head, k):  # type: ignore[no-untyped-def]
     factors.check_observed(head, k)
     scalars[tb.CHI2] += f[tb.OBS_ENERGY]
     scalars[tb.ERROR2_SUM] += f[tb.OBS_ERROR2]
-    if (f[tb.OBS_ERROR2] > LEAST_SHARE * scalars[tb.SETTING_SHARE]
+    if (f[tb.OBS_ERROR2] > factors.LEAST_SHARE * scalars[tb.SETTING_SHARE]
             and observed_i[k, tb.OBS_WAITS] == 0):
         observed_i[k, tb.OBS_WAITS] = 1
         _wait(head, -1 - k)
@@ -101,7 +100,7 @@ def _look_at_turned(head):  # type: ignore[no-untyped-def]
         slip = frames.frame_slip(head, c)
         error2 = frames.interface_error2(head, c, slip, tb.work_f(head))
         scalars[tb.ERROR2_SUM] += error2
-        if error2 > LEAST_SHARE * scalars[tb.SETTING_SHARE]:
+        if error2 > factors.LEAST_SHARE * scalars[tb.SETTING_SHARE]:
             clique_f[c, tb.SLIP_ERROR2] = error2
             turned[kept] = c
             kept += 1
