@@ -18,9 +18,10 @@ MODULES = sorted(path.relative_to(PACKAGE) for path in PACKAGE.rglob('*.py'))
 CORE = (
     'kernel_cache', 'jit', 'exceptions', 'arrays', 'sources', 'config', 'se2', 'motion',
     'covariance', 'measurements', 'admission', 'constraints', 'linearize', 'robust',
-    # the engine
-    'tables', 'vectors', 'cholesky', 'factors', 'undo', 'rows', 'ordering', 'frames', 'fronts',
-    'structure', 'assembly', 'elimination', 'editing', 'graph',
+    # the graph, which knows nothing of how it is solved
+    'tables', 'vectors', 'cholesky', 'factors', 'undo', 'rows', 'editing', 'graph',
+    # elimination
+    'ordering', 'frames', 'fronts', 'structure', 'assembly', 'elimination',
     # the batch optimiser, which knows nothing of the smoother
     'symbolic', 'complex_system', 'initialization', 'joint_start', 'gauss_newton', 'descent',
     'batch', 'starts',

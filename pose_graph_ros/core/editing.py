@@ -9,13 +9,22 @@ What is not plainly sound has been checked by `graph.Graph`.
 import math
 
 from pose_graph_ros.core import factors, rows, tables as tb, undo
-from pose_graph_ros.core.elimination import add_seed
 from pose_graph_ros.core.jit import kernel
 
 # Answers of `add_rows`.
 ADDED, NO_ROOM, UNSOUND = range(3)
 # What `edit` does to a row.
 WEIGH_EDGE, WEIGH_OBSERVED, FIX = range(3)
+
+
+@kernel
+def add_seed(head, v):  # type: ignore[no-untyped-def]
+    """Have a node eliminated again in the next iteration; the caller has logged it."""
+    node_i, seeds = tb.node_i(head), tb.seeds(head)
+    if node_i[v, tb.SEEDED] == 0:
+        node_i[v, tb.SEEDED] = 1
+        seeds[head[tb.N_SEEDS]] = v
+        head[tb.N_SEEDS] += 1
 
 
 @kernel

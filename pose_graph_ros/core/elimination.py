@@ -24,16 +24,6 @@ RELAXED_ZEROS = 16
 RELAXED_FRONTAL = 16
 
 
-@kernel
-def add_seed(head, v):  # type: ignore[no-untyped-def]
-    """Have a node eliminated again in the next iteration; the caller has logged it."""
-    node_i, seeds = tb.node_i(head), tb.seeds(head)
-    if node_i[v, tb.SEEDED] == 0:
-        node_i[v, tb.SEEDED] = 1
-        seeds[head[tb.N_SEEDS]] = v
-        head[tb.N_SEEDS] += 1
-
-
 @kernel(allocates=True)
 def mark(head):  # type: ignore[no-untyped-def]
     """

@@ -13,7 +13,7 @@ import math
 
 from pose_graph_ros.core import factors, frames, tables as tb, undo
 from pose_graph_ros.core.back_substitution import back_substitute
-from pose_graph_ros.core.elimination import add_seed
+from pose_graph_ros.core.editing import add_seed
 from pose_graph_ros.core.jit import kernel
 
 # What linearizing again leaves of the budget.
