@@ -17,7 +17,8 @@ MODULES = sorted(path.relative_to(PACKAGE) for path in PACKAGE.rglob('*.py'))
 # A module of core may import those before it, and no others.
 CORE = (
     'kernel_cache', 'jit', 'exceptions', 'arrays', 'sources', 'config', 'se2', 'motion',
-    'covariance', 'measurements', 'admission', 'constraints', 'linearize', 'robust',
+    'saved_columns', 'covariance', 'measurements', 'admission', 'constraints', 'linearize',
+    'robust',
     # the graph, which knows nothing of how it is solved
     'tables', 'vectors', 'cholesky', 'factors', 'undo', 'rows', 'editing', 'graph',
     # elimination
@@ -29,11 +30,12 @@ CORE = (
     'carrying', 'back_substitution', 'relinearization', 'step', 'chain', 'sparse_inverse',
     'marginals', 'rescue', 'incremental',
     # what drives it
-    'tangent_plane', 'saved_graph', 'timeline', 'unheard', 'odometry_stream', 'trajectory',
-    'consensus', 'alignment', 'binding', 'hidden_nodes', 'anchoring', 'pending', 'reweighing',
-    'closing', 'autocorrelation', 'correlated', 'joining', 'arrivals', 'springs', 'estimate',
-    'aligning', 'saving', 'backend', 'prediction', 'io', 'io.g2o', 'io.tum', 'io.plain',
-    'io.whole_files', 'io.graph_files', 'helper_process', 'warm_up',
+    'timeline', 'unheard', 'odometry_stream', 'trajectory', 'consensus', 'alignment', 'binding',
+    'hidden_nodes', 'anchoring', 'pending', 'reweighing', 'closing', 'autocorrelation',
+    'correlated', 'joining', 'arrivals', 'springs', 'estimate', 'aligning',
+    # the whole as a value, with its place on the Earth, and who drives all that
+    'tangent_plane', 'saved_graph', 'saving', 'backend', 'prediction', 'io', 'io.g2o', 'io.tum',
+    'io.plain', 'io.whole_files', 'io.graph_files', 'helper_process', 'warm_up',
 )
 CORE_NEEDS = {'numpy', 'scipy', 'numba', 'pyproj'}
 
@@ -44,7 +46,7 @@ WITHOUT_RCLPY = {
     'setting', 'slew', 'sources', 'static_frames'}
 ROS = {'rclpy', 'rosidl_runtime_py', 'ament_index_python', 'launch', 'launch_ros'}
 
-MOST_LINES = 400
+MOST_LINES = 450
 
 
 def imports(path: Path, *, at_run_time: bool = False) -> set[str]:

@@ -8,6 +8,7 @@ they are all judged again: the first few may have been wrong.
 """
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
@@ -20,7 +21,7 @@ from pose_graph_ros.core.constraints import full, ObservedKind, ObservedNodes, u
 from pose_graph_ros.core.estimate import AlignmentState
 from pose_graph_ros.core.hidden_nodes import HiddenNodes
 from pose_graph_ros.core.joining import Bound
-from pose_graph_ros.core.saved_graph import SavedAlignment
+from pose_graph_ros.core.saved_columns import Integers, Rows3, Rows6
 from pose_graph_ros.core.se2 import FloatArray
 from pose_graph_ros.core.sources import MeasurementSource, OdometryNoise
 
@@ -28,6 +29,25 @@ from pose_graph_ros.core.sources import MeasurementSource, OdometryNoise
 LAST_VERDICT = 4096
 # The first verdict over one that has turned the graph comes with so many.
 FIRST_VERDICT = 8
+
+
+@dataclass(frozen=True, slots=True)
+class SavedAlignment:
+    """What is known of the angle between odometry and map, and the measurements that tell it."""
+
+    state: str
+    sigma: float | None
+    """[rad]; None for infinite."""
+    next_verdict: int
+    sources: tuple[str, ...]
+    source: Integers
+    """Index of each measurement's source."""
+    stamps_ns: Integers
+    node: Integers
+    offset: Rows3
+    mean: Rows3
+    information: Rows6
+    kind: Integers
 
 
 class Heard(NamedTuple):

@@ -29,7 +29,7 @@ from pose_graph_ros.core import covariance, se2
 from pose_graph_ros.core.binding import Anchor, swept_variance
 from pose_graph_ros.core.constraints import EdgeKind, Edges, ObservedKind, ObservedNodes
 from pose_graph_ros.core.measurements import Absolute, HeadingOnly, Position
-from pose_graph_ros.core.saved_graph import SavedBins
+from pose_graph_ros.core.saved_columns import Integers
 from pose_graph_ros.core.se2 import FloatArray, IntArray
 from pose_graph_ros.core.sources import MeasurementSource
 
@@ -87,6 +87,17 @@ class _Bin:
     """In the graph."""
     tie: int
     """Edge to the state before; for the first bin the observed node that is its prior."""
+
+
+@dataclass(frozen=True, slots=True)
+class SavedBins:
+    """The states of the error of a source."""
+
+    width_ns: int
+    numbers: Integers
+    """Of the bins, increasing."""
+    rows: Integers
+    ties: Integers
 
 
 class BiasChain:

@@ -13,7 +13,8 @@ in the order of their stamps but for the reorder window: at an instant that a so
 all that was before it is there.
 """
 
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Mapping
+from dataclasses import dataclass
 import math
 from typing import cast
 
@@ -26,10 +27,40 @@ from pose_graph_ros.core.config import BackendConfig
 from pose_graph_ros.core.constraints import EdgeKind, Edges
 from pose_graph_ros.core.measurements import Answer, OdometrySample
 from pose_graph_ros.core.motion import Pose, wrap_one
-from pose_graph_ros.core.odometry_stream import OdometryStream
-from pose_graph_ros.core.saved_graph import as_matrix, as_pose, SavedBridge, SavedNodes
+from pose_graph_ros.core.odometry_stream import OdometryStream, SavedStream
+from pose_graph_ros.core.saved_columns import as_matrix, as_pose, Integers, Matrix, Rows3
 from pose_graph_ros.core.se2 import FloatArray, IntArray
 from pose_graph_ros.core.unheard import unheard_motion
+
+
+@dataclass(frozen=True, slots=True)
+class SavedBridge:
+    """Motion from the newest node to where the leading source began to lead."""
+
+    mean: Pose
+    covariance: Matrix
+
+
+@dataclass(frozen=True, slots=True)
+class SavedNodes:
+    """The hidden nodes by stamp, and who made them."""
+
+    stamps_ns: Integers
+    """Shape (H,)."""
+    rows: Integers
+    """In the graph, shape (H,)."""
+    odometry: Rows3
+    """Where odometry alone puts them, shape (H, 3)."""
+    leads: tuple[str, ...]
+    """Sources of odometry that made them, one after the other ..."""
+    leads_after_ns: Integers
+    """... each with the stamp after which it did."""
+    lead_ns: int
+    base_ns: int
+    base: Pose
+    bridge: SavedBridge | None
+    streams: Mapping[str, SavedStream]
+
 
 MakeNode = Callable[[FloatArray, FloatArray | None, str], int]
 """Takes the pose of the first node, or pose and information of an edge; returns the row or -1."""

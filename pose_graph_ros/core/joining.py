@@ -19,11 +19,11 @@ from pose_graph_ros.core.arrays import GrowingArray
 from pose_graph_ros.core.binding import Anchor
 from pose_graph_ros.core.config import BackendConfig
 from pose_graph_ros.core.constraints import EdgeKind, Edges, ObservedNodes
-from pose_graph_ros.core.correlated import Additions, BiasChain, GraphSizes, Shares
+from pose_graph_ros.core.correlated import Additions, BiasChain, GraphSizes, SavedBins, Shares
 from pose_graph_ros.core.graph import Graph, GraphUpdate
 from pose_graph_ros.core.measurements import Absolute
 from pose_graph_ros.core.reweighing import Reweighing
-from pose_graph_ros.core.saved_graph import SavedSource
+from pose_graph_ros.core.saved_columns import Integers, Pairs, Rows3, Rows6
 from pose_graph_ros.core.se2 import FloatArray, IntArray
 from pose_graph_ros.core.sources import (
     Correlation,
@@ -37,6 +37,36 @@ MOST_RESIDUALS = 5000
 MORE_RESIDUALS = 1.05
 # Residuals that are so much smaller than was claimed do no harm, whatever they look like.
 LEAST_ENERGY = 0.1
+
+
+@dataclass(frozen=True, slots=True)
+class SavedSource:
+    """A source of measurements."""
+
+    seen_ns: Integers
+    """Stamps of all that have come, increasing ..."""
+    seen_references: Integers
+    """... and what tells closures of one stamp apart; see `pending`."""
+    rows: Pairs
+    """Stamps and rows of its constraints, shape (K, 2): edges to biases or observed nodes."""
+    n_otherwise: int
+    """Constraints that came before its settings were others."""
+    ties: Integers
+    """Its edges between hidden nodes; not those of an odometry that made the nodes."""
+    bins: SavedBins | None
+    """Where its errors are estimated as a bias."""
+
+
+@dataclass(frozen=True, slots=True)
+class SavedEdges:
+    """Edges that have not joined the graph yet."""
+
+    sources: tuple[str, ...]
+    i: Integers
+    j: Integers
+    mean: Rows3
+    information: Rows6
+    kind: Integers
 
 
 class Bound(NamedTuple):

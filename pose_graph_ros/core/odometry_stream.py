@@ -10,7 +10,7 @@ about what it was before, and what follows goes on from there.
 
 import bisect
 from collections.abc import Iterator
-from dataclasses import replace
+from dataclasses import dataclass, replace
 import math
 from typing import NamedTuple
 
@@ -27,7 +27,7 @@ from pose_graph_ros.core.measurements import (
     value_defect,
 )
 from pose_graph_ros.core.motion import between_one, compose_one, Motion, Pose, wrap_one
-from pose_graph_ros.core.saved_graph import SavedInstant, SavedStream
+from pose_graph_ros.core.saved_columns import Flags, Integers, Rows7, Rows8
 from pose_graph_ros.core.se2 import FloatArray, IntArray
 from pose_graph_ros.core.sources import NoiseFrom, OdometrySource
 from pose_graph_ros.core.timeline import next_row, NOTHING, OdometryTimeline, Row, Variances
@@ -48,6 +48,47 @@ FAR_AHEAD_NS = 10_000_000_000
 MANY_BEHIND = 5
 # All samples of so long are saved with a graph: measurements may come late by that [ns].
 RECENT_NS = 60_000_000_000
+
+
+@dataclass(frozen=True, slots=True)
+class SavedInstant:
+    """The state of a source of odometry at its newest settled sample."""
+
+    raw: Pose
+    """The sample as it came."""
+    offset: Pose | None
+    counted: Pose
+    counted_ns: int
+    held: Pose
+    rate: tuple[float, float, float, float, float, float, float] | None
+    """Velocity, recent and greatest speeds; None before they are known."""
+    since_ns: int
+    since: Pose
+    way: tuple[float, float]
+    jumped: bool
+
+
+@dataclass(frozen=True, slots=True)
+class SavedStream:
+    """A source of odometry: its samples near the hidden nodes and its newest ones."""
+
+    stamps_ns: Integers
+    """Of samples that are settled, shape (T,)."""
+    samples: Rows8
+    """In a frame without jumps; with path lengths, turns and variances so far, shape (T, 8)."""
+    dense: Flags
+    resting: bool
+    last: SavedInstant | None
+    waiting_ns: Integers
+    """Of samples that are not settled yet, shape (W,)."""
+    waiting: Rows7
+    """As they came: pose, speed, variances of the twist (zero where unknown), shape (W, 7)."""
+    restarted_ns: int
+    """The newest stamp at which it began anew after a graph was loaded, or -1."""
+    tied: int
+    """Newest node that it ties to another, or -1 ..."""
+    next_to_tie: int
+    """... and the next to look at."""
 
 
 class _Sample(NamedTuple):

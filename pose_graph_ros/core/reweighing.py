@@ -17,7 +17,7 @@ import numpy as np
 from pose_graph_ros.core import linearize, robust
 from pose_graph_ros.core.arrays import GrowingArray
 from pose_graph_ros.core.graph import Graph
-from pose_graph_ros.core.saved_graph import SavedLosses
+from pose_graph_ros.core.saved_columns import Integers, Numbers
 from pose_graph_ros.core.se2 import FloatArray, IntArray
 from pose_graph_ros.core.sources import Loss
 
@@ -27,6 +27,18 @@ WINDOW = 200
 LEAST_CHANGE = 0.005
 
 _LOSSES = tuple(Loss)
+
+
+@dataclass(frozen=True, slots=True)
+class SavedLosses:
+    """Constraints of one table that have a robust loss."""
+
+    rows: Integers
+    losses: Integers
+    """0 none, 1 Huber, 2 Cauchy."""
+    thresholds: Numbers
+    shares: Numbers
+    cursor: int
 
 
 @dataclass

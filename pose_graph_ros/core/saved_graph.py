@@ -3,21 +3,26 @@
 """
 A whole pose graph with all that the engine knows about it, as a value: what files keep.
 
-The parts of the engine write and read these values (`saving`), `io.graph_files` makes text of
-them. Settings are no part of it: a graph that is loaded goes on with those of its new owner.
+Each part of the engine gives and takes its own state, a value beside it; `saving` puts them
+together, and `io.graph_files` makes text of them. Settings are no part of it: a graph that is
+loaded goes on with those of its new owner.
 """
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Annotated, Any, NamedTuple
+from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 
+from pose_graph_ros.core.aligning import SavedAlignment
 from pose_graph_ros.core.constraints import check as check_table, EdgeKind
+from pose_graph_ros.core.estimate import AlignmentState
 from pose_graph_ros.core.graph import GraphRows
-from pose_graph_ros.core.motion import Pose
-from pose_graph_ros.core.se2 import FloatArray, IntArray
+from pose_graph_ros.core.hidden_nodes import SavedNodes
+from pose_graph_ros.core.joining import SavedEdges, SavedSource
+from pose_graph_ros.core.reweighing import SavedLosses
+from pose_graph_ros.core.saved_columns import Matrix
+from pose_graph_ros.core.se2 import IntArray
 from pose_graph_ros.core.sources import Loss
 from pose_graph_ros.core.tangent_plane import distances, MapOrigin, TangentPlane
 
@@ -26,169 +31,7 @@ SAME_PLACE = 0.01
 SAME_YAW = 1e-6
 # A first fix within this of any node of the saved graph is one of the same site [m].
 SAME_SITE = 10_000.0
-# Of `estimate.AlignmentState`, by its values.
-STATES = ('local', 'unaligned', 'aligned')
-
-
-class Column(NamedTuple):
-    """What the rows of an array are."""
-
-    kind: type
-    shape: tuple[int, ...] = ()
-
-
-Integers = Annotated[IntArray, Column(int)]
-Flags = Annotated[npt.NDArray[np.bool_], Column(bool)]
-Numbers = Annotated[FloatArray, Column(float)]
-Rows3 = Annotated[FloatArray, Column(float, (3,))]
-Rows4 = Annotated[FloatArray, Column(float, (4,))]
-Rows6 = Annotated[FloatArray, Column(float, (6,))]
-Rows7 = Annotated[FloatArray, Column(float, (7,))]
-Rows8 = Annotated[FloatArray, Column(float, (8,))]
-Pairs = Annotated[IntArray, Column(int, (2,))]
-Matrix = tuple[Pose, Pose, Pose]
-
-
-@dataclass(frozen=True, slots=True)
-class SavedInstant:
-    """The state of a source of odometry at its newest settled sample; see `odometry_stream`."""
-
-    raw: Pose
-    """The sample as it came."""
-    offset: Pose | None
-    counted: Pose
-    counted_ns: int
-    held: Pose
-    rate: tuple[float, float, float, float, float, float, float] | None
-    """Velocity, recent and greatest speeds; None before they are known."""
-    since_ns: int
-    since: Pose
-    way: tuple[float, float]
-    jumped: bool
-
-
-@dataclass(frozen=True, slots=True)
-class SavedStream:
-    """A source of odometry: its samples near the hidden nodes and its newest ones."""
-
-    stamps_ns: Integers
-    """Of samples that are settled, shape (T,)."""
-    samples: Rows8
-    """In a frame without jumps; with path lengths, turns and variances so far, shape (T, 8)."""
-    dense: Flags
-    resting: bool
-    last: SavedInstant | None
-    waiting_ns: Integers
-    """Of samples that are not settled yet, shape (W,)."""
-    waiting: Rows7
-    """As they came: pose, speed, variances of the twist (zero where unknown), shape (W, 7)."""
-    restarted_ns: int
-    """The newest stamp at which it began anew after a graph was loaded, or -1."""
-    tied: int
-    """Newest node that it ties to another, or -1 ..."""
-    next_to_tie: int
-    """... and the next to look at."""
-
-
-@dataclass(frozen=True, slots=True)
-class SavedBridge:
-    """Motion from the newest node to where the leading source began to lead."""
-
-    mean: Pose
-    covariance: Matrix
-
-
-@dataclass(frozen=True, slots=True)
-class SavedNodes:
-    """The hidden nodes by stamp, and who made them."""
-
-    stamps_ns: Integers
-    """Shape (H,)."""
-    rows: Integers
-    """In the graph, shape (H,)."""
-    odometry: Rows3
-    """Where odometry alone puts them, shape (H, 3)."""
-    leads: tuple[str, ...]
-    """Sources of odometry that made them, one after the other ..."""
-    leads_after_ns: Integers
-    """... each with the stamp after which it did."""
-    lead_ns: int
-    base_ns: int
-    base: Pose
-    bridge: SavedBridge | None
-    streams: Mapping[str, SavedStream]
-
-
-@dataclass(frozen=True, slots=True)
-class SavedBins:
-    """The states of the error of a source; see `correlated`."""
-
-    width_ns: int
-    numbers: Integers
-    """Of the bins, increasing."""
-    rows: Integers
-    ties: Integers
-
-
-@dataclass(frozen=True, slots=True)
-class SavedSource:
-    """A source of measurements."""
-
-    seen_ns: Integers
-    """Stamps of all that have come, increasing ..."""
-    seen_references: Integers
-    """... and what tells closures of one stamp apart; see `pending`."""
-    rows: Pairs
-    """Stamps and rows of its constraints, shape (K, 2): edges to biases or observed nodes."""
-    n_otherwise: int
-    """Constraints that came before its settings were others."""
-    ties: Integers
-    """Its edges between hidden nodes; not those of an odometry that made the nodes."""
-    bins: SavedBins | None
-    """Where its errors are estimated as a bias."""
-
-
-@dataclass(frozen=True, slots=True)
-class SavedLosses:
-    """Constraints of one table that have a robust loss."""
-
-    rows: Integers
-    losses: Integers
-    """0 none, 1 Huber, 2 Cauchy."""
-    thresholds: Numbers
-    shares: Numbers
-    cursor: int
-
-
-@dataclass(frozen=True, slots=True)
-class SavedAlignment:
-    """What is known of the angle between odometry and map, and the measurements that tell it."""
-
-    state: str
-    sigma: float | None
-    """[rad]; None for infinite."""
-    next_verdict: int
-    sources: tuple[str, ...]
-    source: Integers
-    """Index of each measurement's source."""
-    stamps_ns: Integers
-    node: Integers
-    offset: Rows3
-    mean: Rows3
-    information: Rows6
-    kind: Integers
-
-
-@dataclass(frozen=True, slots=True)
-class SavedEdges:
-    """Edges that have not joined the graph yet."""
-
-    sources: tuple[str, ...]
-    i: Integers
-    j: Integers
-    mean: Rows3
-    information: Rows6
-    kind: Integers
+STATES = tuple(state.value for state in AlignmentState)
 
 
 @dataclass(frozen=True, slots=True)
@@ -351,22 +194,10 @@ def _way_to(saved: SavedGraph, fix: MapOrigin) -> float:
     """Return how far a fix is from the datum or from any hidden node, whichever is nearer [m]."""
     assert saved.datum is not None
     least = float(distances(fix, saved.datum.latitude, saved.datum.longitude)[0])
-    if saved.alignment.state != 'aligned':
+    if saved.alignment.state != AlignmentState.ALIGNED.value:
         return least  # the nodes are not in the map
     points = TangentPlane(*saved.datum).to_geodetic(saved.rows.poses[saved.nodes.rows, :2])
     return min(least, float(np.min(distances(fix, points[:, 0], points[:, 1]))))
-
-
-def as_pose(numbers: FloatArray) -> Pose:
-    """Return three numbers as plain ones."""
-    x, y, theta = numbers.tolist()
-    return x, y, theta
-
-
-def as_matrix(numbers: FloatArray) -> Matrix:
-    """Return a matrix, shape (3, 3), in plain numbers."""
-    first, second, third = numbers
-    return as_pose(first), as_pose(second), as_pose(third)
 
 
 def _require(sound: bool, reason: str) -> None:

@@ -19,9 +19,10 @@ from pose_graph_ros.core.constraints import Edges, full, upper
 from pose_graph_ros.core.exceptions import NothingToSaveError
 from pose_graph_ros.core.graph import Graph
 from pose_graph_ros.core.hidden_nodes import HiddenNodes
-from pose_graph_ros.core.joining import Joining, Queue
+from pose_graph_ros.core.joining import Joining, Queue, SavedEdges, SavedSource
 from pose_graph_ros.core.reweighing import Reweighing
-from pose_graph_ros.core.saved_graph import as_matrix, SavedEdges, SavedGraph, SavedSource
+from pose_graph_ros.core.saved_columns import as_matrix
+from pose_graph_ros.core.saved_graph import SavedGraph
 from pose_graph_ros.core.se2 import FloatArray, IntArray
 from pose_graph_ros.core.tangent_plane import MapOrigin
 

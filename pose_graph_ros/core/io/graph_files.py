@@ -27,14 +27,8 @@ from pose_graph_ros.core.io.g2o import g2o_text
 from pose_graph_ros.core.io.plain import annotations, decoded, encoded
 from pose_graph_ros.core.io.tum import tum_text
 from pose_graph_ros.core.io.whole_files import write_files
-from pose_graph_ros.core.saved_graph import (
-    Integers,
-    Numbers,
-    Rows3,
-    Rows4,
-    Rows6,
-    SavedGraph,
-)
+from pose_graph_ros.core.saved_columns import Integers, Numbers, Rows3, Rows4, Rows6
+from pose_graph_ros.core.saved_graph import SavedGraph
 from pose_graph_ros.core.se2 import FloatArray, IntArray
 from pose_graph_ros.core.trajectory import Trajectory
 

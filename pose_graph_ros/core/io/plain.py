@@ -15,7 +15,7 @@ from typing import Annotated, Any, get_args, get_origin, get_type_hints, TypeVar
 import numpy as np
 import numpy.typing as npt
 
-from pose_graph_ros.core.saved_graph import Column
+from pose_graph_ros.core.saved_columns import Column
 
 T = TypeVar('T')
 
