@@ -16,9 +16,8 @@ MODULES = sorted(path.relative_to(PACKAGE) for path in PACKAGE.rglob('*.py'))
 
 # A module of core may import those before it, and no others.
 CORE = (
-    'kernel_cache', 'jit', 'exceptions', 'arrays', 'sources', 'config', 'se2', 'motion',
-    'saved_columns', 'covariance', 'measurements', 'admission', 'constraints', 'linearize',
-    'robust',
+    'kernel_cache', 'jit', 'exceptions', 'arrays', 'sources', 'se2', 'motion', 'saved_columns',
+    'covariance', 'measurements', 'config', 'admission', 'constraints', 'linearize', 'robust',
     # the graph, which knows nothing of how it is solved
     'tables', 'vectors', 'cholesky', 'factors', 'undo', 'rows', 'editing', 'graph',
     # elimination

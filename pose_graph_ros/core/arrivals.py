@@ -58,7 +58,7 @@ class Arrivals:
         return self.count(source, self._take(measurement, source))
 
     def _take(self, measurement: Measurement, source: str) -> Answer:
-        settings = self._joins.settings(source, closure=isinstance(measurement, LoopClosure))
+        settings = self._joins.settings(source, type(measurement))
         admitted = admit(measurement, settings.covariance)
         if isinstance(admitted, Answer):
             return admitted

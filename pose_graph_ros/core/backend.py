@@ -197,7 +197,7 @@ class PoseGraphBackend:
         pose = replace(pose, stamp_ns=min(max(pose.stamp_ns, first_ns), last_ns))
         if self._aligning.state is not AlignmentState.ALIGNED:
             return self.add_measurement(pose, source)
-        admitted = admit(pose, self._joins.settings(source).covariance)
+        admitted = admit(pose, self._joins.settings(source, GlobalPose).covariance)
         if isinstance(admitted, Answer):
             return self._arrivals.count(source, admitted)
         measurement = admitted.measurement

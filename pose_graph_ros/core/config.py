@@ -10,7 +10,15 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 
 from pose_graph_ros.core.exceptions import ConfigError
-from pose_graph_ros.core.sources import MeasurementSource, OdometrySource, require
+from pose_graph_ros.core.measurements import HeadingOnly, LoopClosure, Measurement
+from pose_graph_ros.core.sources import (
+    HEADINGS,
+    LOOP_CLOSURES,
+    MeasurementSource,
+    OdometrySource,
+    POSITIONS,
+    require,
+)
 
 # Motion since the last hidden node below these is standing still: odometry jitters [m, rad].
 REST_DISTANCE = 0.05
@@ -120,7 +128,7 @@ class BackendConfig:
     odometry: Mapping[str, OdometrySource] = field(default_factory=dict)
     """Sources of odometry by name, the preferred one first; defaults for others."""
     measurements: Mapping[str, MeasurementSource] = field(default_factory=dict)
-    """Other sources by name; defaults for those that are not named."""
+    """Other sources by name; those that are not named have the defaults of what they send."""
     odometry_patience: float = 2.0
     """Another odometry makes the hidden nodes when the one that did is so much behind [s]."""
 
@@ -130,6 +138,11 @@ class BackendConfig:
     def odometry_source(self, name: str) -> OdometrySource:
         """Return the settings of a source of odometry."""
         return self.odometry.get(name, OdometrySource())
+
+    def measurement_source(self, name: str, kind: type[Measurement]) -> MeasurementSource:
+        """Return the settings of a source of measurements of a kind."""
+        defaults = {LoopClosure: LOOP_CLOSURES, HeadingOnly: HEADINGS}
+        return self.measurements.get(name, defaults.get(kind, POSITIONS))
 
     def changed_to(self, wanted: 'BackendConfig') -> 'BackendConfig':
         """

@@ -21,16 +21,11 @@ from pose_graph_ros.core.config import BackendConfig
 from pose_graph_ros.core.constraints import EdgeKind, Edges, ObservedNodes
 from pose_graph_ros.core.correlated import Additions, BiasChain, GraphSizes, SavedBins, Shares
 from pose_graph_ros.core.graph import Graph, GraphUpdate
-from pose_graph_ros.core.measurements import Absolute
+from pose_graph_ros.core.measurements import Absolute, GlobalPose, LoopClosure, Measurement
 from pose_graph_ros.core.reweighing import Reweighing
 from pose_graph_ros.core.saved_columns import Integers, Pairs, Rows3, Rows6
 from pose_graph_ros.core.se2 import FloatArray, IntArray
-from pose_graph_ros.core.sources import (
-    Correlation,
-    LOOP_CLOSURES,
-    MeasurementSource,
-    OdometrySource,
-)
+from pose_graph_ros.core.sources import Correlation, MeasurementSource, OdometrySource
 
 # So many of the newest residuals of a source are looked at, anew when there are so many more.
 MOST_RESIDUALS = 5000
@@ -120,6 +115,17 @@ class Origin(NamedTuple):
     """Of the measurement [ns]; -1 for an edge between poses."""
 
 
+class _Enlisted(NamedTuple):
+    """A constraint of the update that was begun."""
+
+    is_edge: bool
+    row: int
+    source: str
+    stamp_ns: int
+    """Of the measurement [ns]; -1 for an edge between poses."""
+    kind: type[Measurement]
+
+
 class _Own:
     """The constraints of one source."""
 
@@ -150,7 +156,7 @@ class Joining:
         self._own: dict[str, _Own] = {}
         self._ties: dict[str, GrowingArray] = {}
         """Of each source its edges between poses, by their numbers in the graph."""
-        self._enlisted: list[tuple[bool, int, str, int]] = []
+        self._enlisted: list[_Enlisted] = []
         self._n_new = 0
         self._shares: dict[int, float] = {}
         self.n_bias_edges = 0
@@ -160,10 +166,9 @@ class Joining:
         """Take other settings, for what joins from now on; of errors that live on the same."""
         self._config = config
 
-    def settings(self, source: str, *, closure: bool = False) -> MeasurementSource:
-        """Return the settings of a source of measurements."""
-        default = LOOP_CLOSURES if closure else MeasurementSource()
-        return self._config.measurements.get(source, default)
+    def settings(self, source: str, kind: type[Measurement]) -> MeasurementSource:
+        """Return the settings of a source of measurements of a kind."""
+        return self._config.measurement_source(source, kind)
 
     @property
     def n_measurements(self) -> int:
@@ -177,17 +182,19 @@ class Joining:
         for old in self._correlated.values():
             old.begin()
         for source, edge in queue.edges:
-            self._enlisted.append((True, additions.add_edge(edge), source, -1))
+            self._enlisted.append(
+                _Enlisted(True, additions.add_edge(edge), source, -1, LoopClosure))
         for bound in sorted(queue.observed, key=lambda bound: bound.measurement.stamp_ns):
-            stamp_ns = bound.measurement.stamp_ns
-            chain = self._chain(bound.source)
+            kind, stamp_ns = type(bound.measurement), bound.measurement.stamp_ns
+            chain = self._chain(bound.source, kind)
             if isinstance(chain, BiasChain):
                 row = chain.add(bound.measurement, bound.anchor, additions)
             elif isinstance(chain, Shares):
                 row = chain.add(stamp_ns, bound.observed, additions)
             else:
                 row = additions.add_observed(bound.observed)
-            self._enlisted.append((isinstance(chain, BiasChain), row, bound.source, stamp_ns))
+            self._enlisted.append(
+                _Enlisted(isinstance(chain, BiasChain), row, bound.source, stamp_ns, kind))
         self._n_new = len(additions.edges) - len(queue.edges)
         self._shares = additions.weigh_observed
         return GraphUpdate(
@@ -196,8 +203,8 @@ class Joining:
             remove_edges=additions.remove_edges, remove_observed=additions.remove_observed,
             weigh_observed=additions.weigh_observed)
 
-    def _chain(self, source: str) -> BiasChain | Shares | None:
-        settings = self.settings(source)
+    def _chain(self, source: str, kind: type[Measurement]) -> BiasChain | Shares | None:
+        settings = self.settings(source, kind)
         if settings.correlation_time == 0.0:
             return None
         if source not in self._correlated:
@@ -213,10 +220,10 @@ class Joining:
     def finish(self) -> None:
         """Remember what the update that was begun has added."""
         self.n_bias_edges += self._n_new
-        for is_edge, row, source, stamp_ns in self._enlisted:
+        for is_edge, row, source, stamp_ns, kind in self._enlisted:
             settings: MeasurementSource | OdometrySource | None = (
                 self._config.odometry.get(source) if stamp_ns < 0 else None)
-            settings = settings or self.settings(source, closure=stamp_ns < 0)
+            settings = settings or self.settings(source, kind)
             enlist = self._reweighing.add_edge if is_edge else self._reweighing.add_observed
             enlist(row, settings.loss, settings.rejection_threshold)
             if stamp_ns >= 0:
@@ -273,7 +280,8 @@ class Joining:
         if len(saved.rows) + saved.n_otherwise == 0:
             return
         self._own[source] = own = _Own()
-        chain = self._chain(source)
+        # by default errors live on with no kind of measurements
+        chain = self._chain(source, GlobalPose)
         if isinstance(chain, BiasChain):
             same = saved.bins is not None and chain.restore(saved.bins)
         else:

@@ -170,5 +170,11 @@ class MeasurementSource:
                               f'got {self.white_share!r}')
 
 
+POSITIONS = MeasurementSource(loss=Loss.HUBER)
+"""Defaults of a source of global poses or of positions: a few of them are always wrong."""
+HEADINGS = MeasurementSource(minimum_period=0.5)
+"""Defaults of a source of headings: an imu sends a hundred a second, which say the same."""
+SET_POSES = MeasurementSource()
+"""For poses that somebody sets who knows: they count in full."""
 LOOP_CLOSURES = MeasurementSource(covariance=CovariancePolicy(repair=False))
 """A closure whose sender does not know how good it is does more harm than good."""

@@ -192,8 +192,10 @@ def _optimize() -> None:
     batch.optimize_from_nothing(graph, SolverConfig())
     # without the joint start: it has no kernels, and SciPy can be loaded when it is needed
     solve_from_two_starts(graph, SolverConfig(), batch.optimize, closing=False)
-    # only an optimisation that stalls calls this one
-    gauss_newton.product_with_step(graph.memory.head, np.zeros((graph.n_nodes, 3)))
+    # only optimisations that stall, or take many iterations, call these
+    right = np.zeros((graph.n_nodes, 3))
+    gauss_newton.product_with_step(graph.memory.head, right)
+    gauss_newton.chord_step(graph.memory.head, right)
 
 
 def _drive() -> None:

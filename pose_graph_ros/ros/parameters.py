@@ -20,11 +20,13 @@ from pose_graph_ros.core.sources import (
     Correlation,
     CovariancePolicy,
     Heading,
+    HEADINGS,
     LOOP_CLOSURES,
     Loss,
     MeasurementSource,
     NoiseFrom,
     OdometrySource,
+    POSITIONS,
 )
 from pose_graph_ros.ros.sources import DEFAULT_SOURCES, Kind, KNOWN_SOURCES, source_names
 
@@ -71,6 +73,7 @@ def _values(choices: type[Enum]) -> tuple[str, ...]:
 _NODES, _ALIGNMENT, _BACKEND = NodePolicy(), AlignmentPolicy(), BackendConfig()
 _ODOMETRY, _MEASUREMENT, _COVARIANCE = OdometrySource(), MeasurementSource(), CovariancePolicy()
 _NOISE = _ODOMETRY.noise
+_POLICY = {True: 'repair', False: 'refuse'}
 
 PARAMETERS: tuple[Parameter, ...] = (
     Parameter('sources', list(DEFAULT_SOURCES), '', 'Names of the sources, each with parameters '
@@ -160,15 +163,17 @@ SOURCE_PARAMETERS: tuple[Parameter, ...] = (
               'message by less than this is sorted in.', 0.0, 60.0, kinds=_WHEELS),
     Parameter('maximum_speed', _ODOMETRY.maximum_speed, 'm/s', 'A faster motion is a jump of the '
               'odometry, not of the robot.', 0.01, 1e4, kinds=_WHEELS),
-    Parameter('covariance_policy', 'repair', '', 'What becomes of a broken covariance.',
-              choices=('repair', 'refuse'), kinds=_NOT_CLOSURES),
-    Parameter('covariance_policy', 'repair' if LOOP_CLOSURES.covariance.repair else 'refuse', '',
+    Parameter('covariance_policy', _POLICY[_COVARIANCE.repair], '',
+              'What becomes of a broken covariance.', choices=('repair', 'refuse'),
+              kinds=_NOT_CLOSURES),
+    Parameter('covariance_policy', _POLICY[LOOP_CLOSURES.covariance.repair], '',
               'What becomes of a broken covariance.', choices=('repair', 'refuse'),
               kinds=(Kind.LOOP_CLOSURE,)),
-    Parameter('covariance_override', [], 'm, rad', 'Sigma of the position and, if there are two '
-              'numbers, of the heading, taken instead of the covariances.', 1e-6, 1e6,
-              sizes=(0, 1, 2), kinds=_OTHERS),
-    Parameter('covariance_scale', 1.0, '', 'Factor on every covariance.', 1e-6, 1e6, kinds=_ALL),
+    Parameter('covariance_override', list(_COVARIANCE.override), 'm, rad', 'Sigma of the position '
+              'and, if there are two numbers, of the heading, taken instead of the covariances.',
+              1e-6, 1e6, sizes=(0, 1, 2), kinds=_OTHERS),
+    Parameter('covariance_scale', _COVARIANCE.scale, '', 'Factor on every covariance.', 1e-6, 1e6,
+              kinds=_ALL),
     Parameter('sigma_floor', [_COVARIANCE.position_floor, _COVARIANCE.heading_floor], 'm, rad',
               'No position and no heading is believed to be better.', 1e-6, 100.0, sizes=(2,),
               kinds=_OTHERS),
@@ -184,16 +189,16 @@ SOURCE_PARAMETERS: tuple[Parameter, ...] = (
               'from /tf_static if it is there.', -1e3, 1e3, sizes=(2,), kinds=(Kind.FIX,)),
     Parameter('yaw_offset', 0.0, 'rad', 'Added to the yaw; its zero is east.', -6.3, 6.3,
               kinds=(Kind.IMU,)),
-    Parameter('robust_loss', Loss.HUBER.value, '', 'How large errors count.',
+    Parameter('robust_loss', POSITIONS.loss.value, '', 'How large errors count.',
               choices=_values(Loss), kinds=_POSITIONS),
-    Parameter('robust_loss', Loss.NONE.value, '', 'How large errors count.',
+    Parameter('robust_loss', _MEASUREMENT.loss.value, '', 'How large errors count.',
               choices=_values(Loss), kinds=tuple(kind for kind in Kind if kind not in _POSITIONS)),
     Parameter('rejection_threshold', _MEASUREMENT.rejection_threshold, '', 'From so many sigmas '
               'on the loss holds back.', 0.1, 1e3, kinds=_ALL),
     Parameter('minimum_period', _MEASUREMENT.minimum_period, 's', 'Of messages whose stamps lie '
               'closer the first to come is used; 0: all.', 0.0, 3600.0, kinds=_POSITIONS),
-    Parameter('minimum_period', 0.5, 's', 'Of messages whose stamps lie closer the first to come '
-              'is used; 0: all.', 0.0, 3600.0, kinds=(Kind.IMU,)),
+    Parameter('minimum_period', HEADINGS.minimum_period, 's', 'Of messages whose stamps lie '
+              'closer the first to come is used; 0: all.', 0.0, 3600.0, kinds=(Kind.IMU,)),
     Parameter('correlation_time', _MEASUREMENT.correlation_time, 's',
               'How long an error lives, its time constant; 0: it is white.', 0.0, 1e5,
               kinds=_NOT_CLOSURES, change=Change.UNCONFIGURED),

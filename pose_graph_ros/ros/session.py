@@ -43,7 +43,7 @@ from pose_graph_ros.ros.intake import Intake, PAUSED
 from pose_graph_ros.ros.publishers import Publishers
 from pose_graph_ros.ros.rewind import Heard
 from pose_graph_ros.ros.setting import PoseSetting
-from pose_graph_ros.ros.sources import backend_config, Kind, Source
+from pose_graph_ros.ros.sources import backend_config, Kind, SET_POSE, Source
 from pose_graph_ros.ros.transforms import TFMessage
 from pose_graph_ros.ros.worker import Worker
 
@@ -254,7 +254,7 @@ class Session:
         answer = PAUSED if self.intake.paused else self._setting.take(
             message, early=self.worker.estimate is None)
         if answer is not None:
-            self.intake.refuse('set_pose', answer)
+            self.intake.refuse(SET_POSE, answer)
         self._set_pose()
 
     def _set_pose(self) -> None:
@@ -266,7 +266,7 @@ class Session:
         self.node.get_logger().info(
             f'the pose is set to ({x:.3f}, {y:.3f}, {yaw:.3f}) in {self.out.map_frame}')
         self.out.jump()
-        self.worker.call(lambda backend: backend.set_pose(pose, 'set_pose'))
+        self.worker.call(lambda backend: backend.set_pose(pose, SET_POSE))
         self.worker.request_update()
 
     # ---- time

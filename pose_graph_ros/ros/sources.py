@@ -22,6 +22,7 @@ from pose_graph_ros.core.sources import (
     NoiseFrom,
     OdometryNoise,
     OdometrySource,
+    SET_POSES,
 )
 
 NANOSECONDS = 1_000_000_000
@@ -48,6 +49,8 @@ MESSAGE_TYPES = {
     Kind.FIX: 'sensor_msgs/msg/NavSatFix', Kind.IMU: 'sensor_msgs/msg/Imu',
     Kind.LOOP_CLOSURE: _POSE}
 
+SET_POSE = 'set_pose'
+"""Name under which poses that are set are counted."""
 CLOSURES = 'loop_closure'
 """Name of the source of loop closures that is always there."""
 KNOWN_SOURCES = {
@@ -105,7 +108,7 @@ def backend_config(values: Mapping[str, Any]) -> BackendConfig:
 
     """
     odometry: dict[str, OdometrySource] = {}
-    measurements: dict[str, MeasurementSource] = {}
+    measurements = {SET_POSE: SET_POSES}
     for source in source_list(values):
         own = {name.removeprefix(f'{source.name}.'): value for name, value in values.items()
                if name.startswith(f'{source.name}.')}
@@ -158,7 +161,8 @@ def _measurement_source(own: Mapping[str, Any]) -> MeasurementSource:
             override=tuple(own['covariance_override']), scale=own['covariance_scale'],
             position_floor=position_floor, heading_floor=heading_floor,
             position_ceiling=own['sigma_ceiling'], default_position=default_position,
-            default_heading=default_heading, heading=Heading(own.get('heading', 'auto'))),
+            default_heading=default_heading,
+            **{} if 'heading' not in own else {'heading': Heading(own['heading'])}),
         loss=Loss(own['robust_loss']), rejection_threshold=own['rejection_threshold'],
         # of loop closures there are no more than of places that are seen again
         **{} if 'correlation_time' not in own else {

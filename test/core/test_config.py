@@ -9,11 +9,21 @@ import pytest
 
 from pose_graph_ros.core.config import AlignmentPolicy, BackendConfig, NodePolicy, SolverConfig
 from pose_graph_ros.core.exceptions import ConfigError
+from pose_graph_ros.core.measurements import (
+    GlobalPose,
+    HeadingOnly,
+    LoopClosure,
+    Measurement,
+    Position,
+)
 from pose_graph_ros.core.sources import (
     CovariancePolicy,
+    HEADINGS,
+    LOOP_CLOSURES,
     MeasurementSource,
     OdometryNoise,
     OdometrySource,
+    POSITIONS,
 )
 
 NUMBERS = [(kind, item.name)
@@ -53,6 +63,18 @@ def test_a_config_error_is_a_value_error_and_settings_are_frozen() -> None:
     assert issubclass(ConfigError, ValueError)
     with pytest.raises(FrozenInstanceError):
         BackendConfig().odometry_patience = 3.0
+
+
+@pytest.mark.parametrize(('kind', 'default'), [
+    (GlobalPose, POSITIONS), (Position, POSITIONS), (HeadingOnly, HEADINGS),
+    (LoopClosure, LOOP_CLOSURES)])
+def test_a_source_that_is_not_named_has_the_defaults_of_what_it_sends(
+    kind: type[Measurement], default: MeasurementSource,
+) -> None:
+    own = MeasurementSource(rejection_threshold=7.0)
+    config = BackendConfig(measurements={'named': own})
+    assert config.measurement_source('other', kind) == default
+    assert config.measurement_source('named', kind) == own
 
 
 @pytest.mark.parametrize(('distance', 'turned', 'elapsed', 'due'), [

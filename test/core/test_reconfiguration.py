@@ -43,7 +43,8 @@ Event = tuple[str, OdometrySample | Measurement]
 PROMPT = OdometrySource(reorder_window=0.0)
 CONFIG = BackendConfig(
     odometry={'odom': PROMPT, 'visual': PROMPT},
-    measurements={'fix': MeasurementSource(), 'gnss': MeasurementSource(correlation_time=20.0)})
+    measurements={'fix': MeasurementSource(), 'global_pose': MeasurementSource(),
+                  'gnss': MeasurementSource(correlation_time=20.0)})
 
 
 def drive(seed: int = 0, n: int = 300) -> list[Event]:
