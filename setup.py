@@ -82,7 +82,8 @@ setup(
         'PyYAML>=6.0',
     ],
     extras_require={
-        'test': ['pytest>=7.4', 'pytest-timeout>=2.2', 'hypothesis>=6.98'],
+        'test': ['pytest>=7.4', 'pytest-timeout>=2.2', 'pytest-xdist>=3.4', 'coverage>=7.4',
+                 'hypothesis>=6.98'],
         'dev': ['ruff', 'mypy', 'scipy-stubs'],
     },
 )

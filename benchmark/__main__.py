@@ -92,7 +92,7 @@ def _measure(name: str, options: Options) -> Section:
     say(f'{name}: {time.perf_counter() - begin:.1f} s')
     for metric in section.metrics:
         if not metric.reached:
-            say(f'  {metric.key}: {metric.value:.4g}{metric.unit}, {metric.verdict()}')
+            say(f'  {metric.key}: {metric.value:.4g}{metric.unit}, {metric.status()}')
     return section
 
 

@@ -8,12 +8,11 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.signal import lfilter
 
-from pose_graph_ros.core import se2
 from pose_graph_ros.core.backend import PoseGraphBackend
-from pose_graph_ros.core.config import BackendConfig
+from pose_graph_ros.core.config import BackendConfig, MeasurementSource, OdometryNoise
+from pose_graph_ros.core.geometry import se2
+from pose_graph_ros.core.geometry.se2 import FloatArray, IntArray
 from pose_graph_ros.core.measurements import Measurement, OdometrySample, Position
-from pose_graph_ros.core.se2 import FloatArray, IntArray
-from pose_graph_ros.core.sources import MeasurementSource, OdometryNoise
 
 SECOND = 1_000_000_000
 

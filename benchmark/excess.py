@@ -14,9 +14,9 @@ import numpy as np
 
 from benchmark.runs import Run
 from benchmark.worlds import World
-from pose_graph_ros.core import batch
+from pose_graph_ros.core.batch import optimizer
 from pose_graph_ros.core.config import SolverConfig
-from pose_graph_ros.core.se2 import FloatArray
+from pose_graph_ros.core.geometry.se2 import FloatArray
 
 EXACT = SolverConfig(max_iterations=200, step_tolerance=1e-10)
 
@@ -57,7 +57,7 @@ def _by_ours(world: World, step: int, poses: FloatArray) -> tuple[float, float, 
     """Return chi2 of the estimate, chi2 of the optimum and the largest distance between them."""
     graph = world.graph(poses, step)
     before = graph.energies().chi2
-    result = batch.optimize(graph, EXACT)
+    result = optimizer.optimize(graph, EXACT)
     return before, result.chi2, _worst(poses, graph.poses)
 
 

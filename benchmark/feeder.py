@@ -27,8 +27,8 @@ from rclpy.qos import QoSDurabilityPolicy, QoSProfile, QoSReliabilityPolicy
 from rclpy.serialization import deserialize_message, serialize_message
 from sensor_msgs.msg import NavSatFix
 
-from pose_graph_ros.core.se2 import FloatArray
-from pose_graph_ros.core.tangent_plane import TangentPlane
+from pose_graph_ros.core.geometry.geodesy import TangentPlane
+from pose_graph_ros.core.geometry.se2 import FloatArray
 
 # As a driver has it; the node listens with best effort, so nothing is sent again.
 SENT_QOS = QoSProfile(depth=1000, reliability=QoSReliabilityPolicy.RELIABLE)

@@ -11,9 +11,9 @@ from pathlib import Path
 import numpy as np
 
 from benchmark.worlds import World
-from pose_graph_ros.core.constraints import EdgeKind, Edges
 from pose_graph_ros.core.exceptions import FileFormatError
-from pose_graph_ros.core.graph import Graph
+from pose_graph_ros.core.graph.constraints import EdgeKind, Edges
+from pose_graph_ros.core.graph.graph import Graph
 from pose_graph_ros.core.io.g2o import read_g2o
 
 DEFAULT_FOLDER = Path(__file__).resolve().parents[2] / 'shared' / 'data' / 'graphs'

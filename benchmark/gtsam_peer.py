@@ -20,9 +20,9 @@ import numpy as np
 
 from benchmark.runs import Plan, quiet, Run
 from benchmark.worlds import World
-from pose_graph_ros.core import se2
-from pose_graph_ros.core.constraints import Edges, ObservedNodes
-from pose_graph_ros.core.se2 import FloatArray
+from pose_graph_ros.core.geometry import se2
+from pose_graph_ros.core.geometry.se2 import FloatArray
+from pose_graph_ros.core.graph.constraints import Edges, ObservedNodes
 
 PRIOR_SIGMA = 1e-5
 """Of the pose of node 0 [m, rad]: as good as fixed, and no harder for Cholesky than 1e-3."""

@@ -21,10 +21,17 @@ from benchmark import drives, report
 from benchmark.drives import Kind
 from benchmark.metrics import Metric
 from benchmark.section import say, Section, Table
-from pose_graph_ros.core import se2
-from pose_graph_ros.core.admission import admit
+from pose_graph_ros.core.alignment.monitor import AlignmentState
 from pose_graph_ros.core.backend import PoseGraphBackend
-from pose_graph_ros.core.estimate import AlignmentState
+from pose_graph_ros.core.config import (
+    Correlation,
+    CovariancePolicy,
+    Loss,
+    MeasurementSource,
+    OdometryNoise,
+)
+from pose_graph_ros.core.geometry import se2
+from pose_graph_ros.core.geometry.trajectory import Trajectory
 from pose_graph_ros.core.measurements import (
     Answer,
     GlobalPose,
@@ -32,14 +39,7 @@ from pose_graph_ros.core.measurements import (
     OdometrySample,
     Position,
 )
-from pose_graph_ros.core.sources import (
-    Correlation,
-    CovariancePolicy,
-    Loss,
-    MeasurementSource,
-    OdometryNoise,
-)
-from pose_graph_ros.core.trajectory import Trajectory
+from pose_graph_ros.core.sources.validation import validate
 
 NEES = 0.8, 1.3
 """What is asked for."""
@@ -272,8 +272,8 @@ def door() -> Section:
     table = Table('', ('covariance', 'repaired', 'taken as', 'sigmas taken', 'not repaired'))
     for name, cov in BAD.items():
         given = GlobalPose(1, np.zeros(3), cov)
-        mended = admit(given, CovariancePolicy())
-        refused = admit(given, CovariancePolicy(repair=False))
+        mended = validate(given, CovariancePolicy())
+        refused = validate(given, CovariancePolicy(repair=False))
         no = refused.reason if isinstance(refused, Answer) else 'taken'
         if isinstance(mended, Answer):
             table.add(name, f'refused: {mended.reason}', '', '', no)
@@ -320,7 +320,7 @@ def stamps() -> Section:
             backend.add_measurement(fix(stamp_ns), 'fix')
         answer = (backend.add_odometry(event) if isinstance(event, OdometrySample)
                   else backend.add_measurement(event, 'fix'))
-        table.add(name, f'{stamp_ns * 1e-9:g} s', answer.reason or answer.verdict.value)
+        table.add(name, f'{stamp_ns * 1e-9:g} s', answer.reason or answer.status.value)
     section.tables.append(table)
     return section
 

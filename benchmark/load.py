@@ -32,7 +32,7 @@ from benchmark.feeder import DATUM, Feeder, Phase
 from benchmark.metrics import Metric
 from benchmark.section import say, Section, Table
 from pose_graph_ros.cli.demo import isolated_environment
-from pose_graph_ros.core.trajectory import Trajectory
+from pose_graph_ros.core.geometry.trajectory import Trajectory
 from pose_graph_ros.ros.messages import path_cdr
 
 NODE = 'pose_graph_ros.ros.main'

@@ -55,7 +55,7 @@ class Metric:
             return True
         return self.value >= self.target if self.higher_is_better else self.value <= self.target
 
-    def verdict(self) -> str:
+    def status(self) -> str:
         """Return what was asked for, and by how much it is reached or not."""
         if self.target is None:
             return ''

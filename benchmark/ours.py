@@ -10,6 +10,7 @@ through `extend`.
 """
 
 from collections.abc import Callable
+from dataclasses import replace
 import itertools
 import math
 import time
@@ -21,12 +22,14 @@ from scipy.sparse import linalg
 
 from benchmark.runs import Plan, quiet, Run
 from benchmark.worlds import chain, laps, World
-from pose_graph_ros.core import batch, initialization, linearize, se2
+from pose_graph_ros.core.batch import chordal_start, optimizer
 from pose_graph_ros.core.config import SolverConfig
-from pose_graph_ros.core.constraints import Edges
-from pose_graph_ros.core.graph import Graph, GraphUpdate
-from pose_graph_ros.core.incremental import IncrementalSmoother, UpdateResult
-from pose_graph_ros.core.se2 import FloatArray
+from pose_graph_ros.core.geometry import se2
+from pose_graph_ros.core.geometry.se2 import FloatArray, IntArray
+from pose_graph_ros.core.graph import error_functions
+from pose_graph_ros.core.graph.constraints import Edges
+from pose_graph_ros.core.graph.graph import Graph, GraphUpdate
+from pose_graph_ros.core.smoother.incremental import IncrementalSmoother, UpdateResult
 
 NAME = 'ours'
 BATCH = SolverConfig(max_iterations=100, step_tolerance=1e-5)
@@ -63,7 +66,7 @@ def run(world: World, plan: Plan, after_step: AfterStep | None = None) -> Run:
             result = step(smoother, k)
             seconds[k] = time.perf_counter() - begin
             total += seconds[k]
-            if result.status is batch.Status.FAILED:
+            if result.status is optimizer.Status.FAILED:
                 raise RuntimeError(f'{world.name}, step {k}: {result.reason}')
             if after_step is not None:
                 after_step(smoother, k)
@@ -176,17 +179,17 @@ class _Steps:
 
 def solve_from_nothing(graph: Graph) -> float:
     """Optimise a graph without a guess and return chi2."""
-    return float(batch.optimize_from_nothing(graph, BATCH).chi2)
+    return float(optimizer.optimize_from_linear_start(graph, BATCH).chi2)
 
 
 def solve(graph: Graph) -> float:
     """Optimise a graph from its poses and return chi2."""
-    return float(batch.optimize(graph, BATCH).chi2)
+    return float(optimizer.optimize(graph, BATCH).chi2)
 
 
 def iterate(graph: Graph) -> None:
     """Linearize, factorise and solve once: what a factorisation costs with all around it."""
-    batch.optimize(graph, SINGLE)
+    optimizer.optimize(graph, SINGLE)
 
 
 def polished(world: World, poses: FloatArray) -> float:
@@ -194,22 +197,48 @@ def polished(world: World, poses: FloatArray) -> float:
     poses = poses.copy()
     poses[0] = world.first      # fixed; GTSAM's prior gives way a little
     graph = world.graph(poses)
-    return float(batch.optimize(graph, SolverConfig(max_iterations=300, step_tolerance=1e-9)).chi2)
+    config = SolverConfig(max_iterations=300, step_tolerance=1e-9)
+    return float(optimizer.optimize(graph, config).chi2)
 
 
-def chordal_start(world: World) -> FloatArray:
+def start_of_batch(world: World) -> FloatArray:
     """Return the start that both tools are given in the batch comparison, shape (N, 3)."""
-    return initialization.chordal(world.graph(world.dead_reckoning()))
+    return chordal_start.chordal(world.graph(world.dead_reckoning()))
+
+
+def _jacobians(
+    poses: FloatArray, ends: tuple[IntArray, ...],
+    errors: Callable[[FloatArray, list[IntArray]], FloatArray],
+) -> list[FloatArray]:
+    """Return the derivatives of errors by the poses of each end, (M, 3, 3), by differences."""
+    size, step = len(ends[0]), 1e-6
+    # each constraint gets ends of its own, so that all of them can be moved at once
+    own = np.concatenate([poses[end] for end in ends])
+    at = [np.arange(k * size, (k + 1) * size) for k in range(len(ends))]
+    found = []
+    for rows in at:
+        columns = []
+        for k in range(3):
+            moved = [own.copy(), own.copy()]
+            moved[0][rows, k] -= step
+            moved[1][rows, k] += step
+            difference = errors(moved[1], at) - errors(moved[0], at)
+            difference[:, 2] = se2.wrap(difference[:, 2])
+            columns.append(difference / (2.0 * step))
+        found.append(np.stack(columns, axis=2))
+    return found
 
 
 def oracle_covariances(graph: Graph, nodes: list[int]) -> FloatArray:
     """Return covariances, shape (len(nodes), 3, 3), from the plain sparse system: slow, sure."""
     edges, observed, size = graph.edges, graph.observed, 3 * graph.n_nodes
     blocks = []
-    _, A, B = linearize.linearize_edges(graph.poses, edges)
+    A, B = _jacobians(graph.poses, (edges.i, edges.j), lambda poses, at: (
+        error_functions.edge_errors(poses, replace(edges, i=at[0], j=at[1]))))
     for (i, left), (j, right) in itertools.product(((edges.i, A), (edges.j, B)), repeat=2):
         blocks.append((i, j, np.swapaxes(left, 1, 2) @ edges.weighted_information @ right))
-    _, A = linearize.linearize_observed(graph.poses, observed)
+    A, = _jacobians(graph.poses, (observed.node,), lambda poses, at: (
+        error_functions.observed_errors(poses, replace(observed, node=at[0]))))
     blocks.append((observed.node, observed.node,
                    np.swapaxes(A, 1, 2) @ observed.weighted_information @ A))
     three = np.arange(3)

@@ -109,7 +109,7 @@ def _verdicts(sections: list[Section]) -> list[str]:
             table.add(section.title, 'failed', section.notes[-1])
         for metric in section.metrics:
             if metric.target is not None:
-                table.add(metric.key, f'{metric.value:.4g}{metric.unit}', metric.verdict())
+                table.add(metric.key, f'{metric.value:.4g}{metric.unit}', metric.status())
     return _markdown(table)
 
 

@@ -55,7 +55,7 @@ def measure(options: Options) -> Section:
 
 
 def _measure_world(section: Section, table: Table, world: World, options: Options) -> None:
-    odometry, same = world.dead_reckoning(), ours.chordal_start(world)
+    odometry, same = world.dead_reckoning(), ours.start_of_batch(world)
     nothing = world.graph(odometry)
     from_same = world.graph(same)
 

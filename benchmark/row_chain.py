@@ -12,7 +12,7 @@ from benchmark.online import Comparison
 from benchmark.runs import MICROSECOND
 from benchmark.section import Curve, Options, say, Section, Table
 from benchmark.worlds import chain
-from pose_graph_ros.core.se2 import FloatArray
+from pose_graph_ros.core.geometry.se2 import FloatArray
 
 RATIOS = {1000: 25.0, 10000: 200.0}
 """What is asked for, by number of nodes."""

@@ -83,7 +83,7 @@ def _fill(
 
 def _final(row: str, item: Comparison) -> list[Metric]:
     """Return the best known optimum of the whole graph, and how far above it ours has ended."""
-    best = ours.polished(item.world, ours.chordal_start(item.world))
+    best = ours.polished(item.world, ours.start_of_batch(item.world))
     key = f'{row}/{item.world.name}'
     judged, steps = item.judged[ours.NAME], item.runs[ours.NAME][0].steps
     if steps < item.world.n_nodes:

@@ -17,7 +17,7 @@ from benchmark.metrics import ACCURACY, Metric
 from benchmark.runs import MICROSECOND, Plan, quiet
 from benchmark.section import file_worlds, Options, say, Section, Table
 from benchmark.worlds import chain
-from pose_graph_ros.core.se2 import FloatArray
+from pose_graph_ros.core.geometry.se2 import FloatArray
 
 NEWEST = 1.0
 """Time of the newest covariance [us]."""
@@ -33,9 +33,9 @@ _START = '''
 import time
 begin = time.perf_counter()
 import numpy as np
-from pose_graph_ros.core.constraints import Edges
-from pose_graph_ros.core.graph import GraphUpdate
-from pose_graph_ros.core.incremental import IncrementalSmoother
+from pose_graph_ros.core.graph.constraints import Edges
+from pose_graph_ros.core.graph.graph import GraphUpdate
+from pose_graph_ros.core.smoother.incremental import IncrementalSmoother
 from pose_graph_ros.core.warm_up import warm_up
 imported = time.perf_counter()
 warm_up()

@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from benchmark.worlds import World
-from pose_graph_ros.core.se2 import FloatArray
+from pose_graph_ros.core.geometry.se2 import FloatArray
 
 if TYPE_CHECKING:
     from collections.abc import Iterator

@@ -12,7 +12,7 @@ from benchmark import files
 from benchmark.metrics import Metric
 from benchmark.runs import Plan, Run
 from benchmark.worlds import World
-from pose_graph_ros.core.se2 import FloatArray
+from pose_graph_ros.core.geometry.se2 import FloatArray
 
 
 @dataclass(frozen=True, slots=True)

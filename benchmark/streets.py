@@ -24,8 +24,8 @@ from scipy.ndimage import uniform_filter1d
 from scipy.spatial import cKDTree
 
 from benchmark.worlds import arranged, closures, odometry, SEED, seen, World
-from pose_graph_ros.core.constraints import Edges
-from pose_graph_ros.core.se2 import FloatArray, IntArray
+from pose_graph_ros.core.geometry.se2 import FloatArray, IntArray
+from pose_graph_ros.core.graph.constraints import Edges
 
 # Four directions of a crossing's streets, counter-clockwise.
 _DIRECTIONS = np.array([(1, 0), (0, 1), (-1, 0), (0, -1)])

@@ -16,10 +16,10 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.signal import lfilter
 
-from pose_graph_ros.core import se2
-from pose_graph_ros.core.constraints import EdgeKind, Edges, ObservedKind, ObservedNodes
-from pose_graph_ros.core.graph import Graph, GraphUpdate
-from pose_graph_ros.core.se2 import FloatArray, IntArray
+from pose_graph_ros.core.geometry import se2
+from pose_graph_ros.core.geometry.se2 import FloatArray, IntArray
+from pose_graph_ros.core.graph.constraints import EdgeKind, Edges, ObservedKind, ObservedNodes
+from pose_graph_ros.core.graph.graph import Graph, GraphUpdate
 
 SEED = 20260
 CHAIN_SIGMA = (0.05, 0.02, 0.003)

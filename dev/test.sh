@@ -4,11 +4,14 @@
 #
 # usage: dev/test.sh VENV [arguments of pytest...]
 # Run the checks and then the tests, all of them even if one fails; fail if any has failed.
+# Without arguments, all tests run, in parallel, and the coverage is measured and gated.
 
 set -uo pipefail
 cd -- "$(dirname -- "$0")/.." || exit 1
-VENV=$1
+PYTHON=$1/bin/python
 shift
+CORE_COVERAGE=95
+OTHER_COVERAGE=88
 failed=()
 
 run() { # name, command...
@@ -18,16 +21,34 @@ run() { # name, command...
     "$@" || failed+=("$name")
 }
 
-run ruff "$VENV/bin/ruff" check
+coverage() { "$PYTHON" -m coverage "$@"; }
+
+with_coverage() { # files in parallel: many of their tests wait for other processes
+    coverage erase
+    coverage run -m pytest -ra --durations=20 -n "${PYTEST_WORKERS:-3}" --dist loadfile
+    local status=$?
+    coverage combine --quiet
+    return "$status"
+}
+
+run ruff "$PYTHON" -m ruff check
 if [ -z "${ROS_DISTRO:-}" ]; then
-    run mypy "$VENV/bin/python" -m mypy
+    run mypy "$PYTHON" -m mypy
 else
     echo '--- mypy: left out, it is exact only with the NumPy of requirements.lock'
 fi
 # once, not in each of the processes that tests start
-run kernels "$VENV/bin/python" -c 'from pose_graph_ros.core.warm_up import warm_up
+run kernels "$PYTHON" -c 'from pose_graph_ros.core.warm_up import warm_up
 print(f"compiled, or loaded, in {warm_up():.1f} s")'
-run pytest "$VENV/bin/python" -m pytest -ra --durations=10 "$@"
+if [ "$#" -gt 0 ]; then
+    run pytest "$PYTHON" -m pytest -ra --durations=10 "$@"
+else
+    run pytest with_coverage
+    run 'coverage of core' coverage report --skip-covered --sort=cover \
+        --include='pose_graph_ros/core/*' --fail-under="$CORE_COVERAGE"
+    run 'coverage of the rest' coverage report --skip-covered --sort=cover \
+        --omit='pose_graph_ros/core/*' --fail-under="$OTHER_COVERAGE"
+fi
 
 if [ "${#failed[@]}" -gt 0 ]; then
     printf 'failed: %s\n' "${failed[*]}" >&2

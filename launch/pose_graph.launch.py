@@ -1,7 +1,7 @@
 # Copyright 2026 The pose_graph_ros authors
 # SPDX-License-Identifier: Apache-2.0
 """
-Start the node with its parameter file, and RViz if that is wanted.
+Start the node with its parameter file, and optionally RViz.
 
     ros2 launch pose_graph_ros pose_graph.launch.py odom:=/wheel/odometry fix:=/gnss/fix rviz:=true
 """
@@ -16,7 +16,7 @@ from launch_ros.substitutions import FindPackageShare
 
 PACKAGE = 'pose_graph_ros'
 
-# launch argument, topic of the node, what arrives there
+# Launch argument, topic of the node, and type of the messages of each input.
 INPUTS = (
     ('odom', 'odom', 'nav_msgs/Odometry'),
     ('fix', 'gps/fix', 'sensor_msgs/NavSatFix'),
@@ -24,7 +24,7 @@ INPUTS = (
     ('global_pose', 'global_pose', 'geometry_msgs/PoseWithCovarianceStamped'),
     ('loop_closure', 'loop_closure', 'geometry_msgs/PoseWithCovarianceStamped'),
 )
-# ... and what goes out
+# The same of each output.
 OUTPUTS = (
     ('path', 'path', 'nav_msgs/Path'),
     ('pose', 'pose', 'geometry_msgs/PoseWithCovarianceStamped'),
@@ -53,7 +53,7 @@ def generate_launch_description() -> LaunchDescription:
             description='configure and activate the node; otherwise a lifecycle manager does'),
         DeclareLaunchArgument(
             'rviz', default_value='false', choices=TRUE_OR_FALSE,
-            description='start RViz too, which has to be installed (rviz2)'),
+            description='start RViz as well; rviz2 must be installed'),
         DeclareLaunchArgument(
             'rviz_config', default_value=PathJoinSubstitution([config, 'pose_graph.rviz']),
             description='configuration of RViz'),
@@ -78,8 +78,8 @@ def generate_launch_description() -> LaunchDescription:
         remappings=[(topic, LaunchConfiguration(name)) for name, topic, _ in INPUTS] + outputs,
         ros_arguments=['--log-level', LaunchConfiguration('log_level')],
     )
-    # Its displays subscribe with the names in the configuration as any node does. The names are
-    # relative there, so this namespace and these remaps hold for them, too.
+    # The topics in the configuration of RViz are relative, so this namespace and these remappings
+    # apply to them as well.
     rviz = Node(
         condition=IfCondition(LaunchConfiguration('rviz')),
         package='rviz2',

@@ -1,8 +1,9 @@
 # Copyright 2026 The pose_graph_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""Who may import whom, read from the imports themselves."""
+"""Which package may import which, read from the imports themselves."""
 
 import ast
+from collections.abc import Iterator
 from pathlib import Path
 import subprocess
 import sys
@@ -14,74 +15,60 @@ import pose_graph_ros
 PACKAGE = Path(pose_graph_ros.__file__).parent
 MODULES = sorted(path.relative_to(PACKAGE) for path in PACKAGE.rglob('*.py'))
 
-# A module of core may import those before it, and no others.
-CORE = (
-    'kernel_cache', 'jit', 'exceptions', 'arrays', 'sources', 'se2', 'motion', 'saved_columns',
-    'covariance', 'measurements', 'config', 'admission', 'constraints', 'linearize', 'robust',
-    # the graph, which knows nothing of how it is solved
-    'tables', 'vectors', 'cholesky', 'factors', 'undo', 'rows', 'editing', 'graph',
-    # elimination
-    'ordering', 'frames', 'fronts', 'structure', 'assembly', 'elimination',
-    # the batch optimiser, which knows nothing of the smoother
-    'symbolic', 'complex_system', 'initialization', 'joint_start', 'gauss_newton', 'descent',
-    'batch', 'starts',
-    # the incremental smoother
-    'carrying', 'back_substitution', 'relinearization', 'step', 'chain', 'sparse_inverse',
-    'marginals', 'rescue', 'incremental',
-    # what drives it
-    'timeline', 'unheard', 'odometry_stream', 'trajectory', 'consensus', 'alignment', 'binding',
-    'hidden_nodes', 'anchoring', 'pending', 'reweighing', 'closing', 'autocorrelation',
-    'correlated', 'joining', 'arrivals', 'springs', 'estimate', 'aligning',
-    # the whole as a value, with its place on the Earth, and who drives all that
-    'tangent_plane', 'saved_graph', 'saving', 'backend', 'prediction', 'io', 'io.g2o', 'io.tum',
-    'io.plain', 'io.whole_files', 'io.graph_files', 'helper_process', 'warm_up',
-)
-CORE_NEEDS = {'numpy', 'scipy', 'numba', 'pyproj'}
-
-# Modules of ros that the offline tools share: they know messages by their fields alone.
-WITHOUT_RCLPY = {
-    'bag_writer', 'bags', 'continuity', 'conversions', 'fixes', 'hearing', 'inputs', 'intake',
-    'markers', 'memory', 'parameter_changes', 'parameter_texts', 'parameters', 'reader', 'rewind',
-    'setting', 'slew', 'sources', 'static_frames'}
+# What everything in `core` may import: settings, values and errors.
+BASE = {'core.exceptions', 'core.config', 'core.measurements', 'core.saved_columns'}
+# The packages of `core`, and the other packages that each may import.
+CORE = {
+    'core.compiled': set(),
+    'core.geometry': set(),
+    'core.graph': {'core.compiled', 'core.geometry'},
+    'core.elimination': {'core.compiled', 'core.graph'},
+    'core.batch': {'core.compiled', 'core.geometry', 'core.graph', 'core.elimination'},
+    'core.smoother': {
+        'core.compiled', 'core.geometry', 'core.graph', 'core.elimination', 'core.batch'},
+    'core.odometry': {'core.compiled', 'core.geometry', 'core.graph'},
+    'core.sources': {'core.compiled', 'core.geometry', 'core.graph', 'core.odometry'},
+    'core.alignment': {'core.geometry', 'core.graph', 'core.odometry', 'core.sources'},
+}
+CORE['core.io'] = set(CORE)
+# The modules on top of the packages: the facade, what it hands out, and who drives it.
+TOP = {'core.estimate', 'core.prediction', 'core.transaction', 'core.backend', 'core.warm_up',
+       'core.helper_process'}
+# Third-party libraries of `core`.
+LIBRARIES = {'numpy', 'scipy', 'numba', 'pyproj'}
 ROS = {'rclpy', 'rosidl_runtime_py', 'ament_index_python', 'launch', 'launch_ros'}
 
 MOST_LINES = 450
 
 
-def imports(path: Path, *, at_run_time: bool = False) -> set[str]:
-    """
-    Return the full names of all that a module imports, anywhere in it.
-
-    `from a import b` counts as `a.b`; whether b is a module or a name in a does not matter here.
-    At run time leaves out what stands under `if TYPE_CHECKING`.
-    """
-    tree = ast.parse((PACKAGE / path).read_text(encoding='utf-8'))
-    skipped: set[ast.AST] = set()
-    if at_run_time:
-        for node in ast.walk(tree):
-            if isinstance(node, ast.If) and 'TYPE_CHECKING' in ast.unparse(node.test):
-                skipped |= {inner for statement in node.body for inner in ast.walk(statement)}
-    names = set()
-    for node in ast.walk(tree):
-        if node in skipped:
-            continue
+def imports(path: Path) -> Iterator[str]:
+    """Yield the full names of all that a module imports; `from a import b` counts as `a.b`."""
+    for node in ast.walk(ast.parse((PACKAGE / path).read_text(encoding='utf-8'))):
         if isinstance(node, ast.Import):
-            names |= {alias.name for alias in node.names}
+            yield from (alias.name for alias in node.names)
         elif isinstance(node, ast.ImportFrom):
             assert node.level == 0, f'{path}:{node.lineno}: a relative import'
-            names |= {f'{node.module}.{alias.name}' for alias in node.names}
-    return names
+            yield from (f'{node.module}.{alias.name}' for alias in node.names)
 
 
-def tops(names: set[str]) -> set[str]:
-    """Return the packages that the names begin with, without the standard library."""
-    return {name.partition('.')[0] for name in names} - set(sys.stdlib_module_names)
+def package_of(module: str) -> str:
+    """Return `core.graph` for `core.graph.graph.Graph`, `core.config` for `core.config.X`."""
+    parts = module.split('.')
+    return '.'.join(parts[:2]) if parts[0] == 'core' else parts[0]
 
 
-def own(names: set[str], layer: str) -> set[str]:
-    """Return what follows `pose_graph_ros.<layer>.` in the names that have it."""
-    prefix = f'pose_graph_ros.{layer}.'
-    return {name.removeprefix(prefix) for name in names if name.startswith(prefix)}
+def own_imports(path: Path) -> set[str]:
+    """Return the packages of this project that a module imports, but for its own."""
+    prefix = 'pose_graph_ros.'
+    found = {package_of(name.removeprefix(prefix)) for name in imports(path)
+             if name.startswith(prefix)}
+    return found - {package_of('.'.join(path.with_suffix('').parts)), '__version__'}
+
+
+def libraries(path: Path) -> set[str]:
+    """Return the third-party libraries that a module imports."""
+    tops = {name.partition('.')[0] for name in imports(path)}
+    return tops - set(sys.stdlib_module_names) - {'pose_graph_ros'}
 
 
 def is_ros(name: str) -> bool:
@@ -89,53 +76,59 @@ def is_ros(name: str) -> bool:
     return top in ROS or top.endswith(('_msgs', '_srvs', '_interfaces'))
 
 
-def modules(layer: str) -> list[Path]:
-    return [path for path in MODULES if path.parts[0] == layer]
+def modules(*parts: str) -> list[Path]:
+    return [path for path in MODULES if path.parts[:len(parts)] == parts]
 
 
-def core_name(path: Path) -> str:
-    return '.'.join(path.with_suffix('').parts[1:]).removesuffix('.__init__')
+def test_every_package_is_looked_at() -> None:
+    assert {path.parts[0] for path in MODULES} == {'core', 'adapters', 'ros', 'cli', '__init__.py'}
+    inside = {package_of('.'.join(path.with_suffix('').parts)) for path in modules('core')}
+    assert inside == {*CORE, *BASE, *TOP, 'core.__init__'}
 
 
-CORE_MODULES = [path for path in modules('core') if path != Path('core/__init__.py')]
-
-
-def test_every_layer_is_looked_at() -> None:
-    assert {path.parts[0] for path in MODULES} == {'core', 'ros', 'cli', '__init__.py'}
-    assert {core_name(path) for path in CORE_MODULES} == set(CORE)
-    assert all(len(modules(layer)) > 5 for layer in ('core', 'ros', 'cli'))
-
-
-@pytest.mark.parametrize('path', CORE_MODULES, ids=core_name)
+@pytest.mark.parametrize('path', modules('core'), ids=str)
 def test_core_imports_only_numbers(path: Path) -> None:
-    assert tops(imports(path)) <= CORE_NEEDS | {'pose_graph_ros'}
-    assert not own(imports(path), 'ros')
-    assert not own(imports(path), 'cli')
+    assert libraries(path) <= LIBRARIES
+    assert not own_imports(path) & {'adapters', 'ros', 'cli'}
 
 
-@pytest.mark.parametrize('path', CORE_MODULES, ids=core_name)
-def test_a_module_of_core_imports_only_those_before_it(path: Path) -> None:
-    before = CORE[:CORE.index(core_name(path))]
-    for name in own(imports(path), 'core'):
-        module = name if name in CORE else name.rpartition('.')[0]
-        assert module in before, f'{core_name(path)} imports {name}'
+@pytest.mark.parametrize('package', CORE)
+def test_a_package_of_core_imports_only_those_below_it(package: str) -> None:
+    paths = modules(*package.split('.'))
+    assert len(paths) > 1
+    for path in paths:
+        assert own_imports(path) <= CORE[package] | BASE, path
+
+
+def test_the_arrows_between_packages_form_no_circle() -> None:
+    below: set[str] = set()
+    for package, allowed in CORE.items():
+        assert allowed <= below, package
+        below.add(package)
+
+
+@pytest.mark.parametrize('name', sorted(BASE))
+def test_the_base_of_core_imports_no_engine(name: str) -> None:
+    path = Path(*name.split('.')).with_suffix('.py')
+    assert own_imports(path) <= BASE | {'core.geometry'}
+
+
+@pytest.mark.parametrize('path', modules('adapters'), ids=str)
+def test_adapters_import_no_rclpy_and_nothing_above_them(path: Path) -> None:
+    assert not {name for name in imports(path) if is_ros(name)}
+    assert not own_imports(path) & {'ros', 'cli'}
 
 
 @pytest.mark.parametrize('path', modules('ros'), ids=str)
-def test_ros_never_imports_cli_and_shares_what_it_promises(path: Path) -> None:
-    assert not own(imports(path), 'cli')
-    if path.stem in WITHOUT_RCLPY:
-        assert not {name for name in imports(path) if is_ros(name)}
-        others = own(imports(path), 'ros')
-        assert {name.partition('.')[0] for name in others} <= WITHOUT_RCLPY
+def test_ros_never_imports_cli(path: Path) -> None:
+    assert 'cli' not in own_imports(path)
 
 
 @pytest.mark.parametrize('path', modules('cli'), ids=str)
-def test_cli_never_imports_ros_packages(path: Path) -> None:
-    names = imports(path)
-    assert not {name for name in names if is_ros(name)}
-    shared = {name.partition('.')[0] for name in own(names, 'ros')}
-    assert shared <= WITHOUT_RCLPY
+def test_cli_never_imports_ros(path: Path) -> None:
+    # the player is started as a process of its own
+    assert not {name for name in imports(path) if is_ros(name)}
+    assert 'ros' not in own_imports(path)
 
 
 @pytest.mark.parametrize('module', [

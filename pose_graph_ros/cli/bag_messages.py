@@ -1,6 +1,6 @@
 # Copyright 2026 The pose_graph_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""Messages for a bag from arrays: what drivers of wheels, receivers and matchers would publish."""
+"""Create messages for a bag from arrays, as drivers and scan matchers would publish them."""
 
 from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
@@ -8,13 +8,13 @@ from typing import Any
 
 import numpy as np
 
-from pose_graph_ros.core import se2
-from pose_graph_ros.core.se2 import FloatArray, IntArray
-from pose_graph_ros.core.trajectory import Trajectory
-from pose_graph_ros.ros.bag_writer import BagWriter, message_types
+from pose_graph_ros.adapters.bag_writer import BagWriter, message_types
+from pose_graph_ros.core.geometry import se2
+from pose_graph_ros.core.geometry.se2 import FloatArray, IntArray
+from pose_graph_ros.core.geometry.trajectory import Trajectory
 
 Message = tuple[str, str, int, Any]
-"""Topic, type, stamp [ns] and message."""
+"""Topic, type, time of recording [ns] and message."""
 _TYPES = message_types()
 _ODOMETRY = 'nav_msgs/msg/Odometry'
 _FIX = 'sensor_msgs/msg/NavSatFix'
@@ -27,6 +27,13 @@ def write_bag(
 ) -> None:
     """
     Write messages as a rosbag2, in the order of their stamps.
+
+    Parameters
+    ----------
+    folder : str or Path
+    messages : iterable of Message
+    overwrite : bool
+        Whether to replace an existing bag.
 
     Raises
     ------
@@ -42,7 +49,20 @@ def write_bag(
 def odometry_messages(
     topic: str, frame: str, path: Trajectory, variances: Sequence[float], latency_ns: int = 0,
 ) -> Iterator[Message]:
-    """Return nav_msgs/Odometry with the twists that lead from each pose to the next."""
+    """
+    Return nav_msgs/Odometry messages with the twists between consecutive poses.
+
+    Parameters
+    ----------
+    topic, frame : str
+    path : Trajectory
+        Poses of base_link in the frame.
+    variances : sequence of float, length 6
+        Of the pose and of the twist.
+    latency_ns : int
+        Time from the stamp to the recording [ns].
+
+    """
     pose_with_covariance, twist_with_covariance, make_twist, vector = (
         _TYPES[f'geometry_msgs/msg/{key}']
         for key in ('PoseWithCovariance', 'TwistWithCovariance', 'Twist', 'Vector3'))
@@ -60,7 +80,21 @@ def odometry_messages(
 def fix_messages(
     topic: str, stamps_ns: IntArray, geodetic: FloatArray, sigma: float, latency_ns: int = 0,
 ) -> Iterator[Message]:
-    """Return sensor_msgs/NavSatFix from latitude, longitude and height, (M, 3) [deg, deg, m]."""
+    """
+    Return sensor_msgs/NavSatFix messages.
+
+    Parameters
+    ----------
+    topic : str
+    stamps_ns : ndarray, shape (M,)
+    geodetic : ndarray, shape (M, 3)
+        Latitude, longitude and ellipsoidal height [deg, deg, m].
+    sigma : float
+        Standard deviation along each of east and north [m]; that of the height is twice as large.
+    latency_ns : int
+        Time from the stamp to the recording [ns].
+
+    """
     status = _TYPES['sensor_msgs/msg/NavSatStatus']
     covariance = sigma**2 * np.diag([1.0, 1.0, 4.0]).ravel()
     for stamp, fix in zip(stamps_ns.tolist(), geodetic.tolist(), strict=True):
@@ -73,7 +107,22 @@ def loop_closure_messages(
     topic: str, stamps_ns: IntArray, poses: FloatArray, covariance: FloatArray,
     latency_ns: int = 0,
 ) -> Iterator[Message]:
-    """Return the poses (L, 3) of the robot at the later of two stamps (L, 2), in the earlier."""
+    """
+    Return loop closures as geometry_msgs/PoseWithCovarianceStamped messages.
+
+    Parameters
+    ----------
+    topic : str
+    stamps_ns : ndarray, shape (L, 2)
+        Stamps of the earlier and of the later pose [ns].
+    poses : ndarray, shape (L, 3)
+        Later pose of the robot in the frame of the earlier one [m, m, rad].
+    covariance : ndarray, shape (3, 3)
+        Of each of the poses.
+    latency_ns : int
+        Time from the later stamp to the recording [ns].
+
+    """
     pose_with_covariance = _TYPES['geometry_msgs/msg/PoseWithCovariance']
     full = np.diag([0.0, 0.0, 0.01, 3e-4, 3e-4, 0.0])
     full[_PLANAR] = covariance

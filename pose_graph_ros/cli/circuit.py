@@ -1,11 +1,11 @@
 # Copyright 2026 The pose_graph_ros authors
 # SPDX-License-Identifier: Apache-2.0
 """
-A car that drives round and round some city blocks: the motion behind the simulated drive.
+Simulate the motion of a car that drives laps around some city blocks.
 
 The circuit is a list of intersections. The car keeps to the right lane of the streets, which are
-gently bent; a turn has a curvature that begins and ends at zero; the speed obeys limits of speed,
-lateral and longitudinal acceleration, and falls to zero at lights.
+slightly curved. The curvature of a turn begins and ends at zero. The speed obeys limits of speed,
+lateral and longitudinal acceleration, and is zero at traffic lights.
 """
 
 from dataclasses import dataclass
@@ -14,42 +14,56 @@ import numpy as np
 from scipy.ndimage import gaussian_filter1d
 from scipy.signal import lfilter
 
-from pose_graph_ros.core import se2
-from pose_graph_ros.core.se2 import FloatArray, IntArray
+from pose_graph_ros.core.geometry import se2
+from pose_graph_ros.core.geometry.se2 import FloatArray, IntArray
 
 CORNERS = ((310, 0), (310, 180), (105, 180), (105, 0), (200, 0), (200, 260), (0, 260), (0, 0))
 """Intersections at which the circuit turns by 90 degrees, in driving order [m]."""
 STOP_CORNERS = (1, 4, 6)
-"""Indices of the corners with a light before them."""
+"""Indices of the corners with a traffic light before them."""
 LANE_OFFSET = 1.8
-"""To the right of the middle of the street [m]."""
+"""Offset of the lane to the right of the middle of the street [m]."""
 STREET_BEARING = 0.35
-"""Of the first street, from east to north [rad]."""
+"""Angle of the first street, from east to north [rad]."""
 TURN_LENGTH = 18.0
-"""Arc length of a turn [m]; the smallest radius is this over pi."""
+"""Arc length of a turn [m]; its smallest radius is this divided by pi."""
 PATH_STEP = 0.1
+"""Distance of the points of the path [m]."""
 MAX_SPEED = 7.2
+"""Largest speed [m/s]."""
 MAX_ACCELERATION = 1.4
 MAX_LATERAL_ACCELERATION = 2.0
+"""Largest accelerations along and across the path [m/s^2]."""
 PERIOD_S = 0.01
+"""Sample period of the motion [s]."""
 
 
 @dataclass(frozen=True, slots=True)
 class Motion:
-    """Where the car is, every 10 ms."""
+    """Poses of the car, every 10 ms."""
 
     time: FloatArray
-    """Since the begin, shape (N,) [s]."""
+    """Time since the start, shape (N,) [s]."""
     distance: FloatArray
-    """Driven so far, shape (N,) [m]."""
+    """Distance driven since the start, shape (N,) [m]."""
     poses: FloatArray
-    """In the frame of the city, shape (N, 3) [m, m, rad]; headings are not wrapped."""
+    """Poses in the frame of the city, shape (N, 3) [m, m, rad]; headings are not wrapped."""
     lap_time: float
-    """When the second lap begins [s]; beyond the end, or infinite, if it does not."""
+    """Time at which the second lap begins [s]; after the end, or infinite, if there is none."""
 
 
 def drive_circuit(generator: np.random.Generator, duration_s: float) -> Motion:
-    """Drive along the circuit; the way within the lane and the waits at lights are random."""
+    """
+    Return a drive along the circuit.
+
+    Parameters
+    ----------
+    generator : numpy.random.Generator
+        Source of the random position within the lane and of the random waits at lights.
+    duration_s : float
+        Length of the drive [s].
+
+    """
     heading, stops, lap_length = _circuit(duration_s)
     path = _streets(generator, heading)
     length = np.concatenate(([0.0], np.cumsum(np.hypot(*np.diff(path[:, :2], axis=0).T))))
@@ -58,7 +72,7 @@ def drive_circuit(generator: np.random.Generator, duration_s: float) -> Motion:
     speed_limit = np.minimum(
         MAX_SPEED, np.sqrt(MAX_LATERAL_ACCELERATION / np.maximum(np.abs(curvature), 1e-6)))
     speed_limit[[0, *stops]] = 0.0
-    # v^2 grows and shrinks by at most 2 a per metre: the lower envelope of cones over the limits
+    # v^2 changes by at most 2 a per metre: take the lower envelope of cones over the limits
     slope = 2.0 * MAX_ACCELERATION * length
     forward = slope + np.minimum.accumulate(speed_limit**2 - slope)
     backward = np.minimum.accumulate((speed_limit**2 + slope)[::-1])[::-1] - slope
@@ -71,7 +85,7 @@ def drive_circuit(generator: np.random.Generator, duration_s: float) -> Motion:
     arrival = np.concatenate(([0.0], np.cumsum(travel + wait[:-1])))
     knots = np.column_stack((arrival, arrival + wait)).ravel()
     time = np.arange(0.0, duration_s + 5.0, PERIOD_S)
-    # smoothing over half a second takes away the jumps of the acceleration, and spoils the end
+    # smoothing over half a second removes jumps of the acceleration, but distorts the last samples
     distance = gaussian_filter1d(np.interp(time, knots, np.repeat(length, 2)), 0.25 / PERIOD_S)
     time, distance = time[time <= duration_s], distance[time <= duration_s]
     poses = np.column_stack([np.interp(distance, length, column) for column in path.T])
@@ -83,15 +97,27 @@ def drive_circuit(generator: np.random.Generator, duration_s: float) -> Motion:
 def gauss_markov(
     generator: np.random.Generator, count: int, sigma: float, step: float,
 ) -> FloatArray:
-    """Return a stationary first-order process; `step` is the sample period over the time const."""
-    keep = np.exp(-step)
-    noise = generator.normal(0.0, sigma * np.sqrt(1.0 - keep**2), count)
+    """
+    Return samples of a stationary first-order Gauss-Markov process, shape (count,).
+
+    Parameters
+    ----------
+    generator : numpy.random.Generator
+    count : int
+    sigma : float
+        Standard deviation of each sample.
+    step : float
+        Sample period divided by the time constant.
+
+    """
+    decay = np.exp(-step)
+    noise = generator.normal(0.0, sigma * np.sqrt(1.0 - decay**2), count)
     noise[0] = generator.normal(0.0, sigma)
-    return np.asarray(lfilter([1.0], [1.0, -keep], noise))
+    return np.asarray(lfilter([1.0], [1.0, -decay], noise))
 
 
 def _circuit(duration_s: float) -> tuple[FloatArray, IntArray, float]:
-    """Return heading every `PATH_STEP` [rad], indices of the stops and the length of a lap [m]."""
+    """Return headings every `PATH_STEP` [rad], indices of the stops and length of a lap [m]."""
     corners = np.array(CORNERS, dtype=np.float64)
     incoming = corners - np.roll(corners, 1, axis=0)
     incoming /= np.linalg.norm(incoming, axis=1, keepdims=True)
@@ -102,7 +128,7 @@ def _circuit(duration_s: float) -> tuple[FloatArray, IntArray, float]:
         incoming[:, 0] * outgoing[:, 1] - incoming[:, 1] * outgoing[:, 0],
         np.sum(incoming * outgoing, axis=1))
 
-    # how far from its corner a turn begins and ends: the integral of the cosine of its heading
+    # distance from the corner to the ends of a turn: the integral of the cosine of its heading
     turn = (np.arange(1000) + 0.5) / 1000
     reach = TURN_LENGTH * np.mean(np.cos(0.5 * np.pi * _ramp(turn)))
     straights = np.linalg.norm(lane - np.roll(lane, 1, axis=0), axis=1) - 2.0 * reach
@@ -120,13 +146,13 @@ def _circuit(duration_s: float) -> tuple[FloatArray, IntArray, float]:
 
 
 def _ramp(u: FloatArray) -> FloatArray:
-    """Rise from 0 to 1 on [0, 1] with a derivative that begins and ends at 0."""
+    """Return a ramp from 0 to 1 on [0, 1] whose derivative begins and ends at 0."""
     u = np.clip(u, 0.0, 1.0)
     return u - np.sin(2.0 * np.pi * u) / (2.0 * np.pi)
 
 
 def _streets(generator: np.random.Generator, heading: FloatArray) -> FloatArray:
-    """Return the path driven, shape (N, 3): streets are bent a little, nobody drives straight."""
+    """Return the path along bent streets with a random position in the lane, shape (N, 3)."""
     middle = 0.5 * (heading[1:] + heading[:-1])
     steps = PATH_STEP * np.column_stack((np.cos(middle), np.sin(middle)))
     grid = np.concatenate(([[0.0, 0.0]], np.cumsum(steps, axis=0)))

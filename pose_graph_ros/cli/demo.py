@@ -1,10 +1,10 @@
 # Copyright 2026 The pose_graph_ros authors
 # SPDX-License-Identifier: Apache-2.0
 """
-Run the real node on a bag, over DDS, and leave the corrected path and a picture.
+Play a bag to the node over DDS, and write the corrected path and a picture.
 
-The node and the player are processes of their own, on this machine alone and in a domain of their
-own. Without a bag a simulated drive is made first, with a known truth.
+The node and the player run as separate processes in a ROS domain of their own, restricted to this
+machine. Without a bag, a drive with known ground truth is simulated first.
 """
 
 import argparse
@@ -23,30 +23,30 @@ from typing import Any, IO
 
 import numpy as np
 
+from pose_graph_ros.adapters.bag_inputs import choose_inputs, Inputs
+from pose_graph_ros.adapters.bags import BagError, open_bag
+from pose_graph_ros.adapters.conversions import planar_pose, stamp_ns
+from pose_graph_ros.adapters.sources import Source, source_list
 from pose_graph_ros.cli import options as shared
 from pose_graph_ros.cli.results import collect_drive, write_results
 from pose_graph_ros.cli.simulate import simulate_drive, write_drive
 from pose_graph_ros.core.exceptions import PoseGraphError
-from pose_graph_ros.core.trajectory import Trajectory
-from pose_graph_ros.ros.bags import BagError, open_bag
-from pose_graph_ros.ros.conversions import planar_pose, stamp_ns
-from pose_graph_ros.ros.inputs import choose_inputs, Inputs
-from pose_graph_ros.ros.sources import Source, source_list
+from pose_graph_ros.core.geometry.trajectory import Trajectory
 
 SIMULATED_TOPICS = {'odom': '/odom', 'fix': '/gps/fix', 'loop_closure': '/loop_closure'}
 SIMULATED_TRUTH = '/ground_truth'
-# Often enough for the player to know what is under way, and for a path soon after the end.
+# Short periods [s]: the player reads from the diagnostics which messages the node has processed.
 DEMO_PARAMETERS = ('diagnostics_period:=0.05', 'path_period:=0.5')
-STOP_TIMEOUT = 15.0
-POLL_PERIOD = 0.1
-# As the player says it; its module cannot be imported without ROS.
+# Time for a process to end after SIGINT, and period of checking on the processes [s].
+STOP_TIMEOUT, POLL_PERIOD = 15.0, 0.1
+# Exit code of the player, whose module cannot be imported without ROS.
 NOT_CONVERGED = 3
-# Locks of the domains of the newest environments: older ones are no longer in use.
+# Lock files of the domains in use; older ones are released.
 _DOMAINS: deque[IO[str]] = deque(maxlen=8)
 
 
 class DemoError(PoseGraphError):
-    """A process of the demo failed; the message says which."""
+    """A process of the demo failed, which the message names."""
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -56,9 +56,10 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument('-o', '--out', metavar='DIR', type=Path, default=Path('demo'),
                         help='folder for the results (default: %(default)s)')
     parser.add_argument('--rate', type=float, default=20.0,
-                        help='times the recorded speed, 0 for as fast as the node takes it '
+                        help='speed as a multiple of real time, 0 for as fast as the node can '
                              '(default: %(default)s)')
-    parser.add_argument('--seed', type=int, default=1, help='of the simulated drive')
+    parser.add_argument('--seed', type=int, default=1, help='seed of the simulated drive '
+                             '(default: %(default)s)')
     shared.add_inputs(parser)
     shared.add_parameters(parser)
 
@@ -78,7 +79,7 @@ def execute(options: argparse.Namespace) -> int:
         print(f'  {source:<13} {topic}')
 
     start = time.monotonic()
-    signal.signal(signal.SIGTERM, signal.default_int_handler)  # so that no process is left behind
+    signal.signal(signal.SIGTERM, signal.default_int_handler)  # also stop the processes on SIGTERM
     converged = _run(bag_path, inputs, source_list(values), options)
     seconds = time.monotonic() - start
     corrected = _read_path(options.out / 'corrected')
@@ -95,7 +96,7 @@ def execute(options: argparse.Namespace) -> int:
 def _bag(
     options: argparse.Namespace,
 ) -> tuple[Path, Mapping[str, str | None], str | None, str]:
-    """Return the bag to play, its topics, that of the truth, and a title for the picture."""
+    """Return the bag to play, its topics, the topic of the truth, and the title of the picture."""
     if options.bag is not None:
         return options.bag, shared.wanted_topics(options), options.truth, options.bag.stem
     path = options.out / 'simulated_drive'
@@ -109,7 +110,7 @@ def _bag(
 def _run(
     bag: Path, inputs: Inputs, sources: Sequence[Source], options: argparse.Namespace,
 ) -> bool:
-    """Start the node, play the bag to it, stop it; tell whether the optimisation converged."""
+    """Tell whether the optimisation converged after playing the bag to the node."""
     ros_args = shared.ros_arguments(options)
     with tempfile.TemporaryDirectory(prefix='pose_graph_') as log:
         env = isolated_environment(Path(log))
@@ -141,9 +142,9 @@ def _run(
 
 
 def isolated_environment(log: Path) -> dict[str, str]:
-    """Return an environment for ROS processes that talk to each other alone."""
+    """Return environment variables for ROS processes that only communicate with each other."""
     env = dict(os.environ)
-    # the wheels from PyPI do not set it; a sourced ROS does
+    # set by a sourced ROS, but not by the wheels from PyPI
     env.setdefault('AMENT_PREFIX_PATH', sys.prefix)
     env['ROS_AUTOMATIC_DISCOVERY_RANGE'] = 'LOCALHOST'
     env['ROS_DOMAIN_ID'] = str(_free_domain())
@@ -153,7 +154,7 @@ def isolated_environment(log: Path) -> dict[str, str]:
 
 
 def _free_domain() -> int:
-    """Return a domain that no other program of this package on this machine uses now."""
+    """Return a ROS domain that no other program of this package on this machine uses."""
     domains = random.SystemRandom().sample(range(1, 101), 100)
     for domain in domains:
         name = Path(tempfile.gettempdir()) / f'pose_graph_ros_domain_{domain}'
@@ -168,7 +169,7 @@ def _free_domain() -> int:
 
 
 def _stop(node: 'subprocess.Popen[bytes]') -> int:
-    """End a process by SIGINT, as Ctrl-C does; return its exit code."""
+    """Stop a process by SIGINT, as Ctrl-C does; return its exit code."""
     if node.poll() is None:
         node.send_signal(signal.SIGINT)
     try:
@@ -179,7 +180,7 @@ def _stop(node: 'subprocess.Popen[bytes]') -> int:
 
 
 def _read_path(folder: Path) -> Trajectory:
-    """Return the last path in the bag that the player wrote."""
+    """Return the last path in the bag that the player has recorded."""
     with open_bag(folder) as bag:
         path = None
         for message in bag.messages(['/path']) if '/path' in bag.topics else ():
@@ -192,7 +193,7 @@ def _read_path(folder: Path) -> Trajectory:
 
 
 def _read_diagnostics(folder: Path) -> dict[str, Any]:
-    """Return the node's last diagnostics in the bag that the player wrote."""
+    """Return the last diagnostics in the bag that the player has recorded."""
     with open_bag(folder) as bag:
         last = None
         for message in bag.messages(['/diagnostics']) if '/diagnostics' in bag.topics else ():

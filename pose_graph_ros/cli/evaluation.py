@@ -1,11 +1,11 @@
 # Copyright 2026 The pose_graph_ros authors
 # SPDX-License-Identifier: Apache-2.0
 """
-Measure how far the corrected path is from the truth and from the fixes, and odometry alone.
+Compute the distances of the corrected path and of odometry alone from the truth and the fixes.
 
-Distances are taken at the stamps of the truth or of the fixes, with the paths interpolated at
-them; what lies outside the time of a path is left out. Odometry has a frame of its own, so it is
-first laid over the truth (or the fixes) as well as a rigid motion can: the kindest view of it.
+Paths are interpolated at the stamps of the truth or of the fixes; stamps outside a path are
+ignored. Odometry has its own frame, so it is first aligned with the truth (or the fixes) by the
+best rigid motion, which is the most favourable comparison for it.
 """
 
 from collections.abc import Mapping, Sequence
@@ -15,39 +15,40 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from pose_graph_ros.core import alignment, se2
-from pose_graph_ros.core.se2 import FloatArray, IntArray
-from pose_graph_ros.core.trajectory import Trajectory
+from pose_graph_ros.core.alignment import estimator
+from pose_graph_ros.core.geometry import se2
+from pose_graph_ros.core.geometry.se2 import FloatArray, IntArray
+from pose_graph_ros.core.geometry.trajectory import Trajectory
 
 
 @dataclass(frozen=True, slots=True)
 class Drive:
     """
-    What went into the pose graph, what came out, and the truth if it is known.
+    Input and result of the pose graph, and the truth if it is known.
 
     Raises
     ------
     ValueError
-        If the shapes do not fit or a position is not finite.
+        If shapes do not match or a pose is not finite.
 
     """
 
     odometry: Trajectory
     """Raw odometry, `T_odom_base`."""
     fix_stamps_ns: IntArray
-    """Shape (M,) [ns]."""
+    """Stamps of the fixes, shape (M,) [ns]."""
     fix_positions: FloatArray
     """Positions of the fixes in the map, shape (M, 2) [m]."""
     fix_held_out: npt.NDArray[np.bool_]
-    """Fixes that the pose graph did not get, shape (M,)."""
+    """Whether a fix was kept out of the pose graph, shape (M,)."""
     corrected: Trajectory
-    """The result, `T_map_base`."""
+    """Result, `T_map_base`."""
     truth: Trajectory | None
-    """`T_map_base`."""
+    """True poses, `T_map_base`; None if unknown."""
     loop_stamps_ns: IntArray
     """Stamps of both ends of the loop closures, shape (L, 2) [ns]."""
     map_axes: tuple[str, str] = ('x', 'y')
-    """What the axes of the map are called."""
+    """Names of the axes of the map."""
 
     def __post_init__(self) -> None:
         count = len(self.fix_stamps_ns)
@@ -66,7 +67,7 @@ class Drive:
 
 @dataclass(frozen=True, slots=True)
 class ErrorRow:
-    """Statistics of one kind of error; it stands for at least one value."""
+    """Statistics of at least one error of one kind."""
 
     name: str
     count: int
@@ -79,9 +80,9 @@ class ErrorRow:
 
 def fit_rigid(source: FloatArray, target: FloatArray) -> FloatArray:
     """
-    Return the rigid motion that lays points over others with the least sum of squares.
+    Return the rigid motion that aligns points with others in the least-squares sense.
 
-    All points count alike. If they say nothing about the angle it is 0.
+    All points have the same weight. If they do not determine the angle, it is 0.
 
     Parameters
     ----------
@@ -91,7 +92,7 @@ def fit_rigid(source: FloatArray, target: FloatArray) -> FloatArray:
     Returns
     -------
     ndarray, shape (3,)
-        `T_target_source`: `se2.transform(it, source)` is next to `target`.
+        `T_target_source`; `se2.transform` with it moves `source` onto `target`.
 
     Raises
     ------
@@ -102,14 +103,14 @@ def fit_rigid(source: FloatArray, target: FloatArray) -> FloatArray:
     if source.shape != target.shape or source.ndim != 2 or len(source) == 0:
         raise ValueError(
             f'expected equally many points (N, 2), N > 0, got {source.shape} and {target.shape}')
-    return se2.wrapped(alignment.align(source, target, np.ones(len(source))).T_map_odom)
+    return se2.wrapped(estimator.align(source, target, np.ones(len(source))).T_map_odom)
 
 
 def place_odometry(drive: Drive) -> Trajectory:
     """
-    Return the odometry laid over the truth if known, else over the fixes, else the result.
+    Return the odometry aligned with the truth if known, else with the fixes, else the result.
 
-    Where even the result shares no time with the odometry, the odometry stays where it is.
+    Odometry that does not overlap with any of them in time is returned unchanged.
     """
     anchors = [(drive.fix_stamps_ns, drive.fix_positions),
                (drive.corrected.stamps_ns, drive.corrected.poses[:, :2])]
@@ -128,7 +129,7 @@ def distances(
     path: Trajectory, stamps_ns: IntArray, positions: FloatArray,
 ) -> tuple[IntArray, FloatArray]:
     """
-    Return the distances of a path from stamped positions where the path covers their stamps.
+    Return the distances of a path from positions at the stamps that the path covers.
 
     Parameters
     ----------
@@ -140,9 +141,9 @@ def distances(
     Returns
     -------
     stamps_ns : ndarray, shape (K,)
-        Those of the stamps that the path covers [ns].
+        Stamps that the path covers [ns].
     distances : ndarray, shape (K,)
-        At these stamps [m].
+        Distances at these stamps [m].
 
     """
     inside = path.covers(stamps_ns)
@@ -151,7 +152,17 @@ def distances(
 
 
 def error_rows(name: str, errors: FloatArray, unit: str = 'm') -> list[ErrorRow]:
-    """Return the row of statistics of non-negative errors, shape (N,); no row without errors."""
+    """
+    Return a list with the statistics of errors; an empty one without errors.
+
+    Parameters
+    ----------
+    name : str
+    errors : ndarray, shape (N,)
+        Absolute values.
+    unit : str
+
+    """
     if len(errors) == 0:
         return []
     return [ErrorRow(
@@ -161,9 +172,9 @@ def error_rows(name: str, errors: FloatArray, unit: str = 'm') -> list[ErrorRow]
 
 def evaluate(drive: Drive) -> list[ErrorRow]:
     """
-    Compare odometry alone, the fixes and the corrected path with the truth and with the fixes.
+    Return the errors of odometry, fixes and corrected path to the truth and to the fixes.
 
-    Rows for which there is nothing to compare are left out.
+    Rows without any error are left out.
     """
     rows: list[ErrorRow] = []
     paths = {'odometry alone': place_odometry(drive), 'corrected path': drive.corrected}
@@ -188,7 +199,7 @@ def evaluate(drive: Drive) -> list[ErrorRow]:
 def format_table(rows: Sequence[ErrorRow]) -> str:
     """Return the rows as a plain text table of less than 80 columns."""
     if len(rows) == 0:
-        return 'nothing to compare: neither truth nor fixes share time with the paths'
+        return 'nothing to compare: neither truth nor fixes overlap with the paths in time'
     width = max(len(row.name) for row in rows)
     lines = [f'{"":{width}}  {"median":>7} {"rms":>7} {"95 %":>7} {"max":>7}      {"count":>7}']
     for row in rows:
@@ -207,9 +218,9 @@ def summary(
     ----------
     drive : Drive
     rows : sequence of ErrorRow
-        What `evaluate` said.
+        Result of `evaluate`.
     extra : mapping
-        Further figures; they win over those of this function.
+        Further figures, which replace figures with the same name.
 
     """
     stamps, positions = drive.corrected.stamps_ns, drive.corrected.poses[:, :2]

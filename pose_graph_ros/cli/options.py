@@ -1,6 +1,6 @@
 # Copyright 2026 The pose_graph_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""Command-line options that several tools share."""
+"""Command line options shared by several tools."""
 
 import argparse
 from collections.abc import Mapping
@@ -9,27 +9,30 @@ from typing import Any
 
 import yaml
 
+from pose_graph_ros.adapters.bag_inputs import OPTIONS
+from pose_graph_ros.adapters.bags import one_line
+from pose_graph_ros.adapters.parameters import checked
 from pose_graph_ros.core.exceptions import ConfigError
-from pose_graph_ros.ros.inputs import OPTIONS
-from pose_graph_ros.ros.parameters import checked
 
 
 def add_inputs(parser: argparse.ArgumentParser) -> None:
-    """Add the options that choose topics, and what is held out."""
+    """Add the options that choose topics and the fixes to hold out."""
     group = parser.add_argument_group(
-        'topics in the bag', 'where an option is not given, the only topic of its type is taken')
+        'topics in the bag', 'by default, the only topic of the type is used')
     group.add_argument('--odom', metavar='TOPIC', help='nav_msgs/Odometry')
     group.add_argument('--fix', metavar='TOPIC', help='sensor_msgs/NavSatFix')
     group.add_argument('--global-pose', metavar='TOPIC',
                        help='geometry_msgs/PoseWithCovarianceStamped in the map')
     group.add_argument('--loop-closure', metavar='TOPIC',
-                       help='geometry_msgs/PoseWithCovarianceStamped seen from another pose')
+                       help='geometry_msgs/PoseWithCovarianceStamped relative to another pose')
     group.add_argument('--imu', metavar='TOPIC',
-                       help='sensor_msgs/Imu with an absolute heading, if sources list it')
+                       help='sensor_msgs/Imu with an absolute heading, if the parameter sources '
+                            'lists imu')
     group.add_argument('--truth', metavar='TOPIC',
-                       help='Odometry or PoseStamped in the map, for comparison alone')
+                       help='Odometry, PoseStamped or PoseWithCovarianceStamped in the map, '
+                            'only used for comparison')
     parser.add_argument('--hold-out', metavar='N', type=int, default=0,
-                        help='keep every N-th fix out of the graph and measure against it')
+                        help='keep every N-th fix out of the graph and use it for comparison')
 
 
 def add_parameters(parser: argparse.ArgumentParser) -> None:
@@ -37,22 +40,22 @@ def add_parameters(parser: argparse.ArgumentParser) -> None:
     parser.add_argument('--params-file', metavar='FILE', type=Path,
                         help='ROS 2 parameter file of the node')
     parser.add_argument('-p', '--param', metavar='NAME:=VALUE', action='append', default=[],
-                        help='a parameter of the node, as after --ros-args')
+                        help='parameter of the node, as after --ros-args; may be repeated')
 
 
 def wanted_topics(options: argparse.Namespace) -> dict[str, str | None]:
-    """Return the topics that the options name, by source."""
+    """Return the topics given by the options, by name of the source; None if not given."""
     return {source: getattr(options, source) for source in OPTIONS}
 
 
 def parameter_values(options: argparse.Namespace) -> dict[str, Any]:
     """
-    Return all parameters as the node would have them.
+    Return all parameters of the node by the options, as the node would read them.
 
     Raises
     ------
     ConfigError
-        If a file or a value is not what the node takes.
+        If the file cannot be read, or a parameter is invalid.
 
     """
     given: dict[str, Any] = {}
@@ -62,12 +65,15 @@ def parameter_values(options: argparse.Namespace) -> dict[str, Any]:
         name, separator, value = text.partition(':=')
         if separator == '':
             raise ConfigError(f'--param: expected NAME:=VALUE, got {text!r}')
-        given[name] = yaml.safe_load(value)
+        try:
+            given[name] = yaml.safe_load(value)
+        except yaml.YAMLError as error:
+            raise ConfigError(f'--param {name}: {value!r} is not YAML') from error
     return checked(given)
 
 
 def ros_arguments(options: argparse.Namespace) -> list[str]:
-    """Return the same parameters as arguments for the node."""
+    """Return the command line arguments that give the node the same parameters."""
     arguments = ['--ros-args']
     if options.params_file is not None:
         arguments += ['--params-file', str(options.params_file.resolve())]
@@ -77,11 +83,11 @@ def ros_arguments(options: argparse.Namespace) -> list[str]:
 
 
 def _read_file(path: Path) -> dict[str, Any]:
-    """Read the parameters that a ROS 2 parameter file has for the node."""
+    """Return the parameters for the node in a ROS 2 parameter file."""
     try:
         content = yaml.safe_load(path.read_text(encoding='utf-8'))
     except (OSError, UnicodeDecodeError, yaml.YAMLError) as error:
-        raise ConfigError(f'{path}: cannot be read as yaml: {error}') from error
+        raise ConfigError(f'{path}: cannot be read as yaml: {one_line(error)}') from error
     given: dict[str, Any] = {}
     for name, section in (content if isinstance(content, Mapping) else {}).items():
         if str(name).rpartition('/')[2] not in ('**', '*', 'pose_graph'):

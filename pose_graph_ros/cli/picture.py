@@ -1,9 +1,10 @@
 # Copyright 2026 The pose_graph_ros authors
 # SPDX-License-Identifier: Apache-2.0
 """
-Draw a drive: a map of all paths, and below it how far off they are over time.
+Draw a drive: a map of all paths, and below it (beside it, if it is tall) their errors over time.
 
-The colours are after Okabe and Ito: people with any kind of colour vision tell them apart.
+The colours follow Okabe and Ito, so that people with any kind of colour vision can distinguish
+them.
 """
 
 from pathlib import Path
@@ -18,44 +19,46 @@ from matplotlib.ticker import FuncFormatter, MultipleLocator
 import numpy as np
 
 from pose_graph_ros.cli.evaluation import distances, Drive, evaluate, place_odometry
-from pose_graph_ros.core.se2 import FloatArray, IntArray
-from pose_graph_ros.core.trajectory import Trajectory
+from pose_graph_ros.core.geometry.se2 import FloatArray, IntArray
+from pose_graph_ros.core.geometry.trajectory import Trajectory
 
 BLUE, ORANGE, VERMILION, GREEN, PURPLE = '#0072B2', '#E69F00', '#D55E00', '#009E73', '#B583A4'
 INK, GREY, GRID, SHADE = '#222222', '#666666', '#E2E2E2', '#F0F0F0'
 WIDTH, DPI = 16.0, 100
-"""Width of the picture [inch] and dots per inch."""
+"""Width of the picture [inch] and resolution [dots per inch]."""
 LEFT, RIGHT, TOP, BETWEEN, BOTTOM = 0.8, 0.3, 0.95, 1.05, 0.6
 """Margins of the panels [inch]."""
 LEGEND_WIDTH, ERROR_HEIGHT = 2.9, 2.5
+"""Width of the legend and height of the plot of errors [inch]."""
 MAP_HEIGHTS = (4.5, 9.0)
-"""Least and greatest height of the map [inch]; between them it has the shape of the drive."""
+"""Smallest and largest height of the map [inch]; in between it depends on the drive."""
 TALL, TALL_HEIGHT, TALL_WIDTHS = 1.15, 8.4, (4.5, 7.5)
-"""A drive this much taller than wide has its map beside the errors: height and widths [inch]."""
+"""Smallest ratio of height to width for a map beside the errors; its height and widths [inch]."""
 OUTAGE_S = 5.0
-"""A pause of the fixes longer than this and than ten usual periods is an outage [s]."""
+"""An outage is a time without fixes of more than this [s] and more than 10 median periods."""
 MIN_FIXES = 3
-"""With fewer fixes there is no usual period."""
+"""With fewer fixes no outages are shown."""
 SECOND = 10**9
+"""One second [ns]."""
 TICK_SPACING = 1.6
-"""Of the grid of the map, at most [inch]."""
+"""Largest spacing of the grid of the map [inch]."""
 TWO_DIGITS = 10.0
-"""Errors below are given in centimetres [m]."""
+"""Errors below this are shown with two digits after the point [m]."""
 LOG_RATIO = 4.0
-"""The error axis is logarithmic if odometry alone is this many times worse than the rest."""
+"""The error axis is logarithmic if the errors of odometry exceed the others by this factor."""
 LOG_FLOOR = 0.05
-"""What lies below cannot be told apart on a logarithmic axis [m]."""
+"""Lower end of a logarithmic error axis [m]."""
 
 
 def draw_drive(drive: Drive, file: Path, title: str) -> None:
     """
-    Draw a drive into a picture, 1600 pixels wide.
+    Draw a drive as a picture with a width of 1600 pixels, and write it to a file.
 
     Parameters
     ----------
     drive : Drive
     file : Path
-        What is written; the suffix (`.png`, `.svg`, `.pdf`) chooses the format.
+        Its suffix (`.png`, `.svg`, `.pdf`) determines the format.
     title : str
 
     """
@@ -94,7 +97,7 @@ def draw_drive(drive: Drive, file: Path, title: str) -> None:
 
 
 def _add_axes(figure: Figure, box: tuple[float, float, float, float]) -> Axes:
-    """Add a panel; left, bottom, width, height are in inches."""
+    """Add a panel with a box (left, bottom, width, height) in inches."""
     width, height = figure.get_size_inches()
     left, bottom, box_width, box_height = box
     axes = figure.add_axes(
@@ -108,7 +111,7 @@ def _add_axes(figure: Figure, box: tuple[float, float, float, float]) -> Axes:
 
 
 def _limits(drive: Drive, odometry: Trajectory) -> tuple[FloatArray, FloatArray]:
-    """Return two corners of the map: it shows the paths, but of odometry what stays near them."""
+    """Return two corners of the map; odometry and fixes far from the other paths are cut off."""
     paths = [drive.corrected, *([] if drive.truth is None else [drive.truth])]
     near = np.concatenate([path.poses[:, :2] for path in paths])
     stray = np.concatenate((odometry.poses[:, :2], drive.fix_positions))
@@ -123,13 +126,13 @@ def _limits(drive: Drive, odometry: Trajectory) -> tuple[FloatArray, FloatArray]
 
 
 def _nice_step(step: float) -> float:
-    """Return the largest of 1, 2, 5, 10, 20, 50, ... that is at most the step, but 1 at least."""
+    """Return the largest of 1, 2, 5, 10, 20 and so on that is at most the step, at least 1."""
     power = 10.0 ** np.floor(np.log10(max(step, 1.0)))
     return float(max(factor * power for factor in (1, 2, 5) if factor * power <= max(step, 1.0)))
 
 
 def _facts(drive: Drive) -> str:
-    """Return the line below the title."""
+    """Return the subtitle: duration, length and numbers of measurements."""
     path = max(drive.corrected, drive.odometry, key=len)
     parts = []
     if len(path) > 1:
@@ -143,6 +146,7 @@ def _facts(drive: Drive) -> str:
 
 
 def _draw_map(axes: Axes, drive: Drive, odometry: Trajectory) -> None:
+    """Draw all paths and measurements, with median and rms of the errors in the legend."""
     rows = {row.name: row for row in evaluate(drive)}
     reference = next(
         (name for name in ('truth', 'fixes held out', 'fixes used')
@@ -196,39 +200,39 @@ def _draw_map(axes: Axes, drive: Drive, odometry: Trajectory) -> None:
 
 
 def _draw_errors(axes: Axes, drive: Drive, odometry: Trajectory) -> None:
-    """Draw distances over time: to the truth, else to the fixes, else to the corrected path."""
+    """Draw distances over time to the truth, else to the fixes, else to the corrected path."""
     paths = [path for path in (odometry, drive.corrected) if len(path)]
     begin = min((int(path.stamps_ns[0]) for path in paths), default=0)
     end = max((int(path.stamps_ns[-1]) for path in paths), default=SECOND)
     lines: list[tuple[Trajectory, IntArray, FloatArray, dict[str, Any]]]
-    look_odometry = {'color': PURPLE, 'linewidth': 1.2, 'zorder': 2}
-    look_fixes = {'color': ORANGE, 'marker': 'o', 'markersize': 3, 'markeredgewidth': 0,
+    odometry_style = {'color': PURPLE, 'linewidth': 1.2, 'zorder': 2}
+    fixes_style = {'color': ORANGE, 'marker': 'o', 'markersize': 3, 'markeredgewidth': 0,
                   'linestyle': 'none', 'alpha': 0.6, 'zorder': 1}
-    look_corrected = {'color': BLUE, 'linewidth': 2.2, 'zorder': 3}
+    corrected_style = {'color': BLUE, 'linewidth': 2.2, 'zorder': 3}
     stamps, positions = drive.fix_stamps_ns, drive.fix_positions
     if drive.truth is not None:
         target = 'the truth'
         true_stamps, true_positions = drive.truth.stamps_ns, drive.truth.poses[:, :2]
-        lines = [(odometry, true_stamps, true_positions, look_odometry),
-                 (drive.truth, stamps, positions, look_fixes),
-                 (drive.corrected, true_stamps, true_positions, look_corrected)]
+        lines = [(odometry, true_stamps, true_positions, odometry_style),
+                 (drive.truth, stamps, positions, fixes_style),
+                 (drive.corrected, true_stamps, true_positions, corrected_style)]
     elif len(stamps) == 0:
         target = 'the corrected path'
         lines = [(odometry, drive.corrected.stamps_ns, drive.corrected.poses[:, :2],
-                  look_odometry)]
+                  odometry_style)]
     else:
         target = 'the fixes'
         held_out = drive.fix_held_out
-        look_held_out = {'color': 'none', 'marker': 'D', 'markeredgecolor': VERMILION,
+        held_out_style = {'color': 'none', 'marker': 'D', 'markeredgecolor': VERMILION,
                          'markersize': 4, 'linestyle': 'none', 'zorder': 4}
-        lines = [(odometry, stamps, positions, look_odometry),
-                 (drive.corrected, stamps, positions, look_corrected),
-                 (drive.corrected, stamps[held_out], positions[held_out], look_held_out)]
+        lines = [(odometry, stamps, positions, odometry_style),
+                 (drive.corrected, stamps, positions, corrected_style),
+                 (drive.corrected, stamps[held_out], positions[held_out], held_out_style)]
 
     highest = []
-    for path, line_stamps, line_positions, look in lines:
+    for path, line_stamps, line_positions, style in lines:
         covered, errors = distances(path, line_stamps, line_positions)
-        axes.plot((covered - begin) * 1e-9, errors, **look)
+        axes.plot((covered - begin) * 1e-9, errors, **style)
         highest.append(float(np.percentile(errors, 99.0)) if len(errors) else 0.0)
     axes.set_xlim(0.0, max((end - begin) * 1e-9, 1.0))
     if highest[0] > LOG_RATIO * max(highest[1:], default=0.0) > 0.0:
@@ -248,7 +252,7 @@ def _draw_errors(axes: Axes, drive: Drive, odometry: Trajectory) -> None:
 
 
 def _outages(drive: Drive, begin: int, end: int) -> list[tuple[float, float]]:
-    """Return begin and end [s] of the times without a fix that the pose graph got."""
+    """Return begin and end of the outages of the fixes in the pose graph [s]."""
     used = np.sort(drive.fix_stamps_ns[~drive.fix_held_out])
     used = used[(used > begin) & (used < end)]
     if len(used) < MIN_FIXES:

@@ -1,10 +1,10 @@
 # Copyright 2026 The pose_graph_ros authors
 # SPDX-License-Identifier: Apache-2.0
 """
-Run a bag through the same engine as the node, without ROS and as fast as it goes.
+Run a bag through the engine of the node, without ROS and as fast as possible.
 
-The messages are read and added as in the node, without threads, and the same full optimisation
-ends the stream, so the path is that of a node which got the same messages.
+Messages are read and added as in the node, but without threads, and the same full optimisation
+follows at the end. The path is the one of a node that receives the same messages.
 """
 
 import argparse
@@ -17,40 +17,55 @@ import sys
 import time
 from typing import Any
 
+from pose_graph_ros.adapters.bag_inputs import (
+    choose_inputs,
+    Inputs,
+    read_inputs,
+    read_static_frames,
+)
+from pose_graph_ros.adapters.bags import BagError, BagReader, MessageError, open_bag
+from pose_graph_ros.adapters.message_reader import MessageReader
+from pose_graph_ros.adapters.sources import backend_config, Kind, source_list
 from pose_graph_ros.cli import options as shared
 from pose_graph_ros.cli.results import collect_drive, write_results
 from pose_graph_ros.core.backend import PoseGraphBackend
-from pose_graph_ros.core.batch import Status
+from pose_graph_ros.core.batch.optimizer import Status
 from pose_graph_ros.core.estimate import UpdateReport
 from pose_graph_ros.core.exceptions import PoseGraphError
 from pose_graph_ros.core.io.g2o import write_g2o
 from pose_graph_ros.core.measurements import Answer, OdometrySample
-from pose_graph_ros.ros.bags import BagError, BagReader, MessageError, open_bag
-from pose_graph_ros.ros.inputs import choose_inputs, Inputs, read_inputs, read_static_frames
-from pose_graph_ros.ros.reader import MessageReader
-from pose_graph_ros.ros.sources import backend_config, Kind, source_list
 
-# An update each time that so many hidden nodes have come keeps the estimate near the optimum.
+# Number of new hidden nodes after which the graph is updated, to keep it near the optimum.
 UPDATE_EVERY = 10
 
 
 @dataclass(frozen=True, slots=True)
 class Replayed:
-    """A bag's run through the engine."""
+    """Result of running a bag through the engine."""
 
     backend: PoseGraphBackend
     report: UpdateReport
-    """Of the closing optimisation."""
+    """Report of the final optimisation."""
     refused: Counter[tuple[str, str]]
-    """Messages that could not be turned into measurements, by input and reason."""
+    """Number of messages without a valid measurement, by source and reason."""
 
 
 def run(bag: BagReader, inputs: Inputs, values: Mapping[str, Any]) -> Replayed:
-    """Feed a bag's messages to a new engine and optimise fully at the end."""
+    """
+    Return a new engine after adding all messages of a bag and a full optimisation.
+
+    Parameters
+    ----------
+    bag : BagReader
+    inputs : Inputs
+    values : mapping
+        All parameters of the node.
+
+    """
     backend = PoseGraphBackend(backend_config(values))
     reader = MessageReader(values)
     for message in read_static_frames(bag):
-        reader.frames.take(message.decode())
+        reader.frames.receive(message.decode())
     refused: Counter[tuple[str, str]] = Counter()
     next_update = UPDATE_EVERY
     for source, message, held_out in read_inputs(bag, inputs):
@@ -113,9 +128,10 @@ def execute(options: argparse.Namespace) -> int:
           f'{estimate.alignment.value}')
     for source, fit in sorted(backend.reports().items()):
         print(f'{source}: squared residual {fit.energy:.3g} sigma^2' + (
-            f'; errors of {fit.errors.sigma_correlated:.3g} m live for {fit.errors.tau:.3g} s'
+            f'; errors of {fit.errors.sigma_correlated:.3g} m with a time constant of '
+            f'{fit.errors.tau:.3g} s'
             if fit.errors.significant else '') + (
-            f', but are taken for white: see {source}.correlation_time'
+            f', but are treated as white: see {source}.correlation_time'
             if fit.wrongly_white else ''))
     print('counts: ' + ', '.join(f'{name} {count}' for name, count in counts.items()))
     print(f'\n{table}\n\nwritten: {options.out}/path.tum, drive.png, summary.json, graph.g2o')
@@ -123,7 +139,7 @@ def execute(options: argparse.Namespace) -> int:
 
 
 def main(args: list[str] | None = None) -> int:
-    """Run `replay` as a program of its own."""
+    """Run `replay` as a separate program; return the exit code."""
     parser = argparse.ArgumentParser(
         prog='replay', description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     add_arguments(parser)
@@ -131,10 +147,24 @@ def main(args: list[str] | None = None) -> int:
 
 
 def guarded(execute: Any, options: argparse.Namespace) -> int:
-    """Run a tool; what the user can mend is one line on stderr and exit code 2."""
+    """
+    Run a tool and return its exit code; print errors that the user can correct on one line.
+
+    Parameters
+    ----------
+    execute : callable
+        Tool that is called with `options` and returns the exit code.
+    options : argparse.Namespace
+
+    Returns
+    -------
+    int
+        2 after a `PoseGraphError` or `OSError`, 130 after Ctrl-C, else that of the tool.
+
+    """
     try:
         return int(execute(options))
-    except BrokenPipeError:  # who reads the output has seen enough
+    except BrokenPipeError:  # the reader of the output, such as head, has ended
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return 1
     except (PoseGraphError, OSError) as error:

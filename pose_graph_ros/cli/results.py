@@ -1,6 +1,6 @@
 # Copyright 2026 The pose_graph_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""What a run leaves behind: the corrected path, a picture, a summary and a table of errors."""
+"""Write the results of a run: corrected path, picture, summary and table of errors."""
 
 from collections.abc import Mapping
 import json
@@ -9,9 +9,15 @@ from typing import Any
 
 import numpy as np
 
+from pose_graph_ros.adapters.bag_inputs import Inputs, read_inputs, read_static_frames
+from pose_graph_ros.adapters.bags import BagError, BagReader, MessageError
+from pose_graph_ros.adapters.conversions import planar_pose, stamp_ns
+from pose_graph_ros.adapters.message_reader import MessageReader
+from pose_graph_ros.adapters.sources import Kind
 from pose_graph_ros.cli.evaluation import Drive, evaluate, format_table, summary
 from pose_graph_ros.cli.picture import draw_drive
-from pose_graph_ros.core import se2
+from pose_graph_ros.core.geometry import se2
+from pose_graph_ros.core.geometry.trajectory import Trajectory
 from pose_graph_ros.core.io.tum import write_tum
 from pose_graph_ros.core.measurements import (
     Answer,
@@ -20,15 +26,10 @@ from pose_graph_ros.core.measurements import (
     LoopClosure,
     Position,
 )
-from pose_graph_ros.core.trajectory import Trajectory
-from pose_graph_ros.ros.bags import BagError, BagReader, MessageError
-from pose_graph_ros.ros.conversions import planar_pose, stamp_ns
-from pose_graph_ros.ros.inputs import Inputs, read_inputs, read_static_frames
-from pose_graph_ros.ros.reader import MessageReader
-from pose_graph_ros.ros.sources import Kind
 
 TRUTH_TYPES = ('nav_msgs/msg/Odometry', 'geometry_msgs/msg/PoseStamped',
                'geometry_msgs/msg/PoseWithCovarianceStamped')
+"""Message types of which a topic of the truth can be."""
 
 
 def collect_drive(
@@ -36,7 +37,7 @@ def collect_drive(
     truth_topic: str | None,
 ) -> Drive:
     """
-    Read what went into the graph once more, for comparing it with the corrected path.
+    Return the corrected path together with the measurements of the bag that went into the graph.
 
     Parameters
     ----------
@@ -45,14 +46,19 @@ def collect_drive(
     values : mapping
         All parameters of the node.
     corrected : Trajectory
-        The result, `T_map_base`.
-    truth_topic : str, optional
-        Poses in the map that are taken for the truth.
+        Result, `T_map_base`.
+    truth_topic : str or None
+        Topic of true poses in the map.
+
+    Raises
+    ------
+    BagError
+        If `truth_topic` is missing or of an unsupported type.
 
     """
     reader = MessageReader(values)
     for frames in read_static_frames(bag):
-        reader.frames.take(frames.decode())
+        reader.frames.receive(frames.decode())
     preferred = inputs.of(Kind.ODOMETRY)[0]
     odometry: dict[int, np.ndarray] = {}
     observed: list[tuple[int, np.ndarray, np.ndarray, bool]] = []
@@ -79,7 +85,7 @@ def collect_drive(
     positions = np.array([row[1] for row in observed]).reshape(-1, 2)
     arms = np.array([row[2] for row in observed]).reshape(-1, 2)
     inside = corrected.covers(stamps)
-    if np.any(arms):  # from the antenna to the robot, as the corrected path has it turned
+    if np.any(arms):  # from the antenna to the robot, with the heading of the corrected path
         turn = corrected.at(stamps[inside]) * (0.0, 0.0, 1.0)
         positions[inside] -= se2.transform(turn, arms[inside])
     return Drive(
@@ -93,12 +99,17 @@ def collect_drive(
 
 def read_truth(bag: BagReader, topic: str) -> Trajectory:
     """
-    Read poses that are taken for the truth.
+    Return the true poses in a bag; invalid messages are ignored.
+
+    Parameters
+    ----------
+    bag : BagReader
+    topic : str
 
     Raises
     ------
     BagError
-        If there is no such topic, or its type holds no pose.
+        If the topic is missing or of an unsupported type.
 
     """
     info = bag.topics.get(topic)
@@ -125,17 +136,22 @@ def _trajectory(poses: Mapping[int, np.ndarray]) -> Trajectory:
 
 def write_results(drive: Drive, folder: Path, title: str, facts: Mapping[str, Any]) -> str:
     """
-    Write `path.tum`, `drive.png` and `summary.json` into a folder; return the table of errors.
+    Write `path.tum`, `drive.png` and `summary.json` to a folder.
 
     Parameters
     ----------
     drive : Drive
     folder : Path
-        Made if it is not there.
+        Created if it does not exist.
     title : str
-        Of the picture.
+        Title of the picture.
     facts : mapping
-        What else belongs into the summary.
+        Further entries of the summary.
+
+    Returns
+    -------
+    str
+        Table of errors.
 
     """
     folder.mkdir(parents=True, exist_ok=True)

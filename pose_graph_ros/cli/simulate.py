@@ -1,19 +1,19 @@
 # Copyright 2026 The pose_graph_ros authors
 # SPDX-License-Identifier: Apache-2.0
 """
-Simulate a drive through some city blocks, whose truth is known, and write it as a rosbag2.
+Simulate a drive through some city blocks with known ground truth, and write it as a rosbag2.
 
-The car keeps to the right lane of gently bent streets, slows down for corners, stops at lights
-and drives some streets again, on the second lap all of them. It has
+The car keeps to the right lane of slightly curved streets, slows down for corners, stops at
+traffic lights, and drives along some streets twice, on the second lap along all of them. It has
 
 - wheel odometry: two wheels with wrong radii, a wrong track width, slip in turns and in a few
-  events, and a heading that wanders; the odometry's frame is turned by about 2 rad to the map;
-- fixes: a slow (Gauss-Markov) and a white error, none for 70 s around the begin of lap two;
-- loop closures, wherever it comes to a place for the second time in the same direction.
+  events, and a drifting heading; the odometry frame is rotated by about 2 rad against the map;
+- fixes: a slow (Gauss-Markov) and a white error, and an outage of 70 s around the start of lap 2;
+- loop closures at places that are visited again in the same direction.
 
-The frame `map` is east and north on the plane that touches the ellipsoid at the position that the
-*first fix of the bag* reports, error included, because a localisation that starts from fixes has
-no better origin. The antenna sits over base_link.
+The frame `map` is east and north on the plane that touches the ellipsoid at the measured position
+of the *first fix of the bag*, including its error, because a localisation that starts from fixes
+has no better origin. The antenna is above base_link.
 """
 
 from dataclasses import dataclass
@@ -30,74 +30,84 @@ from pose_graph_ros.cli.bag_messages import (
     write_bag,
 )
 from pose_graph_ros.cli.circuit import drive_circuit, gauss_markov, PERIOD_S
-from pose_graph_ros.core import se2
-from pose_graph_ros.core.se2 import FloatArray, IntArray
-from pose_graph_ros.core.tangent_plane import TangentPlane
-from pose_graph_ros.core.trajectory import Trajectory
+from pose_graph_ros.core.geometry import se2
+from pose_graph_ros.core.geometry.geodesy import TangentPlane
+from pose_graph_ros.core.geometry.se2 import FloatArray, IntArray
+from pose_graph_ros.core.geometry.trajectory import Trajectory
 
 MIN_DURATION_S = 10.0
 START_NS = 1_746_518_400_250_000_000
+"""Stamp of the start [ns]."""
 CITY = TangentPlane(50.7271, 7.0866, 61.0)
-"""The plane in which the circuit lies; it begins where the plane touches the ellipsoid."""
+"""Plane of the circuit, which begins at the point where the plane touches the ellipsoid."""
 ODOMETRY_PERIOD_S = 0.05
 TRACK_WIDTH = 1.5
+"""Distance of the wheels [m]."""
 WHEEL_SCALE = (1.0068, 1.0070)
-"""Measured over true distance of the left and the right wheel."""
+"""Ratio of measured to true distance of the left and the right wheel."""
 TRACK_SCALE = 1.012
+"""Ratio of assumed to true track width."""
 SLIP_EVENTS_PER_S = 1.0 / 60.0
 SLIP_S = 0.012
-"""Excess of a wheel's speed in a slip event, integrated over the event [s]."""
+"""Relative excess of the speed of a wheel in a slip event, integrated over the event [s]."""
 HEADING_WANDER = 1.2e-3
-"""Standard deviation of the wandering error of the yaw rate [rad/s]."""
+"""Standard deviation of the time-correlated error of the yaw rate [rad/s]."""
 WANDER_TIME_S = 40.0
+"""Time constant of this error [s]."""
 ODOMETRY_VARIANCES = (1e-3, 1e-3, 1e6, 1e6, 1e6, 3e-2)
-"""Constant diagonal that common drivers give to the pose and to the twist."""
+"""Constant variances of pose and twist, as many drivers set them."""
 FIX_PERIOD_S = 0.5
 FIX_SIGMA_SLOW = 1.2
 FIX_SIGMA_WHITE = 0.4
+"""Standard deviations of the time-correlated and the white error of fixes [m]."""
 FIX_CORRELATION_S = 60.0
+"""Time constant of the time-correlated error [s]."""
 OUTAGE_S = (-40.0, 30.0)
-"""Begin and end of the outage of the fixes relative to the begin of the second lap [s]."""
+"""Start and end of the outage of the fixes relative to the start of the second lap [s]."""
 ODOMETRY_LATENCY_NS, FIX_LATENCY_NS, LOOP_LATENCY_NS = 4_000_000, 130_000_000, 800_000_000
-"""From the stamp of a measurement to its recording [ns]."""
+"""Time from the stamp of a measurement to its recording [ns]."""
 LOOP_SIGMAS = (0.1, 0.1, np.deg2rad(1.0))
+"""Standard deviations of loop closures [m, m, rad]."""
 LOOP_SPACING = 25.0
+"""Length of the stretches of the path with at most one loop closure each [m]."""
 LOOP_RADIUS = 2.0
 LOOP_ANGLE = np.deg2rad(20.0)
+"""Largest distance [m] and angle [rad] between the true poses of a loop closure."""
 LOOP_MIN_TIME_S = 15.0
 LOOP_MIN_DISTANCE = 50.0
+"""Smallest time [s] and driven distance [m] between the poses of a loop closure."""
 
 
 @dataclass(frozen=True, slots=True)
 class SimulatedDrive:
-    """What the sensors of a simulated drive said, and the truth."""
+    """Measurements and true poses of a simulated drive."""
 
     truth: Trajectory
-    """`T_map_base`."""
+    """True poses, `T_map_base`."""
     odometry: Trajectory
-    """`T_odom_base`."""
+    """Measured poses, `T_odom_base`."""
     fix_stamps_ns: IntArray
-    """Shape (M,) [ns]."""
+    """Stamps of the fixes, shape (M,) [ns]."""
     fixes: FloatArray
-    """Latitude, longitude, ellipsoidal height, shape (M, 3) [deg, deg, m]."""
+    """Latitude, longitude and ellipsoidal height, shape (M, 3) [deg, deg, m]."""
     fix_sigma: float
     """Standard deviation of a fix along each of east and north [m]."""
     loop_stamps_ns: IntArray
     """Stamps of the earlier and of the later pose of the loop closures, shape (L, 2) [ns]."""
     loop_poses: FloatArray
-    """Measured pose of the later in the frame of the earlier, shape (L, 3) [m, m, rad]."""
+    """Measured later pose in the frame of the earlier one, shape (L, 3) [m, m, rad]."""
     loop_covariance: FloatArray
-    """Covariance of each of the measured poses, shape (3, 3)."""
+    """Covariance of each measured pose, shape (3, 3)."""
 
 
 def simulate_drive(seed: int = 1, duration_s: float = 440.0) -> SimulatedDrive:
     """
-    Simulate a drive; equal arguments give equal drives.
+    Return a simulated drive; equal arguments give equal drives.
 
     Parameters
     ----------
     seed : int
-        Seed of all that is random: the sensors' errors, the way within the lane, waits at lights.
+        Seed of the sensor errors, the position within the lane and the waits at traffic lights.
     duration_s : float
         Length of the recording [s]; the second lap begins after about 310 s.
 
@@ -134,6 +144,13 @@ def write_drive(drive: SimulatedDrive, folder: str | Path, *, overwrite: bool = 
     """
     Write a drive as a rosbag2 with `/odom`, `/gps/fix`, `/loop_closure` and `/ground_truth`.
 
+    Parameters
+    ----------
+    drive : SimulatedDrive
+    folder : str or Path
+    overwrite : bool
+        Whether to replace an existing bag.
+
     Raises
     ------
     BagError
@@ -155,7 +172,7 @@ def write_drive(drive: SimulatedDrive, folder: str | Path, *, overwrite: bool = 
 def _jittered_stamps(
     generator: np.random.Generator, truth: Trajectory, period_s: float,
 ) -> IntArray:
-    """Return stamps [ns] of a sensor within the time of the truth: own phase, own jitter."""
+    """Return stamps of a sensor during the truth, with random phase and jitter [ns]."""
     span = truth.stamps_ns[-1] - truth.stamps_ns[0]
     ticks = np.arange(generator.uniform(0.2, 0.8), span * 1e-9 / period_s - 0.2)
     ticks += np.clip(generator.normal(0.0, 0.01, len(ticks)), -0.1, 0.1)
@@ -164,13 +181,13 @@ def _jittered_stamps(
 
 
 def _odometry(generator: np.random.Generator, truth: Trajectory) -> Trajectory:
-    """Integrate what the wheels measure; return `T_odom_base`."""
+    """Return `T_odom_base`, integrated from simulated measurements of the wheels."""
     steps = se2.between(truth.poses[:-1], truth.poses[1:])
     forward, turn = np.hypot(steps[:, 0], steps[:, 1]), steps[:, 2]
     left = WHEEL_SCALE[0] * (forward - 0.5 * TRACK_WIDTH * turn)
     right = WHEEL_SCALE[1] * (forward + 0.5 * TRACK_WIDTH * turn)
 
-    # in a turn the inner wheel skids a little, and now and then a wheel spins for half a second
+    # the inner wheel skids slightly in turns, and sometimes a wheel spins for half a second
     turning = np.abs(turn) / PERIOD_S
     left *= 1.0 + np.where(turn > 0.0, 0.02, 0.005) * turning
     right *= 1.0 + np.where(turn < 0.0, 0.02, 0.005) * turning
@@ -211,8 +228,8 @@ def _fixes(
 def _loop_closures(
     generator: np.random.Generator, truth: Trajectory, distance: FloatArray,
 ) -> tuple[IntArray, FloatArray]:
-    """Return stamps (L, 2) and measured poses (L, 3) where the car comes along again."""
-    # a place every half metre of the way, so that a standing car is at one place only
+    """Return stamps (L, 2) and measured poses (L, 3) of loop closures at revisited places."""
+    # a place every half metre of the path, so that a car at rest is at one place only
     places = np.unique(np.searchsorted(distance, np.arange(0.0, distance[-1], 0.5)))
     poses, stamps = truth.poses[places], truth.stamps_ns[places]
     pairs = KDTree(poses[:, :2]).query_pairs(LOOP_RADIUS, output_type='ndarray')
@@ -222,11 +239,11 @@ def _loop_closures(
         & (distance[places[new]] - distance[places[old]] > LOOP_MIN_DISTANCE)
         & (np.abs(se2.wrap(poses[new, 2] - poses[old, 2])) < LOOP_ANGLE))
     old, new = old[good], new[good]
-    # one pair, drawn by lot, of each stretch of the way
-    lot = generator.permutation(len(new))
-    _, first = np.unique(distance[places[new[lot]]] // LOOP_SPACING, return_index=True)
-    old, new = old[lot[first]], new[lot[first]]
-    # a camera knows nothing of the other sensors' stamps
+    # one random pair of each stretch of the path
+    order = generator.permutation(len(new))
+    _, first = np.unique(distance[places[new[order]]] // LOOP_SPACING, return_index=True)
+    old, new = old[order[first]], new[order[first]]
+    # stamps of a camera, which is not synchronised with the other sensors
     pairs_ns = np.column_stack((stamps[old], stamps[new]))
     pairs_ns += generator.integers(1, round(PERIOD_S * 1e9), pairs_ns.shape)
     pairs_ns = np.minimum(pairs_ns, truth.stamps_ns[-1])

@@ -1,44 +1,217 @@
 # Copyright 2026 The pose_graph_ros authors
 # SPDX-License-Identifier: Apache-2.0
 """
-All settings of the engine and their defaults, in one place.
+All settings of the engine and their defaults.
 
-The ROS parameters, the yaml file and the README's table take their defaults from here.
+The ROS parameters, the yaml files and the tables in the documentation take their defaults from
+here. All constructors raise ConfigError if a value is out of range.
 """
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
+from enum import Enum
+import math
 
 from pose_graph_ros.core.exceptions import ConfigError
 from pose_graph_ros.core.measurements import HeadingOnly, LoopClosure, Measurement
-from pose_graph_ros.core.sources import (
-    HEADINGS,
-    LOOP_CLOSURES,
-    MeasurementSource,
-    OdometrySource,
-    POSITIONS,
-    require,
-)
 
-# Motion since the last hidden node below these is standing still: odometry jitters [m, rad].
+# Motion since the last hidden node below which the robot stands still [m], [rad].
 REST_DISTANCE = 0.05
 REST_HEADING = 0.05
+# Sigma of a heading that is uniform on the circle [rad].
+FLAT_GUESS = math.pi / math.sqrt(3.0)
+
+
+def require(settings: object, *names: str, positive: bool = False) -> None:
+    """
+    Raise ConfigError unless the named settings are finite and not negative.
+
+    Parameters
+    ----------
+    settings : object
+    *names : str
+        Attributes of `settings`.
+    positive : bool
+        Whether 0 is invalid, too.
+
+    """
+    for name in names:
+        value = getattr(settings, name)
+        if not math.isfinite(value) or value < 0.0 or (positive and value == 0.0):
+            expected = 'a positive number' if positive else 'a number that is not negative'
+            raise ConfigError(
+                f'{type(settings).__name__}.{name}: expected {expected}, got {value!r}')
+
+
+class Loss(Enum):
+    """Loss of a constraint as a function of its energy; see `graph.losses`."""
+
+    NONE = 'none'
+    HUBER = 'huber'
+    CAUCHY = 'cauchy'
+
+
+class Correlation(Enum):
+    """Model of time-correlated errors of measurements."""
+
+    BIAS = 'bias'
+    """A Gauss-Markov bias of the source is estimated in the graph."""
+    INFLATE = 'inflate'
+    """Covariances are inflated."""
+
+
+class Heading(Enum):
+    """Whether the heading of a global pose is used."""
+
+    AUTO = 'auto'
+    """If its variance is positive and smaller than that of a uniform distribution."""
+    ALWAYS = 'always'
+    """The default replaces an unknown variance."""
+    NEVER = 'never'
+
+
+class NoiseFrom(Enum):
+    """Source of the noise of odometry."""
+
+    MODEL = 'model'
+    """`OdometryNoise`, from the length of the path and the turns."""
+    TWIST = 'twist'
+    """Covariance of the twist in each message, times the time to the next message."""
+
+
+@dataclass(frozen=True, slots=True)
+class OdometryNoise:
+    """
+    Random-walk noise of odometry: variances grow with the path length and the turns.
+
+    The noise of an increment is the sum of the noise of its parts. Except for the small floors,
+    the spacing of the hidden nodes therefore does not change the covariance of the estimate.
+    """
+
+    sigma_distance: float = 0.05
+    """Sigma along the direction of travel [m per sqrt(m) travelled]."""
+    sigma_lateral: float = 0.03
+    """Sigma across the direction of travel [m per sqrt(m) travelled]."""
+    sigma_heading_distance: float = 0.01
+    """Sigma of the heading by distance [rad per sqrt(m) travelled]."""
+    sigma_heading_turn: float = 0.05
+    """Sigma of the heading by turns [rad per sqrt(rad) turned]."""
+    sigma_floor_position: float = 0.002
+    """Sigma of the position added per increment [m]; keeps the information finite at rest."""
+    sigma_floor_heading: float = 0.0005
+    """Sigma of the heading added per increment [rad]."""
+
+    def __post_init__(self) -> None:
+        require(self, 'sigma_distance', 'sigma_lateral', 'sigma_heading_distance',
+                 'sigma_heading_turn')
+        require(self, 'sigma_floor_position', 'sigma_floor_heading', positive=True)
+
+
+@dataclass(frozen=True, slots=True)
+class OdometrySource:
+    """Settings of a source of odometry."""
+
+    noise: OdometryNoise = field(default_factory=OdometryNoise)
+    noise_from: NoiseFrom = NoiseFrom.MODEL
+    covariance_scale: float = 1.0
+    """Factor on the covariance of every increment."""
+    reorder_window: float = 0.25
+    """A sample that is older by stamp than the newest one by up to this is still used [s]."""
+    maximum_speed: float = 60.0
+    """A faster motion counts as a jump of the odometry [m/s]."""
+    loss: Loss = Loss.NONE
+    rejection_threshold: float = 3.0
+    """Threshold k of the loss [sigma]."""
+
+    def __post_init__(self) -> None:
+        require(self, 'covariance_scale', 'maximum_speed', 'rejection_threshold', positive=True)
+        require(self, 'reorder_window')
+
+
+@dataclass(frozen=True, slots=True)
+class CovariancePolicy:
+    """How the covariances of a source are validated; see `sources.validation`."""
+
+    repair: bool = True
+    """Whether invalid covariances are repaired; otherwise the measurement is rejected."""
+    override: tuple[float, ...] = ()
+    """Sigmas that replace every covariance: position [m], heading [rad]; empty for none."""
+    scale: float = 1.0
+    """Factor on the covariance."""
+    position_floor: float = 0.01
+    """Lower bound of the sigma of a position [m]."""
+    heading_floor: float = 0.001
+    """Lower bound of the sigma of a heading [rad]."""
+    position_ceiling: float = 1000.0
+    """Upper bound of the sigma of a position [m]; replaces infinite ones."""
+    default_position: float = 5.0
+    """Sigma of a position if it is unknown [m]."""
+    default_heading: float = 0.3
+    """Sigma of a heading if it is unknown [rad]."""
+    heading: Heading = Heading.AUTO
+
+    def __post_init__(self) -> None:
+        require(self, 'scale', 'position_floor', 'heading_floor', 'position_ceiling',
+                'default_position', 'default_heading', positive=True)
+        if len(self.override) not in (0, 1, 2) or not all(
+                0.0 < sigma < math.inf for sigma in self.override):
+            raise ConfigError('CovariancePolicy.override: expected no, one or two positive '
+                              f'sigmas, got {list(self.override)}')
+        if self.position_ceiling < self.position_floor:
+            raise ConfigError(
+                'CovariancePolicy.position_ceiling: expected at least the floor '
+                f'{self.position_floor}, got {self.position_ceiling}')
+        if self.heading_floor > FLAT_GUESS:
+            raise ConfigError('CovariancePolicy.heading_floor: expected less than that of a flat '
+                              f'guess {FLAT_GUESS:.2f}, got {self.heading_floor}')
+
+
+@dataclass(frozen=True, slots=True)
+class MeasurementSource:
+    """Settings of a source of global poses, positions, headings or loop closures."""
+
+    covariance: CovariancePolicy = field(default_factory=CovariancePolicy)
+    loss: Loss = Loss.NONE
+    rejection_threshold: float = 3.0
+    """Threshold k of the loss [sigma]."""
+    minimum_period: float = 0.0
+    """Of measurements with stamps closer than this only the first to arrive is used [s]."""
+    correlation_time: float = 0.0
+    """Time constant of the errors [s]; 0 for white noise."""
+    correlation: Correlation = Correlation.BIAS
+    white_share: float = 0.05
+    """Fraction of the variance that is white noise if errors are correlated, in [0, 1]."""
+
+    def __post_init__(self) -> None:
+        require(self, 'rejection_threshold', positive=True)
+        require(self, 'minimum_period', 'correlation_time', 'white_share')
+        if self.white_share > 1.0:
+            raise ConfigError('MeasurementSource.white_share: expected a number in [0, 1], '
+                              f'got {self.white_share!r}')
+
+
+POSITIONS = MeasurementSource(loss=Loss.HUBER)
+"""Defaults of a source of global poses or positions."""
+HEADINGS = MeasurementSource(minimum_period=0.5)
+"""Defaults of a source of headings; thinned, as an IMU sends many redundant ones."""
+LOOP_CLOSURES = MeasurementSource(covariance=CovariancePolicy(repair=False))
+"""Defaults of a source of loop closures; those with an invalid covariance are rejected."""
 
 
 @dataclass(frozen=True, slots=True)
 class NodePolicy:
-    """When odometry makes a new hidden node: after enough motion, or as a slow heartbeat."""
+    """Conditions for a new hidden node: enough motion, or a maximum time."""
 
     minimum_travel_distance: float = 1.0
-    """Distance from the last hidden node that makes the next one [m]."""
+    """Distance from the last hidden node at which the next one is created [m]."""
     minimum_travel_heading: float = 0.3
-    """Turn since the last hidden node that makes the next one [rad]."""
+    """Turn since the last hidden node at which the next one is created [rad]."""
     minimum_interval: float = 0.2
-    """Never more hidden nodes than one in this time [s]; bounds the graph at high speed."""
+    """Minimum time between hidden nodes [s]; limits the size of the graph at high speed."""
     moving_interval: float = 1.0
-    """A hidden node at the latest after this time, unless the robot stands still [s]."""
+    """Maximum time between hidden nodes while the robot moves [s]."""
     heartbeat: float = 10.0
-    """A hidden node at the latest after this time, even when standing still [s]."""
+    """Maximum time between hidden nodes at standstill [s]."""
 
     def __post_init__(self) -> None:
         require(self, 'minimum_travel_distance', 'minimum_travel_heading', 'minimum_interval')
@@ -46,12 +219,12 @@ class NodePolicy:
 
     def due(self, distance: float, turned: float, elapsed: float) -> bool:
         """
-        Tell whether a node is due.
+        Tell whether a new hidden node is due.
 
         Parameters
         ----------
         distance, turned, elapsed : float
-            From the last hidden node: straight distance [m], angle [rad] and time [s].
+            Since the last hidden node: straight distance [m], angle [rad] and time [s].
 
         """
         far = distance >= self.minimum_travel_distance or turned >= self.minimum_travel_heading
@@ -62,14 +235,14 @@ class NodePolicy:
 
 @dataclass(frozen=True, slots=True)
 class AlignmentPolicy:
-    """When the angle between odometry and map counts as known from positions alone."""
+    """When the angle between odometry and map, computed from positions, counts as known."""
 
     sigma_heading: float = 0.15
-    """The closed-form angle must be at least this certain [rad]."""
+    """Maximum sigma of the angle [rad]."""
     minimum_baseline: float = 1.0
-    """The positions must span at least this length [m] ..."""
+    """Minimum extent of the positions [m]."""
     baseline_in_sigmas: float = 5.0
-    """... and at least this many sigmas of a position."""
+    """Minimum extent of the positions, in sigmas of a position."""
 
     def __post_init__(self) -> None:
         require(self, 'sigma_heading', 'minimum_baseline', 'baseline_in_sigmas', positive=True)
@@ -77,35 +250,32 @@ class AlignmentPolicy:
 
 @dataclass(frozen=True, slots=True)
 class SolverConfig:
-    """Gauss-Newton with Levenberg-Marquardt damping where a step would raise chi2."""
+    """Settings of Gauss-Newton with Levenberg-Marquardt damping, for a whole graph."""
 
     max_iterations: int = 50
-    """Iterations at the most."""
+    """Maximum number of iterations."""
     step_tolerance: float = 1e-8
-    """Converged when no coordinate would move by more than this any more [m, rad]."""
-    initial_damping: float = 0.0
-    """Factor on the diagonal of H in the first iteration; 0 is Gauss-Newton."""
+    """Converged if no coordinate of the next step is larger than this [m, rad]."""
 
     def __post_init__(self) -> None:
         if self.max_iterations < 1:
             raise ConfigError(f'SolverConfig.max_iterations: expected >= 1, '
                               f'got {self.max_iterations!r}')
         require(self, 'step_tolerance', positive=True)
-        require(self, 'initial_damping')
 
 
 @dataclass(frozen=True, slots=True)
 class SmootherConfig:
-    """How exact the incremental smoother is, and how much work a step may do."""
+    """Accuracy of the incremental smoother, and the work per update."""
 
     alpha: float = 0.02
-    """A node that has moved by less than this many sigmas moves no other node."""
+    """Back-substitution stops at nodes that move by less than this [sigma]."""
     budget: float = 0.001
-    """Squared linearization error [sigma^2] that a step may leave in all that it has moved ..."""
+    """Upper limit of the squared linearisation error that a step may leave [sigma^2]."""
     budget_share: float = 6e-6
-    """... and for each node that it has moved: the smaller of both counts."""
+    """The same limit per node that the step has moved; the smaller limit applies [sigma^2]."""
     max_iterations: int = 5
-    """Iterations of one update at the most; what is left over is done in the next."""
+    """Maximum number of iterations per update; the next update continues."""
 
     def __post_init__(self) -> None:
         require(self, 'alpha', 'budget', 'budget_share')
@@ -121,16 +291,16 @@ class BackendConfig:
     nodes: NodePolicy = field(default_factory=NodePolicy)
     alignment: AlignmentPolicy = field(default_factory=AlignmentPolicy)
     smoother: SmootherConfig = field(default_factory=SmootherConfig)
-    """For the timer: what is left over is done at the next update."""
-    closing: SolverConfig = field(
+    """Of the update at each tick of the timer."""
+    final_optimization: SolverConfig = field(
         default_factory=lambda: SolverConfig(max_iterations=400, step_tolerance=1e-10))
-    """For the full optimisation at the end of a stream; an outage can make it converge slowly."""
+    """Of the full optimisation at the end of a stream; after outages it can converge slowly."""
     odometry: Mapping[str, OdometrySource] = field(default_factory=dict)
-    """Sources of odometry by name, the preferred one first; defaults for others."""
+    """Sources of odometry by name, the preferred one first; others have the defaults."""
     measurements: Mapping[str, MeasurementSource] = field(default_factory=dict)
-    """Other sources by name; those that are not named have the defaults of what they send."""
+    """Sources of measurements by name; others have the defaults of their kind."""
     odometry_patience: float = 2.0
-    """Another odometry makes the hidden nodes when the one that did is so much behind [s]."""
+    """Silence of the primary odometry source after which another one replaces it [s]."""
 
     def __post_init__(self) -> None:
         require(self, 'odometry_patience', positive=True)
@@ -140,21 +310,30 @@ class BackendConfig:
         return self.odometry.get(name, OdometrySource())
 
     def measurement_source(self, name: str, kind: type[Measurement]) -> MeasurementSource:
-        """Return the settings of a source of measurements of a kind."""
+        """
+        Return the settings of a source of measurements.
+
+        Parameters
+        ----------
+        name : str
+        kind : type
+            Of the measurement; selects the defaults of a source without settings.
+
+        """
         defaults = {LoopClosure: LOOP_CLOSURES, HeadingOnly: HEADINGS}
         return self.measurements.get(name, defaults.get(kind, POSITIONS))
 
     def changed_to(self, wanted: 'BackendConfig') -> 'BackendConfig':
         """
-        Return the wanted settings, if a back end with these can take them while it runs.
+        Return the wanted settings if a back end with these settings can change to them.
 
-        What decides how the past was kept stays: where odometry has its noise from, which is
-        summed up sample by sample, and how errors live on, for which the graph holds states.
+        Settings of stored data cannot change: `noise_from`, as noise is summed up sample by
+        sample, the correlation of errors, as the graph contains states for it, and the smoother.
 
         Raises
         ------
         ConfigError
-            If something else is wanted there: what it is, and what is wanted.
+            If one of these differs; the message names it with both values.
 
         """
         _require_same('SmootherConfig', self.smoother, wanted.smoother)

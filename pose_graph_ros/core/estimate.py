@@ -1,46 +1,36 @@
 # Copyright 2026 The pose_graph_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""What the engine hands out: snapshots that do not change later."""
+"""Outputs of the engine, as immutable values."""
 
 from dataclasses import dataclass, replace
-from enum import Enum
 
-from pose_graph_ros.core.batch import Status
-from pose_graph_ros.core.se2 import FloatArray
-from pose_graph_ros.core.sources import OdometryNoise
-from pose_graph_ros.core.trajectory import Trajectory
-
-
-class AlignmentState(Enum):
-    """What is known of the odometry frame in the map."""
-
-    LOCAL = 'local'
-    """Nothing was measured in the map: the map is the odometry frame of the start."""
-    UNALIGNED = 'unaligned'
-    """Positions are known, the angle between odometry and map is not yet."""
-    ALIGNED = 'aligned'
+from pose_graph_ros.core.alignment.monitor import AlignmentState
+from pose_graph_ros.core.batch.optimizer import Status
+from pose_graph_ros.core.config import OdometryNoise
+from pose_graph_ros.core.geometry.se2 import FloatArray
+from pose_graph_ros.core.geometry.trajectory import Trajectory
 
 
 @dataclass(frozen=True, slots=True)
 class UpdateReport:
-    """What an update did."""
+    """Result of an update or of an optimisation."""
 
     status: Status
     reason: str
-    """Why it failed, else empty."""
+    """Why it failed; empty if it did not."""
     new_constraints: int
-    """Loop closures and observed nodes that joined the graph."""
+    """Number of constraints that were added to the graph."""
     iterations: int
     chi2: float
     relinearized: int = 0
-    """Constraints that the smoother linearized again."""
+    """Number of constraints that the smoother linearised again."""
     eliminated: int = 0
-    """Hidden nodes that it eliminated again."""
+    """Number of hidden nodes that it eliminated again."""
     visited: int = 0
-    """Cliques of hidden nodes that it solved for again."""
+    """Number of cliques of hidden nodes that it solved for again."""
 
     def after(self, solved: 'UpdateReport') -> 'UpdateReport':
-        """Return the report of this update and of the optimisation of the whole after it."""
+        """Return one report of this update and the optimisation of the whole graph after it."""
         failed = next((part for part in (self, solved) if part.status is Status.FAILED), solved)
         return replace(
             self, status=failed.status, reason=failed.reason,
@@ -49,45 +39,45 @@ class UpdateReport:
 
 @dataclass(frozen=True, slots=True)
 class Estimate:
-    """A snapshot for publishing; nothing in it changes later."""
+    """An estimate for publishing; its arrays are read-only."""
 
     stamp_ns: int
-    """Of the newest odometry [ns]."""
+    """Stamp of the newest odometry [ns]."""
     T_odom_base: FloatArray
-    """Newest odometry, shape (3,)."""
+    """Newest odometry, shape (3,) [m, m, rad]."""
     T_map_base: FloatArray
-    """Estimate at the newest odometry, shape (3,)."""
+    """Estimate at the newest odometry, shape (3,) [m, m, rad]."""
     T_map_odom: FloatArray
-    """Pose of the odometry frame in the map, shape (3,): corrects any later odometry."""
+    """Pose of the odometry frame in the map, shape (3,) [m, m, rad]."""
     covariance: FloatArray
     """Of `T_map_base`, in map axes, shape (3, 3)."""
     alignment: AlignmentState
     alignment_sigma: float
-    """Of the heading between odometry and map [rad], infinite before anything is known of it."""
+    """Of the angle between odometry and map [rad]; infinite if it is unknown."""
     chi2: float
     n_hidden: int
     n_edges: int
     """Edges between hidden nodes."""
     n_observed: int
-    """Observed nodes, those with an error that lives on included."""
+    """Observed nodes, including measurements with a bias."""
     n_biases: int
-    """States of such errors."""
-    lead: str
+    """Hidden nodes that are biases: states of time-correlated errors."""
+    primary: str
     """Source of the odometry in `T_odom_base`."""
     noise: OdometryNoise
-    """Of that odometry."""
+    """Noise settings of that source."""
     trajectory: Trajectory | None = None
-    """What `path` returns."""
+    """The value of `path`; None if the estimate was made without it."""
 
     @property
     def path(self) -> Trajectory:
         """
-        `T_map_base` at the hidden nodes, and last at the newest odometry.
+        `T_map_base` at all hidden nodes, and last at the newest odometry.
 
         Raises
         ------
         ValueError
-            If the estimate was made without it.
+            If the estimate was made without its path.
 
         """
         if self.trajectory is None:

@@ -1,22 +1,22 @@
 # Copyright 2026 The pose_graph_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""The exceptions that `core` raises; all of them derive from `PoseGraphError`."""
+"""The exceptions of the engine; all derive from `PoseGraphError`."""
 
 
 class PoseGraphError(Exception):
-    """Root of all exceptions of this package."""
+    """Base class of all exceptions of this package."""
 
 
 class ConfigError(PoseGraphError, ValueError):
-    """A setting has a value that it cannot take."""
+    """A setting has an invalid value."""
 
 
 class GraphUpdateError(PoseGraphError, ValueError):
-    """A `GraphUpdate` does not fit the graph; the graph is unchanged."""
+    """A `GraphUpdate` is inconsistent with the graph, which is unchanged."""
 
 
 class FileFormatError(PoseGraphError, ValueError):
-    """A file cannot be read; the message names the file and, where there is one, the line."""
+    """A file cannot be read; the message names the file and, for text, the line."""
 
 
 class LinearSolveError(PoseGraphError):
@@ -24,8 +24,8 @@ class LinearSolveError(PoseGraphError):
 
 
 class NothingToSaveError(PoseGraphError):
-    """There is no graph yet that could be saved."""
+    """There is no graph to save, because it has no hidden node yet."""
 
 
 class FileWriteError(PoseGraphError):
-    """Files cannot be written; what was there before is as it was."""
+    """Files cannot be written; existing files are unchanged."""

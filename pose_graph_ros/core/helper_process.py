@@ -5,8 +5,8 @@ A second interpreter that does a part of the work, and ends with this one in any
 
 Numba's compiler holds a lock, so threads cannot share its work: processes can, as what one has
 compiled the other loads. This one may be a node with threads and handlers of signals, so the other
-is started afresh and not forked, and nothing but the path of imports and the environment is
-handed to it. It says nothing, and nothing is lost but time if it fails.
+is started afresh and not forked, and gets nothing but the path of imports and the environment.
+Its output is discarded; a failure only costs time.
 """
 
 from collections.abc import Callable
@@ -62,7 +62,17 @@ class HelperProcess:
                 self._process.stdin.close()
 
     def wait(self, patience: float, stopped: Callable[[], bool]) -> None:
-        """Wait until it has ended, in whichever way, for so many seconds [s] at most."""
+        """
+        Wait until the process has ended.
+
+        Parameters
+        ----------
+        patience : float
+            Maximum time [s].
+        stopped : callable
+            Ends the wait once it returns True.
+
+        """
         deadline = time.monotonic() + patience
         while (self._process is not None and self._process.poll() is None and not stopped()
                and time.monotonic() < deadline):

@@ -1,10 +1,10 @@
 # Copyright 2026 The pose_graph_ros authors
 # SPDX-License-Identifier: Apache-2.0
 """
-What sensors say, as frozen values with their stamps, and the answers that they get.
+Inputs of the engine, as immutable values with stamps [ns], and the answers to them.
 
-Covariances have the axes in which ROS messages carry them: those of the frame in which the pose
-is expressed (docs/conventions.md, section "Covariances").
+The axes of covariances are those of ROS messages, the frame in which the pose is expressed; see
+docs/conventions.md, section "Covariances".
 """
 
 from dataclasses import dataclass
@@ -12,31 +12,30 @@ from enum import Enum
 
 import numpy as np
 
-from pose_graph_ros.core.se2 import FloatArray
+from pose_graph_ros.core.geometry.se2 import FloatArray
 
-# No coordinate of a map or of odometry is larger [m, rad]; numbers beyond are broken ones, and
-# their squares would not fit.
+# Largest valid coordinate in a map or in odometry [m, rad]; a larger one is a faulty number.
 LARGEST_COORDINATE = 1e9
-# No stamp is later than the year 2116 [ns].
+# Largest valid stamp [ns]: in the year 2116.
 LARGEST_STAMP = 2**62
 
 
 @dataclass(frozen=True, slots=True)
 class OdometrySample:
-    """Where the robot is by odometry."""
+    """Pose of the robot in the odometry frame."""
 
     stamp_ns: int
     pose: FloatArray
     """`T_odom_base`, shape (3,) [m, m, rad]."""
     speed: float = 0.0
-    """By the twist that came with it, if one did [m/s]."""
+    """Of the twist in the same message [m/s]; 0 if it has none."""
     twist_variance: FloatArray | None = None
-    """Of the twist (v_x, v_y, yaw rate) in the robot's frame, shape (3,); None if unknown."""
+    """Of (v_x, v_y, yaw rate) in the robot's frame, shape (3,); None if unknown."""
 
 
 @dataclass(frozen=True, slots=True)
 class GlobalPose:
-    """Where the robot is in the map, with its heading."""
+    """Pose of the robot in the map."""
 
     stamp_ns: int
     pose: FloatArray
@@ -47,11 +46,11 @@ class GlobalPose:
 
 @dataclass(frozen=True, slots=True)
 class Position:
-    """Where a point of the robot, such as an antenna, is in the map."""
+    """Position in the map of a point of the robot, such as an antenna."""
 
     stamp_ns: int
     position: FloatArray
-    """Shape (2,) [m] in the map."""
+    """In the map, shape (2,) [m]."""
     covariance: FloatArray
     """In map axes, shape (2, 2)."""
     lever_arm: FloatArray
@@ -60,7 +59,7 @@ class Position:
 
 @dataclass(frozen=True, slots=True)
 class HeadingOnly:
-    """Which way the robot points in the map."""
+    """Heading of the robot in the map."""
 
     stamp_ns: int
     heading: float
@@ -71,29 +70,29 @@ class HeadingOnly:
 
 @dataclass(frozen=True, slots=True)
 class LoopClosure:
-    """Where the robot is, seen from where it was at another instant (or at a hidden node)."""
+    """Pose of the robot relative to its pose at another stamp, or to a hidden node."""
 
     stamp_ns: int
     pose: FloatArray
     """`T_reference_base`, shape (3,) [m, m, rad]."""
     covariance: FloatArray
     """
-    Of (x, y, theta) in the axes of the reference pose, shape (3, 3); infinite variances of x and
-    y make it a statement on the two headings alone, such as that two walls are perpendicular.
+    Of (x, y, theta) in the axes of the reference pose, shape (3, 3). With infinite variances of x
+    and y only the difference of the headings is used.
     """
     reference_ns: int | None = None
-    """Instant of the reference pose ..."""
+    """Stamp of the reference pose [ns]; None if `reference_node` is given."""
     reference_node: int | None = None
-    """... or its hidden node; exactly one of the two is given."""
+    """Index of the reference's hidden node; None if `reference_ns` is given."""
 
 
 Absolute = GlobalPose | Position | HeadingOnly
-"""What tells of the robot in the map."""
+"""Measurements relative to the map."""
 Measurement = Absolute | LoopClosure
 
 
-class Verdict(Enum):
-    """What becomes of a measurement."""
+class AnswerStatus(Enum):
+    """Whether an input is used."""
 
     ACCEPTED = 'accepted'
     PENDING = 'pending'
@@ -102,20 +101,20 @@ class Verdict(Enum):
 
 @dataclass(frozen=True, slots=True)
 class Answer:
-    """What becomes of a measurement, and why."""
+    """Whether an input is used, and why it is not."""
 
-    verdict: Verdict
+    status: AnswerStatus
     reason: str = ''
-    """One word for counting, such as `not_finite`; empty when accepted."""
+    """Key for counting, such as `not_finite`; empty if accepted."""
     detail: str = ''
-    """A sentence with the numbers, for people."""
+    """Explanation with numbers, for users."""
 
 
-ACCEPTED = Answer(Verdict.ACCEPTED)
+ACCEPTED = Answer(AnswerStatus.ACCEPTED)
 
 
 def value_defect(value: FloatArray) -> str | None:
-    """Say in one word what keeps numbers from being a pose or a position; None if nothing."""
+    """Return why numbers are not a valid pose or position, as a reason; None if they are valid."""
     if not np.all(np.isfinite(value)):
         return 'not_finite'
     if np.any(np.abs(value) > LARGEST_COORDINATE):
@@ -124,5 +123,13 @@ def value_defect(value: FloatArray) -> str | None:
 
 
 def rejected(reason: str, detail: str = '') -> Answer:
-    """Return the answer to what cannot be used."""
-    return Answer(Verdict.REJECTED, reason, detail)
+    """
+    Return the answer that rejects an input.
+
+    Parameters
+    ----------
+    reason, detail : str
+        As in `Answer`.
+
+    """
+    return Answer(AnswerStatus.REJECTED, reason, detail)

@@ -1,10 +1,10 @@
 # Copyright 2026 The pose_graph_ros authors
 # SPDX-License-Identifier: Apache-2.0
 """
-From the newest estimate to the newest odometry: one composition, no solver.
+Prediction of the pose at the newest odometry from the newest estimate, without the solver.
 
-Each message of odometry is answered by one, at up to a thousand a second, so all of it is plain
-numbers; `covariance.odometry_covariance` and `covariance.propagated` say the same with matrices.
+It runs for each odometry message, up to a thousand times per second, and therefore uses plain
+numbers. `odometry_covariance` and `covariance.propagated` compute the same with matrices.
 """
 
 import math
@@ -12,14 +12,14 @@ from typing import NamedTuple
 
 import numpy as np
 
-from pose_graph_ros.core.covariance import UNKNOWN_HEADING_VARIANCE
 from pose_graph_ros.core.estimate import Estimate
-from pose_graph_ros.core.motion import between_one, compose_one
-from pose_graph_ros.core.se2 import FloatArray
+from pose_graph_ros.core.geometry.covariance import UNKNOWN_HEADING_VARIANCE
+from pose_graph_ros.core.geometry.scalar_se2 import between_one, compose_one
+from pose_graph_ros.core.geometry.se2 import FloatArray
 
 
 class Prediction(NamedTuple):
-    """Where the robot is."""
+    """Predicted pose and covariance of the robot."""
 
     T_map_base: FloatArray
     """Shape (3,) [m, m, rad]."""
@@ -29,14 +29,22 @@ class Prediction(NamedTuple):
 
 def predict(estimate: Estimate, T_odom_base: FloatArray) -> Prediction:
     """
-    Carry the estimate to an odometry pose, shape (3,), a little later or earlier.
+    Return the estimate propagated to an odometry pose shortly after or before it.
 
-    The path in between is taken as straight; it is short, as each update makes a new estimate.
+    The path in between is assumed to be straight; it is short because each update makes a new
+    estimate.
+
+    Parameters
+    ----------
+    estimate : Estimate
+    T_odom_base : ndarray, shape (3,)
+        [m, m, rad].
+
     """
     x, y, theta = between_one(estimate.T_odom_base.tolist(), T_odom_base.tolist())
     begin = estimate.T_map_base.tolist()
     end = compose_one(begin, (x, y, theta))
-    # what the odometry in between adds, along (a) and across (b) the robot at its end
+    # noise of the odometry in between, along (a) and across (b) the robot's final heading
     noise, distance = estimate.noise, math.hypot(x, y)
     q = min(noise.sigma_heading_distance**2 * distance + noise.sigma_heading_turn**2 * abs(theta),
             UNKNOWN_HEADING_VARIANCE)
@@ -45,11 +53,11 @@ def predict(estimate: Estimate, T_odom_base: FloatArray) -> Prediction:
     aa = q / 3.0 * sweep_a * sweep_a + noise.sigma_distance**2 * distance
     ab = q / 3.0 * sweep_a * sweep_b
     bb = q / 3.0 * sweep_b * sweep_b + noise.sigma_lateral**2 * distance
-    # the same in the axes of the map
+    # the same in map axes
     c, s = math.cos(end[2]), math.sin(end[2])
     sweep_x, sweep_y = c * sweep_a - s * sweep_b, s * sweep_a + c * sweep_b
     (xx, xy, xt), (_, yy, yt), (_, _, tt) = estimate.covariance.tolist()
-    # an error of the heading before turns the increment
+    # an error of the initial heading rotates the increment
     dx, dy = begin[1] - end[1], end[0] - begin[0]
     xx += (2.0 * xt + dx * tt) * dx + c * c * aa - 2.0 * c * s * ab + s * s * bb
     xy += dx * yt + dy * xt + dx * dy * tt + c * s * (aa - bb) + (c * c - s * s) * ab

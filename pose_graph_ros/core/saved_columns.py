@@ -1,11 +1,10 @@
 # Copyright 2026 The pose_graph_ros authors
 # SPDX-License-Identifier: Apache-2.0
 """
-What the columns of saved states are.
+Types of the columns of saved states.
 
-Each part of the engine that has something to save has a plain dataclass for it, `Saved...`, beside
-it. The arrays in these are annotated with what stands here, by which `io` reads, checks and writes
-them.
+Each part of the engine defines a plain dataclass `Saved...` of its own state. The arrays in it are
+annotated with the types of this module, which `io` uses to read, check and write them.
 """
 
 from typing import Annotated, NamedTuple
@@ -13,12 +12,12 @@ from typing import Annotated, NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-from pose_graph_ros.core.motion import Pose
-from pose_graph_ros.core.se2 import FloatArray, IntArray
+from pose_graph_ros.core.geometry.scalar_se2 import Pose
+from pose_graph_ros.core.geometry.se2 import FloatArray, IntArray
 
 
 class Column(NamedTuple):
-    """What the rows of an array are."""
+    """Type and shape of the rows of an array."""
 
     kind: type
     shape: tuple[int, ...] = ()
@@ -37,12 +36,12 @@ Matrix = tuple[Pose, Pose, Pose]
 
 
 def as_pose(numbers: FloatArray) -> Pose:
-    """Return three numbers as plain ones."""
+    """Return a pose, shape (3,), as plain numbers."""
     x, y, theta = numbers.tolist()
     return x, y, theta
 
 
 def as_matrix(numbers: FloatArray) -> Matrix:
-    """Return a matrix, shape (3, 3), in plain numbers."""
+    """Return a matrix, shape (3, 3), as plain numbers."""
     first, second, third = numbers
     return as_pose(first), as_pose(second), as_pose(third)

@@ -3,12 +3,12 @@
 """
 Compile all kernels before the first measurement, or load them from the cache.
 
-Importing this module imports all modules that hold kernels, so that `jit.registered` is complete.
-Each step is a small job for the engine, through its own front doors: what a kernel is called with
-is then what it will be called with.
+Importing this module imports all modules with kernels. Each step runs a small problem through the
+public methods of the engine, so that each kernel is compiled for the argument types of later
+calls.
 
-To compile them all takes half a minute of computing. Where there are two processors, and a cache
-to meet at, a second process does about half of it.
+Compiling all kernels takes half a minute of processor time. With two processors and a cache on
+disk, a second process compiles about half of them.
 """
 
 from collections.abc import Callable, Iterator
@@ -19,46 +19,41 @@ import time
 
 import numpy as np
 
-from pose_graph_ros.core import batch, complex_system, gauss_newton, jit, se2, symbolic
 from pose_graph_ros.core.backend import PoseGraphBackend
+from pose_graph_ros.core.batch import complex_system, gauss_newton, optimizer
+from pose_graph_ros.core.batch.optimizer import optimize_from_two_starts
+from pose_graph_ros.core.compiled import jit
 from pose_graph_ros.core.config import SmootherConfig, SolverConfig
-from pose_graph_ros.core.constraints import EdgeKind, Edges, ObservedKind, ObservedNodes
-from pose_graph_ros.core.graph import Graph, GraphUpdate
+from pose_graph_ros.core.elimination import symbolic
+from pose_graph_ros.core.geometry import se2
+from pose_graph_ros.core.geometry.se2 import FloatArray
+from pose_graph_ros.core.graph.constraints import EdgeKind, Edges, ObservedKind, ObservedNodes
+from pose_graph_ros.core.graph.graph import Graph, GraphUpdate
+from pose_graph_ros.core.graph.tables import Memory
 from pose_graph_ros.core.helper_process import end_with_parent, HelperProcess
-from pose_graph_ros.core.incremental import IncrementalSmoother
 from pose_graph_ros.core.measurements import GlobalPose, LoopClosure, OdometrySample, Position
-from pose_graph_ros.core.se2 import FloatArray
-from pose_graph_ros.core.sparse_inverse import all_covariances
-from pose_graph_ros.core.starts import solve_from_two_starts
-from pose_graph_ros.core.tables import Memory
+from pose_graph_ros.core.smoother.incremental import IncrementalSmoother
+from pose_graph_ros.core.smoother.sparse_inverse import all_covariances
 
-# Of a drive in circles, a lap in so many nodes. Odometry is a little wrong, so that there is
-# something to correct.
+# The example is a drive in circles with LAP nodes per lap. STEP is the true motion between two
+# nodes and ERROR the error of odometry, both [m, m, rad].
 LAP = 12
 STEP: FloatArray = np.array([1.0, 0.0, 2.0 * np.pi / LAP])
 ERROR: FloatArray = np.array([0.02, -0.01, 0.01])
 INFORMATION: FloatArray = np.diag((400.0, 900.0, 2500.0))
-# So many laps that there are old nodes and new ones.
+# Number of hidden nodes: four laps, so that there are old nodes and new ones.
 N_NODES = 4 * LAP
-# What the helper process is to call.
+# Function that the helper process calls.
 HELPER = (__name__, 'help_along')
+# Threshold of the garbage collector while kernels are compiled [objects].
 MANY_OBJECTS = 200_000
 
 
 def warm_up(stopped: Callable[[], bool] = lambda: False) -> float:
     """
-    Run all kernels once, on a few numbers.
+    Run all kernels once, on a small problem, and return the duration [s].
 
-    Parameters
-    ----------
-    stopped : callable
-        Asked before each step; once it says yes, the rest is left out.
-
-    Returns
-    -------
-    seconds : float
-        How long it took [s].
-
+    `stopped` is called before each step; the remaining steps are skipped once it returns True.
     """
     start = time.perf_counter()
     with _rare_collections(), contextlib.ExitStack() as stack:
@@ -67,7 +62,7 @@ def warm_up(stopped: Callable[[], bool] = lambda: False) -> float:
             helper = stack.enter_context(HelperProcess(*HELPER))
         for step in STEPS:
             if helper is not None and step in HELPED:
-                # one that takes twice as long as this process is stuck: its part is done here
+                # a helper that takes twice as long as this process counts as stuck
                 helper.wait(time.perf_counter() - start, stopped)
             if stopped():
                 break
@@ -76,7 +71,7 @@ def warm_up(stopped: Callable[[], bool] = lambda: False) -> float:
 
 
 def help_along() -> None:
-    """Do the part of the helper process; what it has compiled is in the cache as soon as it is."""
+    """Run the steps of the helper process, which store the kernels in the cache."""
     end_with_parent()
     with _rare_collections():
         for step in HELPERS_STEPS:
@@ -84,14 +79,14 @@ def help_along() -> None:
 
 
 def _is_worth_a_helper() -> bool:
-    """Tell whether there is something to compile, a cache to meet at and a processor to spare."""
+    """Tell whether kernels must be compiled, and there are a cache and two processors."""
     return (len(os.sched_getaffinity(0)) > 1 and jit.can_be_kept()
             and not jit.is_cached(*HELPERS_KERNELS))
 
 
 @contextlib.contextmanager
 def _rare_collections() -> Iterator[None]:
-    """Look for cycles seldom: the compiler makes many objects, and keeps most of them."""
+    """Collect garbage rarely, as the compiler creates many objects and keeps most of them."""
     thresholds = gc.get_threshold()
     gc.set_threshold(MANY_OBJECTS)
     try:
@@ -101,7 +96,7 @@ def _rare_collections() -> Iterator[None]:
 
 
 def _chain(config: SmootherConfig | None = None) -> IncrementalSmoother:
-    """Return a chain that is held at its first node, and by every fifth."""
+    """Return a chain with a fixed first node, and an observed node at every fifth node."""
     smoother, truth = IncrementalSmoother(config), np.zeros(3)
     smoother.update(GraphUpdate(hidden=truth[None], fix=(0,)))
     for k in range(1, N_NODES):
@@ -111,7 +106,7 @@ def _chain(config: SmootherConfig | None = None) -> IncrementalSmoother:
 
 
 def _closures(node: int) -> Edges:
-    """Return the edges that say that this node and the next are where they were a lap before."""
+    """Return loop closures from a node and the next to those of the previous lap."""
     return Edges([node - LAP, node - LAP + 1], [node, node + 1], np.zeros((2, 3)),
                  np.repeat(INFORMATION[None], 2, axis=0), [EdgeKind.LOOP_CLOSURE] * 2)
 
@@ -122,7 +117,7 @@ def _pose_of(node: int) -> ObservedNodes:
 
 
 def _with_a_bias(node: int) -> GraphUpdate:
-    """Return a bias, the node after this one, and an old node that was measured with it."""
+    """Return an update with a bias as node `node + 1`, and a measurement of node 3 with it."""
     return GraphUpdate(
         biases=np.zeros((1, 3)), observed=ObservedNodes(
             [node + 1], None, np.zeros((1, 3)), INFORMATION[None], [ObservedKind.GLOBAL_POSE]),
@@ -131,8 +126,8 @@ def _with_a_bias(node: int) -> GraphUpdate:
 
 
 def _update() -> None:
-    """Tie far nodes together, observe an old one, weigh, remove, fix and free."""
-    # with hardly any budget, so that something is linearized again
+    """Apply each kind of `GraphUpdate`: closures, observed nodes, biases, weights and so forth."""
+    # with a small budget, so that constraints are linearised again
     smoother = _chain(SmootherConfig(alpha=1e-6, budget=1e-12, budget_share=1e-12))
     for update in (
             GraphUpdate(edges=_closures(N_NODES - 5)), GraphUpdate(observed=_pose_of(3)),
@@ -140,18 +135,19 @@ def _update() -> None:
             GraphUpdate(weigh_edges={N_NODES - 1: 0.5}, weigh_observed={0: 0.5}),
             GraphUpdate(remove_edges=(N_NODES,), remove_observed=(1,)),
             GraphUpdate(fix=(5,)), GraphUpdate(free=(0, 5)), GraphUpdate()):
-        smoother.update(update, chi2=True)
+        smoother.update(update)
+    smoother.chi2()
 
 
-def _rescue() -> None:
-    """Tie far nodes together as they cannot be."""
+def _fall_back_to_batch() -> None:
+    """Add a loop closure that is so wrong that the smoother optimises the whole graph."""
     _chain().update(GraphUpdate(edges=Edges(
         [2], [N_NODES - 3], [[40.0, -30.0, 2.5]], 1e4 * INFORMATION[None],
         [EdgeKind.LOOP_CLOSURE])))
 
 
-def _undo() -> None:
-    """Add a node that nothing holds, and go on without it."""
+def _roll_back() -> None:
+    """Add a node without constraints, which fails, and continue with another update."""
     smoother = _chain()
     smoother.update(GraphUpdate(hidden=np.zeros((1, 3)), edges=_closures(N_NODES - 5)))
     smoother.update(GraphUpdate(edges=_closures(N_NODES - 5)))
@@ -165,19 +161,19 @@ def _covariances_of_some() -> None:
 
 
 def _covariances_of_all() -> None:
-    """Ask for those of all nodes where there are none: that needs no smoother."""
+    """Compute the covariances of an empty graph, which needs no smoother."""
     all_covariances(Memory().head, np.zeros((0, 3, 3)))
 
 
 def _eliminate_nothing() -> None:
-    """Order and eliminate no node at all, which needs no more than empty tables."""
+    """Order and eliminate an empty graph."""
     head = Memory().head
     gauss_newton.eliminate(head, 0.0)
     symbolic.analyse(head)
 
 
 def _optimize() -> None:
-    """Optimise a whole graph, with damping and without, from all starts; it needs no smoother."""
+    """Optimise a whole graph from all starts, without a smoother."""
     graph, last = Graph(), N_NODES - 1
     kinds = [EdgeKind.ODOMETRY] * last
     nodes, truth = np.arange(N_NODES), np.zeros((N_NODES, 3))
@@ -188,18 +184,18 @@ def _optimize() -> None:
             nodes[:-1], nodes[1:], np.tile(STEP + ERROR, (last, 1)),
             np.tile(INFORMATION, (last, 1, 1)), kinds)))
     graph.apply(GraphUpdate(edges=_closures(N_NODES - 5), observed=_pose_of(3), free=(0,)))
-    batch.optimize(graph, SolverConfig(initial_damping=1.0))
-    batch.optimize_from_nothing(graph, SolverConfig())
-    # without the joint start: it has no kernels, and SciPy can be loaded when it is needed
-    solve_from_two_starts(graph, SolverConfig(), batch.optimize, closing=False)
-    # only optimisations that stall, or take many iterations, call these
+    optimizer.optimize(graph, SolverConfig())
+    optimizer.optimize_from_linear_start(graph, SolverConfig())
+    # without the joint start, which has no kernels and would load SciPy
+    optimize_from_two_starts(graph, SolverConfig(), optimizer.optimize, both=False)
+    # optimisations call these only if they stall or take many iterations
     right = np.zeros((graph.n_nodes, 3))
     gauss_newton.product_with_step(graph.memory.head, right)
     gauss_newton.chord_step(graph.memory.head, right)
 
 
 def _drive() -> None:
-    """Drive the whole engine: align with positions, take what comes late, optimise at the end."""
+    """Run the back end with alignment by positions, a late pose and a loop closure."""
     backend, truth = PoseGraphBackend(), np.zeros(3)
     for k in range(1, N_NODES):
         stamp_ns = k * 1_000_000_000
@@ -220,8 +216,8 @@ def _drive() -> None:
     backend.view()
 
 
-def _close() -> None:
-    """Optimise a drive at its end, which nothing ties to the map."""
+def _optimize_drive() -> None:
+    """Run the final optimisation of a drive without measurements in the map."""
     backend = PoseGraphBackend()
     for k in range(1, N_NODES):
         backend.add_odometry(OdometrySample(k * 1_000_000_000, k * STEP))
@@ -230,14 +226,14 @@ def _close() -> None:
     backend.optimize()
 
 
-# Between two of them the warm-up can be stopped.
+# Steps of the warm-up, which can be stopped between two of them.
 STEPS: tuple[Callable[[], object], ...] = (
-    IncrementalSmoother, _chain, _update, _undo, _covariances_of_some, _optimize,
-    _covariances_of_all, _rescue, _drive, _close)
-# Those for which the helper compiles, and what it does for them: first what the smoother needs
-# too, before this process comes to it. What edits a graph this process has compiled by then.
+    IncrementalSmoother, _chain, _update, _roll_back, _covariances_of_some, _optimize,
+    _covariances_of_all, _fall_back_to_batch, _drive, _optimize_drive)
+# Steps whose kernels the helper compiles, and the steps that it runs for this: first those whose
+# kernels the smoother uses, too.
 HELPED = (_optimize, _covariances_of_all)
 HELPERS_STEPS: tuple[Callable[[], object], ...] = (
     _eliminate_nothing, _optimize, _covariances_of_all)
-# The largest that it compiles: they are kept only with all that they call.
+# The largest kernels that the helper compiles; if they are cached, so are all that they call.
 HELPERS_KERNELS = (gauss_newton.eliminate, complex_system.solve, all_covariances)

@@ -1,6 +1,6 @@
 # Copyright 2026 The pose_graph_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""What the node says of itself in /diagnostics; no rclpy but messages."""
+"""Values and summary of the node's status in /diagnostics; imports only messages of ROS."""
 
 from collections.abc import Iterator
 import math
@@ -11,29 +11,29 @@ from typing import TYPE_CHECKING
 
 from diagnostic_msgs.msg import DiagnosticStatus
 
-from pose_graph_ros.core.batch import Status
-from pose_graph_ros.core.estimate import AlignmentState
-from pose_graph_ros.core.joining import LEAST_ENERGY
+from pose_graph_ros.core.alignment.monitor import AlignmentState
+from pose_graph_ros.core.batch.optimizer import Status
+from pose_graph_ros.core.sources.source_report import LEAST_ENERGY
 
 if TYPE_CHECKING:
     from pose_graph_ros.ros.session import Session
 
 
 def values(session: 'Session') -> dict[str, object]:
-    """Return all values of the diagnostics."""
+    """Return all values of the diagnostics by key."""
     return {**_state(session), **_inputs(session), **_fits(session)}
 
 
 def _state(session: 'Session') -> dict[str, object]:
     """Return the counts by source and reason, and the state of graph and solver."""
-    worker, received, refused = session.worker, session.intake.received, session.intake.refused
+    worker, received, rejected = session.worker, session.input.received, session.input.rejected
     status, estimate = worker.status, worker.estimate
     found: dict[str, object] = {
         'received': sum(received.values()),
-        'processed': status.processed + sum(refused.values()),
+        'processed': status.processed + sum(rejected.values()),
         'pending': status.pending, 'quarantined': status.quarantined,
         'updates': status.updates, 'prepared': int(worker.prepared),
-        'active': int(session.active), 'paused': int(session.intake.paused),
+        'active': int(session.active), 'paused': int(session.input.paused),
         'resets': session.n_resets,
         'solve_mean_ms': f'{1e3 * status.solve_mean:.3f}',
         'solve_max_ms': f'{1e3 * status.solve_max:.3f}',
@@ -42,26 +42,26 @@ def _state(session: 'Session') -> dict[str, object]:
         found['reset_reason'] = session.reset_reason
     for source, count in sorted(received.items()):
         found[f'received.{source}'] = count
-    for (source, answer), count in sorted((status.counts + refused).items()):
+    for (source, answer), count in sorted((status.counts + rejected).items()):
         found[f'{source}.{answer}'] = count
     if estimate is not None:
         found.update({
-            'odometry': estimate.lead,
+            'odometry': estimate.primary,
             'alignment': estimate.alignment.value,
             'alignment_yaw_deg': f'{math.degrees(estimate.T_map_odom[2]):.3f}',
             'alignment_sigma_deg': f'{math.degrees(estimate.alignment_sigma):.3f}',
             'hidden_nodes': estimate.n_hidden, 'edges': estimate.n_edges,
             'observed_nodes': estimate.n_observed, 'biases': estimate.n_biases,
             'chi2': f'{estimate.chi2:.6g}'})
-    for rank, spring in enumerate(session.strained, 1):
-        found[f'largest_energy.{rank}'] = f'{spring.name}: {spring.energy:.4g}' + (
-            '' if spring.unweighted == spring.energy else
-            f', without its loss {spring.unweighted:.4g}')
+    for rank, largest in enumerate(session.largest_energies, 1):
+        found[f'largest_energy.{rank}'] = f'{largest.name}: {largest.energy:.4g}' + (
+            '' if largest.unweighted == largest.energy else
+            f', without its loss {largest.unweighted:.4g}')
     return found
 
 
 def memory() -> int:
-    """Return the resident memory of the process [bytes]; 0 where the system does not tell."""
+    """Return the resident memory of the process [bytes]; 0 if the system does not provide it."""
     try:
         return int(Path('/proc/self/statm').read_text().split()[1]) * os.sysconf('SC_PAGE_SIZE')
     except OSError:
@@ -69,13 +69,13 @@ def memory() -> int:
 
 
 def _inputs(session: 'Session') -> dict[str, object]:
-    """Return how often each source is heard, its silence, where antennas are, and the datum."""
-    reader, hearing = session.intake.reader, session.intake.hearing
+    """Return rate and silence of each source, the lever arms of antennas, and the datum."""
+    reader, liveness = session.input.reader, session.input.liveness
     now = time.monotonic()
     found: dict[str, object] = {}
     for name in reader.sources:
-        silence, rate = hearing.silence(name, now), hearing.rate(name)
-        found[f'{name}.silence_s'] = 'never heard' if silence is None else f'{silence:.1f}'
+        silence, rate = liveness.silence(name, now), liveness.rate(name)
+        found[f'{name}.silence_s'] = 'never received' if silence is None else f'{silence:.1f}'
         if rate > 0.0:
             found[f'{name}.rate_hz'] = f'{rate:.1f}'
     for name, fixes in reader.fixes.items():
@@ -93,38 +93,38 @@ def _fits(session: 'Session') -> dict[str, object]:
     """Return how well the measurements of each source fit the estimate."""
     found: dict[str, object] = {}
     for name, report in session.worker.status.sources.items():
-        # 1 where the sigmas are right, less where a source is all that the estimate has
+        # 1 if the sigmas are right, less if the estimate depends on this source alone
         found[f'{name}.squared_residual'] = f'{report.energy:.4g}'
         errors = report.errors
         if errors.significant and report.energy >= LEAST_ENERGY:
             found[f'{name}.errors_live'] = (
                 f'{errors.tau:.2g} s, with a sigma of {errors.sigma_correlated:.2g} m'
-                + (f'; they are treated as white: set {name}.correlation_time'
+                + (f'; treated as white: set {name}.correlation_time'
                    if report.wrongly_white else ''))
     return found
 
 
 def health(session: 'Session') -> tuple[bytes, str]:
-    """Return the level of the diagnostics and a sentence that says what to do."""
+    """Return the level of the diagnostics and a sentence with the state and what to do."""
     return next(_concerns(session))
 
 
 def _concerns(session: 'Session') -> Iterator[tuple[bytes, str]]:
-    """Yield what is to be said of the node, the most urgent first."""
+    """Yield level and sentence of all that applies to the node, the most urgent first."""
     error, warn, good = DiagnosticStatus.ERROR, DiagnosticStatus.WARN, DiagnosticStatus.OK
     worker = session.worker
     estimate, report = worker.estimate, worker.status.report
     if not worker.alive:
-        yield error, 'The worker has ended: start the node again.'
+        yield error, 'The worker thread has ended: restart the node.'
     if report is not None and report.status is Status.FAILED:
-        yield error, ('The newest measurements made the solver fail and were set aside; the last '
-                      'good estimate stays. See the log for the reason.')
+        yield error, ('The solver failed with the newest measurements, which were set aside; the '
+                      'last good estimate is kept. See the log for the reason.')
     if not session.active:
         yield good, 'Inactive: activate the node (ros2 lifecycle set).'
-    if session.intake.paused:
-        yield warn, 'Paused: call ~/pause with false to go on.'
+    if session.input.paused:
+        yield warn, 'Paused: call ~/pause with false to resume.'
     if not worker.prepared:
-        yield warn, 'Compiling, as at every first start: what comes in waits.'
+        yield warn, 'Compiling kernels, as at every first start; messages wait until then.'
     if estimate is None:
         yield warn, f'No odometry yet: check {" or ".join(session.odometry_topics)}.'
         return
@@ -132,16 +132,17 @@ def _concerns(session: 'Session') -> Iterator[tuple[bytes, str]]:
     if transforms is not None and transforms.other != '':
         yield warn, transforms.other[0].upper() + transforms.other[1:] + '.'
     if len(silent) > 0:
-        yield warn, (f'{" and ".join(silent)} {"is" if len(silent) == 1 else "are"} silent, '
-                     'others go on: check the drivers.')
+        yield warn, (f'{" and ".join(silent)} {"is" if len(silent) == 1 else "are"} silent '
+                     'while other sources are not: check the drivers.')
     if estimate.alignment is AlignmentState.UNALIGNED:
         yield warn, ('Unaligned: the angle between odometry and map is not known yet. Drive some '
-                     'metres with a fix.')
+                     'metres while fixes come in.')
     if estimate.alignment is AlignmentState.LOCAL:
-        yield good, 'Running; nothing was measured in the map, which begins where odometry does.'
+        yield good, ('Running without measurements in the map: its frame is that of the first '
+                     'odometry.')
     for name, fit in worker.status.sources.items():
         if fit.wrongly_white:
-            yield warn, (f'The errors of {name} live on but are treated as white, so the '
-                         f'covariances are too small: set {name}.correlation_time to about '
+            yield warn, (f'The errors of {name} are correlated in time but treated as white, so '
+                         f'the covariances are too small: set {name}.correlation_time to about '
                          f'{fit.errors.tau:.2g} s.')
     yield good, 'Running.'

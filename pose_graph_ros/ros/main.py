@@ -3,22 +3,20 @@
 """
 The process of the node: from the command line to a clean end.
 
-SIGINT and SIGTERM set a flag that the loop looks at, so a second one, or one that comes while the
-node starts or ends, changes nothing.
+SIGINT and SIGTERM set a flag that the loop checks, so a second signal, or one while the node
+starts or ends, has no further effect.
 """
 
-import logging
 import signal
 import sys
-import traceback
 from types import FrameType
 
-# How long a thread may go on while another one waits [s].
+# Time for which a thread may run Python while another one waits for the interpreter [s].
 SWITCH_INTERVAL = 0.0005
 
 
 class StopSignals:
-    """Takes SIGINT and SIGTERM from its construction on."""
+    """Handles SIGINT and SIGTERM from its construction on."""
 
     def __init__(self) -> None:
         self.received = False
@@ -32,7 +30,10 @@ class StopSignals:
 def main(args: list[str] | None = None) -> int:
     """Run the node until SIGINT or SIGTERM; return the exit code."""
     stop = StopSignals()
-    # ruff: noqa: PLC0415  the imports take most of the start, and signals must be taken by then
+    # ruff: noqa: PLC0415  the imports take most of the start; signals must be handled before
+    import logging
+    import traceback
+
     import rclpy
     from rclpy.exceptions import InvalidParameterTypeException, InvalidParameterValueException
     from rclpy.executors import SingleThreadedExecutor
@@ -43,7 +44,7 @@ def main(args: list[str] | None = None) -> int:
     from pose_graph_ros.ros.node import PoseGraphNode
 
     memory.give_back_large_arrays()
-    # a thread that runs Python, the engine's, would hold up messages for 5 ms at a time
+    # by default the thread of the engine would delay messages by 5 ms at a time
     sys.setswitchinterval(SWITCH_INTERVAL)
     logging.basicConfig(level=logging.WARNING, format='[%(levelname)s] [%(name)s] %(message)s')
     try:
@@ -52,7 +53,7 @@ def main(args: list[str] | None = None) -> int:
         if node.autostarts:
             node.start()
     except (ConfigError, InvalidParameterTypeException, InvalidParameterValueException,
-            RuntimeError) as error:  # the errors of rcl, such as for bad arguments
+            RuntimeError) as error:  # RuntimeError: by rcl, such as for bad arguments
         print(f'pose_graph_node: {error}', file=sys.stderr)
         rclpy.try_shutdown()
         return 2
@@ -62,7 +63,7 @@ def main(args: list[str] | None = None) -> int:
         try:
             executor.spin_once(timeout_sec=0.1)
         except Exception:
-            # whatever a message or the middleware does, the node goes on
+            # no message, and no error of the middleware, may end the node
             node.get_logger().error(f'a callback failed:\n{traceback.format_exc()}')
     node.close()
     executor.shutdown()

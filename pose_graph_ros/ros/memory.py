@@ -1,22 +1,22 @@
 # Copyright 2026 The pose_graph_ros authors
 # SPDX-License-Identifier: Apache-2.0
 """
-Memory that only the start of the process has needed, back to the system; no rclpy.
+Return memory to the system that only the start of the process needs; imports no rclpy.
 
-To load compiled kernels the start reads much of LLVM, and of other libraries: more than 100 MB of
-files stay mapped in that nobody looks at again.
+Loading compiled kernels reads much of LLVM and of other libraries: more than 100 MB of pages of
+their files stay in memory and are not used again.
 """
 
 import ctypes
 from pathlib import Path
 
-# As <sys/mman.h> and <malloc.h> of Linux have them.
+# Constants of <sys/mman.h> and <malloc.h> of Linux.
 MADV_DONTNEED = 4
 M_MMAP_THRESHOLD = -3
 M_ARENA_MAX = -8
-# Arrays beyond this get pages of their own, which go back when they are freed [bytes].
+# Size from which an array gets pages of its own, which are returned when it is freed [bytes].
 LARGE = 256 * 1024
-# The middleware has a dozen threads; each would have a heap of its own, mostly empty.
+# Number of heaps: each of the dozen threads of the middleware would have its own, mostly empty.
 ARENAS = 2
 
 SMAPS = Path('/proc/self/smaps')
@@ -24,9 +24,9 @@ SMAPS = Path('/proc/self/smaps')
 
 def give_back_large_arrays() -> None:
     """
-    Have every large array give its pages back when it is freed.
+    Make glibc return the pages of every large array when it is freed.
 
-    Left alone, glibc learns from the first ones that are freed to keep later ones in its heap.
+    By default it raises its threshold after the first ones and keeps later ones in its heap.
     """
     mallopt = getattr(ctypes.CDLL(None), 'mallopt', None)
     if mallopt is not None:
@@ -34,12 +34,12 @@ def give_back_large_arrays() -> None:
         mallopt(M_ARENA_MAX, ARENAS)
 
 
-def let_go() -> None:
+def release_memory() -> None:
     """
-    Let go of file pages and of free heap; does nothing where the system has no such thing.
+    Return pages of mapped files and of the free heap to the system, where it supports that.
 
-    Only what can be read from its file again at any time: of mappings that cannot be written to,
-    and in which nothing was changed when they were loaded.
+    Only pages that the system can read again from their file: those of read-only mappings in
+    which nothing was changed when they were loaded.
     """
     libc = ctypes.CDLL(None)
     trim, madvise = getattr(libc, 'malloc_trim', None), getattr(libc, 'madvise', None)
@@ -52,7 +52,7 @@ def let_go() -> None:
 
 
 def unchanged_mappings() -> list[tuple[int, int]]:
-    """Return begin and end of what is mapped from files read-only, and as it is there."""
+    """Return begin and end of the read-only mappings of files that are equal to the file."""
     try:
         lines = SMAPS.read_text(encoding='utf-8', errors='replace').splitlines()
     except OSError:

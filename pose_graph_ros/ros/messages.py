@@ -3,9 +3,9 @@
 """
 From estimates to messages.
 
-What goes out with each message of odometry is written as the bytes of the middleware (CDR, little
-endian): filling in messages number by number would take ten times as long. There every number lies
-at a multiple of its size, counted from behind the four bytes that open the stream.
+Messages that are sent with each odometry message are written as the bytes of the middleware (CDR,
+little endian): filling in message objects would take ten times as long. In CDR every number is
+aligned to its size, counted from the end of the four bytes at the start of the stream.
 """
 
 from collections.abc import Mapping
@@ -20,19 +20,19 @@ import numpy as np
 from sensor_msgs.msg import NavSatFix, NavSatStatus
 from std_msgs.msg import Header
 
-from pose_graph_ros.core import covariance as cov
+from pose_graph_ros.adapters.sources import NANOSECONDS
+from pose_graph_ros.core.geometry import covariance as cov
+from pose_graph_ros.core.geometry.geodesy import TangentPlane
+from pose_graph_ros.core.geometry.se2 import FloatArray
+from pose_graph_ros.core.geometry.trajectory import Trajectory
 from pose_graph_ros.core.prediction import Prediction
-from pose_graph_ros.core.se2 import FloatArray
-from pose_graph_ros.core.tangent_plane import TangentPlane
-from pose_graph_ros.core.trajectory import Trajectory
-from pose_graph_ros.ros.sources import NANOSECONDS
 
-# Height, roll and pitch are not estimated: their variance says so to filters [m^2, rad^2] ...
+# Variance of height, roll and pitch in messages for filters: they are not estimated [m^2, rad^2].
 UNKNOWN_VARIANCE = 1e6
-# ... but of a pose for viewers, who would draw a pillar of a kilometre.
+# The same in poses for viewers, which would draw an ellipsoid of a kilometre [m^2, rad^2].
 PLANAR_VARIANCE = 1e-6
 
-# Poses of a path that are written at a time.
+# Number of poses of a path that are written at a time.
 PATH_CHUNK = 2048
 
 CDR = b'\x00\x01\x00\x00'
@@ -51,7 +51,20 @@ def time_message(stamp_ns: int) -> Time:
 def fix_message(
     stamp_ns: int, prediction: Prediction, plane: TangentPlane, altitude: float, base_frame: str,
 ) -> NavSatFix:
-    """Return where the robot is on the Earth, its covariance turned to east and north."""
+    """
+    Return the robot's position on the Earth, its covariance in east and north.
+
+    Parameters
+    ----------
+    stamp_ns : int
+    prediction : Prediction
+    plane : TangentPlane
+        Of the map.
+    altitude : float
+        Above the ellipsoid [m].
+    base_frame : str
+
+    """
     latitude, longitude, _ = plane.to_geodetic(prediction.T_map_base[:2], altitude)
     covariance = np.diag((0.0, 0.0, UNKNOWN_VARIANCE))
     turned = cov.turned(prediction.covariance[:2, :2], -plane.yaw)
@@ -66,7 +79,7 @@ def fix_message(
 
 @functools.cache
 def _names(at: int, frame_id: str, child_frame_id: str = '') -> bytes:
-    """Return one frame id, or two, from an offset on, up to where a double may begin."""
+    """Serialise one or two frame ids at an offset [bytes], padded for a double to follow."""
     data = b''
     for text in (frame_id, child_frame_id) if child_frame_id else (frame_id,):
         data += bytes(-(at + len(data)) % 4)
@@ -78,7 +91,18 @@ def _names(at: int, frame_id: str, child_frame_id: str = '') -> bytes:
 def odometry_cdr(
     stamp_ns: int, prediction: Prediction, source: Odometry, map_frame: str, base_frame: str,
 ) -> bytes:
-    """Serialise the pose in the map, with the twist of the odometry if it is finite."""
+    """
+    Return a serialised nav_msgs/Odometry: the pose in the map and the twist of the odometry.
+
+    Parameters
+    ----------
+    stamp_ns : int
+    prediction : Prediction
+    source : nav_msgs.msg.Odometry
+        Its twist is replaced by an unknown one if it is not finite.
+    map_frame, base_frame : str
+
+    """
     twist = source.twist
     linear, angular = twist.twist.linear, twist.twist.angular
     numbers = (linear.x, linear.y, linear.z, angular.x, angular.y, angular.z)
@@ -91,13 +115,22 @@ def odometry_cdr(
 
 
 def stamped_pose_cdr(stamp_ns: int, prediction: Prediction, map_frame: str) -> bytes:
-    """Serialise the pose in the map as a geometry_msgs/PoseWithCovarianceStamped."""
+    """
+    Return a serialised geometry_msgs/PoseWithCovarianceStamped in the map.
+
+    Parameters
+    ----------
+    stamp_ns : int
+    prediction : Prediction
+    map_frame : str
+
+    """
     return b''.join((CDR, _STAMP.pack(*divmod(stamp_ns, NANOSECONDS)), _names(8, map_frame),
                      _pose_with_covariance_cdr(prediction, PLANAR_VARIANCE)))
 
 
 def _pose_with_covariance_cdr(prediction: Prediction, u: float) -> bytes:
-    """Serialise a planar pose; what is not planar has the variance u."""
+    """Serialise a planar pose; height, roll and pitch have the variance u."""
     x, y, theta = prediction.T_map_base.tolist()
     (xx, xy, xt), (yx, yy, yt), (tx, ty, tt) = prediction.covariance.tolist()
     return _POSE_WITH_COVARIANCE.pack(
@@ -113,7 +146,16 @@ def _pose_with_covariance_cdr(prediction: Prediction, u: float) -> bytes:
 def transform_cdr(
     stamp_ns: int, T_map_odom: FloatArray, map_frame: str, odom_frame: str,
 ) -> bytes:
-    """Serialise a tf2_msgs/TFMessage with the transform from the map to the odometry frame."""
+    """
+    Return a serialised tf2_msgs/TFMessage with the transform from map to odom.
+
+    Parameters
+    ----------
+    stamp_ns : int
+    T_map_odom : ndarray, shape (3,)
+    map_frame, odom_frame : str
+
+    """
     x, y, theta = T_map_odom.tolist()
     return b''.join((
         CDR, _LENGTH.pack(1), _STAMP.pack(*divmod(stamp_ns, NANOSECONDS)),
@@ -123,17 +165,25 @@ def transform_cdr(
 
 def path_cdr(path: Trajectory, stamp_ns: int, frame_id: str) -> bytes:
     """
-    Serialise a nav_msgs/Path whose poses all lie in one frame, without a message a pose.
+    Return a serialised nav_msgs/Path whose poses all lie in one frame.
 
-    A PoseStamped ends at a multiple of 8, so all but the first have the same layout, and NumPy
-    fills many at once.
+    A PoseStamped ends at a multiple of 8 bytes, so all but the first have the same layout, and
+    NumPy fills many at once.
+
+    Parameters
+    ----------
+    path : Trajectory
+    stamp_ns : int
+        Stamp of the path; each pose has its own [ns].
+    frame_id : str
+
     """
     name = frame_id.encode() + b'\0'
     head = _STAMP.pack(*divmod(stamp_ns, NANOSECONDS)) + _LENGTH.pack(len(name)) + name
     head += bytes(-len(head) % 4) + _LENGTH.pack(len(path))
     if len(path) == 0:
         return CDR + head
-    # some at a time, which stay in the processor's cache while they are filled in
+    # as many at a time as stay in the processor's cache while they are filled in
     size = 12 + len(name) + -(12 + len(name)) % 8 + 7 * 8
     numbers = np.zeros((PATH_CHUNK, size // 8), dtype='<f8')
     pose, integers = numbers[:, -7:], numbers.view('<u4')
@@ -148,7 +198,7 @@ def path_cdr(path: Trajectory, stamp_ns: int, frame_id: str) -> bytes:
         pose[:n, :2] = poses[:, :2]
         pose[:n, 5], pose[:n, 6] = np.sin(half), np.cos(half)
         if begin == 0:
-            # it begins where the head ends, the others at a multiple of 8
+            # the first pose begins at the end of the head, the others at a multiple of 8
             first, names_end = numbers[0].tobytes(), 12 + len(name)
             parts += (first[:names_end], bytes(-(len(head) + names_end) % 8), first[-56:])
         parts.append(numbers[begin == 0:n].tobytes())
@@ -158,7 +208,22 @@ def path_cdr(path: Trajectory, stamp_ns: int, frame_id: str) -> bytes:
 def diagnostics_message(
     stamp: Time, name: str, level: bytes, text: str, values: Mapping[str, object],
 ) -> DiagnosticArray:
-    """Return one status with its values."""
+    """
+    Return a message with one status.
+
+    Parameters
+    ----------
+    stamp : builtin_interfaces.msg.Time
+    name : str
+        Name of the status.
+    level : bytes
+        One of the levels of DiagnosticStatus.
+    text : str
+        The status in a sentence.
+    values : mapping
+        Written as texts.
+
+    """
     status = DiagnosticStatus(
         level=level, name=name, message=text, hardware_id='pose_graph',
         values=[KeyValue(key=key, value=str(value)) for key, value in values.items()])

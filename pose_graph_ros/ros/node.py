@@ -1,6 +1,6 @@
 # Copyright 2026 The pose_graph_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""The managed node: its parameters, and its transitions from unconfigured to active and back."""
+"""The managed node: its parameters and the transitions of its lifecycle."""
 
 from array import array
 from collections.abc import Callable, Mapping, Sequence
@@ -11,9 +11,8 @@ from rcl_interfaces.msg import FloatingPointRange, ParameterDescriptor, SetParam
 from rclpy.lifecycle import LifecycleNode, LifecycleState, TransitionCallbackReturn
 from rclpy.parameter import Parameter as RosParameter
 
-from pose_graph_ros.core.exceptions import ConfigError
-from pose_graph_ros.ros.parameter_changes import changed, require_together
-from pose_graph_ros.ros.parameters import (
+from pose_graph_ros.adapters.parameter_changes import changed, require_together
+from pose_graph_ros.adapters.parameters import (
     all_parameters,
     Change,
     checked,
@@ -24,6 +23,7 @@ from pose_graph_ros.ros.parameters import (
     source_parameters,
     type_parameter,
 )
+from pose_graph_ros.core.exceptions import ConfigError
 from pose_graph_ros.ros.services import Services
 from pose_graph_ros.ros.session import Session
 
@@ -32,12 +32,12 @@ class PoseGraphNode(LifecycleNode):
     """
     The online back end of pose-graph SLAM as a managed node.
 
-    What it does while it is configured is in `Session`; this is its life.
+    This class has the parameters and the lifecycle; `Session` does the work of a configured node.
 
     Raises
     ------
     ConfigError
-        If `sources` cannot be, by which it is decided which parameters there are.
+        If `sources` is not valid, which determines the other parameters.
 
     """
 
@@ -46,9 +46,9 @@ class PoseGraphNode(LifecycleNode):
         self.failure = ''
         """Why the last configuration failed."""
         self._session: Session | None = None
-        self._offer: Services | None = None
+        self._offered: Services | None = None
         self._given = self._declared()
-        """Parameters of the node's own that are set."""
+        """The node's own parameters that have a value."""
         self._own = frozenset(parameter.name for parameter in all_parameters(self._given))
         self._warn_of_unknown()
         self.add_on_set_parameters_callback(self._on_set_parameters)
@@ -60,7 +60,7 @@ class PoseGraphNode(LifecycleNode):
         """Whether the node is to configure and activate itself."""
         return bool(self._given['autostart'])
 
-    # ---- life
+    # ---- lifecycle
 
     def start(self) -> None:
         """
@@ -69,7 +69,7 @@ class PoseGraphNode(LifecycleNode):
         Raises
         ------
         ConfigError
-            If that cannot be: the reason.
+            If a transition failed: the reason.
 
         """
         for trigger in (self.trigger_configure, self.trigger_activate):
@@ -77,33 +77,33 @@ class PoseGraphNode(LifecycleNode):
                 raise ConfigError(self.failure)
 
     def on_configure(self, state: LifecycleState) -> TransitionCallbackReturn:
-        """Check the parameters; have worker, services and diagnostics."""
+        """Check the parameters; start worker, services and diagnostics."""
         return self._transition(self._configure, state)
 
     def on_activate(self, state: LifecycleState) -> TransitionCallbackReturn:
-        """Listen and publish."""
+        """Start receiving and publishing."""
         return self._transition(self._configured.activate, state)
 
     def on_deactivate(self, state: LifecycleState) -> TransitionCallbackReturn:
-        """Listen and publish no more; the graph stays."""
+        """Stop receiving and publishing; keep the graph."""
         return self._transition(self._configured.deactivate, state)
 
     def on_cleanup(self, state: LifecycleState) -> TransitionCallbackReturn:
-        """Let the graph go."""
+        """Discard the graph."""
         return self._transition(self.close, state)
 
     def on_shutdown(self, state: LifecycleState) -> TransitionCallbackReturn:
-        """Let everything go, for good."""
+        """Discard everything before the end of the node."""
         return self._transition(self.close, state)
 
     def on_error(self, state: LifecycleState) -> TransitionCallbackReturn:
-        """Be unconfigured again after a transition that raised."""
+        """Discard everything after a transition that raised, to be unconfigured again."""
         return self._transition(self.close, state)
 
     def _transition(
         self, change: Callable[[], None], _: LifecycleState,
     ) -> TransitionCallbackReturn:
-        """Change the state; keep the reason if that fails, which rclpy does not."""
+        """Change the state; if that fails, keep the reason, which rclpy does not."""
         try:
             change()
         except ConfigError as error:
@@ -124,11 +124,11 @@ class PoseGraphNode(LifecycleNode):
         values = checked(self._given)
         require_together(values)
         self._session = Session(self, values)
-        self._offer = Services(self, self._session)
+        self._offered = Services(self, self._session)
 
     def close(self) -> None:
-        """End the worker and let go what was configured."""
-        offer, self._offer = self._offer, None
+        """Stop the worker and destroy all that was configured."""
+        offer, self._offered = self._offered, None
         session, self._session = self._session, None
         if offer is not None:
             offer.close()
@@ -137,9 +137,9 @@ class PoseGraphNode(LifecycleNode):
 
     def _answer_every_change_of_state(self) -> None:
         """
-        Answer requests for a transition that is not possible now, and say why one failed.
+        Answer also requests for transitions that are not possible now, and log why one failed.
 
-        For the first rclpy raises, and who asked would wait for ever; of the second it is silent.
+        rclpy raises for the former, so that the client would wait for ever, and logs no reasons.
         """
         service = self._service_change_state
         change = service.callback
@@ -175,14 +175,14 @@ class PoseGraphNode(LifecycleNode):
                 self.declare_parameter(
                     parameter.name, None if unset else parameter.default, _descriptor(parameter))
             value = self.get_parameter(parameter.name).value
-            # a file that `ros2 param dump` wrote has null for what is not set, read as a text
+            # files of `ros2 param dump` have null for values that are not set, read as a text
             if value is not None and not (value == 'null' and isinstance(parameter.default, list)):
                 given[parameter.name] = (
                     list(value) if isinstance(value, array | tuple) else value)
         return given
 
     def _warn_of_unknown(self) -> None:
-        """Say what was given in vain: rclpy does not, as a file may be for other nodes as well."""
+        """Warn of unknown parameters: rclpy does not, as a file may be for several nodes."""
         overrides: Mapping[str, object] = getattr(self, '_parameter_overrides', {})
         own = {parameter.name for parameter in SOURCE_PARAMETERS}
         for name in sorted(set(overrides) - self._own):
@@ -190,10 +190,10 @@ class PoseGraphNode(LifecycleNode):
             if leaf in own:
                 self.get_logger().warning(
                     f'parameter {name} is not known: {source} is not in sources, or is of a type '
-                    'that has none')
+                    'without this parameter')
 
     def _on_set_parameters(self, parameters: list[RosParameter]) -> SetParametersResult:
-        """Say whether all of some changes can be made now."""
+        """Return whether all of some changes can be made now, and why not."""
         try:
             self._changed(parameters)
         except ConfigError as error:
@@ -201,7 +201,7 @@ class PoseGraphNode(LifecycleNode):
         return SetParametersResult(successful=True)
 
     def _on_parameters_set(self, parameters: list[RosParameter]) -> None:
-        """Let changes that were found to be possible take effect."""
+        """Apply changes that were found to be possible."""
         # rclpy calls this for every declaration as well
         if any(parameter.name in self._own for parameter in parameters):
             self._given = self._changed(parameters)

@@ -1,11 +1,11 @@
 # Copyright 2026 The pose_graph_ros authors
 # SPDX-License-Identifier: Apache-2.0
 """
-Plays a bag to the node over DDS, as a process of its own, and records what the node answers.
+Play a bag to the node over DDS, from a separate process, and record the node's outputs.
 
-Nothing is lost on the way: the writers are reliable, and no more messages are under way than the
-node's queue holds, by the node's own count of processed messages in its diagnostics. At the end
-the node is asked for the full optimisation, and its last path is recorded.
+No message is lost: the writers are reliable, and the node's queues hold all messages that it has
+not processed yet, by its own count in the diagnostics. At the end the node is asked for the final
+optimisation, and its last path is recorded.
 """
 
 import argparse
@@ -27,10 +27,15 @@ from rclpy.serialization import deserialize_message
 from sensor_msgs.msg import Imu, NavSatFix
 from std_srvs.srv import Trigger
 
-from pose_graph_ros.ros.bag_writer import BagWriter
-from pose_graph_ros.ros.bags import BagError, MessageError, open_bag
-from pose_graph_ros.ros.inputs import Inputs, read_inputs, read_static_frames, STATIC_FRAMES
-from pose_graph_ros.ros.sources import Kind, MESSAGE_TYPES
+from pose_graph_ros.adapters.bag_inputs import (
+    Inputs,
+    read_inputs,
+    read_static_frames,
+    STATIC_FRAMES,
+)
+from pose_graph_ros.adapters.bag_writer import BagWriter
+from pose_graph_ros.adapters.bags import BagError, MessageError, open_bag
+from pose_graph_ros.adapters.sources import Kind, MESSAGE_TYPES
 
 try:
     from tf2_msgs.msg import TFMessage
@@ -45,22 +50,22 @@ LATCHED = QoSProfile(depth=1, reliability=QoSReliabilityPolicy.RELIABLE,
                      durability=QoSDurabilityPolicy.TRANSIENT_LOCAL)
 STATIC = QoSProfile(depth=100, reliability=QoSReliabilityPolicy.RELIABLE,
                     durability=QoSDurabilityPolicy.TRANSIENT_LOCAL)
-# Messages under way, well below the depth of the node's queues.
+# Greatest number of unprocessed messages, well below the depth of the node's queues.
 WINDOW = 400
-# Patience with the node: to appear, to compile at its first start, to process another message, to
-# answer [s].
+# Longest waits for the node: to appear, to compile at its first start, to process another message,
+# and to answer [s].
 APPEAR_TIMEOUT = 30.0
 PREPARE_TIMEOUT = 600.0
 STALL_TIMEOUT = 20.0
 ANSWER_TIMEOUT = 90.0
-# Exit code where all was played and recorded, but the optimisation did not get to its end.
+# Exit code if everything was played and recorded, but the optimisation did not converge.
 NOT_CONVERGED = 3
-# No path for so long means that the last one has come; the node's `path_period` is below [s].
+# Time without a path after which the last one has come; longer than the node's `path_period` [s].
 PATH_SILENCE = 1.0
 
 
 class PlayError(Exception):
-    """The node did not do its part; the message says which."""
+    """The node did not respond as expected; the message says how."""
 
 
 class Player(Node):
@@ -71,9 +76,9 @@ class Player(Node):
     ----------
     inputs : Inputs
     topics : mapping
-        Source to the topic of the node.
+        Topic of the node for each source.
     node_name : str
-        Name of the node that is played to, for its service and its diagnostics.
+        Name of the node, for its service and its diagnostics.
 
     """
 
@@ -92,7 +97,7 @@ class Player(Node):
         self._static = None if TFMessage is None else self.create_publisher(
             TFMessage, STATIC_FRAMES[0], STATIC)
         self.recorded: list[tuple[str, str, int, bytes]] = []
-        """Topic, type, time of arrival [ns] and bytes of what the node published."""
+        """Topic, type, time of arrival [ns] and bytes of the node's messages."""
         self.path: bytes | None = None
         """The newest path."""
         self._path_at = -float('inf')
@@ -111,10 +116,10 @@ class Player(Node):
     def _record(self, topic: str, message_type: type, type_name: str) -> None:
         name = self.resolve_topic_name(topic)
 
-        def take(raw: bytes) -> None:
+        def record(raw: bytes) -> None:
             self.recorded.append((name, type_name, time.time_ns(), raw))
 
-        self.create_subscription(message_type, topic, take, RELIABLE, raw=True)
+        self.create_subscription(message_type, topic, record, RELIABLE, raw=True)
 
     def _on_path(self, raw: bytes) -> None:
         self.path, self._path_at = raw, time.monotonic()
@@ -127,11 +132,28 @@ class Player(Node):
 
     @property
     def processed(self) -> int:
-        """Messages that the node says it has processed."""
+        """Number of messages that the node has processed, by its diagnostics."""
         return int(self.diagnostics.get('processed', 0))
 
     def spin_until(self, done: Callable[[], bool], timeout: float, failure: str) -> None:
-        """Take messages until something holds."""
+        """
+        Receive messages until a condition holds.
+
+        Parameters
+        ----------
+        done : callable
+            Returns whether it holds.
+        timeout : float
+            Longest wait [s].
+        failure : str
+            Message of the error.
+
+        Raises
+        ------
+        PlayError
+            If the condition does not hold in time.
+
+        """
         end = time.monotonic() + timeout
         while not done():
             if time.monotonic() > end:
@@ -140,25 +162,37 @@ class Player(Node):
 
     def play(self, bag: Path, rate: float) -> Counter[str]:
         """
-        Publish the inputs at `rate` times the recorded speed, 0 for as fast as the node takes.
+        Publish the inputs of a bag, and wait until the node has processed them.
+
+        Parameters
+        ----------
+        bag : Path
+        rate : float
+            Speed relative to the recorded one; 0 for as fast as the node can process.
 
         Returns
         -------
-        Counter
-            Messages published by input, and held out under `held_out`.
+        published : Counter
+            Number of published messages by input, of those held out under `held_out`, and of those
+            that cannot be decoded under `malformed`.
+
+        Raises
+        ------
+        PlayError
+            If the node does not appear, or stops processing.
 
         """
         self.spin_until(
             lambda: all(writer.get_subscription_count() > 0 for writer in self._writers.values())
             and len(self.diagnostics) > 0 and self._optimize.service_is_ready(), APPEAR_TIMEOUT,
-            'the node does not listen')
+            'the node does not subscribe')
         self.spin_until(lambda: self.diagnostics.get('prepared') != '0', PREPARE_TIMEOUT,
-                        'the node still compiles')
+                        'the node is still compiling')
         if self._static is not None:
             with open_bag(bag) as reader:
                 for frames in read_static_frames(reader):
                     self._static.publish(frames.raw)
-        # matching is not simultaneous on both sides
+        # the other side of a match may learn of it a little later
         settled = time.monotonic() + 0.5
         self.spin_until(lambda: time.monotonic() > settled, 2.0, '')
         already = self.processed
@@ -174,7 +208,7 @@ class Player(Node):
                 try:
                     message.decode()
                 except MessageError:
-                    # the node would never see it, and the replay leaves it out as well
+                    # the middleware would drop it, and the replay leaves it out as well
                     published['malformed'] += 1
                     continue
                 if start is None or first_ns is None:
@@ -200,23 +234,23 @@ class Player(Node):
             self._executor.spin_once(timeout_sec=min(left, 0.05))
 
     def _wait_for(self, count: int) -> None:
-        """Wait until the node has processed so many; patient as long as it gets on."""
+        """Wait until the node has processed a number of messages, as long as it makes progress."""
         while (before := self.processed) < count:
             self.spin_until(
                 partial(self._more_than, before), STALL_TIMEOUT,
-                f'the node has processed {before} messages of {count} and does not get on')
+                f'the node has processed {before} of {count} messages and makes no progress')
 
     def _more_than(self, count: int) -> bool:
         return self.processed > count
 
-    def close(self) -> tuple[bool, str]:
-        """Ask the node for the full optimisation, wait for its path; return its answer."""
+    def request_final_optimization(self) -> tuple[bool, str]:
+        """Call ~/optimize, and wait for the path after it; return success and message."""
         answer = self._optimize.call_async(Trigger.Request())
         asked_at = time.monotonic()
         self.spin_until(answer.done, ANSWER_TIMEOUT, 'no answer from ~/optimize')
         answered_at = time.monotonic()
         response = answer.result()
-        # one that was under way may come first: the last one is taken, after a silence
+        # an earlier path may still come first: wait until no other one comes
         self.spin_until(
             lambda: asked_at < self._path_at
             and max(answered_at, self._path_at) < time.monotonic() - PATH_SILENCE,
@@ -224,7 +258,7 @@ class Player(Node):
         return bool(response.success), str(response.message)
 
     def write(self, folder: Path) -> None:
-        """Write what was recorded as a rosbag2; of path and diagnostics the last message."""
+        """Write a rosbag2 of all that was recorded, of path and diagnostics the last message."""
         path_topic = self.resolve_topic_name('path')
         with BagWriter(folder, overwrite=True, latched=[path_topic]) as writer:
             for topic, type_name, arrived_ns, raw in self.recorded:
@@ -235,7 +269,7 @@ class Player(Node):
                          self._diagnostics_raw)
 
     def n_path_poses(self) -> int:
-        """Return how many poses the newest path has."""
+        """Return the number of poses of the newest path."""
         return 0 if self.path is None else len(deserialize_message(self.path, PathMessage).poses)
 
 
@@ -251,7 +285,7 @@ def _progress(done: int, total: int) -> None:
 
 
 def main(args: list[str] | None = None) -> int:
-    """Play a bag; the arguments come from `pose-graph demo`."""
+    """Play a bag and return the exit code; `pose-graph demo` passes the arguments."""
     parser = argparse.ArgumentParser(prog='player', description=__doc__)
     parser.add_argument('bag', type=Path)
     parser.add_argument('out', type=Path, help='folder of the rosbag2 to write')
@@ -267,7 +301,7 @@ def main(args: list[str] | None = None) -> int:
     try:
         player = Player(inputs, {source: topic for source, _, topic, _ in options.input})
         published = player.play(options.bag, options.rate)
-        success, answer = player.close()
+        success, answer = player.request_final_optimization()
         player.write(options.out)
         print('published: ' + ', '.join(f'{key} {count}' for key, count in published.items()))
         print(f'the node: processed {player.processed}; optimisation {answer}; '

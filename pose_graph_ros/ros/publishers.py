@@ -1,10 +1,11 @@
 # Copyright 2026 The pose_graph_ros authors
 # SPDX-License-Identifier: Apache-2.0
 """
-What the node publishes, with strictly increasing stamps and while someone listens.
+The outputs of the node, with strictly increasing stamps.
 
-Pose, odometry, fix and transform go out with an odometry message, from the executor's thread; path
-and markers, which can be large, from the thread that owns the engine.
+Pose, odometry, fix and transform are published with each odometry message, from the executor's
+thread; path and markers, which can be large, from the thread that owns the engine. All but the
+transform and the diagnostics are made only while there is a subscriber.
 """
 
 from collections.abc import Callable, Mapping
@@ -24,36 +25,37 @@ from sensor_msgs.msg import NavSatFix
 from std_msgs.msg import Header
 from visualization_msgs.msg import Marker, MarkerArray
 
-from pose_graph_ros.core.estimate import AlignmentState, Estimate
+from pose_graph_ros.adapters.conversions import frame
+from pose_graph_ros.adapters.fixes import Datum
+from pose_graph_ros.adapters.markers import markers_cdr
+from pose_graph_ros.adapters.sources import NANOSECONDS
+from pose_graph_ros.core.alignment.monitor import AlignmentState
+from pose_graph_ros.core.estimate import Estimate
+from pose_graph_ros.core.geometry.trajectory import Trajectory
+from pose_graph_ros.core.graph.graph_view import GraphView
 from pose_graph_ros.core.measurements import OdometrySample
 from pose_graph_ros.core.prediction import predict
-from pose_graph_ros.core.springs import GraphView
-from pose_graph_ros.core.trajectory import Trajectory
 from pose_graph_ros.ros import messages
-from pose_graph_ros.ros.conversions import frame
-from pose_graph_ros.ros.fixes import Datum
-from pose_graph_ros.ros.markers import markers_cdr
 from pose_graph_ros.ros.slew import Slew
-from pose_graph_ros.ros.sources import NANOSECONDS
 from pose_graph_ros.ros.transforms import TF_QOS, TFMessage, TOPIC, TransformPublisher
 
 OUTPUT_QOS = QoSProfile(depth=10, reliability=QoSReliabilityPolicy.RELIABLE)
-# Who joins late gets the newest path and graph at once.
+# Late subscribers receive the newest path and graph at once.
 LATCHED_QOS = QoSProfile(depth=1, reliability=QoSReliabilityPolicy.RELIABLE,
                       durability=QoSDurabilityPolicy.TRANSIENT_LOCAL)
 
 
 class Publishers:
     """
-    The outputs of the node.
+    Publishes all outputs of the node.
 
     Parameters
     ----------
     node : rclpy.node.Node
     values : mapping
-        The node's parameters.
+        All checked parameters.
     on_other : callable
-        Called with a sentence when somebody else publishes the same transform.
+        Called with a sentence if another node publishes the same transform.
 
     """
 
@@ -73,14 +75,14 @@ class Publishers:
         self._publishers = (self._pose, self._odometry, self._fix, self._path, self._graph,
                             self._diagnostics)
         self.transforms: TransformPublisher | None = None
-        """None if they are not wanted, or cannot be had without tf2_msgs."""
+        """None if `publish_tf` is false or tf2_msgs is not installed."""
         self._on_other = on_other
         self._slew = Slew()
         self._aligned = False
         self._newest_ns = 0
         self.graph = 0
-        """Number of the present graph: how often one began anew."""
-        # what the two threads share
+        """Number of the present graph: how many were started after the first."""
+        # shared by the two threads
         self._lock = threading.Lock()
         self._path_shown: Estimate | None = None
         self._path_stamp_ns = self._graph_stamp_ns = 0
@@ -93,9 +95,9 @@ class Publishers:
             qos_overriding_options=QoSOverridingOptions.with_default_policies())
 
     def configure(self, values: Mapping[str, Any]) -> None:
-        """Take the parameters that can change while the node runs."""
+        """Set the parameters that can change while the node runs."""
         if values['publish_tf'] and self.transforms is None:
-            self._begin_transforms()
+            self._create_transforms()
         elif not values['publish_tf'] and self.transforms is not None:
             self.transforms.close()
             self.transforms = None
@@ -103,7 +105,7 @@ class Publishers:
         self._slew_limits = values['transform_slew_linear'], values['transform_slew_angular']
         self._path_period, self._graph_period = values['path_period'], values['graph_period']
 
-    def _begin_transforms(self) -> None:
+    def _create_transforms(self) -> None:
         if TFMessage is None:
             self._node.get_logger().warning(
                 'tf2_msgs is not installed: the transform from map to odom is not published',
@@ -117,7 +119,19 @@ class Publishers:
     def publish_pose(
         self, estimate: Estimate, odometry: Odometry, sample: OdometrySample, datum: Datum,
     ) -> None:
-        """Publish pose, odometry, fix and transform at an odometry message and its sample."""
+        """
+        Publish pose, odometry, fix and transform at an odometry message.
+
+        Parameters
+        ----------
+        estimate : Estimate
+            The newest estimate, with the same primary odometry.
+        odometry : nav_msgs.msg.Odometry
+        sample : OdometrySample
+            The same message, as it was read.
+        datum : Datum
+
+        """
         stamp, plane = sample.stamp_ns, datum.plane
         if stamp <= self._newest_ns:
             return
@@ -125,7 +139,7 @@ class Publishers:
         if (self.transforms is not None
                 and frame(odometry.header.frame_id) in ('', self.odom_frame)):
             if (estimate.alignment is AlignmentState.ALIGNED) != self._aligned:
-                # the map was not where it is: that is no correction
+                # the map frame itself has moved, which is no correction of the pose
                 self._aligned = not self._aligned
                 self._slew.forget()
             self.transforms.publish(stamp + self._tf_offset_ns, self._slew.limited(
@@ -140,39 +154,61 @@ class Publishers:
                 stamp, prediction, odometry, self.map_frame, self.base_frame))
         if self._pose in wanted:
             self._pose.publish(messages.stamped_pose_cdr(stamp, prediction, self.map_frame))
-        # before anything was measured in it, the map may be anywhere on the Earth
+        # before the first measurement in the map, its place on the Earth is unknown
         if (self._fix in wanted and plane is not None
                 and estimate.alignment is not AlignmentState.LOCAL):
             self._fix.publish(messages.fix_message(
                 stamp, prediction, plane, datum.altitude, self.base_frame))
 
     def jump(self) -> None:
-        """Let the next transform be published as it is: the robot was put elsewhere."""
+        """Let the next transform be published without limits: the robot was put elsewhere."""
         self._slew.forget()
 
     def path_is_due(self, estimate: Estimate) -> bool:
-        """Tell whether someone wants a path, of an estimate not shown yet, and it is time."""
+        """Tell whether to publish the path of an estimate: new, wanted, and not too soon."""
         return (estimate is not self._path_shown
                 and time.monotonic() - self._path_at >= self._path_period
                 and self._path.get_subscription_count() > 0)
 
     def publish_path(self, estimate: Estimate, path: Trajectory, graph: int) -> None:
-        """Publish the path of an estimate, if it is of the present graph."""
+        """
+        Publish the path of an estimate, if it is of the present graph.
+
+        Parameters
+        ----------
+        estimate : Estimate
+        path : Trajectory
+            In the map.
+        graph : int
+            Number of its graph.
+
+        """
         with self._lock:
             if graph != self.graph:
                 return
             self._path_shown, self._path_at = estimate, time.monotonic()
-            # the same newest odometry with better poses: a nanosecond keeps the stamps increasing
+            # a better path with the same newest odometry: 1 ns keeps the stamps increasing
             self._path_stamp_ns = max(estimate.stamp_ns, self._path_stamp_ns + 1)
             self._path.publish(messages.path_cdr(path, self._path_stamp_ns, self.map_frame))
 
     def graph_is_due(self) -> bool:
-        """Tell whether someone wants to see the graph, and the last time is long enough ago."""
+        """Tell whether to publish the markers of the graph: wanted, and not too soon."""
         return (self._graph.get_subscription_count() > 0
                 and time.monotonic() - self._graph_at >= self._graph_period)
 
     def publish_graph(self, view: GraphView, stamp_ns: int, graph: int) -> None:
-        """Publish the markers of a graph, if it is the present one; with a stamp [ns]."""
+        """
+        Publish the markers of a graph, if it is the present one.
+
+        Parameters
+        ----------
+        view : GraphView
+        stamp_ns : int
+            Stamp of the newest odometry in it [ns].
+        graph : int
+            Number of the graph.
+
+        """
         with self._lock:
             if graph != self.graph:
                 return
@@ -180,8 +216,8 @@ class Publishers:
             self._graph_stamp_ns = max(stamp_ns, self._graph_stamp_ns + 1)
             self._graph.publish(markers_cdr(view, self._graph_stamp_ns, self.map_frame))
 
-    def begin_anew(self) -> None:
-        """Forget all stamps, and take back the path and the markers: there is no graph."""
+    def start_new_graph(self) -> None:
+        """Forget all stamps; publish an empty path and the deletion of all markers."""
         self._newest_ns = 0
         self._aligned = False
         self._slew.forget()
@@ -200,13 +236,24 @@ class Publishers:
     def publish_diagnostics(
         self, level: bytes, text: str, values: Mapping[str, object],
     ) -> None:
-        """Publish the state of the node; this alone is stamped by the node's clock."""
+        """
+        Publish the state of the node; the only output that is stamped by the node's clock.
+
+        Parameters
+        ----------
+        level : bytes
+            One of the levels of DiagnosticStatus.
+        text : str
+            The state in a sentence.
+        values : mapping
+
+        """
         name = f'{self._node.get_fully_qualified_name()}: pose graph'
         self._diagnostics.publish(messages.diagnostics_message(
             self._node.get_clock().now().to_msg(), name, level, text, values))
 
     def close(self) -> None:
-        """Take all publishers away."""
+        """Destroy all publishers."""
         if self.transforms is not None:
             self.transforms.close()
         with self._lock:

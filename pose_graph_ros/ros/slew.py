@@ -1,21 +1,21 @@
 # Copyright 2026 The pose_graph_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""How fast the published transform may move; no rclpy."""
+"""Speed limit of the published transform; imports no rclpy."""
 
 import math
 
 import numpy as np
 
-from pose_graph_ros.core import se2
-from pose_graph_ros.core.se2 import FloatArray
+from pose_graph_ros.core.geometry import se2
+from pose_graph_ros.core.geometry.se2 import FloatArray
 
 
 class Slew:
     """
-    Lets the robot's pose by the published transform follow the estimate at a limited speed.
+    Limits the speed at which corrections move the robot in the published transform.
 
-    A correction that moves the odometry frame by little can move a robot far from its origin by
-    much, so the limits hold where the robot is. The graph knows nothing of them.
+    A small turn of the odometry frame moves a robot far from its origin by much, so the limits
+    hold at the robot. They do not affect the graph.
     """
 
     def __init__(self) -> None:
@@ -23,7 +23,7 @@ class Slew:
         self._stamp_ns = 0
 
     def forget(self) -> None:
-        """Let the next transform be published as it is."""
+        """Let the next transform be published without limits."""
         self._last = None
 
     def limited(
@@ -31,17 +31,18 @@ class Slew:
         angular: float,
     ) -> FloatArray:
         """
-        Return the transform to publish.
+        Return the transform from map to odom to publish, shape (3,).
 
         Parameters
         ----------
         stamp_ns : int
+            Newer than in the call before [ns].
         T_map_odom : ndarray, shape (3,)
-            As estimated.
+            The estimate.
         T_odom_base : ndarray, shape (3,)
             Odometry at the stamp.
         linear, angular : float
-            Speeds [m/s, rad/s] at which the robot's pose may be corrected at the most; 0: at any.
+            Greatest speeds of corrections at the robot [m/s, rad/s]; 0: no limit.
 
         """
         if self._last is not None and (linear > 0.0 or angular > 0.0):

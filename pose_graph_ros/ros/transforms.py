@@ -1,6 +1,6 @@
 # Copyright 2026 The pose_graph_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""The transform from map to odom: who publishes it, and that nobody else does."""
+"""The published transform from map to odom, and a check that no other node publishes it."""
 
 from collections import deque
 from collections.abc import Callable
@@ -13,29 +13,29 @@ from rclpy.qos import QoSProfile, QoSReliabilityPolicy
 from rclpy.serialization import deserialize_message
 from rclpy.subscription import Subscription
 
-from pose_graph_ros.core.se2 import FloatArray
+from pose_graph_ros.adapters.conversions import frame, stamp_ns
+from pose_graph_ros.core.geometry.se2 import FloatArray
 from pose_graph_ros.ros import messages
-from pose_graph_ros.ros.conversions import frame, stamp_ns
 
 try:
     from tf2_msgs.msg import TFMessage
 except ImportError:  # ROS 2 from PyPI lacks tf2_msgs until it is built
     TFMessage = None
 
-# As tf2_ros has it.
+# The profile of tf2_ros.
 TF_QOS = QoSProfile(depth=100, reliability=QoSReliabilityPolicy.RELIABLE)
 TOPIC = '/tf'
-# Reading all of /tf costs as much as reading odometry: it is read for so long at a time [s] ...
+# Reading all of /tf costs as much as reading odometry, so it is read for this time only [s].
 LISTENING = 2.0
-# ... and again after so long, or at once where there is a new publisher [s].
+# Period of the listening; a new publisher on /tf starts it at once [s].
 PAUSE = 30.0
-# The newest transforms of this node, to know them when they are heard.
+# Number of the newest transforms of this node that are kept, to recognise them on /tf.
 OWN = 2000
 
 
 class TransformPublisher:
     """
-    Publishes `map -> odom`, each with a newer stamp than the one before.
+    Publishes the transform from map to odom, each with a newer stamp than the one before.
 
     Parameters
     ----------
@@ -43,7 +43,7 @@ class TransformPublisher:
     publisher : rclpy.publisher.Publisher
     map_frame, odom_frame : str
     on_other : callable
-        Called once when somebody else is heard to publish the same transform, with a sentence.
+        Called once with a sentence if another node publishes the same transform.
 
     """
 
@@ -60,10 +60,19 @@ class TransformPublisher:
         self._known: set[bytes] = set()
         self._since = -float('inf')
         self.other = ''
-        """What is to be said of another publisher; empty if none was heard."""
+        """Warning about another publisher of the transform; empty if there is none."""
 
     def publish(self, at_ns: int, T_map_odom: FloatArray) -> None:
-        """Publish the transform at a stamp [ns], unless one as new was."""
+        """
+        Publish the transform, unless its stamp is not newer than the last one.
+
+        Parameters
+        ----------
+        at_ns : int
+            Stamp [ns].
+        T_map_odom : ndarray, shape (3,)
+
+        """
         if at_ns <= self._newest_ns:
             return
         self._newest_ns = at_ns
@@ -72,38 +81,38 @@ class TransformPublisher:
             at_ns, T_map_odom, self._map_frame, self._odom_frame))
 
     def forget(self) -> None:
-        """Let time begin anew."""
+        """Let the next transform have any stamp."""
         self._newest_ns = 0
 
-    def look_for_others(self) -> None:
-        """Listen to /tf for a while if there are others who publish there; call now and then."""
+    def check_for_others(self) -> None:
+        """Listen to /tf for a while if other nodes publish there; to be called periodically."""
         if self.other != '':
             return
         now = time.monotonic()
         if self._subscription is not None:
             if now - self._since > LISTENING:
-                self._listen_no_more()
+                self._stop_listening()
             return
-        # another instance of this node, by mistake, has its name as well
+        # by endpoint: a second instance of this node, started by mistake, has the same name
         everyone = {bytes(info.endpoint_gid)
                     for info in self._node.get_publishers_info_by_topic(TOPIC)}
         if len(everyone) > 1 and (not everyone <= self._known or now - self._since > PAUSE):
             self._known, self._since = everyone, now
             self._subscription = self._node.create_subscription(
-                TFMessage, TOPIC, self._hear, TF_QOS, raw=True)
+                TFMessage, TOPIC, self._on_transforms, TF_QOS, raw=True)
 
     def close(self) -> None:
-        """Publish and listen no more."""
-        self._listen_no_more()
+        """Destroy the publisher and the subscription."""
+        self._stop_listening()
         self._node.destroy_publisher(self._publisher)
 
-    def _listen_no_more(self) -> None:
+    def _stop_listening(self) -> None:
         if self._subscription is not None:
             self._node.destroy_subscription(self._subscription)
             self._subscription = None
 
-    def _hear(self, data: bytes) -> None:
-        # most of what is on /tf is about the robot's joints: not worth a message
+    def _on_transforms(self, data: bytes) -> None:
+        # most transforms are of the robot's joints: not worth a deserialisation
         if self._odom_frame.encode() not in data or self.other != '':
             return
         for transform in deserialize_message(data, TFMessage).transforms:
@@ -113,7 +122,7 @@ class TransformPublisher:
                 continue
             wrong = '' if parent == self._map_frame else ', so that it has two parents'
             self.other = (
-                f'somebody else publishes {parent} -> {self._odom_frame} on {TOPIC}{wrong}: '
+                f'another node publishes {parent} -> {self._odom_frame} on {TOPIC}{wrong}: '
                 'set publish_tf of one of the two to false')
             self._on_other(self.other)
             return

@@ -3,9 +3,9 @@
 """
 The thread that owns the engine: the single writer of the graph.
 
-Callbacks post measurements and ask for updates or jobs; they never wait for a solver. What they
-read is a frozen estimate that the thread swaps in. A worker serves one graph: where that begins
-anew, another worker takes over. Imports no ROS.
+Callbacks post measurements and request updates or jobs; they never wait for a solver. They read
+an immutable estimate that the thread replaces as a whole. A worker serves one graph: a new graph
+gets a new worker. Imports no ROS.
 """
 
 from collections import Counter, deque
@@ -19,16 +19,16 @@ from typing import TypeVar
 
 from pose_graph_ros.core.backend import PoseGraphBackend
 from pose_graph_ros.core.estimate import Estimate, UpdateReport
-from pose_graph_ros.core.joining import SourceReport
-from pose_graph_ros.core.measurements import Measurement, OdometrySample, Verdict
+from pose_graph_ros.core.measurements import AnswerStatus, Measurement, OdometrySample
+from pose_graph_ros.core.sources.source_report import SourceReport
 
 logger = logging.getLogger(__name__)
 
 Result = TypeVar('Result')
 Job = Callable[[PoseGraphBackend], Result]
-"""Something to be done in the thread that owns the engine."""
+"""A function that is called in the worker's thread with the engine."""
 
-# More than this waiting means that the worker has lost touch; what comes then is counted as lost.
+# Greatest number of measurements that wait for the thread; further ones are rejected.
 INBOX_LIMIT = 100_000
 
 
@@ -37,16 +37,17 @@ class WorkerStatus:
     """A snapshot for the diagnostics."""
 
     processed: int = 0
-    """Measurements that the engine has taken or refused."""
+    """Number of measurements that the engine has accepted or rejected."""
     counts: Counter[tuple[str, str]] = field(default_factory=Counter)
-    """(source, 'accepted' or reason) to how often."""
+    """Number of measurements by source and 'accepted' or a reason."""
     pending: int = 0
     quarantined: int = 0
     updates: int = 0
-    """Updates that solved something."""
+    """Number of updates that ran the solver."""
     solve_mean: float = 0.0
-    """Duration of such an update [s]."""
+    """Mean duration of such an update [s]."""
     solve_max: float = 0.0
+    """Longest such duration [s]."""
     report: UpdateReport | None = None
     """Of the newest update."""
     sources: Mapping[str, SourceReport] = field(default_factory=dict)
@@ -63,8 +64,8 @@ class Worker:
     on_estimate : callable
         Called in the worker's thread after each new estimate, with the backend.
     prepare : callable
-        Called in the worker's thread before its first work, while what is posted waits; gets a
-        function that tells whether the worker is to end.
+        Called in the worker's thread before its first work, while posted measurements wait; gets
+        a function that returns whether the worker is to end.
 
     """
 
@@ -76,7 +77,7 @@ class Worker:
         self._on_estimate = on_estimate
         self._prepare = prepare
         self.prepared = False
-        """Whether the preparation is over."""
+        """Whether the preparation has ended."""
         self._inbox: deque[tuple[str, OdometrySample | Measurement]] = deque()
         self._update_wanted = False
         self._jobs: list[tuple[Job[object], Future[object]]] = []
@@ -84,7 +85,7 @@ class Worker:
         self._condition = threading.Condition()
         self._revision = backend.revision
         self._solves, self._solve_total, self._solve_max = 0, 0.0, 0.0
-        self._said: set[tuple[str, str]] = set()
+        self._warned: set[tuple[str, str]] = set()
         self.estimate: Estimate | None = None
         """The newest estimate, without its path; replaced as a whole."""
         self.status = WorkerStatus()
@@ -101,7 +102,7 @@ class Worker:
         return self._thread.is_alive()
 
     def stop(self, timeout: float) -> bool:
-        """End the thread, waiting so long [s] for a solve; tell whether it has ended."""
+        """Make the thread end, wait for it at most a time [s], and return whether it has ended."""
         with self._condition:
             self._stopping = True
             self._condition.notify()
@@ -109,7 +110,19 @@ class Worker:
         return not self._thread.is_alive()
 
     def post(self, source: str, measurement: OdometrySample | Measurement) -> bool:
-        """Hand a measurement over; False if the inbox is full and it was dropped."""
+        """
+        Hand a measurement over; return False if the inbox is full.
+
+        Parameters
+        ----------
+        source : str
+        measurement : OdometrySample or Measurement
+
+        Returns
+        -------
+        posted : bool
+
+        """
         with self._condition:
             if len(self._inbox) >= INBOX_LIMIT:
                 return False
@@ -118,17 +131,17 @@ class Worker:
         return True
 
     def request_update(self) -> None:
-        """Ask for an update of the graph with all that has been posted."""
+        """Request an update of the graph with all posted measurements."""
         with self._condition:
             self._update_wanted = True
             self._condition.notify()
 
-    def request_closing(self) -> 'Future[UpdateReport]':
-        """Ask for a full optimisation of all that has been posted."""
-        return self.call(self.close)
+    def request_final_optimization(self) -> 'Future[UpdateReport]':
+        """Request a full optimisation with all posted measurements."""
+        return self.call(self.optimize_fully)
 
     def call(self, job: Job[Result]) -> 'Future[Result]':
-        """Have something done in the thread, after all that has been posted."""
+        """Request a call in the thread, after all posted measurements were added."""
         future: Future[Result] = Future()
         with self._condition:
             if self._stopping:
@@ -156,13 +169,13 @@ class Worker:
                 for source, measurement in batch:
                     self._add(source, measurement)
                 report = self._update(self._backend.update) if wanted else None
-                # where odometry has jumped the old estimate cannot be carried on
+                # after a jump of the odometry the old estimate cannot be propagated
                 stale = self._revision != self._backend.revision
                 if report is not None or self.estimate is None or stale:
                     self._publish()
                 self._report(report, len(batch))
             except Exception:
-                # the thread must outlive whatever comes: it is the only one that writes
+                # no error may end the thread, which is the only one that adds measurements
                 logger.exception('the worker failed')
                 self._backend.counts['worker', 'internal_error'] += 1
             for job, future in jobs:
@@ -178,8 +191,8 @@ class Worker:
         else:
             future.set_result(result)
 
-    def close(self, backend: PoseGraphBackend) -> UpdateReport:
-        """Optimise fully; a job for `call`."""
+    def optimize_fully(self, backend: PoseGraphBackend) -> UpdateReport:
+        """Optimise the whole graph; a job for `call`."""
         try:
             report = self._update(backend.optimize)
             self._publish()
@@ -195,7 +208,7 @@ class Worker:
             if self._prepare is not None:
                 self._prepare(lambda: self._stopping)
         except Exception:
-            # what was to be prepared is then made when it is first needed
+            # kernels are then compiled when they are first needed
             logger.exception('the preparation of the worker failed')
         self.prepared = True
 
@@ -206,9 +219,9 @@ class Worker:
             else:
                 answer = self._backend.add_measurement(measurement, source)
             key = (source, answer.reason)
-            if answer.verdict is Verdict.REJECTED and key not in self._said:
-                self._said.add(key)
-                logger.warning('%s: %s: %s (said once, counted in diagnostics)', source,
+            if answer.status is AnswerStatus.REJECTED and key not in self._warned:
+                self._warned.add(key)
+                logger.warning('%s: %s: %s (logged once, counted in diagnostics)', source,
                                answer.reason, answer.detail)
         except Exception:
             self._backend.counts[source, 'internal_error'] += 1
@@ -223,7 +236,7 @@ class Worker:
             self._solve_total += seconds
             self._solve_max = max(self._solve_max, seconds)
         if report.reason != '':
-            logger.warning('the solver failed, the last good estimate stays: %s', report.reason)
+            logger.warning('the solver failed, the last good estimate is kept: %s', report.reason)
         return report
 
     def _publish(self) -> None:
@@ -233,11 +246,11 @@ class Worker:
             self._on_estimate(self._backend)
 
     def _report(self, report: UpdateReport | None, processed: int) -> None:
-        """Swap in a new status, whole; the report of the last update stays if there is none."""
+        """Replace the status; keep the report of the last update if there is no new one."""
         status, backend = self.status, self._backend
         self.status = WorkerStatus(
             processed=status.processed + processed, counts=Counter(backend.counts),
-            pending=backend.n_pending, quarantined=backend.n_quarantined, updates=self._solves,
+            pending=backend.n_waiting, quarantined=backend.n_quarantined, updates=self._solves,
             solve_mean=self._solve_total / max(self._solves, 1), solve_max=self._solve_max,
             report=status.report if report is None else report,
             sources=status.sources if report is None else backend.reports())

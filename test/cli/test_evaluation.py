@@ -24,8 +24,8 @@ from pose_graph_ros.cli.evaluation import (
     summary,
 )
 from pose_graph_ros.cli.picture import BLUE, draw_drive, GREEN, VERMILION
-from pose_graph_ros.core import se2
-from pose_graph_ros.core.trajectory import Trajectory
+from pose_graph_ros.core.geometry import se2
+from pose_graph_ros.core.geometry.trajectory import Trajectory
 
 NOTHING = Trajectory(np.zeros(0, dtype=np.int64), np.zeros((0, 3)))
 NO_LOOPS = np.zeros((0, 2), dtype=np.int64)

@@ -7,14 +7,14 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from pose_graph_ros.adapters.bags import open_bag
 from pose_graph_ros.cli.simulate import (
     simulate_drive,
     SimulatedDrive,
     write_drive,
 )
-from pose_graph_ros.core import se2
-from pose_graph_ros.core.tangent_plane import TangentPlane
-from pose_graph_ros.ros.bags import open_bag
+from pose_graph_ros.core.geometry import se2
+from pose_graph_ros.core.geometry.geodesy import TangentPlane
 
 
 @pytest.fixture(scope='module')

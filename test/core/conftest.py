@@ -4,7 +4,7 @@
 
 from hypothesis import settings
 
-from pose_graph_ros.core import tables
+from pose_graph_ros.core.graph import tables
 
 settings.register_profile('core', deadline=None, derandomize=True)
 settings.load_profile('core')

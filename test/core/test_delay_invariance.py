@@ -8,11 +8,12 @@ from dataclasses import dataclass
 from hypothesis import given, settings, strategies as st
 import numpy as np
 
-from pose_graph_ros.core import se2
+from pose_graph_ros.core.alignment.monitor import AlignmentState
 from pose_graph_ros.core.backend import PoseGraphBackend
-from pose_graph_ros.core.batch import Status
-from pose_graph_ros.core.config import BackendConfig
-from pose_graph_ros.core.estimate import AlignmentState
+from pose_graph_ros.core.batch.optimizer import Status
+from pose_graph_ros.core.config import BackendConfig, Loss, MeasurementSource, OdometrySource
+from pose_graph_ros.core.geometry import se2
+from pose_graph_ros.core.geometry.se2 import FloatArray
 from pose_graph_ros.core.measurements import (
     GlobalPose,
     HeadingOnly,
@@ -21,8 +22,6 @@ from pose_graph_ros.core.measurements import (
     OdometrySample,
     Position,
 )
-from pose_graph_ros.core.se2 import FloatArray
-from pose_graph_ros.core.sources import Loss, MeasurementSource, OdometrySource
 
 SECOND = 1_000_000_000
 EPOCH = 1_767_225_600 * SECOND
@@ -165,7 +164,7 @@ def run(events: list[Event], config: BackendConfig, updates: frozenset[int]) -> 
     assert online is not None
     report = backend.optimize()
     assert report.status is Status.CONVERGED
-    assert (backend.n_pending, backend.n_quarantined) == (0, 0)
+    assert (backend.n_waiting, backend.n_quarantined) == (0, 0)
     estimate = backend.estimate()
     assert estimate.alignment is AlignmentState.ALIGNED
     return Result(online.path.poses, estimate.path.stamps_ns, estimate.path.poses,

@@ -15,14 +15,15 @@ from types import ModuleType
 import numba
 import pytest
 
-from pose_graph_ros.core import jit, kernel_cache, warm_up
+from pose_graph_ros.core import warm_up
+from pose_graph_ros.core.compiled import jit, kernel_cache
 from pose_graph_ros.core.helper_process import HelperProcess
 
 PACKAGE = 'helped_kernels_of_a_test'
 FILES = {
     '__init__': '',
     'outer': """
-from pose_graph_ros.core.jit import kernel
+from pose_graph_ros.core.compiled.jit import kernel
 
 @kernel
 def twice(x):

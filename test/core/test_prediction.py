@@ -8,13 +8,13 @@ from hypothesis import given, strategies as st
 import numpy as np
 import pytest
 
-from pose_graph_ros.core import covariance, se2
 from pose_graph_ros.core.backend import PoseGraphBackend
 from pose_graph_ros.core.estimate import Estimate
+from pose_graph_ros.core.geometry import covariance, se2
+from pose_graph_ros.core.geometry.se2 import FloatArray
 from pose_graph_ros.core.measurements import GlobalPose, OdometrySample
-from pose_graph_ros.core.motion import Motion, NO_MOTION
+from pose_graph_ros.core.odometry.motion import Motion, NO_MOTION, odometry_covariance
 from pose_graph_ros.core.prediction import predict
-from pose_graph_ros.core.se2 import FloatArray
 
 SECOND = 1_000_000_000
 
@@ -64,7 +64,7 @@ def test_later_odometry_is_appended_as_the_next_estimate_would(
     then = estimate_of(backend)
     np.testing.assert_allclose(ahead.T_map_base, then.T_map_base, atol=1e-12)
     # the estimate's own covariance holds the floor of one increment more, at the most
-    floor = covariance.odometry_covariance(estimate.noise, NO_MOTION)
+    floor = odometry_covariance(estimate.noise, NO_MOTION)
     difference = then.covariance - ahead.covariance
     assert np.abs(difference[:2, :2]).max() <= 2.0 * floor[0, 0]
 
@@ -93,7 +93,7 @@ def test_plain_numbers_say_what_matrices_say(
     motion = Motion(increment, float(np.hypot(*increment[:2])), abs(float(increment[2])))
     expected = covariance.propagated(
         T_map_base, estimate.covariance, increment,
-        covariance.odometry_covariance(estimate.noise, motion, floor=False))
+        odometry_covariance(estimate.noise, motion, floor=False))
     pose = se2.compose(T_map_base, increment)
     np.testing.assert_allclose(prediction.T_map_base[:2], pose[:2], rtol=0.0, atol=1e-10)
     assert abs(se2.wrap(prediction.T_map_base[2] - pose[2])) < 1e-12

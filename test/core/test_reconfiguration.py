@@ -9,33 +9,32 @@ from hypothesis import given, settings, strategies as st
 import numpy as np
 import pytest
 
-from pose_graph_ros.core import robust, se2
+from pose_graph_ros.core.alignment.monitor import AlignmentState
 from pose_graph_ros.core.backend import PoseGraphBackend
-from pose_graph_ros.core.batch import Status
+from pose_graph_ros.core.batch.optimizer import Status
 from pose_graph_ros.core.config import (
     AlignmentPolicy,
     BackendConfig,
-    NodePolicy,
-    SmootherConfig,
-)
-from pose_graph_ros.core.estimate import AlignmentState
-from pose_graph_ros.core.exceptions import ConfigError
-from pose_graph_ros.core.measurements import (
-    GlobalPose,
-    Measurement,
-    OdometrySample,
-    Position,
-    Verdict,
-)
-from pose_graph_ros.core.se2 import FloatArray
-from pose_graph_ros.core.sources import (
     Correlation,
     CovariancePolicy,
     Loss,
     MeasurementSource,
+    NodePolicy,
     NoiseFrom,
     OdometryNoise,
     OdometrySource,
+    SmootherConfig,
+)
+from pose_graph_ros.core.exceptions import ConfigError
+from pose_graph_ros.core.geometry import se2
+from pose_graph_ros.core.geometry.se2 import FloatArray
+from pose_graph_ros.core.graph import losses
+from pose_graph_ros.core.measurements import (
+    AnswerStatus,
+    GlobalPose,
+    Measurement,
+    OdometrySample,
+    Position,
 )
 
 SECOND = 1_000_000_000
@@ -253,14 +252,14 @@ def test_another_reorder_window_takes_what_comes_late_from_then_on() -> None:
 
     backend = PoseGraphBackend(CONFIG)
     for k in (0, 1, 2, 3, 5):
-        assert backend.add_odometry(sample(k)).verdict is Verdict.ACCEPTED
+        assert backend.add_odometry(sample(k)).status is AnswerStatus.ACCEPTED
     assert backend.add_odometry(sample(4)).reason == 'out_of_order'
     backend.configure(with_odometry(reorder_window=0.5))
     for k in (8, 7, 6):
-        assert backend.add_odometry(sample(k)).verdict is Verdict.ACCEPTED
+        assert backend.add_odometry(sample(k)).status is AnswerStatus.ACCEPTED
     assert backend.add_odometry(sample(4)).reason == 'out_of_order'
     backend.configure(CONFIG)
-    assert backend.add_odometry(sample(10)).verdict is Verdict.ACCEPTED
+    assert backend.add_odometry(sample(10)).status is AnswerStatus.ACCEPTED
     assert backend.add_odometry(sample(9)).reason == 'out_of_order'
 
 
@@ -271,9 +270,9 @@ def test_another_patience_lets_another_odometry_lead_sooner() -> None:
         backend.configure(replace(CONFIG, odometry_patience=patience[-1]))
         return feed(backend, only(DRIVE[HALF:HALF + 100], 'visual'))
 
-    assert run(600.0).estimate().lead == 'odom'
-    assert run(600.0, 1.0).estimate().lead == 'visual'
-    assert run(1.0, 600.0).estimate().lead == 'odom'
+    assert run(600.0).estimate().primary == 'odom'
+    assert run(600.0, 1.0).estimate().primary == 'visual'
+    assert run(1.0, 600.0).estimate().primary == 'odom'
 
 
 # --- Measurements --------------------------------------------------------------------------------
@@ -314,11 +313,11 @@ def test_a_loss_counts_for_what_joins_from_then_on() -> None:
     assert np.all(weights[:made] == 1.0)
     assert np.min(weights[made:]) < 0.1
     table = backend.graph.observed_at(np.arange(made, backend.graph.n_observed))
-    energies = backend.energies().observed[made:] / weights[made:]
+    energies = backend.graph.energies().observed[made:] / weights[made:]
     positions = table.information[:, 2, 2] == 0.0
     np.testing.assert_allclose(
         weights[made:][positions],
-        robust.weights(Loss.CAUCHY, energies[positions], 2.0), rtol=1e-6)
+        losses.weights(Loss.CAUCHY, energies[positions], 2.0), rtol=1e-6)
     assert np.all(weights[made:][~positions] == 1.0)
     # and back: what has one keeps it
     backend.configure(CONFIG)

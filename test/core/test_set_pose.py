@@ -7,10 +7,12 @@ import math
 import numpy as np
 import pytest
 
-from pose_graph_ros.core import se2
 from pose_graph_ros.core.backend import PoseGraphBackend
-from pose_graph_ros.core.batch import Status
-from pose_graph_ros.core.measurements import GlobalPose, OdometrySample, Position, Verdict
+from pose_graph_ros.core.batch.optimizer import Status
+from pose_graph_ros.core.config import BackendConfig, CovariancePolicy, MeasurementSource
+from pose_graph_ros.core.geometry import se2
+from pose_graph_ros.core.measurements import AnswerStatus, GlobalPose, OdometrySample, Position
+from pose_graph_ros.core.smoother.incremental import IncrementalSmoother, UpdateResult
 
 SIGMA = np.diag((0.25, 0.25, 0.07))
 
@@ -58,7 +60,7 @@ def test_in_a_map_the_robot_is_put_elsewhere_and_the_past_stays(ago: int) -> Non
     past = backend.estimate().path
     pose = np.array([300.0, -50.0, 2.5])
     answer = backend.set_pose(GlobalPose(stamp(99 - ago), pose, SIGMA), 'set_pose')
-    assert answer.verdict is Verdict.ACCEPTED
+    assert answer.status is AnswerStatus.ACCEPTED
     backend.update()
     now = se2.compose(pose, np.array([0.2 * ago, 0.0, 0.0]))
     estimate = backend.estimate()
@@ -83,7 +85,7 @@ def test_measurements_count_on_their_side_of_it() -> None:
     late = Position(stamp(95), np.array([5.0 + 19.0, 1.0]), 0.01 * np.eye(2), np.zeros(2))
     soon = Position(stamp(105), np.array([301.2, 0.0]), 0.01 * np.eye(2), np.zeros(2))
     for fix in (late, soon):
-        assert backend.add_measurement(fix, 'fix').verdict is Verdict.ACCEPTED
+        assert backend.add_measurement(fix, 'fix').status is AnswerStatus.ACCEPTED
     backend.optimize()
     assert backend.estimate().chi2 < 1e-6
 
@@ -106,3 +108,46 @@ def test_without_odometry_it_is_refused() -> None:
     answer = backend.set_pose(GlobalPose(1, np.zeros(3), SIGMA), 'set_pose')
     assert answer.reason == 'before_odometry'
     assert backend.counts['set_pose', 'before_odometry'] == 1
+
+
+def test_a_pose_with_an_invalid_covariance_is_refused_and_changes_nothing() -> None:
+    backend = PoseGraphBackend(BackendConfig(measurements={
+        'set_pose': MeasurementSource(covariance=CovariancePolicy(repair=False))}))
+    drive(backend, 0, 100, np.array([5.0, 1.0, 0.0]))
+    backend.update()
+    pose = GlobalPose(stamp(99), np.array([9.0, 0.0, 0.0]), -SIGMA)
+    assert backend.set_pose(pose, 'set_pose').status is AnswerStatus.REJECTED
+    expected = PoseGraphBackend()
+    drive(expected, 0, 100, np.array([5.0, 1.0, 0.0]))
+    expected.update()
+    expected.finish()
+    assert backend.counts['set_pose', 'accepted'] == 0
+    assert len(backend.node_stamps_ns) == len(expected.node_stamps_ns)
+    np.testing.assert_allclose(
+        backend.estimate().path.poses, expected.estimate().path.poses, atol=1e-9)
+
+
+def test_a_pose_that_the_solver_makes_no_node_for_is_refused_and_may_be_set_again() -> None:
+    class Refusing(IncrementalSmoother):
+        refuses = False
+
+        def extend(self, *arguments: np.ndarray) -> UpdateResult:
+            if self.refuses:
+                return UpdateResult(Status.FAILED, 'refused', 0, 0, 0, 0)
+            return super().extend(*arguments)
+
+    smoother = Refusing()
+    backend = PoseGraphBackend(smoother=smoother)
+    drive(backend, 0, 100, np.array([5.0, 1.0, 0.0]))
+    backend.update()
+    backend.finish()
+    n, pose = len(backend.node_stamps_ns), np.array([300.0, -50.0, 2.5])
+    smoother.refuses = True
+    answer = backend.set_pose(GlobalPose(stamp(99), pose, SIGMA), 'set_pose')
+    assert (answer.status, answer.reason) == (AnswerStatus.REJECTED, 'failed')
+    assert len(backend.node_stamps_ns) == n
+    smoother.refuses = False
+    assert backend.set_pose(GlobalPose(stamp(99), pose, SIGMA), 'set_pose').reason == ''
+    assert len(backend.node_stamps_ns) == n + 1
+    backend.update()
+    np.testing.assert_allclose(backend.estimate().T_map_base, pose, atol=1e-3)

@@ -13,15 +13,17 @@ from pose_graph_ros.core import warm_up
 RUN = """
 import numpy as np
 from pose_graph_ros.core.warm_up import warm_up
-from pose_graph_ros.core import batch, jit, se2
+from pose_graph_ros.core.batch import optimizer
+from pose_graph_ros.core.compiled import jit
+from pose_graph_ros.core.geometry import se2
 from pose_graph_ros.core.backend import PoseGraphBackend
 from pose_graph_ros.core.config import BackendConfig, SmootherConfig
-from pose_graph_ros.core.graph import GraphUpdate
-from pose_graph_ros.core.batch import Status
+from pose_graph_ros.core.graph.graph import GraphUpdate
+from pose_graph_ros.core.batch.optimizer import Status
 from pose_graph_ros.core.measurements import GlobalPose, LoopClosure, OdometrySample, Position
 
 def signatures():
-    return {name: [str(s) for s in kernel.signatures] for name, kernel in jit.registered().items()}
+    return {name: [str(s) for s in kernel.signatures] for name, kernel in jit._registered.items()}
 
 assert warm_up() > 0.0
 before = signatures()
@@ -57,7 +59,7 @@ for config in (BackendConfig(), BackendConfig(smoother=SmootherConfig(max_iterat
             GraphUpdate(remove_edges=(800,)) if backend.graph.n_edges > 800 else GraphUpdate(),
             GraphUpdate(weigh_observed={3: 0.1}, weigh_edges={5: 2.0}),
             GraphUpdate(fix=(7,)), GraphUpdate(free=(7,)), GraphUpdate(remove_observed=(4,))):
-        smoother.update(update, chi2=True)
+        smoother.update(update)
     smoother.covariances()
     smoother.joint_covariance(5, 600)
     alone = smoother.update(GraphUpdate(hidden=np.zeros((1, 3))))
@@ -73,9 +75,9 @@ assert not grown, grown
 # The next start must not say that it compiles.
 COMPLETE = """
 from pose_graph_ros.core.warm_up import warm_up
-from pose_graph_ros.core import jit
+from pose_graph_ros.core.compiled import jit
 warm_up()
-missing = [name for name, kernel in jit.registered().items() if not kernel._cache.holds_code()]
+missing = [name for name, kernel in jit._registered.items() if not kernel._cache.holds_code()]
 assert jit.is_cached(), missing
 """
 

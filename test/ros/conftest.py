@@ -1,26 +1,23 @@
 # Copyright 2026 The pose_graph_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""What the tests of this folder share; those that need ROS 2 import `harness`."""
+"""Fixtures of this folder; those that need ROS 2 import `harness`."""
 
 from collections.abc import Iterator
 import os
 from pathlib import Path
-import sys
 from typing import Any
 
 import pytest
 
-sys.path.insert(0, str(Path(__file__).parent))
-
 
 @pytest.fixture(autouse=True, scope='session')
 def _on_this_machine_alone(tmp_path_factory: pytest.TempPathFactory) -> Iterator[None]:
-    """The client of a test must not be heard outside, nor write into the home folder."""
+    """Keep the nodes of the tests on this machine, and their logs out of the home folder."""
     with pytest.MonkeyPatch.context() as environment:
         environment.setenv('ROS_AUTOMATIC_DISCOVERY_RANGE', 'LOCALHOST')
         # the name that Fast DDS has for it in Jazzy, and a later one
         for name in ('FASTRTPS_DEFAULT_PROFILES_FILE', 'FASTDDS_DEFAULT_PROFILES_FILE'):
-            environment.setenv(name, str(Path(__file__).parent / 'discovery.xml'))
+            environment.setenv(name, str(Path(__file__).parents[1] / 'helpers' / 'discovery.xml'))
         environment.setenv('ROS_LOG_DIR', str(tmp_path_factory.mktemp('ros_log')))
         assert 'ROS_LOCALHOST_ONLY' not in os.environ, 'unset it: it overrides the range'
         yield
@@ -54,6 +51,6 @@ def _one_node(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Any]:
 
 @pytest.fixture
 def shared(_one_node: Any) -> Any:
-    """A client of a node that other tests of the module had before, which began anew."""
-    _one_node.begin_anew()
+    """A client of the node that the tests of a module share, with a new graph."""
+    _one_node.start_new_graph()
     return _one_node

@@ -69,7 +69,7 @@ def test_it_waits_for_its_manager_and_goes_through_all_states(
     assert client.optimize().success
     nodes = client.values['hidden_nodes']
 
-    # the graph stays while it is inactive, and goes on growing after that
+    # the graph is kept while the node is inactive, and grows when it is active again
     assert manager.change(Transition.TRANSITION_DEACTIVATE)
     client.spin_until(lambda: client.odom.get_subscription_count() == 0, 'nobody listens')
     client.spin_until(lambda: client.values['active'] == '0', 'it is inactive')
@@ -81,7 +81,7 @@ def test_it_waits_for_its_manager_and_goes_through_all_states(
     assert int(client.values['hidden_nodes']) > int(nodes)
     assert 'odom.jump' not in client.values
 
-    # a clean-up lets it go
+    # a clean-up discards it
     assert manager.change(Transition.TRANSITION_DEACTIVATE)
     assert manager.change(Transition.TRANSITION_CLEANUP)
     assert manager.state == State.PRIMARY_STATE_UNCONFIGURED
@@ -90,7 +90,7 @@ def test_it_waits_for_its_manager_and_goes_through_all_states(
     assert len(client.diagnostics) <= count + 1
     assert manager.change(Transition.TRANSITION_CONFIGURE)
     assert manager.change(Transition.TRANSITION_ACTIVATE)
-    client.spin_until(lambda: client.values['received'] == '0', 'it begins anew')
+    client.spin_until(lambda: client.values['received'] == '0', 'a new graph is started')
     client.wait_for_the_node()
     assert 'hidden_nodes' not in client.values
     drive(client, 5.0)

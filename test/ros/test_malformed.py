@@ -3,8 +3,8 @@
 """
 More than 200 malformed messages on every topic, to the real node over DDS.
 
-Each is a right message of the drive with something broken in it. Each must be counted, and none
-may show: what can be mended is right in the rest, what cannot is refused.
+Each is a message of the drive with a broken value. Each must be counted, and none may change the
+path: if its defect can be repaired the rest of it is correct, else it is rejected.
 """
 
 from collections.abc import Callable
@@ -17,12 +17,12 @@ import numpy as np
 import pytest
 from sensor_msgs.msg import Imu
 
-from pose_graph_ros.core import se2
+from pose_graph_ros.core.geometry import se2
 
 COUNT = 210
-"""On each topic."""
+"""Number of messages on each topic."""
 BEFORE = 60.0
-"""Malformed odometry comes before the drive: it leads, and what is older is not looked at [s]."""
+"""Time of the malformed odometry before the drive, since the engine rejects older odometry [s]."""
 DRIVE = 20.0
 TOPICS = ('odom', 'global_pose', 'fix', 'imu', 'loop_closure')
 
@@ -144,7 +144,7 @@ BREAKS: dict[str, tuple[Break, ...]] = {
 
 
 def right_message(topic: str, index: int, generator: random.Random) -> object:
-    """Return a message that nothing is wrong with."""
+    """Return a valid message."""
     seconds = generator.uniform(0.5, DRIVE - 1.0)
     if topic == 'odom':
         return odometry_at(-BEFORE + 0.25 * index)
@@ -206,7 +206,7 @@ def test_every_malformed_message_is_counted_and_none_shows(node: NodeProcess) ->
 
 
 def check_counts(values: dict[str, str]) -> None:
-    """Every message of every topic has been accepted, refused, or waits."""
+    """Check that every message of every topic was accepted or rejected, or waits."""
     total = 0
     for topic in TOPICS:
         counts = {key.partition('.')[2]: int(value) for key, value in values.items()
@@ -229,7 +229,7 @@ def check_counts(values: dict[str, str]) -> None:
 
 
 def check_outputs(client: Client) -> None:
-    """Nothing that is not finite has been published."""
+    """Check that all published numbers are finite."""
     for message in (*client.poses, *client.filtered):
         check_pose(message.pose)
     for message in client.filtered:

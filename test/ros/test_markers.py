@@ -17,8 +17,8 @@ from rclpy.serialization import deserialize_message, serialize_message
 from std_msgs.msg import ColorRGBA
 from visualization_msgs.msg import Marker, MarkerArray
 
-from pose_graph_ros.core.springs import GraphView, Lines
-from pose_graph_ros.ros import markers
+from pose_graph_ros.adapters import markers
+from pose_graph_ros.core.graph.graph_view import GraphView, Lines
 from pose_graph_ros.ros.messages import time_message
 
 STAMP = 1_800_000_000_000_000_007

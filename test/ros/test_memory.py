@@ -1,6 +1,6 @@
 # Copyright 2026 The pose_graph_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""Memory that goes back to the system; in processes of their own, as it concerns all of one."""
+"""Memory that is returned to the system; in separate processes, as all of a process counts."""
 
 import subprocess
 import sys
@@ -33,7 +33,7 @@ def work():
     llvmlite.binding.parse_assembly('define i32 @f() { ret i32 1 }').verify()
     return np.linalg.solve(np.eye(50) + 0.1, np.arange(50.0))
 first, before = work(), resident('RssFile')
-memory.let_go()
+memory.release_memory()
 print(before, resident('RssFile'), int(np.array_equal(first, work())))
 ''')
     assert same == 1.0

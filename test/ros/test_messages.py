@@ -21,10 +21,10 @@ import numpy as np
 from rclpy.serialization import deserialize_message, serialize_message
 from std_msgs.msg import Header
 
+from pose_graph_ros.adapters.conversions import PLANAR
+from pose_graph_ros.core.geometry.trajectory import Trajectory
 from pose_graph_ros.core.prediction import Prediction
-from pose_graph_ros.core.trajectory import Trajectory
 from pose_graph_ros.ros import messages
-from pose_graph_ros.ros.conversions import PLANAR
 
 
 def path_message(path: Trajectory, stamp_ns: int, frame: str) -> Path:

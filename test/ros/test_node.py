@@ -18,12 +18,23 @@ from circle import (
     START,
     true_pose,
 )
-from harness import Client, fix, NodeProcess, odometry, pose, RELIABLE, stamp_ns, TFMessage, yaw
+from harness import (
+    Client,
+    fix,
+    NodeProcess,
+    odometry,
+    PATIENCE,
+    pose,
+    RELIABLE,
+    stamp_ns,
+    TFMessage,
+    yaw,
+)
 import numpy as np
 import pytest
 from rclpy.serialization import serialize_message
 
-from pose_graph_ros.core import se2
+from pose_graph_ros.core.geometry import se2
 
 
 def test_every_message_of_a_drive_is_sound(node: NodeProcess, client: Client) -> None:
@@ -69,7 +80,13 @@ def test_every_message_of_a_drive_is_sound(node: NodeProcess, client: Client) ->
 
 @pytest.mark.skipif(TFMessage is None, reason='tf2_msgs is not built: no /tf')
 def test_the_transform_times_odometry_is_the_pose(node: NodeProcess, client: Client) -> None:
-    drive(client, 15.0)
+    drive(client, 1.0)
+    client.spin_until(lambda: len(client.paths) > 0, 'the first estimate comes')
+    drive(client, 15.0, begin=1.0)
+    last = round((START + 14.9) * 1e9)
+    client.spin_until(
+        lambda: min(stamp_ns(item[-1]) for item in (client.poses, client.transforms)) >= last,
+        'the last pose and transform come')
     poses = {stamp_ns(message): message.pose.pose for message in client.poses}
     compared = 0
     for transform in client.transforms:
@@ -272,7 +289,7 @@ def test_a_bad_parameter_is_one_line_and_no_traceback(
             nodes.append(stack.enter_context(
                 NodeProcess(tmp_path / str(k), ('-p', parameter))))
         for node, (_, expected) in zip(nodes, some, strict=True):
-            assert node.process.wait(20.0) == 2
+            assert node.process.wait(PATIENCE) == 2
             lines = node.stderr().splitlines()
             assert len(lines) == 1, lines
             assert expected in lines[0]
@@ -290,7 +307,7 @@ def test_whole_numbers_are_numbers_and_optimizing_nothing_says_so(tmp_path: Path
 def test_arguments_that_ros_cannot_read_end_the_node_without_a_traceback(tmp_path: Path) -> None:
     for arguments in (('-p', 'frequency'), ('--params-file', '/no/such.yaml'), ('--no-such',)):
         with NodeProcess(tmp_path, arguments) as node:
-            assert node.process.wait(20.0) == 2
+            assert node.process.wait(PATIENCE) == 2
             assert 'pose_graph_node: ' in node.stderr()
             assert 'Traceback' not in node.stderr()
 
@@ -300,7 +317,7 @@ def test_a_signal_during_the_start_ends_the_node_as_quietly(tmp_path: Path) -> N
         with NodeProcess(tmp_path) as node:
             time.sleep(delay)
             node.process.send_signal(signal.SIGINT)
-            node.process.wait(20.0)
+            node.process.wait(PATIENCE)
             stderr = node.stderr()
             # before its first line runs, Python itself takes the signal
             assert 'Traceback' not in stderr or 'pose_graph_ros' not in stderr, stderr

@@ -13,7 +13,7 @@ from rclpy.parameter import parameter_value_to_python
 from rclpy.qos import QoSHistoryPolicy, QoSReliabilityPolicy
 import yaml
 
-from pose_graph_ros.ros.parameters import all_parameters, Change
+from pose_graph_ros.adapters.parameters import all_parameters, Change
 
 
 def test_every_parameter_is_described(node: NodeProcess, client: Client) -> None:
@@ -97,7 +97,7 @@ def test_qualities_of_service_are_as_asked(tmp_path: Path) -> None:
 
 
 def test_two_robots_on_one_machine(tmp_path: Path) -> None:
-    """Each in its namespace, with its frames: what one hears is nothing to the other."""
+    """Each in its namespace, with its frames: messages to one do not affect the other."""
     (tmp_path / 'b').mkdir()
     with NodeProcess(tmp_path, ('-r', '__ns:=/a', '-p', 'odom_frame:=a/odom')) as first:
         domain = int(first.env['ROS_DOMAIN_ID'])

@@ -13,12 +13,12 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from tum_files import read_tum
 
 from pose_graph_ros.cli.bag_messages import fix_messages, odometry_messages, write_bag
 from pose_graph_ros.cli.main import main
-from pose_graph_ros.core.io.tum import read_tum
-from pose_graph_ros.core.tangent_plane import TangentPlane
-from pose_graph_ros.core.trajectory import Trajectory
+from pose_graph_ros.core.geometry.geodesy import TangentPlane
+from pose_graph_ros.core.geometry.trajectory import Trajectory
 
 pytest.importorskip('rclpy', reason='ROS 2 is not there: no rclpy')
 

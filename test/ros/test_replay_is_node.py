@@ -11,16 +11,16 @@ import sys
 import numpy as np
 import pytest
 from rosbags.typesys import get_typestore, Stores
+from tum_files import read_tum
 
+from pose_graph_ros.adapters.bag_writer import BagWriter
+from pose_graph_ros.adapters.bags import open_bag
 from pose_graph_ros.cli.bag_messages import fix_messages, odometry_messages, write_bag
 from pose_graph_ros.cli.main import main
 from pose_graph_ros.cli.simulate import simulate_drive, write_drive
-from pose_graph_ros.core import se2
-from pose_graph_ros.core.io.tum import read_tum
-from pose_graph_ros.core.tangent_plane import TangentPlane
-from pose_graph_ros.core.trajectory import Trajectory
-from pose_graph_ros.ros.bag_writer import BagWriter
-from pose_graph_ros.ros.bags import open_bag
+from pose_graph_ros.core.geometry import se2
+from pose_graph_ros.core.geometry.geodesy import TangentPlane
+from pose_graph_ros.core.geometry.trajectory import Trajectory
 
 pytest.importorskip('rclpy', reason='ROS 2 is not there: no rclpy')
 

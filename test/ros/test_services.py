@@ -14,7 +14,7 @@ import pytest
 from std_srvs.srv import SetBool
 from visualization_msgs.msg import Marker, MarkerArray
 
-from pose_graph_ros.core import se2
+from pose_graph_ros.core.geometry import se2
 
 
 def newest(client: Client) -> np.ndarray:
@@ -162,7 +162,7 @@ def test_the_markers_show_the_graph_while_someone_looks(
 
 
 def test_a_graph_is_saved_and_another_node_goes_on_with_it(tmp_path: Path) -> None:
-    """The second node takes the file, hears the rest of the drive, and has all of the path."""
+    """The second node loads the file, receives the rest of the drive, and has the whole path."""
     (tmp_path / 'b').mkdir()
     file = tmp_path / 'maps' / 'yard.g2o'
     arguments = ('-p', f'graph_file:={file}')

@@ -8,14 +8,25 @@ from pathlib import Path
 import random
 
 from circle import fix_at, odometry_at, odometry_pose, path_error, PLANE, START, true_pose
-from harness import Client, fix, imu, NodeProcess, odometry, pose, stamp_ns, TFMessage, yaw
+from harness import (
+    Client,
+    fix,
+    imu,
+    NodeProcess,
+    odometry,
+    pose,
+    stamp_ns,
+    TFMessage,
+    transform,
+    yaw,
+)
 from nav_msgs.msg import Odometry
 import numpy as np
 import pytest
 from rclpy.qos import QoSDurabilityPolicy, QoSProfile, QoSReliabilityPolicy
 from sensor_msgs.msg import Imu, NavSatFix
 
-from pose_graph_ros.core import se2
+from pose_graph_ros.core.geometry import se2
 
 # Exact measurements: what is left is the rounding of latitude and longitude [m].
 EXACT = 1e-3
@@ -92,10 +103,10 @@ def test_two_of_each_from_a_file_and_one_falls_silent(tmp_path: Path) -> None:
         assert int(values['edges']) > 1.5 * int(values['hidden_nodes'])
         assert path_error(client) < EXACT
         assert float(values['odom.silence_s']) < 5.0
-        assert values['loop_closure.silence_s'] == 'never heard'
+        assert values['loop_closure.silence_s'] == 'never received'
 
         play(client, range(150, 300), visual, front, rear)
-        client.spin_until(lambda: client.values['odometry'] == 'visual', 'the other leads')
+        client.spin_until(lambda: client.values['odometry'] == 'visual', 'visual is primary')
         step = 300
         while 'odom is silent' not in client.diagnostics[-1].status[0].message:
             play(client, range(step, step + 1), visual, front)
@@ -206,8 +217,6 @@ def test_a_reset_of_the_odometry_shows_in_no_output(node: NodeProcess, client: C
 @pytest.mark.skipif(TFMessage is None, reason='tf2_msgs is not built: no /tf_static')
 @pytest.mark.parametrize('node', [('-p', 'base_link_frame:=robot')], indirect=True)
 def test_the_lever_arm_comes_from_tf_static(node: NodeProcess) -> None:
-    from test_fixes import transform  # noqa: PLC0415
-
     with connected(node) as client:
         static = client.node.create_publisher(TFMessage, '/tf_static', QoSProfile(
             depth=10, reliability=QoSReliabilityPolicy.RELIABLE,
@@ -287,7 +296,7 @@ def test_errors_that_live_on_show_in_the_diagnostics(
     assert client.optimize().success
     told = client.values['fix.errors_live']
     assert 0.5 < float(told.partition(' ')[0]) < 100.0
-    treated = 'they are treated as white: set fix.correlation_time' in told
+    treated = 'treated as white: set fix.correlation_time' in told
     assert treated == (request.node.callspec.params['node'] == ())
     assert 0.01 < float(client.values['fix.squared_residual']) < 3.0
 

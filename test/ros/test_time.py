@@ -22,7 +22,7 @@ def set_clock(publisher: object, seconds: float) -> None:
 
 
 def publish_lap(client: Client) -> None:
-    """Publish 8 s of the drive without a look at what becomes of it."""
+    """Publish 8 s of the drive without waiting for the node."""
     for step in range(80):
         client.odom.publish(odometry_at(step / 10.0))
         if step % 5 == 0:
@@ -31,7 +31,7 @@ def publish_lap(client: Client) -> None:
 
 
 def check_one_lap(client: Client, path_begins_at: float = 0.0) -> None:
-    """The graph is that of one lap, and nothing of an earlier one is in it."""
+    """Check that the graph is that of one lap, without measurements of earlier ones."""
     answer = client.optimize()
     assert answer.success, answer.message
     path = client.paths[-1]
@@ -49,7 +49,7 @@ def test_ten_loops_of_a_bag_with_its_clock(node: NodeProcess, client: Client) ->
     for loop in range(LOOPS):
         set_clock(clock, 0.0)
         if loop > 0:
-            client.spin_until(lambda n=loop: client.values['resets'] == str(n), 'it begins anew')
+            client.spin_until(lambda n=loop: client.values['resets'] == str(n), 'a new graph')
             assert 'clock jumped back' in client.values['reset_reason']
             assert len(client.paths[-1].poses) == 0, 'the old path is taken back'
         client.poses.clear()
@@ -71,7 +71,7 @@ def test_ten_loops_of_a_bag_without_a_clock(node: NodeProcess, client: Client) -
     for loop in range(LOOPS):
         publish_lap(client)
         if loop > 0:
-            client.spin_until(lambda n=loop: client.values['resets'] == str(n), 'it begins anew')
+            client.spin_until(lambda n=loop: client.values['resets'] == str(n), 'a new graph')
         check_one_lap(client)
         assert client.values['odom.accepted'] == '80'
         assert int(client.values['fix.accepted']) >= 15

@@ -1,28 +1,32 @@
 # Copyright 2026 The pose_graph_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""`map -> odom` over DDS: its stamps, its speed, and who else publishes it."""
+"""The transform from map to odom over DDS: stamps, speed, and other publishers of it."""
 
 from pathlib import Path
 import signal
 
 from circle import drive, odometry_at, odometry_pose, START, true_pose
-from harness import Client, NodeProcess, odometry, pose, RELIABLE, stamp_ns, TFMessage, yaw
+from harness import (
+    Client,
+    NodeProcess,
+    odometry,
+    pose,
+    RELIABLE,
+    stamp_ns,
+    TFMessage,
+    transform,
+    yaw,
+)
 import numpy as np
 import pytest
 
-from pose_graph_ros.core import se2
+from pose_graph_ros.core.geometry import se2
 
 pytestmark = pytest.mark.skipif(TFMessage is None, reason='tf2_msgs is not built: no /tf')
 
 
-def transform(parent: str, child: str, seconds: float) -> object:
-    from geometry_msgs.msg import TransformStamped  # noqa: PLC0415
-
-    message = TransformStamped(child_frame_id=child)
-    message.header = odometry(START + seconds, 0.0, 0.0, 0.0).header
-    message.header.frame_id = parent
-    message.transform.rotation.w = 1.0
-    return TFMessage(transforms=[message])
+def broadcast(parent: str, child: str, seconds: float) -> object:
+    return TFMessage(transforms=[transform(parent, child, seconds=START + seconds)])
 
 
 def corrections(client: Client) -> np.ndarray:
@@ -70,7 +74,7 @@ def test_the_published_transform_moves_no_faster_than_asked(tmp_path: Path) -> N
         drive(client, 10.0)
         assert client.optimize().success
         client.transforms.clear()
-        # from here on the odometry turns too much; later a pose tells
+        # from here on the odometry turns too much, which a later pose corrects
         odometry_of = {}
         newest = odometry_pose(9.9)
         for step in range(100, 300):
@@ -107,22 +111,22 @@ def test_it_is_not_sent_when_it_is_not_wanted(node: NodeProcess, client: Client)
     assert client.transforms == []
     assert client.set_parameter('publish_tf', value=True) == (True, '')
     drive(client, 6.0, begin=5.0)
-    assert len(client.transforms) > 5
+    client.spin_until(lambda: len(client.transforms) > 5, 'transforms come')
 
 
-def test_somebody_else_who_publishes_it_is_warned_of(node: NodeProcess, client: Client) -> None:
+def test_another_publisher_of_it_is_warned_of(node: NodeProcess, client: Client) -> None:
     broadcaster = client.node.create_publisher(TFMessage, '/tf', RELIABLE)
     drive(client, 4.0)
     for step in range(40):
-        # other transforms of the robot are none of our business
-        broadcaster.publish(transform('odom', 'base_link', 4.0 + 0.1 * step))
+        # other transforms of the robot are no conflict
+        broadcaster.publish(broadcast('odom', 'base_link', 4.0 + 0.1 * step))
         client.spin_for(0.01)
     client.spin_for(0.5)
     assert 'publishes' not in client.diagnostics[-1].status[0].message
 
     def warned() -> bool:
-        broadcaster.publish(transform('map', 'odom', 10.0))
-        return 'omebody else publishes map -> odom' in client.diagnostics[-1].status[0].message
+        broadcaster.publish(broadcast('map', 'odom', 10.0))
+        return 'nother node publishes map -> odom' in client.diagnostics[-1].status[0].message
     client.spin_until(warned, 'it warns')
     assert client.diagnostics[-1].status[0].level == b'\x01'
 

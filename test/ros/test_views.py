@@ -19,9 +19,9 @@ import pytest
 import yaml
 
 import pose_graph_ros
-from pose_graph_ros.ros.markers import NAMESPACES
-from pose_graph_ros.ros.parameters import PARAMETERS
-from pose_graph_ros.ros.sources import KNOWN_SOURCES
+from pose_graph_ros.adapters.markers import NAMESPACES
+from pose_graph_ros.adapters.parameters import PARAMETERS
+from pose_graph_ros.adapters.sources import KNOWN_SOURCES
 
 TREE = Path(__file__).resolve().parents[2]
 LAUNCH = TREE / 'launch' / 'pose_graph.launch.py'

@@ -8,9 +8,9 @@ import time
 
 import numpy as np
 
-from pose_graph_ros.core import batch
 from pose_graph_ros.core.backend import PoseGraphBackend
-from pose_graph_ros.core.batch import Status
+from pose_graph_ros.core.batch import optimizer
+from pose_graph_ros.core.batch.optimizer import Status
 from pose_graph_ros.core.estimate import Estimate
 from pose_graph_ros.core.measurements import GlobalPose, OdometrySample
 from pose_graph_ros.ros.worker import Worker
@@ -38,7 +38,7 @@ def test_all_that_is_posted_is_processed_and_one_estimate_follows_the_other() ->
         worker.post('pose', GlobalPose(step * 100_000_000, np.array([0.3 * step, 0.0, 0.0]),
                                        0.01 * np.eye(3)))
         worker.request_update()
-    report = worker.request_closing().result(PATIENCE)
+    report = worker.request_final_optimization().result(PATIENCE)
     assert report.status is Status.CONVERGED
     wait_until(lambda: worker.status.processed == 200)
     assert worker.status.counts['pose', 'accepted'] == 100
@@ -99,15 +99,15 @@ def test_a_solver_that_raises_is_answered_as_a_failure_and_the_thread_goes_on() 
         calls.append(1)
         if len(calls) == 1:
             raise MemoryError('no memory')
-        return batch.optimize(*arguments)
+        return optimizer.optimize(*arguments)
 
     worker = Worker(PoseGraphBackend(solve=solve), lambda _: None)
     worker.start()
     for step in range(1, 50):
         worker.post('odom', sample(step))
-    failed = worker.request_closing().result(PATIENCE)
+    failed = worker.request_final_optimization().result(PATIENCE)
     assert (failed.status, failed.reason) == (Status.FAILED, 'MemoryError: no memory')
-    assert worker.request_closing().result(PATIENCE).status is Status.CONVERGED
+    assert worker.request_final_optimization().result(PATIENCE).status is Status.CONVERGED
     assert worker.stop(PATIENCE)
 
 
@@ -117,13 +117,13 @@ def test_posting_never_waits_for_the_solver() -> None:
     def solve(*arguments: object) -> object:
         solving.set()
         assert release.wait(PATIENCE)
-        return batch.optimize(*arguments)
+        return optimizer.optimize(*arguments)
 
     worker = Worker(PoseGraphBackend(solve=solve), lambda _: None)
     worker.start()
     for step in range(1, 20):
         worker.post('odom', sample(step))
-    closing = worker.request_closing()
+    closing = worker.request_final_optimization()
     assert solving.wait(PATIENCE)
     for step in range(20, 40):
         worker.post('odom', sample(step))
@@ -139,12 +139,12 @@ def test_stopping_does_not_wait_for_ever() -> None:
 
     def solve(*arguments: object) -> object:
         release.wait(PATIENCE)
-        return batch.optimize(*arguments)
+        return optimizer.optimize(*arguments)
 
     worker = Worker(PoseGraphBackend(solve=solve), lambda _: None)
     worker.start()
     worker.post('odom', sample(1))
-    worker.request_closing()
+    worker.request_final_optimization()
     wait_until(lambda: worker.status is not None)
     time.sleep(0.05)
     assert not worker.stop(0.1)
@@ -158,7 +158,7 @@ def test_what_comes_in_while_the_worker_is_prepared_waits() -> None:
     worker.start()
     for step in range(1, 50):
         assert worker.post('odom', sample(step))
-    closing = worker.request_closing()
+    closing = worker.request_final_optimization()
     assert not worker.prepared
     assert worker.status.processed == 0
     release.set()

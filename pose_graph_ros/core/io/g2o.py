@@ -3,7 +3,7 @@
 """
 Planar graphs in the g2o text format.
 
-Tags that are read and written, one a line:
+Tags that are read and written, one per line:
 
     VERTEX_SE2 id x y theta
     FIX id ...
@@ -12,19 +12,19 @@ Tags that are read and written, one a line:
     EDGE_PRIOR_SE2_XY id x y I11 I12 I22                    a position
     OBSERVED_SE2_OFFSET id ox oy otheta x y theta I11 I12 I13 I22 I23 I33
 
-The last is this project's own, as g2o has no tag for an observed node with an offset; other
-programs pass over it with a warning rather than misread it.
+The last tag is specific to this project, because g2o has no tag for an observed node with an
+offset; other programs skip it with a warning.
 
-There is no tag for a bias either, nor for what was measured with one: they are left out, and a
-comment says how many.
+Biases and the constraints on them have no tag. They are left out, and a comment gives their
+number.
 
-A file does not keep the order of observed nodes with different tags, nor which edges are loop
-closures: those are taken to be the ones between ids that do not follow each other. Of a matrix
-the upper triangle is written.
+A file keeps neither the order of observed nodes with different tags nor the kind of an edge. An
+edge between consecutive ids is read as odometry, any other as a loop closure. Of each information
+matrix the upper triangle is written.
 
-The tags `VERTEX2` and `EDGE2` stand for two formats with different numbers behind the same word:
-TORO orders the information 11 12 22 33 13 23, iSAM stores its square root R11 R12 R13 R22 R23 R33.
-Which of them a file holds must be said.
+The tags `VERTEX2` and `EDGE2` are used by two formats with different numbers: TORO orders the
+information as 11 12 22 33 13 23, iSAM stores its square root as R11 R12 R13 R22 R23 R33. The
+caller has to say which of them a file has.
 """
 
 from dataclasses import dataclass
@@ -33,20 +33,25 @@ from pathlib import Path
 import numpy as np
 import numpy.typing as npt
 
-from pose_graph_ros.core import se2
-from pose_graph_ros.core.constraints import EdgeKind, Edges, ObservedKind, ObservedNodes, upper
 from pose_graph_ros.core.exceptions import FileFormatError, GraphUpdateError
-from pose_graph_ros.core.graph import Graph, GraphRows, GraphUpdate
-from pose_graph_ros.core.se2 import FloatArray, IntArray
+from pose_graph_ros.core.geometry import se2
+from pose_graph_ros.core.geometry.se2 import FloatArray, IntArray
+from pose_graph_ros.core.graph.constraints import (
+    EdgeKind,
+    Edges,
+    ObservedKind,
+    ObservedNodes,
+    upper,
+)
+from pose_graph_ros.core.graph.graph import Graph, GraphRows, GraphUpdate
 
-# How the six numbers behind EDGE2 fill a symmetric (TORO) or an upper triangular (iSAM) matrix.
+# Formats of EDGE2.
 EDGE2_ORDERS = ('toro', 'isam')
+# Row and column of each of six numbers: of an upper triangle, and of the information in TORO.
 _UPPER = ((0, 0), (0, 1), (0, 2), (1, 1), (1, 2), (2, 2))
 _TORO = ((0, 0), (0, 1), (1, 1), (2, 2), (0, 2), (1, 2))
-
-
-# Ids and numbers behind each tag; FIX takes any number of ids.
-_LAYOUT = {
+# Numbers of ids and of values behind each tag; FIX is followed by any number of ids.
+LAYOUT = {
     'VERTEX_SE2': (1, 3),
     'VERTEX2': (1, 3),
     'EDGE_SE2': (2, 9),
@@ -59,17 +64,17 @@ _LAYOUT = {
 
 @dataclass(frozen=True, slots=True)
 class GraphFile:
-    """A graph as a file holds it."""
+    """A graph that was read from a file."""
 
     graph: Graph
     ids: IntArray
     """Id in the file of each hidden node, shape (N,), increasing."""
     has_start: bool
-    """Whether the file gives a pose for every node; if not, the poses were integrated."""
+    """Whether the file has the poses of all nodes; else missing ones were composed from edges."""
 
 
 class _Rows:
-    """Rows of one kind as they are read: ids, numbers and the line that each came from."""
+    """Rows with one tag: ids, values and line number of each."""
 
     def __init__(self, n_ids: int) -> None:
         self.n_ids = n_ids
@@ -91,25 +96,27 @@ def read_g2o(path: Path, edge2_order: str | None = None) -> GraphFile:
     ----------
     path : Path
     edge2_order : {'toro', 'isam'}, optional
-        What `EDGE2` means in this file.
+        Format of `EDGE2` in this file.
 
     Returns
     -------
     GraphFile
-        Hidden nodes in the order of their ids. Without any `FIX` and any prior the node with the
-        smallest id is fixed. Nodes without a `VERTEX_SE2` start where a walk along the edges from
-        the smallest id leads to. Edges between consecutive ids count as odometry, others as loop
-        closures.
+        Hidden nodes in the order of their ids. Without `FIX` and without priors the node with the
+        smallest id is fixed. The pose of a node without `VERTEX_SE2` is composed from edges,
+        breadth-first from the nodes with a pose, else from the smallest id.
 
     Raises
     ------
     FileFormatError
-        Names the file and the line, what was expected and what came.
+        If the file is not such a graph; the message names the file and the line, what was expected
+        and what was found.
+    ValueError
+        If `edge2_order` is unknown.
 
     """
     if edge2_order is not None and edge2_order not in EDGE2_ORDERS:
         raise ValueError(f'edge2_order: expected one of {EDGE2_ORDERS}, got {edge2_order!r}')
-    rows = {tag: _Rows(n_ids) for tag, (n_ids, _) in _LAYOUT.items()}
+    rows = {tag: _Rows(n_ids) for tag, (n_ids, _) in LAYOUT.items()}
     fixes = _Rows(1)
     try:
         text = path.read_text(encoding='utf-8')
@@ -135,9 +142,9 @@ def _read_line(
     if tag not in rows:
         known = ', '.join(['FIX', *rows])
         raise FileFormatError(f'{where}: tag {tag!r} is not known; known are {known}')
-    if len(values) != sum(_LAYOUT[tag]):
+    if len(values) != sum(LAYOUT[tag]):
         raise FileFormatError(
-            f'{where}: {tag} is followed by {sum(_LAYOUT[tag])} numbers, got {len(values)}')
+            f'{where}: {tag} is followed by {sum(LAYOUT[tag])} numbers, got {len(values)}')
     if tag == 'EDGE2' and edge2_order is None:
         raise FileFormatError(
             f'{where}: EDGE2 means two formats with the information in different order; '
@@ -158,23 +165,21 @@ def _build(
     path: Path, rows: dict[str, _Rows], fixes: _Rows, edge2_order: str | None,
 ) -> GraphFile:
     vertices = _joined(rows['VERTEX_SE2'], rows['VERTEX2'])
-    used = [_ids(table) for table in rows.values() if len(table.lines) > 0]
-    if len(used) == 0:
+    ids = np.unique(np.concatenate([_ids(table).ravel() for table in rows.values()]))
+    if len(ids) == 0:
         raise FileFormatError(f'{path}: holds no vertex and no edge')
-    ids = np.unique(np.concatenate([table.ravel() for table in used]))
     given, first = np.unique(_ids(vertices).ravel(), return_index=True)
     if len(given) < len(vertices.lines):
         again = sorted(set(range(len(vertices.lines))) - set(first.tolist()))[0]
         raise FileFormatError(f'{path}:{vertices.lines[again]}: vertex '
-                              f'{vertices.ids[again][0]} stands in the file twice')
+                              f'{vertices.ids[again][0]} is in the file twice')
 
     edges = _edges(rows, ids, edge2_order)
     observed = _observed(rows, ids)
-    poses = np.zeros((len(ids), 3))
-    poses[np.searchsorted(ids, given)] = _numbers(vertices, 3)[first]
-    known = np.isin(ids, given)
+    poses, known = np.zeros((len(ids), 3)), np.isin(ids, given)
+    poses[known] = _numbers(vertices, 3)[first]
     if not np.all(known):
-        _walk(poses, known, edges)
+        _compose_missing(poses, known, edges)
     fixed = _fixed(path, fixes, ids)
     if len(fixed) == 0 and len(observed) == 0:
         fixed = [0]
@@ -183,12 +188,12 @@ def _build(
         graph.apply(GraphUpdate(hidden=poses))
         graph.apply(GraphUpdate(edges=edges, observed=observed, fix=fixed))
     except GraphUpdateError as error:
-        raise FileFormatError(f'{_culprit(path, rows, ids, edge2_order)}: {error}') from error
+        raise FileFormatError(f'{_refused_line(path, rows, ids, edge2_order)}: {error}') from error
     return GraphFile(graph, ids, bool(len(given) == len(ids)))
 
 
 def _joined(*tables: _Rows) -> _Rows:
-    """Return the rows of all tables, in order."""
+    """Return the rows of all tables in one."""
     joined = _Rows(tables[0].n_ids)
     for table in tables:
         joined.ids += table.ids
@@ -207,20 +212,17 @@ def _numbers(table: _Rows, width: int) -> FloatArray:
 
 def _edges(rows: dict[str, _Rows], ids: IntArray, edge2_order: str | None) -> Edges:
     parts = []
-    for tag in ('EDGE_SE2', 'EDGE2'):
-        numbers = _numbers(rows[tag], 9)
-        ends = np.searchsorted(ids, _ids(rows[tag]))
-        order = edge2_order if tag == 'EDGE2' else None
-        information = _information(numbers[:, 3:], order)
-        kind = np.where(np.diff(_ids(rows[tag]), axis=1)[:, 0] == 1,
-                        EdgeKind.ODOMETRY, EdgeKind.LOOP_CLOSURE)
-        parts.append(
-            Edges(ends[:, 0], ends[:, 1], se2.wrapped(numbers[:, :3]), information, kind))
+    for tag, order in (('EDGE_SE2', None), ('EDGE2', edge2_order)):
+        numbers, ends = _numbers(rows[tag], 9), _ids(rows[tag])
+        kind = np.where(np.diff(ends, axis=1)[:, 0] == 1, EdgeKind.ODOMETRY, EdgeKind.LOOP_CLOSURE)
+        i, j = np.searchsorted(ids, ends).T
+        parts.append(Edges(
+            i, j, se2.wrapped(numbers[:, :3]), _information(numbers[:, 3:], order), kind))
     return Edges.joined(parts)
 
 
 def _information(numbers: FloatArray, order: str | None) -> FloatArray:
-    """Return matrices, shape (M, 3, 3), from six numbers each."""
+    """Return information matrices, shape (M, 3, 3), from six numbers each."""
     matrix = np.zeros((len(numbers), 3, 3))
     for column, (row, col) in enumerate(_TORO if order == 'toro' else _UPPER):
         matrix[:, row, col] = numbers[:, column]
@@ -232,43 +234,41 @@ def _information(numbers: FloatArray, order: str | None) -> FloatArray:
 def _observed(rows: dict[str, _Rows], ids: IntArray) -> ObservedNodes:
     parts = []
     for tag in ('EDGE_PRIOR_SE2', 'EDGE_PRIOR_SE2_XY', 'OBSERVED_SE2_OFFSET'):
-        numbers = _numbers(rows[tag], _LAYOUT[tag][1])
+        numbers = _numbers(rows[tag], LAYOUT[tag][1])
         node = np.searchsorted(ids, _ids(rows[tag])[:, 0])
         offset = np.zeros((len(node), 3))
         if tag == 'OBSERVED_SE2_OFFSET':
             offset, numbers = numbers[:, :3], numbers[:, 3:]
         if tag == 'EDGE_PRIOR_SE2_XY':
-            mean = np.column_stack((numbers[:, :2], np.zeros(len(node))))
-            information = np.zeros((len(node), 3, 3))
-            information[:, 0, 0], information[:, 1, 1] = numbers[:, 2], numbers[:, 4]
-            information[:, 0, 1] = information[:, 1, 0] = numbers[:, 3]
-        else:
-            mean, information = se2.wrapped(numbers[:, :3]), _information(numbers[:, 3:], None)
-        position = information[:, 2, 2] == 0.0
-        kind = np.where(position, ObservedKind.POSITION, ObservedKind.GLOBAL_POSE)
-        parts.append(ObservedNodes(node, offset, mean, information, kind))
+            # as a pose with zeros for the heading
+            numbers = np.insert(numbers, (2, 4, 5, 5), 0.0, axis=1)
+        information = _information(numbers[:, 3:], None)
+        kind = np.where(
+            information[:, 2, 2] == 0.0, ObservedKind.POSITION, ObservedKind.GLOBAL_POSE)
+        parts.append(
+            ObservedNodes(node, offset, se2.wrapped(numbers[:, :3]), information, kind))
     return ObservedNodes.joined(parts)
 
 
-def _walk(poses: FloatArray, known: npt.NDArray[np.bool_], edges: Edges) -> None:
-    """Give the nodes without a vertex a pose, along the edges, nearest in the walk first."""
+def _compose_missing(poses: FloatArray, known: npt.NDArray[np.bool_], edges: Edges) -> None:
+    """Set the poses of the nodes that are not known by composing edges, breadth-first."""
     neighbours: dict[int, list[tuple[int, FloatArray]]] = {}
     for i, j, mean in zip(edges.i.tolist(), edges.j.tolist(), edges.mean, strict=True):
         neighbours.setdefault(i, []).append((j, mean))
         neighbours.setdefault(j, []).append((i, se2.inverse(mean)))
     known = known.copy()
-    for seed in (*np.flatnonzero(known).tolist(), *range(len(known))):
-        known[seed] = True
-        front = [seed]
-        while len(front) > 0:
+    for start in (*np.flatnonzero(known).tolist(), *range(len(known))):
+        known[start] = True
+        frontier = [start]
+        while len(frontier) > 0:
             reached = []
-            for node in front:
+            for node in frontier:
                 for neighbour, mean in neighbours.get(node, ()):
                     if not known[neighbour]:
                         poses[neighbour] = se2.compose(poses[node], mean)
                         known[neighbour] = True
                         reached.append(neighbour)
-            front = reached
+            frontier = reached
 
 
 def _fixed(path: Path, fixes: _Rows, ids: IntArray) -> list[int]:
@@ -281,10 +281,10 @@ def _fixed(path: Path, fixes: _Rows, ids: IntArray) -> list[int]:
     return fixed
 
 
-def _culprit(
+def _refused_line(
     path: Path, rows: dict[str, _Rows], ids: IntArray, edge2_order: str | None,
 ) -> str:
-    """Find the first line whose row the graph refuses, by trying them one at a time."""
+    """Return file and number of the first line whose row the graph refuses, tried one by one."""
     lines = [(line, tag, k) for tag, table in rows.items() if not tag.startswith('VERTEX')
              for k, line in enumerate(table.lines)]
     for line, tag, k in sorted(lines):
@@ -302,14 +302,14 @@ def _culprit(
 
 def write_g2o(graph: Graph, path: Path, ids: IntArray | None = None) -> None:
     """
-    Write a graph; numbers read back bit for bit.
+    Write a graph so that its numbers read back bit for bit.
 
     Parameters
     ----------
     graph : Graph
     path : Path
     ids : ndarray, shape (N,), optional
-        Id for each hidden node; their numbers if not given.
+        Id of each hidden node; by default its row in the graph.
 
     """
     path.write_text(g2o_text(graph.rows(), ids), encoding='ascii')
@@ -317,13 +317,13 @@ def write_g2o(graph: Graph, path: Path, ids: IntArray | None = None) -> None:
 
 def g2o_text(rows: GraphRows, ids: IntArray | None = None) -> str:
     """
-    Return a graph as text: vertices, FIX, edges and observed nodes, in their order each.
+    Return the text of a g2o file: vertices, FIX, edges and observed nodes, each in their order.
 
     Parameters
     ----------
     rows : GraphRows
     ids : ndarray, shape (N,), optional
-        Id for each hidden node; their numbers if not given.
+        Id of each hidden node; by default its row in the graph.
 
     """
     ids = np.arange(len(rows.poses)) if ids is None else ids
@@ -363,5 +363,5 @@ def _observed_lines(observed: ObservedNodes, ids: IntArray) -> list[str]:
 
 
 def _texts(rows: FloatArray) -> list[str]:
-    """Return the numbers of each row, as many digits as it takes to read them back."""
+    """Return the numbers of each row with the digits needed to read them back bit for bit."""
     return [' '.join(map(repr, row)) for row in rows.tolist()]

@@ -3,10 +3,10 @@
 """
 A saved graph as three files of plain text: `map.g2o`, `map.json` and `map.tum`.
 
-The g2o file holds the hidden nodes, edges and observed nodes that other programs understand; the
-JSON file all the rest, with the SHA-256 of the g2o file; the TUM file the path, for other programs
-alone. The first member of the JSON file is the SHA-256 of all that follows it in the file. Both
-files are read back to the bit, or refused. See docs/design.md, "Saved graphs".
+The g2o file holds the hidden nodes, edges and observed nodes that other programs can read. The
+JSON file holds the remaining state and the SHA-256 of the g2o file; its first member is the
+SHA-256 of all that follows in it. Both are read back bit for bit, or refused. The TUM file holds
+the path for other programs and is not read. See docs/design.md, "Saved graphs".
 """
 
 from collections.abc import Iterator
@@ -20,17 +20,24 @@ from typing import Any
 import numpy as np
 
 from pose_graph_ros import __version__
-from pose_graph_ros.core.constraints import EdgeKind, Edges, full, KindArray, ObservedNodes, upper
 from pose_graph_ros.core.exceptions import FileFormatError, FileWriteError
-from pose_graph_ros.core.graph import GraphRows
-from pose_graph_ros.core.io.g2o import g2o_text
-from pose_graph_ros.core.io.plain import annotations, decoded, encoded
+from pose_graph_ros.core.geometry.se2 import FloatArray, IntArray
+from pose_graph_ros.core.geometry.trajectory import Trajectory
+from pose_graph_ros.core.graph.constraints import (
+    EdgeKind,
+    Edges,
+    full,
+    KindArray,
+    ObservedNodes,
+    upper,
+)
+from pose_graph_ros.core.graph.graph import GraphRows
+from pose_graph_ros.core.io.atomic_files import write_files
+from pose_graph_ros.core.io.g2o import g2o_text, LAYOUT
+from pose_graph_ros.core.io.json_values import annotations, decoded, encoded
+from pose_graph_ros.core.io.saved_graph import SavedGraph
 from pose_graph_ros.core.io.tum import tum_text
-from pose_graph_ros.core.io.whole_files import write_files
 from pose_graph_ros.core.saved_columns import Integers, Numbers, Rows3, Rows4, Rows6
-from pose_graph_ros.core.saved_graph import SavedGraph
-from pose_graph_ros.core.se2 import FloatArray, IntArray
-from pose_graph_ros.core.trajectory import Trajectory
 
 FORMAT = 'pose_graph_ros graph'
 VERSION = 1
@@ -38,25 +45,22 @@ VERSION = 1
 SUFFIXES = ('.g2o', '.json', '.tum')
 _OPENING, _MIDDLE = b'{\n"sha256": "', b'",\n'
 _DIGITS = 64
-# Ids and numbers behind each tag ...
-_NUMBERS = {'VERTEX_SE2': 4, 'EDGE_SE2': 11, 'OBSERVED_SE2_OFFSET': 13, 'EDGE_PRIOR_SE2': 10,
-            'EDGE_PRIOR_SE2_XY': 6}
-# ... and where those of an observed node belong among node, offset, mean and information.
+# Columns of the numbers behind a tag in a row of node, offset, mean and information.
 _OBSERVED = {'OBSERVED_SE2_OFFSET': range(13), 'EDGE_PRIOR_SE2': (0, *range(4, 13)),
              'EDGE_PRIOR_SE2_XY': (0, 4, 5, 7, 8, 10)}
 
 
 @dataclass(frozen=True, slots=True)
 class SavedRows:
-    """What the g2o file does not tell of the rows of a graph."""
+    """What the g2o file lacks of the rows of a graph."""
 
     fixed: Integers
+    """Rows of the fixed hidden nodes."""
     biases: Integers
-    """Rows of the hidden nodes that are biases ..."""
+    """Rows of the hidden nodes that are biases; all others are vertices of the g2o file."""
     bias_values: Rows3
-    """... and their values; the others are the vertices of the g2o file."""
     edge_kind: Integers
-    """Of all edges; those that lead to biases, of kind 2, are here, the others there."""
+    """Of all edges. Those of kind 2 end at a bias and are given here, others in the g2o file."""
     edge_weight: Numbers
     bias_edge_i: Integers
     bias_edge_j: Integers
@@ -64,10 +68,10 @@ class SavedRows:
     bias_edge_information: Rows6
     bias_edge_bias: Rows4
     observed_kind: Integers
-    """Of all observed nodes; those on biases are here, the others there."""
+    """Of all observed nodes. Those on biases are given here, others in the g2o file."""
     observed_weight: Numbers
     observed_on_bias: Integers
-    """Their numbers."""
+    """Rows of the observed nodes on biases."""
     bias_observed_node: Integers
     bias_observed_offset: Rows3
     bias_observed_mean: Rows3
@@ -75,7 +79,7 @@ class SavedRows:
 
 
 def graph_paths(path: Path) -> tuple[Path, Path, Path]:
-    """Return the g2o, the JSON and the TUM file of a graph; a suffix of theirs does not count."""
+    """Return the g2o, JSON and TUM files of a graph, given with or without one of the suffixes."""
     name = path.name.removesuffix(path.suffix) if path.suffix in SUFFIXES else path.name
     g2o, side, tum = (path.with_name(name + suffix) for suffix in SUFFIXES)
     return g2o, side, tum
@@ -83,23 +87,23 @@ def graph_paths(path: Path) -> tuple[Path, Path, Path]:
 
 def write_graph(saved: SavedGraph, path: Path) -> tuple[Path, Path, Path]:
     """
-    Write a saved graph, all of its files or none; folders that are missing are made.
+    Write the files of a saved graph, all or none; missing folders are created.
 
     Parameters
     ----------
     saved : SavedGraph
     path : Path
-        Of the g2o file, the suffix may be missing; the others lie beside it.
+        Path of the g2o file, with or without suffix; the other files are beside it.
 
     Returns
     -------
     tuple of Path
-        The files that were written: g2o, JSON, TUM.
+        The written files: g2o, JSON, TUM.
 
     Raises
     ------
     FileWriteError
-        If that fails, or the path is a folder; files that were there are as they were.
+        If that fails, or the path is a folder. Previous files are then unchanged.
 
     """
     if path.name == '' or os.path.isdir(path):
@@ -113,8 +117,7 @@ def write_graph(saved: SavedGraph, path: Path) -> tuple[Path, Path, Path]:
         'g2o_sha256': hashlib.sha256(g2o).hexdigest(), 'graph': encoded(_saved_rows(saved.rows)),
         **{name: encoded(getattr(saved, name)) for name in _members()}}
     body = (',\n'.join(_lines(members)) + '\n}\n').encode('ascii')
-    digest = hashlib.sha256(body).hexdigest().encode('ascii')
-    side = _OPENING + digest + _MIDDLE + body
+    side = _OPENING + hashlib.sha256(body).hexdigest().encode('ascii') + _MIDDLE + body
     g2o_path, side_path, tum_path = paths
     write_files({g2o_path: g2o, tum_path: tum, side_path: side})
     return paths
@@ -122,18 +125,13 @@ def write_graph(saved: SavedGraph, path: Path) -> tuple[Path, Path, Path]:
 
 def read_graph(path: Path) -> SavedGraph:
     """
-    Read a saved graph.
-
-    Parameters
-    ----------
-    path : Path
-        As for `write_graph`.
+    Read a saved graph, given the path of its g2o file with or without suffix.
 
     Raises
     ------
     FileFormatError
-        Names the file, what was expected and what came: if a file is missing, damaged, cut off,
-        of another version or of another graph than the one beside it.
+        If a file is missing, damaged, truncated, of another version or of another graph than the
+        one beside it. The message names the file, what was expected and what was found.
 
     """
     if path.name == '':
@@ -147,7 +145,7 @@ def read_graph(path: Path) -> SavedGraph:
     try:
         hints = annotations(SavedGraph)
         rest = {name: decoded(hints[name], members.pop(name), name) for name in _members()}
-        rows = decoded(SavedRows, members.pop('graph'), 'graph')
+        rows: SavedRows = decoded(SavedRows, members.pop('graph'), 'graph')
         saved = SavedGraph(rows=_graph_rows(rows, g2o.decode('ascii')), **rest)
         saved.check()
     except KeyError as error:
@@ -162,7 +160,7 @@ def _members() -> list[str]:
 
 
 def _lines(members: dict[str, Any], indent: str = '') -> Iterator[str]:
-    """Yield each member of an object on a line, those of objects in it on lines of their own."""
+    """Yield the text of each member of an object, with one line for each nested member."""
     for name, value in members.items():
         if isinstance(value, dict) and len(value) > 0:
             inner = ',\n'.join(_lines(value, indent + '  '))
@@ -180,7 +178,7 @@ def _content(path: Path) -> bytes:
 
 
 def _checked_members(path: Path, content: bytes) -> dict[str, Any]:
-    """Return the members of a JSON file behind the sum that vouches for them."""
+    """Return the members of a JSON file after verifying its checksum and version."""
     begin = len(_OPENING) + _DIGITS
     body = content[begin + len(_MIDDLE):]
     if not content.startswith(_OPENING) or content[begin:begin + len(_MIDDLE)] != _MIDDLE:
@@ -211,7 +209,7 @@ def _saved_rows(rows: GraphRows) -> SavedRows:
 
 
 def _graph_rows(rows: SavedRows, text: str) -> GraphRows:
-    """Return the rows of a graph from both files; raise ValueError where they do not agree."""
+    """Return the rows of a graph from both files; raise ValueError if they do not fit together."""
     lines = text.split('\n')
     vertices = _numbers(lines, 'VERTEX_SE2')
     n = len(vertices) + len(rows.biases)
@@ -224,19 +222,19 @@ def _graph_rows(rows: SavedRows, text: str) -> GraphRows:
     if not np.array_equal(vertices[:, 0], np.flatnonzero(~is_bias)):
         raise ValueError('expected the hidden nodes that are no biases as vertices, in order')
     poses[~is_bias] = vertices[:, 1:]
-    _place(poses, rows.biases, rows.bias_values, 'biases')
+    _fill(poses, rows.biases, rows.bias_values, 'biases')
     return GraphRows(poses, is_bias, fixed, _edges(rows, _numbers(lines, 'EDGE_SE2')),
                      _observed(rows, lines))
 
 
 def _edges(rows: SavedRows, numbers: FloatArray) -> Edges:
     to_bias = rows.edge_kind == EdgeKind.BIAS
-    there, here = np.flatnonzero(~to_bias), np.flatnonzero(to_bias)
+    in_g2o, in_json = np.flatnonzero(~to_bias), np.flatnonzero(to_bias)
     bias = np.zeros((len(to_bias), 4))
-    _place(bias, here, rows.bias_edge_bias, 'edges to biases')
+    _fill(bias, in_json, rows.bias_edge_bias, 'edges to biases')
     both = np.zeros((len(to_bias), 11))
-    _place(both, there, numbers, 'edges')
-    _place(both, here, np.column_stack(
+    _fill(both, in_g2o, numbers, 'edges')
+    _fill(both, in_json, np.column_stack(
         (rows.bias_edge_i, rows.bias_edge_j, rows.bias_edge_mean, rows.bias_edge_information)),
         'edges to biases')
     return Edges(
@@ -248,8 +246,8 @@ def _observed(rows: SavedRows, lines: list[str]) -> ObservedNodes:
     size = len(rows.observed_kind)
     if np.any((rows.observed_on_bias < 0) | (rows.observed_on_bias >= size)):
         raise ValueError(f'graph.observed_on_bias: expected numbers in 0..{size - 1}')
-    is_here = np.zeros(size, dtype=bool)
-    is_here[rows.observed_on_bias] = True
+    on_bias = np.zeros(size, dtype=bool)
+    on_bias[rows.observed_on_bias] = True
     lines = [line for line in lines if line.startswith(tuple(_OBSERVED))]
     tags = np.array([line.partition(' ')[0] for line in lines], dtype=np.str_)
     numbers = np.zeros((len(lines), 13))
@@ -257,8 +255,8 @@ def _observed(rows: SavedRows, lines: list[str]) -> ObservedNodes:
         chosen = np.flatnonzero(tags == tag)
         numbers[chosen[:, None], list(columns)] = _numbers(lines, tag)
     both = np.zeros((size, 13))
-    _place(both, np.flatnonzero(~is_here), numbers, 'observed nodes')
-    _place(both, rows.observed_on_bias, np.column_stack((
+    _fill(both, np.flatnonzero(~on_bias), numbers, 'observed nodes')
+    _fill(both, rows.observed_on_bias, np.column_stack((
         rows.bias_observed_node, rows.bias_observed_offset, rows.bias_observed_mean,
         rows.bias_observed_information)), 'observed nodes on biases')
     return ObservedNodes(
@@ -267,8 +265,8 @@ def _observed(rows: SavedRows, lines: list[str]) -> ObservedNodes:
 
 
 def _numbers(lines: list[str], tag: str) -> FloatArray:
-    """Return what follows a tag in the lines that have it, shape (M, n)."""
-    n = _NUMBERS[tag]
+    """Return the numbers behind a tag in the lines that begin with it, shape (M, n)."""
+    n = sum(LAYOUT[tag])
     begin = f'{tag} '
     words = ' '.join(line[len(begin):] for line in lines if line.startswith(begin)).split(' ')
     numbers = np.array([float(word) for word in words if word != ''])
@@ -277,7 +275,8 @@ def _numbers(lines: list[str], tag: str) -> FloatArray:
     return numbers.reshape(-1, n)
 
 
-def _place(table: FloatArray, rows: IntArray, numbers: FloatArray, name: str) -> None:
+def _fill(table: FloatArray, rows: IntArray, numbers: FloatArray, name: str) -> None:
+    """Set rows of a table; raise ValueError if their number is wrong."""
     if len(rows) != len(numbers):
         raise ValueError(f'graph: expected {len(rows)} {name}, got {len(numbers)}')
     table[rows] = numbers

@@ -1,0 +1,203 @@
+# Copyright 2026 The pose_graph_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""
+Choose the topics of a bag that feed the sources of the node, and read their messages.
+
+The player and the offline replay both read bags with this module, so that the engine receives the
+same messages from both. No rclpy.
+"""
+
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
+import logging
+from typing import NamedTuple
+
+from pose_graph_ros.adapters.bags import (
+    BagError,
+    BagMessage,
+    BagReader,
+    choose_topic,
+    MessageError,
+)
+from pose_graph_ros.adapters.sources import CLOSURES, Kind, KNOWN_SOURCES, Source
+
+logger = logging.getLogger(__name__)
+
+OPTIONS = tuple(KNOWN_SOURCES)
+"""Sources with a command line option for their topic; without it their topic is guessed."""
+STATIC_FRAMES = '/tf_static', 'tf2_msgs/msg/TFMessage'
+"""Topic and type of static transforms."""
+
+
+@dataclass(frozen=True, slots=True)
+class Inputs:
+    """
+    Topics of a bag that feed the sources of the node, and how many fixes are held out.
+
+    Raises
+    ------
+    BagError
+        If `hold_out` is negative or 1.
+
+    """
+
+    topics: Mapping[str, str]
+    """Topic in the bag by name of the source, such as `fix`."""
+    kinds: Mapping[str, Kind] = field(default_factory=dict)
+    """Kind by name of the source."""
+    hold_out: int = 0
+    """Every n-th fix (global pose, if there are no fixes) is held out; 0 holds out none."""
+
+    def __post_init__(self) -> None:
+        if self.hold_out < 0 or self.hold_out == 1:
+            raise BagError(f'hold out: expected 0 or at least 2, got {self.hold_out}')
+
+    def of(self, *kinds: Kind) -> list[str]:
+        """Return the names of the sources of the given kinds."""
+        return [source for source in self.topics if self.kinds[source] in kinds]
+
+
+class InputMessage(NamedTuple):
+    """One message of a bag and the source that it belongs to."""
+
+    source: str
+    message: BagMessage
+    held_out: bool
+    """Whether it is kept out of the graph."""
+
+
+def choose_inputs(
+    reader: BagReader, sources: Sequence[Source], wanted: Mapping[str, str | None],
+    hold_out: int = 0,
+) -> Inputs:
+    """
+    Return the topics that feed the sources: wanted ones, else by parameter, else guessed.
+
+    Guesses are made for `odom`, `fix` and `imu`, if the bag has one topic of their type, for
+    `loop_closure`, if its usual topic is in the bag, and for `global_pose`, if one topic of poses
+    is left and no source of fixes has a topic. Fixes are not guessed if global poses are wanted.
+
+    Parameters
+    ----------
+    reader : BagReader
+    sources : sequence of Source
+        All sources of the node.
+    wanted : mapping
+        Topic by name of the source; None leaves the choice open.
+    hold_out : int
+        As in `Inputs`.
+
+    Raises
+    ------
+    BagError
+        If there is no odometry, a wanted topic is missing or of another type, a source is not
+        among the parameters, or there are several candidates, which the message names.
+
+    """
+    kinds = {source.name: source.kind for source in sources}
+    chosen = {name: topic for name, topic in wanted.items() if topic is not None}
+    asked = 'global_pose' in chosen
+    for name in sorted(set(chosen) - set(kinds)):
+        raise BagError(f'--{_option(name)} {chosen[name]}: the parameter sources has no {name}')
+    for source in sources:
+        named = '/' + source.topic.removeprefix('/')
+        if source.name not in chosen and source.topic != _usual_topic(source):
+            if named in reader.topics:
+                chosen[source.name] = named
+            else:
+                logger.warning('%s: no topic %s for %s', reader.path, named, source.name)
+    topics = {name: _checked(reader, name, kinds[name], topic) for name, topic in chosen.items()}
+    for name in ('odom', 'fix', CLOSURES, 'global_pose', 'imu'):
+        if name in topics or name not in kinds or _is_named(name, sources):
+            continue
+        guess = _guess(reader, name, kinds, topics, asked=asked)
+        if guess is not None:
+            topics[name] = guess
+    ordered = {name: topics[name] for name in kinds if name in topics}
+    inputs = Inputs(ordered, {name: kinds[name] for name in ordered}, hold_out)
+    if len(inputs.of(Kind.ODOMETRY)) == 0:
+        raise BagError(f'{reader.path}: no topic of type {Kind.ODOMETRY.message_type} for the '
+                       f'odometry; the bag has {reader.describe()}')
+    return inputs
+
+
+def _option(name: str) -> str:
+    return name.replace('_', '-')
+
+
+def _usual_topic(source: Source) -> str | None:
+    return KNOWN_SOURCES[source.name][1] if source.name in KNOWN_SOURCES else None
+
+
+def _is_named(name: str, sources: Sequence[Source]) -> bool:
+    return any(source.name == name and source.topic != _usual_topic(source) for source in sources)
+
+
+def _checked(reader: BagReader, name: str, kind: Kind, topic: str) -> str:
+    option = f'--{_option(name)}' if name in OPTIONS else f'{name}.topic'
+    chosen = choose_topic(reader, topic, kind.message_type, option)
+    assert chosen is not None
+    return chosen
+
+
+def _guess(
+    reader: BagReader, name: str, kinds: Mapping[str, Kind], topics: Mapping[str, str],
+    *, asked: bool,
+) -> str | None:
+    """Return the topic of a source for which none was given; None if there is no candidate."""
+    kind = kinds[name]
+    free = [topic for topic, info in reader.topics.items()
+            if info.type == kind.message_type and topic not in topics.values()]
+    if kind is Kind.LOOP_CLOSURE:
+        usual = '/' + KNOWN_SOURCES[CLOSURES][1]
+        return usual if usual in free else None
+    if kind is Kind.GLOBAL_POSE:
+        fixes = any(kinds[source] is Kind.FIX for source in topics)
+        return free[0] if len(free) == 1 and not fixes else None
+    if kind is Kind.FIX and asked:
+        return None
+    return choose_topic(reader, None, kind.message_type, f'--{_option(name)}', among=free)
+
+
+def read_inputs(reader: BagReader, inputs: Inputs) -> Iterator[InputMessage]:
+    """
+    Iterate over the messages of the inputs in the order in which they were recorded.
+
+    Parameters
+    ----------
+    reader : BagReader
+    inputs : Inputs
+
+    Raises
+    ------
+    BagError
+        If a topic is not in the bag, or the bag is damaged.
+
+    """
+    sources: dict[str, list[str]] = {}
+    for source, topic in inputs.topics.items():
+        sources.setdefault(topic, []).append(source)
+    held = inputs.of(Kind.FIX) or inputs.of(Kind.GLOBAL_POSE)
+    count = 0
+    for message in reader.messages(list(sources)):
+        for source in sources[message.topic]:
+            held_out = False
+            if source in held and inputs.hold_out > 0:
+                count += 1
+                held_out = count % inputs.hold_out == 0
+            yield InputMessage(source, message, held_out)
+
+
+def read_static_frames(reader: BagReader) -> list[BagMessage]:
+    """Return the valid messages of a bag on /tf_static, to be received before all others."""
+    topic, type_name = STATIC_FRAMES
+    if topic not in reader.topics or reader.topics[topic].type != type_name:
+        return []
+    good = []
+    for message in reader.messages([topic]):
+        try:
+            message.decode()
+        except MessageError:
+            continue
+        good.append(message)
+    return good

@@ -1,0 +1,158 @@
+# Copyright 2026 The pose_graph_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""Write rosbag2 folders in the format of ROS 2 Jazzy, without a ROS installation."""
+
+from collections.abc import Collection
+from pathlib import Path
+import shutil
+import tempfile
+from typing import Any, Final, Self
+
+from rosbags.interfaces import (
+    Connection,
+    Qos,
+    QosDurability,
+    QosHistory,
+    QosLiveliness,
+    QosReliability,
+    QosTime,
+)
+from rosbags.rosbag2 import StoragePlugin, Writer
+from rosbags.typesys import get_typestore, Stores
+
+from pose_graph_ros.adapters.bags import BAG_FILE_SUFFIXES, BagError, one_line
+
+STORAGES = {'mcap': StoragePlugin.MCAP, 'sqlite3': StoragePlugin.SQLITE3}
+BAG_VERSION: Final = 9
+"""Version of the metadata of ROS 2 Jazzy."""
+STATIC_TRANSFORMS = '/tf_static'
+FOREVER = QosTime(9223372036, 854775807)
+"""The "infinite" duration of rmw, 2^63 - 1 ns."""
+
+
+class BagWriter:
+    """
+    A new rosbag2 folder, a context manager.
+
+    The bag is moved to its name when the context ends. If the context ends with an exception, no
+    bag is written, and a bag that was to be overwritten is kept.
+
+    Parameters
+    ----------
+    folder : str or Path
+    storage : str
+        `mcap` or `sqlite3`.
+    overwrite : bool
+        Whether to replace an existing rosbag2 folder; other folders are never replaced.
+    latched : collection of str
+        Topics whose publisher keeps its last message for late subscribers (transient local);
+        `/tf_static` always does.
+
+    Raises
+    ------
+    BagError
+        If `folder` exists and may not be replaced, its parent cannot be written to, or the
+        storage is unknown.
+
+    """
+
+    def __init__(
+        self, folder: str | Path, storage: str = 'mcap', *, overwrite: bool = False,
+        latched: Collection[str] = (),
+    ) -> None:
+        self.folder = Path(folder).resolve()
+        if storage not in STORAGES:
+            raise BagError(f'{folder}: storage {storage!r}, expected {" or ".join(STORAGES)}')
+        if self.folder.exists() and not overwrite:
+            raise BagError(f'{folder}: exists already, not overwritten')
+        if self.folder.exists() and not _is_nothing_but_a_bag(self.folder):
+            raise BagError(f'{folder}: is no rosbag2 folder or holds other files, not overwritten')
+        self._latched = {STATIC_TRANSFORMS, *latched}
+        self._types = get_typestore(Stores.ROS2_JAZZY)
+        self._connections: dict[tuple[str, str], Connection] = {}
+        # under its final name in a scratch folder: rosbags names the files after their folder
+        try:
+            self.folder.parent.mkdir(parents=True, exist_ok=True)
+            self._scratch = Path(tempfile.mkdtemp(
+                prefix=f'.{self.folder.name}-', dir=self.folder.parent))
+        except OSError as error:
+            raise BagError(f'{folder}: cannot be written: {one_line(error)}') from error
+        self._writer = Writer(
+            self._scratch / self.folder.name, version=BAG_VERSION,
+            storage_plugin=STORAGES[storage])
+        self._writer.open()
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, kind: type[BaseException] | None, *exception: object) -> None:
+        try:
+            if kind is not None:
+                self._writer.abort()
+                return
+            self._writer.close()
+            if self.folder.exists():
+                self.folder.rename(self._scratch / f'{self.folder.name}.replaced')
+            self._writer.path.rename(self.folder)
+        finally:
+            shutil.rmtree(self._scratch)
+
+    def write(self, topic: str, type_name: str, recorded_ns: int, message: Any) -> None:
+        """
+        Append a message.
+
+        Parameters
+        ----------
+        topic : str
+        type_name : str
+            A message type of ROS 2 Jazzy, such as `nav_msgs/msg/Path`.
+        recorded_ns : int
+            When the message was received [ns].
+        message : bytes or object
+            Serialised CDR bytes, or an object with the fields of the type.
+
+        Raises
+        ------
+        BagError
+            If the type is unknown or the message does not fit it.
+
+        """
+        connection = self._connections.get((topic, type_name))
+        if connection is None:
+            connection = self._connect(topic, type_name)
+        if not isinstance(message, bytes):
+            try:
+                message = self._types.serialize_cdr(message, type_name)
+            except Exception as error:  # generated code on a foreign object
+                raise BagError(
+                    f'{self.folder}: {topic}: no valid {type_name}: {one_line(error)}',
+                ) from error
+        self._writer.write(connection, recorded_ns, message)
+
+    def _connect(self, topic: str, type_name: str) -> Connection:
+        if type_name not in self._types.fielddefs:
+            raise BagError(f'{self.folder}: {topic}: type {type_name} is unknown to ROS 2 Jazzy')
+        durability = (
+            QosDurability.TRANSIENT_LOCAL if topic in self._latched else QosDurability.VOLATILE)
+        depth = 1 if topic in self._latched else 10
+        qos = Qos(
+            QosHistory.KEEP_LAST, depth, QosReliability.RELIABLE, durability, FOREVER, FOREVER,
+            QosLiveliness.AUTOMATIC, FOREVER, avoid_ros_namespace_conventions=False)
+        connection = self._writer.add_connection(
+            topic, type_name, typestore=self._types, offered_qos_profiles=[qos])
+        self._connections[topic, type_name] = connection
+        return connection
+
+
+def message_types() -> dict[str, Any]:
+    """Return the classes of the ROS 2 Jazzy messages by name of the type."""
+    return dict(get_typestore(Stores.ROS2_JAZZY).types)
+
+
+def _is_nothing_but_a_bag(folder: Path) -> bool:
+    """Tell whether a folder holds the metadata and files of a rosbag2, and no other files."""
+    metadata = folder / 'metadata.yaml'
+    if not metadata.is_file() or b'rosbag2_bagfile_information' not in metadata.read_bytes():
+        return False
+    suffixes = (*BAG_FILE_SUFFIXES, '.zstd')
+    return all(p == metadata or (p.is_file() and p.suffix in suffixes) for p in folder.iterdir())

@@ -1,0 +1,284 @@
+# Copyright 2026 The pose_graph_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""
+Read bags without a ROS installation.
+
+A bag is a rosbag2 folder, one of its .mcap or .db3 files, or a ROS 1 .bag file. A bag that cannot
+be read raises `BagError`, whose message begins with the path. The caller decodes each message, so
+that one that cannot be decoded (`MessageError`) does not end the iteration.
+"""
+
+from collections import Counter
+from collections.abc import Callable, Collection, Iterator
+from dataclasses import dataclass, field
+from functools import partial
+import logging
+from pathlib import Path
+from typing import Any, Self
+
+from rosbags.interfaces import (
+    Connection,
+    MessageDefinitionFormat,
+)
+from rosbags.rosbag1 import Reader as Rosbag1Reader
+from rosbags.rosbag2 import Reader as Rosbag2Reader
+from rosbags.typesys import get_types_from_idl, get_types_from_msg, get_typestore, Stores
+from rosbags.typesys.store import Typestore
+
+from pose_graph_ros.core.exceptions import PoseGraphError
+
+logger = logging.getLogger(__name__)
+
+BAG_FILE_SUFFIXES = ('.mcap', '.db3', '.bag')
+IDL_SEPARATOR = '=' * 80 + '\n'
+
+
+class BagError(PoseGraphError, ValueError):
+    """A bag cannot be read or written; the error message names its path."""
+
+
+class MessageError(BagError):
+    """One message of a bag cannot be decoded; the others may be valid."""
+
+
+@dataclass(frozen=True, slots=True)
+class TopicInfo:
+    """Type and number of messages of one topic of a bag."""
+
+    type: str
+    """Message type, such as `nav_msgs/msg/Odometry`; several types are joined with ` | `."""
+    count: int
+    """Number of messages."""
+
+
+@dataclass(frozen=True, slots=True)
+class BagMessage:
+    """One message of a bag, which is decoded on demand."""
+
+    topic: str
+    type: str
+    recorded_ns: int
+    """When the recorder received the message [ns]; not the stamp in its header."""
+    raw: bytes
+    """The message as stored: in CDR in a rosbag2, in the ROS 1 format in a .bag file."""
+    _decode: Callable[[bytes], Any] = field(repr=False, compare=False)
+
+    def decode(self) -> Any:
+        """
+        Return the message as an object with the fields of its type.
+
+        Raises
+        ------
+        MessageError
+            If the bytes are not a message of the type, or the type is unknown.
+
+        """
+        try:
+            return self._decode(self.raw)
+        except Exception as error:  # generated code can raise anything on invalid bytes
+            raise MessageError(
+                f'{self.topic}: message recorded at {self.recorded_ns} ns is no {self.type}: '
+                f'{one_line(error)}') from error
+
+
+class BagReader:
+    """
+    An open bag, a context manager; made by `open_bag`.
+
+    Parameters
+    ----------
+    path : Path
+    reader : Reader
+        Opened reader of rosbags.
+
+    """
+
+    def __init__(self, path: Path, reader: Rosbag1Reader | Rosbag2Reader) -> None:
+        self.path = path
+        self._reader = reader
+        self._decoders: dict[str, Callable[[bytes], Any]] = {}
+        self.topics: dict[str, TopicInfo] = {}
+        """Topics of the bag by name."""
+        for name in sorted({connection.topic for connection in reader.connections}):
+            connections = [c for c in reader.connections if c.topic == name]
+            types = ' | '.join(sorted({c.msgtype for c in connections}))
+            self.topics[name] = TopicInfo(types, sum(c.msgcount for c in connections))
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *exception: object) -> None:
+        self.close()
+
+    def close(self) -> None:
+        """Close the files; messages that were read before can still be decoded."""
+        self._reader.close()
+
+    def messages(self, topics: Collection[str]) -> Iterator[BagMessage]:
+        """
+        Iterate over the messages of some topics in the order in which they were recorded.
+
+        Raises
+        ------
+        BagError
+            If a topic is not in the bag (at the call), or the file is damaged (on iteration).
+
+        """
+        unknown = sorted(set(topics) - set(self.topics))
+        if unknown:
+            raise BagError(
+                f'{self.path}: no topic {", ".join(unknown)}; the bag has {self.describe()}')
+        return self._messages([c for c in self._reader.connections if c.topic in topics])
+
+    def describe(self) -> str:
+        """Return the topics with their types on one line, for error messages."""
+        if len(self.topics) == 0:
+            return 'no topics'
+        return ', '.join(f'{name} ({info.type})' for name, info in self.topics.items())
+
+    def _messages(self, connections: list[Connection]) -> Iterator[BagMessage]:
+        if len(connections) == 0:  # rosbags reads all topics if it is given none
+            return
+        seen: Counter[str] = Counter()
+        source = self._reader.messages(connections)
+        while True:
+            try:
+                connection, recorded_ns, raw = next(source)
+            except StopIteration:
+                break
+            except Exception as error:  # the parsers can raise anything on a damaged file
+                raise BagError(
+                    f'{self.path}: damaged after {seen.total()} messages: {one_line(error)}',
+                ) from error
+            seen[connection.topic] += 1
+            yield BagMessage(
+                connection.topic, connection.msgtype, recorded_ns, bytes(raw),
+                self._decoder(connection))
+        for topic in sorted({c.topic for c in connections}):
+            if seen[topic] != self.topics[topic].count:
+                logger.warning('%s: %s should have %d messages, %d were found',
+                               self.path, topic, self.topics[topic].count, seen[topic])
+
+    def _decoder(self, connection: Connection) -> Callable[[bytes], Any]:
+        decoder = self._decoders.get(connection.msgtype)
+        if decoder is None:
+            is_ros1 = isinstance(self._reader, Rosbag1Reader)
+            decoder = _make_decoder(connection, is_ros1=is_ros1)
+            self._decoders[connection.msgtype] = decoder
+        return decoder
+
+
+def open_bag(path: str | Path) -> BagReader:
+    """
+    Open a rosbag2 folder (sqlite3 or mcap, also compressed), an .mcap, a .db3 or a .bag file.
+
+    Raises
+    ------
+    BagError
+        If the path does not exist, is no bag, or the bag is damaged or of an unsupported format.
+
+    """
+    path = Path(path)
+    if not path.exists():
+        raise BagError(f'{path}: does not exist')
+    if path.is_dir() and not (path / 'metadata.yaml').exists():
+        inside = sorted(p.name for p in path.iterdir() if p.suffix in BAG_FILE_SUFFIXES)
+        hint = f'; name a file in it: {", ".join(inside)}' if inside else ''
+        raise BagError(f'{path}: no rosbag2 folder, it has no metadata.yaml{hint}')
+    if path.is_file() and path.suffix not in BAG_FILE_SUFFIXES:
+        raise BagError(
+            f'{path}: no bag, expected a rosbag2 folder or a file ending in '
+            f'{", ".join(BAG_FILE_SUFFIXES)}')
+    try:
+        reader: Rosbag1Reader | Rosbag2Reader = (
+            Rosbag1Reader(path) if path.suffix == '.bag' else Rosbag2Reader(path))
+        reader.open()
+    except Exception as error:  # the parsers can raise anything on a damaged file
+        raise BagError(
+            f'{path}: damaged, cut short or not supported: {one_line(error)}') from error
+    return BagReader(path, reader)
+
+
+def choose_topic(
+    reader: BagReader, wanted: str | None, type_name: str, option: str,
+    *, among: Collection[str] | None = None,
+) -> str | None:
+    """
+    Return the topic to read: the wanted one, or else the only one of the type.
+
+    Parameters
+    ----------
+    reader : BagReader
+    wanted : str or None
+        Topic that the user asks for; None chooses the only one of the type.
+    type_name : str
+        Message type that the topic must have, such as `nav_msgs/msg/Odometry`.
+    option : str
+        Command line option for this topic, such as `--odom`, for error messages.
+    among : collection of str, optional
+        Topics to choose from; by default all.
+
+    Returns
+    -------
+    str or None
+        None if `wanted` is None and there is no topic of the type.
+
+    Raises
+    ------
+    BagError
+        If the wanted topic is missing or of another type, or if there are several to choose from.
+
+    """
+    if wanted is not None:
+        info = reader.topics.get(wanted)
+        if info is None:
+            raise BagError(
+                f'{reader.path}: no topic {wanted} ({option}); the bag has {reader.describe()}')
+        if info.type != type_name:
+            raise BagError(
+                f'{reader.path}: {option} {wanted} is of type {info.type}, expected {type_name}')
+        return wanted
+    candidates = [name for name, info in reader.topics.items()
+                  if info.type == type_name and (among is None or name in among)]
+    if len(candidates) > 1:
+        choices = ' or '.join(f'{option} {name}' for name in candidates)
+        raise BagError(
+            f'{reader.path}: {len(candidates)} topics of type {type_name}, choose {choices}')
+    return candidates[0] if candidates else None
+
+
+def _make_decoder(connection: Connection, *, is_ros1: bool) -> Callable[[bytes], Any]:
+    """Return the decoder of a type, by its definition in the bag, else by the standard one."""
+    types = _own_types(connection)
+    if types is None:
+        types = get_typestore(Stores.ROS1_NOETIC if is_ros1 else Stores.ROS2_JAZZY)
+    decode = types.deserialize_ros1 if is_ros1 else types.deserialize_cdr
+    return partial(decode, typename=connection.msgtype)
+
+
+def _own_types(connection: Connection) -> Typestore | None:
+    """Return the types by the definition in the bag; None if it has none that is usable."""
+    text, kind = connection.msgdef.data, connection.msgdef.format
+    if kind == MessageDefinitionFormat.NONE or text.strip() == '':
+        return None
+    types = get_typestore(Stores.EMPTY)
+    try:
+        if kind == MessageDefinitionFormat.MSG:
+            types.register(get_types_from_msg(text, connection.msgtype))
+        else:
+            # several definitions, each after a separator and a line 'IDL: <name>'
+            for part in text.split(IDL_SEPARATOR):
+                idl = part.partition('\n')[2] if part.startswith('IDL: ') else part
+                if idl.strip():
+                    types.register(get_types_from_idl(idl))
+        types.get_msgdef(connection.msgtype)
+    except Exception as error:  # the parser can raise anything on an invalid definition
+        logger.warning('%s: the definition of %s in the bag is not usable, using the standard '
+                       'one: %s', connection.topic, connection.msgtype, one_line(error))
+        return None
+    return types
+
+
+def one_line(error: Exception) -> str:
+    """Return the text of an error on one line."""
+    return ' '.join(str(error).split()) or type(error).__name__

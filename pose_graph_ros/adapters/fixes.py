@@ -1,0 +1,204 @@
+# Copyright 2026 The pose_graph_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""
+Convert GNSS fixes to positions in the map, by the datum and the lever arms of the antennas.
+
+No rclpy.
+"""
+
+from collections.abc import Sequence
+import math
+from typing import NamedTuple
+
+import numpy as np
+
+from pose_graph_ros.adapters.conversions import frame, Message, stamp_ns
+from pose_graph_ros.adapters.sources import Source
+from pose_graph_ros.adapters.static_frames import StaticFrames
+from pose_graph_ros.core.geometry import covariance
+from pose_graph_ros.core.geometry.geodesy import MapOrigin, TangentPlane
+from pose_graph_ros.core.geometry.se2 import FloatArray
+from pose_graph_ros.core.measurements import Answer, Position, rejected
+
+STATUS_NO_FIX = -1
+COVARIANCE_TYPE_UNKNOWN = 0
+# Largest valid distance from the ellipsoid [m].
+LARGEST_ALTITUDE = 1e5
+
+
+class Datum:
+    """
+    The origin of the map on the Earth: a given one, or the position of a fix.
+
+    Parameters
+    ----------
+    given : sequence of float
+        Latitude and longitude [degrees] and, if there are three numbers, the angle of the map's x
+        axis from east [rad]; empty to use the first valid fix.
+    wait : bool
+        Whether to wait for a call of `renew` before a fix is used, if `given` is empty.
+
+    Raises
+    ------
+    ValueError
+        If `given` is not a point on the Earth.
+
+    """
+
+    def __init__(self, given: Sequence[float] = (), *, wait: bool = False) -> None:
+        if len(given) not in (0, 2, 3):
+            raise ValueError(f'datum: expected [latitude, longitude] or [latitude, longitude, '
+                             f'yaw], got {list(given)}')
+        self.yaw = float(given[2]) if len(given) == 3 else 0.0
+        """Angle of the map's x axis from east [rad]."""
+        self.plane: TangentPlane | None = None
+        """Tangent plane of the map; None without a datum."""
+        self.is_given = len(given) > 0
+        """Whether the datum comes from the parameter."""
+        self.is_of_graph = False
+        """Whether the datum comes from a loaded graph."""
+        self.altitude = 0.0
+        """Altitude of the newest fix that has one [m]."""
+        if len(given) > 0:
+            self.plane = TangentPlane(given[0], given[1], yaw=self.yaw)
+        self._waits = wait
+        # a given datum takes its altitude from the first fix; east and north do not depend on it
+        self._to_lift = self.plane is not None
+
+    def keep(self, origin: MapOrigin) -> None:
+        """Use the datum of a loaded graph from now on."""
+        self.plane, self.yaw, self.altitude = TangentPlane(*origin), origin.yaw, origin.altitude
+        self._waits = self._to_lift = False
+        self.is_of_graph = True
+
+    def renew(self) -> None:
+        """Make the next valid fix the datum."""
+        self.plane, self._waits, self._to_lift = None, False, False
+
+    def plane_for(
+        self, latitude: float, longitude: float, altitude: float,
+    ) -> TangentPlane | None:
+        """
+        Return the plane for a valid fix, which becomes the datum if there is none.
+
+        Parameters
+        ----------
+        latitude, longitude : float
+            Of the fix [degrees].
+        altitude : float
+            Of the fix [m]; NaN if unknown.
+
+        Returns
+        -------
+        TangentPlane or None
+            None while the datum waits for `renew`.
+
+        """
+        if math.isfinite(altitude):
+            self.altitude = altitude
+        if self.plane is None and not self._waits:
+            self.plane = TangentPlane(latitude, longitude, self.altitude, self.yaw)
+        elif self.plane is not None and self._to_lift:
+            self.plane = TangentPlane(
+                self.plane.latitude, self.plane.longitude, self.altitude, self.yaw)
+            self._to_lift = False
+        return self.plane
+
+
+class Antenna(NamedTuple):
+    """Position of the antenna of a receiver on the robot."""
+
+    lever_arm: FloatArray
+    """Antenna in the frame of the robot, shape (2,) [m]."""
+    origin: str
+    """`parameter`, `tf_static`, or `none` if unknown (the lever arm is then zero)."""
+
+
+class FixReader:
+    """
+    Converts the NavSatFix messages of one source to positions.
+
+    Parameters
+    ----------
+    source : Source
+    datum : Datum
+        Datum of the map, shared by all sources.
+    frames : StaticFrames
+        Used if the source has no lever arm.
+    base_frame : str
+        Frame of the robot.
+
+    Raises
+    ------
+    ValueError
+        If the lever arm is not two finite numbers.
+
+    """
+
+    def __init__(
+        self, source: Source, datum: Datum, frames: StaticFrames, base_frame: str,
+    ) -> None:
+        self.configure(source)
+        self._datum, self._frames, self._base_frame = datum, frames, base_frame
+        self.antenna: Antenna | None = None
+        """Antenna of the newest fix; None before the first."""
+        self.without_lever_arm = 0
+        """Number of fixes that were read while the antenna was unknown."""
+
+    def configure(self, source: Source) -> None:
+        """
+        Use the time offset and lever arm of a source from now on.
+
+        Raises
+        ------
+        ValueError
+            If the lever arm is not two finite numbers.
+
+        """
+        if len(source.lever_arm) != 2 or not np.all(np.isfinite(source.lever_arm)):
+            raise ValueError(f'{source.name}.lever_arm: expected [x, y] in metres, got '
+                             f'{list(source.lever_arm)}')
+        self._source = source
+
+    def position(self, message: Message) -> Position | Answer:
+        """
+        Return the position in a sensor_msgs/NavSatFix, or the reason for rejecting it.
+
+        An unknown covariance is returned as zeros.
+        """
+        if message.status.status == STATUS_NO_FIX:
+            return rejected('no_fix', 'the receiver reports no fix')
+        latitude, longitude, altitude = message.latitude, message.longitude, message.altitude
+        if not (math.isfinite(latitude) and math.isfinite(longitude)):
+            return rejected('not_finite', f'latitude {latitude}, longitude {longitude}')
+        # an altitude of NaN means that it is unknown, and passes
+        if abs(latitude) > 90.0 or abs(longitude) > 360.0 or abs(altitude) > LARGEST_ALTITUDE:
+            return rejected('out_of_range', f'latitude {latitude}, longitude {longitude}, '
+                                            f'altitude {altitude}')
+        stamp = stamp_ns(message, self._source.time_offset_ns)
+        if stamp <= 0:
+            return rejected('zero_stamp', 'a fix without a stamp')
+        plane = self._datum.plane_for(latitude, longitude, altitude)
+        if plane is None:
+            return rejected('no_datum', 'wait_for_datum is set: call ~/set_datum, or set datum')
+        if not math.isfinite(altitude):
+            altitude = plane.altitude
+        cov = np.zeros((2, 2))
+        if message.position_covariance_type != COVARIANCE_TYPE_UNKNOWN:
+            cov = np.asarray(message.position_covariance, dtype=float).reshape(3, 3)[:2, :2]
+        if np.all(np.isfinite(cov)):
+            with np.errstate(over='ignore', invalid='ignore'):
+                cov = covariance.turned(cov, plane.yaw)
+        self.antenna = self._find_antenna(frame(message.header.frame_id))
+        self.without_lever_arm += self.antenna.origin == 'none'
+        return Position(stamp, plane.to_map(latitude, longitude, altitude), cov,
+                        self.antenna.lever_arm)
+
+    def _find_antenna(self, frame_id: str) -> Antenna:
+        given = np.array(self._source.lever_arm, dtype=np.float64)
+        if np.any(given):
+            return Antenna(given, 'parameter')
+        place = self._frames.position(frame_id, self._base_frame)
+        if place is None:
+            return Antenna(given, 'none')
+        return Antenna(place[:2], 'tf_static')

@@ -1,0 +1,154 @@
+# Copyright 2026 The pose_graph_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""
+Serialise the graph as a visualization_msgs/MarkerArray, directly from arrays.
+
+One message object for every point would take seconds instead of milliseconds. The colour of a
+constraint shows its error in sigmas: green up to 1, yellow at 2, red from 3. No rclpy.
+"""
+
+import struct
+
+import numpy as np
+import numpy.typing as npt
+
+from pose_graph_ros.adapters.sources import NANOSECONDS
+from pose_graph_ros.core.geometry.se2 import FloatArray
+from pose_graph_ros.core.graph.graph_view import GraphView, Lines
+
+# Constants of visualization_msgs/Marker.
+LINE_LIST, POINTS, ADD, DELETEALL = 5, 8, 0, 3
+
+# Colours (red, green, blue, alpha) of constraints at these errors [sigma]; interpolated between.
+SIGMAS = (1.0, 2.0, 3.0)
+COLOURS = ((0.15, 0.7, 0.3, 1.0), (0.95, 0.8, 0.1, 1.0), (0.9, 0.1, 0.1, 1.0))
+# Colour of hidden nodes.
+NODE_COLOUR = (0.4, 0.6, 0.85, 1.0)
+# Sizes of points, and widths of lines [m].
+NODE_SIZE, OBSERVED_SIZE, EDGE_WIDTH, CLOSURE_WIDTH = 0.2, 0.25, 0.06, 0.1
+
+NAMESPACES = ('hidden_nodes', 'odometry', 'loop_closures', 'observed_errors', 'observed_nodes')
+"""Namespaces of the markers by id."""
+
+_Colours = npt.NDArray[np.float32]
+
+
+def markers_cdr(view: GraphView, stamp_ns: int, frame_id: str) -> bytes:
+    """
+    Return the markers of a graph as a message in little-endian CDR.
+
+    The first marker deletes all previous ones. Kinds without points have no marker, because
+    viewers report empty markers as errors.
+
+    Parameters
+    ----------
+    view : GraphView
+    stamp_ns : int
+    frame_id : str
+        Frame of the map.
+
+    """
+    measured = view.observed.ends[:, 1]
+    observed = colours(view.observed.sigmas)
+    drawn = [
+        (POINTS, NODE_SIZE, view.nodes, np.empty((0, 4), dtype=np.float32)),
+        (LINE_LIST, EDGE_WIDTH, *_lines(view.odometry)),
+        (LINE_LIST, CLOSURE_WIDTH, *_lines(view.loop_closures)),
+        (LINE_LIST, EDGE_WIDTH, *_lines(view.observed)),
+        (POINTS, OBSERVED_SIZE, measured, observed)]
+    shown = [number for number, (_, _, points, _) in enumerate(drawn) if len(points) > 0]
+    stream = _Stream()
+    stream.add('I', 1 + len(shown))
+    header = (*divmod(stamp_ns, NANOSECONDS), frame_id)
+    nothing = np.empty((0, 2)), np.empty((0, 4), dtype=np.float32)
+    _add_marker(stream, header, '', (0, 0, DELETEALL), 0.0, *nothing)
+    for number in shown:
+        kind, size, points, point_colours = drawn[number]
+        _add_marker(
+            stream, header, NAMESPACES[number], (number, kind, ADD), size, points, point_colours)
+    return stream.bytes()
+
+
+def colours(sigmas: FloatArray) -> _Colours:
+    """Return the colours, shape (M, 4), of constraints with these errors, shape (M,) [sigma]."""
+    return np.column_stack([
+        np.interp(sigmas, SIGMAS, channel) for channel in zip(*COLOURS, strict=True)
+    ]).astype(np.float32)
+
+
+def _lines(lines: Lines) -> tuple[FloatArray, _Colours]:
+    """Return the ends of lines as points, shape (2 M, 2), and their colours, shape (2 M, 4)."""
+    return lines.ends.reshape(-1, 2), np.repeat(colours(lines.sigmas), 2, axis=0)
+
+
+def _add_marker(  # noqa: PLR0917  fields of a marker
+    stream: '_Stream', header: tuple[int, int, str], namespace: str, what: tuple[int, int, int],
+    size: float, points: FloatArray, point_colours: _Colours,
+) -> None:
+    """Add a visualization_msgs/Marker field by field."""
+    def add_header() -> None:
+        stream.add('i', header[0])
+        stream.add('I', header[1])
+        stream.add_text(header[2])
+
+    add_header()
+    stream.add_text(namespace)
+    stream.add('i', *what)
+    stream.add('d', 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0)  # pose
+    stream.add('d', size, size, 0.0)                    # scale: lines use the first
+    stream.add('f', *NODE_COLOUR)                       # colour of points without their own
+    stream.add('i', 0, 0)                               # lifetime: forever
+    stream.add('B', 0)                                  # frame_locked
+    stream.add('I', len(points))
+    if len(points) > 0:
+        flat = np.zeros((len(points), 3))
+        flat[:, :2] = points
+        stream.add_array(flat)
+    stream.add('I', len(point_colours))
+    stream.add_array(point_colours)
+    stream.add_text('')     # texture_resource
+    add_header()            # texture
+    stream.add_text('')
+    stream.add('I', 0)
+    stream.add('I', 0)      # uv_coordinates
+    stream.add_text('')     # text
+    stream.add_text('')     # mesh_resource
+    stream.add_text('')     # mesh_file
+    stream.add('I', 0)
+    stream.add('B', 0)      # mesh_use_embedded_materials
+
+
+class _Stream:
+    """
+    A stream of CDR.
+
+    The position of each number after the header of four bytes is a multiple of its size.
+    """
+
+    def __init__(self) -> None:
+        self._parts: list[bytes] = []
+        self._size = 0
+
+    def _append(self, part: bytes, alignment: int) -> None:
+        padding = -self._size % alignment
+        self._parts += (bytes(padding), part)
+        self._size += padding + len(part)
+
+    def add(self, code: str, *numbers: float) -> None:
+        """Add numbers with a format code of `struct`."""
+        self._append(struct.pack(f'<{len(numbers)}{code}', *numbers), struct.calcsize(code))
+
+    def add_text(self, text: str) -> None:
+        """Add a string."""
+        name = text.encode() + b'\0'
+        self.add('I', len(name))
+        self._append(name, 1)
+
+    def add_array(self, array: npt.NDArray[np.generic]) -> None:
+        """Add the numbers of an array."""
+        little = array.astype(array.dtype.newbyteorder('<'), copy=False)
+        self._append(little.tobytes(), array.itemsize)
+
+    def bytes(self) -> bytes:
+        """Return the serialised message."""
+        return b''.join((b'\x00\x01\x00\x00', *self._parts))

@@ -1,0 +1,114 @@
+# Copyright 2026 The pose_graph_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""Convert the messages of all sources to measurements, in the node and offline; no rclpy."""
+
+from collections.abc import Mapping
+from typing import Any
+
+from pose_graph_ros.adapters import conversions
+from pose_graph_ros.adapters.conversions import frame, Message
+from pose_graph_ros.adapters.fixes import Datum, FixReader
+from pose_graph_ros.adapters.sources import Kind, NANOSECONDS, Source, source_list
+from pose_graph_ros.adapters.static_frames import StaticFrames
+from pose_graph_ros.core.exceptions import ConfigError
+from pose_graph_ros.core.measurements import Answer, Measurement, OdometrySample, rejected
+from pose_graph_ros.core.odometry.stamp_guard import StampGuard
+
+# Distance from the previous odometry stamps beyond which the stamp guard refuses a stamp [ns]. The
+# poses of odometry are accumulated, so the motion of the few refused messages is not lost.
+LEAP_NS = 60 * NANOSECONDS
+# Largest valid stamp: the seconds have 31 bits, of which one hour is left for offsets [ns].
+LARGEST_STAMP_NS = (2**31 - 3600) * NANOSECONDS
+
+
+class MessageReader:
+    """
+    Converts the messages of all sources to measurements.
+
+    Parameters
+    ----------
+    values : mapping
+        All checked parameters.
+    frames : StaticFrames, optional
+        Static transforms that are known already.
+
+    Raises
+    ------
+    ConfigError
+        If the datum is not a point on the Earth or a lever arm is invalid.
+
+    """
+
+    def __init__(self, values: Mapping[str, Any], frames: StaticFrames | None = None) -> None:
+        self.sources = {source.name: source for source in source_list(values)}
+        """Sources by name."""
+        self._guards = {name: StampGuard(LEAP_NS, behind=True) for name in self.sources}
+        self._map_frame = frame(values['map_frame'])
+        base_frame = frame(values['base_link_frame'])
+        self.frames = StaticFrames() if frames is None else frames
+        """Static transforms of the robot, as received on /tf_static."""
+        try:
+            self.datum = Datum(values['datum'], wait=values['wait_for_datum'])
+            self.fixes = {
+                source.name: FixReader(source, self.datum, self.frames, base_frame)
+                for source in self.sources.values() if source.kind is Kind.FIX}
+        except ValueError as error:
+            raise ConfigError(f'parameter {error}') from error
+
+    def renewed(self, values: Mapping[str, Any]) -> 'MessageReader':
+        """Return a reader for a new graph; it shares the static transforms and nothing else."""
+        return MessageReader(values, self.frames)
+
+    def configure(self, values: Mapping[str, Any]) -> None:
+        """
+        Use other time offsets, lever arms and yaw offsets for messages from now on.
+
+        Sources, topics, frames and datum, which the node reads when it is configured, stay, and so
+        do static transforms and counts.
+        """
+        for source in source_list(values):
+            before = self.sources[source.name]
+            self._guards[source.name].shift(source.time_offset_ns - before.time_offset_ns)
+            self.sources[source.name] = source
+            if source.kind is Kind.FIX:
+                self.fixes[source.name].configure(source)
+
+    def read(self, name: str, message: Message) -> OdometrySample | Measurement | Answer:
+        """
+        Return the measurement in a message, or the reason for rejecting it.
+
+        Parameters
+        ----------
+        name : str
+            Name of the source.
+        message : Message
+            Of the type of the source.
+
+        """
+        source = self.sources[name]
+        measurement = self._read(source, message)
+        if isinstance(measurement, Answer):
+            return measurement
+        stamp_ns = measurement.stamp_ns
+        if stamp_ns > LARGEST_STAMP_NS:
+            return rejected('stamp_out_of_range', f'{stamp_ns} ns')
+        # the engine rejects stamps of zero or less
+        if (source.kind is Kind.ODOMETRY and stamp_ns > 0
+                and not self._guards[name].accepts(stamp_ns)):
+            return rejected('stamp_leap', f'{stamp_ns} ns is far from those before')
+        return measurement
+
+    def _read(self, source: Source, message: Message) -> OdometrySample | Measurement | Answer:
+        offset_ns = source.time_offset_ns
+        match source.kind:
+            case Kind.ODOMETRY:
+                return conversions.odometry_sample(message, offset_ns)
+            case Kind.GLOBAL_POSE:
+                return conversions.global_pose(message, self._map_frame, offset_ns)
+            case Kind.FIX:
+                return self.fixes[source.name].position(message)
+            case Kind.IMU:
+                return conversions.heading(
+                    message, self.datum.yaw, source.yaw_offset, offset_ns)
+            case Kind.LOOP_CLOSURE:
+                return conversions.loop_closure(message, offset_ns)

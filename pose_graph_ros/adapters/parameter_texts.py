@@ -1,0 +1,104 @@
+# Copyright 2026 The pose_graph_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""Format the tables of parameters for docs/parameters.md and as a parameter file; no ROS."""
+
+from collections.abc import Iterable, Iterator
+
+from pose_graph_ros.adapters.parameters import (
+    listed_sources,
+    Parameter,
+    PARAMETERS,
+    SOURCE_PARAMETERS,
+    source_parameters,
+    type_parameter,
+    Value,
+)
+from pose_graph_ros.adapters.sources import Kind
+
+# Examples for lists that are not set by default.
+_EXAMPLES = {'datum': '[0.0, 0.0]', 'covariance_override': '[1.0, 0.1]'}
+
+
+def as_yaml() -> str:
+    """Return the content of `config/pose_graph_full.yaml`: all parameters with their defaults."""
+    lines = ['# All parameters with their defaults. In brackets: unit; range; when it can change.',
+             '# Generated from the tables in pose_graph_ros/adapters/parameters.py by the command',
+             '# `pose-graph parameters --yaml`. pose_graph.yaml has what most robots need.',
+             '/**:', '  ros__parameters:']
+    commented: set[str] = set()
+    group = ''
+    for parameter in PARAMETERS:
+        before, (group, _, leaf) = group, parameter.name.rpartition('.')
+        if group not in ('', before):
+            lines.append(f'    {group}:')
+        lines += _entry(parameter, leaf, '    ' if group == '' else '      ', commented)
+    for source in listed_sources({}):
+        lines.append(f'    {source}:')
+        for parameter in source_parameters(source, str(type_parameter(source).default)):
+            lines += _entry(parameter, parameter.name.partition('.')[2], '      ', commented)
+    return '\n'.join(lines) + '\n'
+
+
+def _entry(
+    parameter: Parameter, leaf: str, indent: str, commented: set[str],
+) -> Iterator[str]:
+    """Return the lines of one parameter; a comment in `commented` is not repeated."""
+    facts = '; '.join(fact for fact in (
+        parameter.unit, _range(parameter), parameter.change.value) if fact != '')
+    comment = f'{indent}# {parameter.description} [{facts}]'
+    if comment not in commented:
+        commented.add(comment)
+        yield comment
+    if parameter.default == []:
+        yield f'{indent}# {leaf}: {_EXAMPLES[leaf]}'
+    else:
+        yield f'{indent}{leaf}: {_yaml(parameter.default)}'
+
+
+def as_markdown() -> str:
+    """Return the table in docs/parameters.md of the parameters of the node."""
+    lines = ['| parameter | default | unit | range | changes | description |',
+             '|---|---|---|---|---|---|']
+    for parameter in PARAMETERS:
+        value = 'unset' if parameter.default == [] else _yaml(parameter.default)
+        lines.append(f'| `{parameter.name}` | {value} | {parameter.unit} | {_range(parameter)} | '
+                     f'{parameter.change.value} | {parameter.description} |')
+    return '\n'.join(lines) + '\n'
+
+
+def sources_as_markdown() -> str:
+    """Return the table in docs/parameters.md of the parameters of a source."""
+    lines = ['| parameter | types | default | unit | range | changes | description |',
+             '|---|---|---|---|---|---|---|']
+    for parameter in SOURCE_PARAMETERS:
+        value = '' if parameter.name in ('type', 'topic') else (
+            'unset' if parameter.default == [] else _yaml(parameter.default))
+        lines.append(f'| `<source>.{parameter.name}` | {_kinds(parameter.kinds)} | {value} | '
+                     f'{parameter.unit} | {_range(parameter)} | {parameter.change.value} | '
+                     f'{parameter.description} |')
+    return '\n'.join(lines) + '\n'
+
+
+def _kinds(kinds: Iterable[Kind]) -> str:
+    kinds = set(kinds)
+    missing = [kind.value for kind in Kind if kind not in kinds]
+    if len(missing) == 0:
+        return 'all'
+    if len(missing) == 1:
+        return f'all but {missing[0]}'
+    return ', '.join(kind.value for kind in Kind if kind in kinds)
+
+
+def _range(parameter: Parameter) -> str:
+    if len(parameter.choices) > 0:
+        return ', '.join(parameter.choices)
+    return '' if parameter.smallest is None else (
+        f'{parameter.smallest:g} to {parameter.largest:g}')
+
+
+def _yaml(value: Value) -> str:
+    if isinstance(value, bool):
+        return str(value).lower()
+    if isinstance(value, list):
+        return f'[{", ".join(_yaml(item) for item in value)}]'
+    return value if isinstance(value, str) and value != '' else repr(value)

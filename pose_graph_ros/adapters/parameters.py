@@ -1,0 +1,397 @@
+# Copyright 2026 The pose_graph_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""
+Define the ROS parameters in two tables: those of the node, and those of each source.
+
+The node declares its parameters from the tables, and the parameter file and docs/parameters.md are
+generated from them. Defaults come from `core.config`. This module imports no ROS.
+"""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from enum import Enum
+import re
+import sys
+from typing import Any
+
+from pose_graph_ros.adapters.sources import DEFAULT_SOURCES, Kind, KNOWN_SOURCES, source_names
+from pose_graph_ros.core.config import (
+    AlignmentPolicy,
+    BackendConfig,
+    Correlation,
+    CovariancePolicy,
+    Heading,
+    HEADINGS,
+    LOOP_CLOSURES,
+    Loss,
+    MeasurementSource,
+    NodePolicy,
+    NoiseFrom,
+    OdometrySource,
+    POSITIONS,
+)
+from pose_graph_ros.core.exceptions import ConfigError
+
+Value = bool | float | str | list[float] | list[str]
+
+
+class Change(Enum):
+    """When a parameter can be changed."""
+
+    ALWAYS = 'running'
+    """At any time; it applies to data received afterwards."""
+    UNCONFIGURED = 'unconfigured'
+    """While the node is not configured; the transition `configure` reads it."""
+    START = 'read-only'
+    """Never; it is read at startup, as it determines other parameters or the startup itself."""
+
+
+@dataclass(frozen=True, slots=True)
+class Parameter:
+    """One parameter of the node, or of its sources if `kinds` is not empty."""
+
+    name: str
+    """For a parameter of a source, without the name of the source."""
+    default: Value
+    """An empty list of numbers means that the parameter is unset."""
+    unit: str
+    description: str
+    smallest: float | None = None
+    """Lower bound of a number, or of each number in a list, inclusive."""
+    largest: float | None = None
+    """Upper bound, inclusive."""
+    choices: tuple[str, ...] = ()
+    """Allowed texts; empty if all are allowed."""
+    sizes: tuple[int, ...] = ()
+    """Allowed sizes of a list; empty if all are allowed."""
+    kinds: tuple[Kind, ...] = ()
+    """Kinds of sources with this parameter."""
+    change: Change = Change.ALWAYS
+
+
+def _values(choices: type[Enum]) -> tuple[str, ...]:
+    return tuple(str(choice.value) for choice in choices)
+
+
+_NODES, _ALIGNMENT, _BACKEND = NodePolicy(), AlignmentPolicy(), BackendConfig()
+_ODOMETRY, _MEASUREMENT, _COVARIANCE = OdometrySource(), MeasurementSource(), CovariancePolicy()
+_NOISE = _ODOMETRY.noise
+_POLICY = {True: 'repair', False: 'refuse'}
+
+PARAMETERS: tuple[Parameter, ...] = (
+    Parameter('sources', list(DEFAULT_SOURCES), '', 'Names of the sources of measurements; the '
+              'parameters of each source are listed under its name. Of several odometry sources '
+              'the first one is preferred. The source `loop_closure` always exists.',
+              change=Change.START),
+    Parameter('autostart', True, '', 'Whether the node configures and activates itself. If false, '
+              'a lifecycle manager must do so.', change=Change.START),
+    Parameter('map_frame', 'map', '', 'Frame of the corrected path.',
+              change=Change.UNCONFIGURED),
+    Parameter('odom_frame', 'odom', '', 'Frame of the odometry, child of `map_frame` in TF.',
+              change=Change.UNCONFIGURED),
+    Parameter('base_link_frame', 'base_link', '', 'Frame of the robot base.',
+              change=Change.UNCONFIGURED),
+    Parameter('publish_tf', True, '', 'Whether to publish the transform from `map_frame` to '
+              '`odom_frame` on /tf.'),
+    Parameter('transform_time_offset', 0.0, 's', 'Time added to the stamp of the published '
+              'transform.', 0.0, 10.0),
+    Parameter('transform_slew_linear', 0.0, 'm/s', 'Maximum linear speed at which corrections '
+              'move the robot in the published transform. If 0, corrections are applied at once.',
+              0.0, 1000.0),
+    Parameter('transform_slew_angular', 0.0, 'rad/s', 'Maximum angular speed at which corrections '
+              'turn the robot in the published transform. If 0, corrections are applied at once.',
+              0.0, 1000.0),
+    Parameter('frequency', 10.0, 'Hz', 'Frequency of the incremental optimisation of the graph.',
+              0.01, 100.0),
+    Parameter('path_period', 1.0, 's', 'Minimum time between two published paths.', 0.0, 3600.0),
+    Parameter('graph_period', 2.0, 's', 'Minimum time between two published sets of graph '
+              'markers.', 0.1, 3600.0),
+    Parameter('diagnostics_period', 1.0, 's', 'Time between two messages on /diagnostics.',
+              0.01, 60.0),
+    Parameter('closing_silence', 2.0, 's', 'Time without any message after which the whole graph '
+              'is optimised until convergence. If 0, it never is.', 0.0, 3600.0),
+    Parameter('clock_jump_threshold', 1.0, 's', 'The graph is reset if the clock of the node or '
+              'the stamps of the odometry jump back by more than this time.', 0.01, 3600.0),
+    Parameter('graph_file', '', '', 'File that `~/save_graph` writes and `~/load_graph` reads, '
+              'such as graph.g2o. Files with the suffixes .json and .tum are stored next to it.'),
+    Parameter('datum', [], 'deg, deg, rad', 'Latitude and longitude of the origin of the map and, '
+              'optionally, the angle from east to its x axis. If unset, the first fix is the '
+              'origin and the x axis points east.', sizes=(0, 2, 3), change=Change.UNCONFIGURED),
+    Parameter('wait_for_datum', False, '', 'Whether to refuse fixes until `~/set_datum` is '
+              'called, if `datum` is unset.', change=Change.UNCONFIGURED),
+    Parameter('minimum_travel_distance', _NODES.minimum_travel_distance, 'm',
+              'Distance from the last hidden node at which a new one is added.', 0.0, 1000.0),
+    Parameter('minimum_travel_heading', _NODES.minimum_travel_heading, 'rad',
+              'Rotation since the last hidden node at which a new one is added.', 0.0, 3.2),
+    Parameter('minimum_node_interval', _NODES.minimum_interval, 's', 'Minimum time between two '
+              'hidden nodes that are added because of distance or rotation.', 0.0, 60.0),
+    Parameter('moving_node_interval', _NODES.moving_interval, 's',
+              'Maximum time between two hidden nodes while the robot moves.', 0.05, 3600.0),
+    Parameter('node_heartbeat', _NODES.heartbeat, 's',
+              'Maximum time between two hidden nodes, also while the robot stands still.',
+              0.1, 86400.0),
+    Parameter('odometry_patience', _BACKEND.odometry_patience, 's', 'Hidden nodes are added from '
+              'another odometry source if the present one lags behind it by more than this time.',
+              0.05, 3600.0),
+    Parameter('alignment.sigma_heading', _ALIGNMENT.sigma_heading, 'rad', 'The map is aligned '
+              'with the odometry from positions alone once the standard deviation of the angle '
+              'between them is at most this.', 1e-3, 1.0),
+    Parameter('alignment.minimum_baseline', _ALIGNMENT.minimum_baseline, 'm', 'Minimum length '
+              'that the positions must span for the alignment.', 0.1, 1000.0),
+    Parameter('alignment.baseline_in_sigmas', _ALIGNMENT.baseline_in_sigmas, '', 'Minimum length '
+              'that the positions must span for the alignment, in standard deviations of a '
+              'position.', 1.0, 100.0),
+)
+
+_ALL = tuple(Kind)
+_WHEELS = (Kind.ODOMETRY,)
+_OTHERS = tuple(kind for kind in Kind if kind is not Kind.ODOMETRY)
+_POSITIONS = (Kind.GLOBAL_POSE, Kind.FIX)
+_NOT_CLOSURES = tuple(kind for kind in _OTHERS if kind is not Kind.LOOP_CLOSURE)
+
+SOURCE_PARAMETERS: tuple[Parameter, ...] = (
+    Parameter('type', '', '', 'Type of the source.', choices=_values(Kind), kinds=_ALL,
+              change=Change.START),
+    Parameter('topic', '', '', 'Topic of the messages. By default the name of the source, unless '
+              'the source is predefined.', kinds=_ALL, change=Change.UNCONFIGURED),
+    Parameter('time_offset', 0.0, 's', 'Time added to the stamps of the messages.', -3600.0,
+              3600.0, kinds=_ALL),
+    Parameter('noise', _ODOMETRY.noise_from.value, '', 'Origin of the odometry noise: `model` '
+              'uses distance and rotation, `twist` the twist covariance times the time step.',
+              choices=_values(NoiseFrom), kinds=_WHEELS, change=Change.UNCONFIGURED),
+    Parameter('sigma_distance', _NOISE.sigma_distance, 'm/sqrt(m)',
+              'Odometry noise along the path, per square root of the distance.', 0.0, 10.0,
+              kinds=_WHEELS),
+    Parameter('sigma_lateral', _NOISE.sigma_lateral, 'm/sqrt(m)',
+              'Odometry noise across the path, per square root of the distance.', 0.0, 10.0,
+              kinds=_WHEELS),
+    Parameter('sigma_heading_distance', _NOISE.sigma_heading_distance, 'rad/sqrt(m)',
+              'Odometry noise of the heading, per square root of the distance.', 0.0, 10.0,
+              kinds=_WHEELS),
+    Parameter('sigma_heading_turn', _NOISE.sigma_heading_turn, 'rad/sqrt(rad)',
+              'Odometry noise of the heading, per square root of the rotation.', 0.0, 10.0,
+              kinds=_WHEELS),
+    Parameter('sigma_floor', [_NOISE.sigma_floor_position, _NOISE.sigma_floor_heading], 'm, rad',
+              'Odometry noise of position and heading added once between two hidden nodes.', 1e-6,
+              100.0, sizes=(2,), kinds=_WHEELS),
+    Parameter('reorder_window', _ODOMETRY.reorder_window, 's', 'Messages older than the newest '
+              'one by less than this time are sorted in; older ones are ignored.', 0.0, 60.0,
+              kinds=_WHEELS),
+    Parameter('maximum_speed', _ODOMETRY.maximum_speed, 'm/s', 'Faster motion is treated as a '
+              'jump of the odometry.', 0.01, 1e4, kinds=_WHEELS),
+    Parameter('covariance_policy', _POLICY[_COVARIANCE.repair], '',
+              'Whether to repair an invalid covariance or to refuse its measurement.',
+              choices=('repair', 'refuse'), kinds=_NOT_CLOSURES),
+    Parameter('covariance_policy', _POLICY[LOOP_CLOSURES.covariance.repair], '',
+              'Whether to repair an invalid covariance or to refuse its measurement.',
+              choices=('repair', 'refuse'), kinds=(Kind.LOOP_CLOSURE,)),
+    Parameter('covariance_override', [], 'm, rad', 'Standard deviation of the position and, '
+              'optionally, of the heading, used instead of the covariance in the messages.', 1e-6,
+              1e6, sizes=(0, 1, 2), kinds=_OTHERS),
+    Parameter('covariance_scale', 1.0, '', 'Factor applied to all covariances.', 1e-6, 1e6,
+              kinds=_ALL),
+    Parameter('sigma_floor', [_COVARIANCE.position_floor, _COVARIANCE.heading_floor], 'm, rad',
+              'Minimum standard deviation of position and heading.', 1e-6, 100.0, sizes=(2,),
+              kinds=_OTHERS),
+    Parameter('sigma_ceiling', _COVARIANCE.position_ceiling, 'm',
+              'Maximum standard deviation of the position.', 1e-3, 1e6, kinds=_OTHERS),
+    Parameter('default_sigma', [_COVARIANCE.default_position, _COVARIANCE.default_heading],
+              'm, rad', 'Standard deviation of position and heading used for variances that are '
+              'zero, negative or NaN, if `covariance_policy` is `repair`.', 1e-5, 1e4,
+              sizes=(2,), kinds=_OTHERS),
+    Parameter('heading', _COVARIANCE.heading.value, '', 'Whether to use the heading of the pose. '
+              'With `auto` it is used if its variance is positive and less than that of a uniform '
+              'distribution on the circle.', choices=_values(Heading), kinds=(Kind.GLOBAL_POSE,)),
+    Parameter('lever_arm', [0.0, 0.0], 'm', 'Position of the antenna in the robot base frame, x '
+              'and y. If zero, it is taken from /tf_static if available.', -1e3, 1e3, sizes=(2,),
+              kinds=(Kind.FIX,)),
+    Parameter('yaw_offset', 0.0, 'rad', 'Angle added to the yaw, such that zero is east.', -6.3,
+              6.3, kinds=(Kind.IMU,)),
+    Parameter('robust_loss', POSITIONS.loss.value, '', 'Robust loss applied to the errors.',
+              choices=_values(Loss), kinds=_POSITIONS),
+    Parameter('robust_loss', _MEASUREMENT.loss.value, '', 'Robust loss applied to the errors.',
+              choices=_values(Loss), kinds=tuple(kind for kind in Kind if kind not in _POSITIONS)),
+    Parameter('rejection_threshold', _MEASUREMENT.rejection_threshold, '', 'Error in standard '
+              'deviations above which the robust loss reduces the weight of a measurement.', 0.1,
+              1e3, kinds=_ALL),
+    Parameter('minimum_period', _MEASUREMENT.minimum_period, 's', 'Minimum time between the '
+              'stamps of two measurements; of closer ones the first to arrive is used. If 0, all '
+              'are used.', 0.0, 3600.0, kinds=_POSITIONS),
+    Parameter('minimum_period', HEADINGS.minimum_period, 's', 'Minimum time between the stamps of '
+              'two measurements; of closer ones the first to arrive is used. If 0, all are used.',
+              0.0, 3600.0, kinds=(Kind.IMU,)),
+    Parameter('correlation_time', _MEASUREMENT.correlation_time, 's',
+              'Time constant of time-correlated errors. If 0, errors are white noise.', 0.0, 1e5,
+              kinds=_NOT_CLOSURES, change=Change.UNCONFIGURED),
+    Parameter('correlation_model', _MEASUREMENT.correlation.value, '', 'Treatment of '
+              'time-correlated errors: `bias` estimates them, `inflate` increases the '
+              'covariances.', choices=_values(Correlation), kinds=_NOT_CLOSURES,
+              change=Change.UNCONFIGURED),
+    Parameter('white_share', _MEASUREMENT.white_share, '', 'Fraction of the variance that is '
+              'white noise, if time-correlated errors are estimated as a bias.', 0.0, 1.0,
+              kinds=_NOT_CLOSURES, change=Change.UNCONFIGURED),
+)
+
+# Names of sources are prefixes of parameters and of counts in the diagnostics.
+_NAME = re.compile(r'[A-Za-z][A-Za-z0-9_]*')
+_TOPIC = re.compile(r'(~?/)?[A-Za-z_][A-Za-z0-9_]*(/[A-Za-z_][A-Za-z0-9_]*)*')
+_TAKEN = {'solver', 'worker', 'received', 'alignment', 'qos_overrides', 'use_sim_time',
+          'start_type_description_service'} | {parameter.name for parameter in PARAMETERS}
+
+
+def type_parameter(source: str) -> Parameter:
+    """Return the parameter with the kind of a source, on which its other parameters depend."""
+    return _of_source(SOURCE_PARAMETERS[0], source)
+
+
+def source_parameters(source: str, kind: str) -> tuple[Parameter, ...]:
+    """
+    Return all parameters of a source with their full names.
+
+    Parameters
+    ----------
+    source : str
+        Name of the source.
+    kind : str
+        Value of a `Kind`.
+
+    Raises
+    ------
+    ConfigError
+        If `kind` is not a kind of source.
+
+    """
+    checked_value(type_parameter(source), kind)
+    return tuple(_of_source(parameter, source) for parameter in SOURCE_PARAMETERS
+                 if Kind(kind) in parameter.kinds)
+
+
+def _of_source(parameter: Parameter, source: str) -> Parameter:
+    kind, topic = KNOWN_SOURCES.get(source, (None, source))
+    default = parameter.default
+    if parameter.name == 'type' and kind is not None:
+        default = kind.value
+    elif parameter.name == 'topic':
+        default = topic
+    return replace(parameter, name=f'{source}.{parameter.name}', default=default)
+
+
+def listed_sources(given: Mapping[str, Any]) -> list[str]:
+    """
+    Return the names of all sources by the given parameters.
+
+    Raises
+    ------
+    ConfigError
+        If `sources` is not a list of different, valid names.
+
+    """
+    names = given.get('sources', list(DEFAULT_SOURCES))
+    names = checked_value(PARAMETERS[0], names)
+    for name in names:
+        if _NAME.fullmatch(name) is None or name in _TAKEN:
+            raise ConfigError(f'parameter sources: {name!r} cannot be the name of a source; '
+                              'expected letters, digits and _, and no reserved name')
+    if len(set(names)) < len(names):
+        raise ConfigError(f'parameter sources: expected different names, got {list(names)}')
+    return source_names(names)
+
+
+def all_parameters(given: Mapping[str, Any]) -> tuple[Parameter, ...]:
+    """
+    Return the parameters of the node and of the sources in the given parameters.
+
+    Raises
+    ------
+    ConfigError
+        If the name or the kind of a source is invalid.
+
+    """
+    parameters = list(PARAMETERS)
+    for source in listed_sources(given):
+        kind = type_parameter(source)
+        parameters += source_parameters(source, given.get(kind.name, kind.default))
+    return tuple(parameters)
+
+
+def checked(given: Mapping[str, Any]) -> dict[str, Any]:
+    """
+    Return all parameters: the given values, after a check of types and ranges, else defaults.
+
+    Raises
+    ------
+    ConfigError
+        If a name is unknown, a type is wrong or a number is out of range.
+
+    """
+    parameters = all_parameters(given)
+    known = {parameter.name for parameter in parameters}
+    for name in sorted(set(given) - known):
+        source, dot, own = name.partition('.')
+        hint = ''
+        if dot and own in {parameter.name for parameter in SOURCE_PARAMETERS}:
+            hint = (f': a source of type {given.get(f"{source}.type", "") or "its kind"} has none'
+                    if f'{source}.type' in known else f': {source} is not in sources')
+        raise ConfigError(f'parameter {name!r} is not known{hint}')
+    return {parameter.name: checked_value(parameter, given[parameter.name])
+            if parameter.name in given else parameter.default for parameter in parameters}
+
+
+def checked_value(parameter: Parameter, value: Any) -> Any:
+    """
+    Return the value of a parameter with the type in the table, such as a float for 5.
+
+    Parameters
+    ----------
+    parameter : Parameter
+    value : object
+        Lists of numbers may be any sequence of numbers.
+
+    Raises
+    ------
+    ConfigError
+        If the type is wrong or the value is out of range.
+
+    """
+    name, default = parameter.name, parameter.default
+    if isinstance(default, bool | str):
+        if type(value) is not type(default):
+            raise ConfigError(f'parameter {name}: expected {type(default).__name__}, '
+                              f'got {value!r}')
+        if len(parameter.choices) > 0 and value not in parameter.choices:
+            raise ConfigError(f'parameter {name}: expected one of '
+                              f'{", ".join(parameter.choices)}, got {value!r}')
+        if name.endswith('.topic') and _TOPIC.fullmatch(str(value)) is None:
+            raise ConfigError(f'parameter {name}: expected the name of a topic, got {value!r}')
+        return value
+    if isinstance(default, list):
+        return _checked_list(parameter, value)
+    return _number(parameter, value)
+
+
+def _checked_list(parameter: Parameter, value: Any) -> Value:
+    name, sizes = parameter.name, parameter.sizes
+    of_names = name == 'sources'
+    if not isinstance(value, Sequence) or isinstance(value, str | bytes) or (
+            of_names and not all(isinstance(item, str) for item in value)):
+        raise ConfigError(f'parameter {name}: expected a list of '
+                          f'{"names" if of_names else "numbers"}, got {value!r}')
+    if of_names:
+        return list(value)
+    if len(sizes) > 0 and len(value) not in sizes:
+        raise ConfigError(f'parameter {name}: expected {" or ".join(map(str, sizes))} numbers '
+                          f'[{parameter.unit}], got {list(value)}')
+    return [_number(parameter, item) for item in value]
+
+
+def _number(parameter: Parameter, value: Any) -> float:
+    name = parameter.name
+    if isinstance(value, bool) or not isinstance(value, (int, float)):
+        raise ConfigError(f'parameter {name}: expected a number, got {value!r}')
+    low = -sys.float_info.max if parameter.smallest is None else parameter.smallest
+    high = sys.float_info.max if parameter.largest is None else parameter.largest
+    if not low <= value <= high:
+        expected = ('a finite number' if parameter.smallest is None
+                    else f'a number in [{low:g}, {high:g}]')
+        raise ConfigError(f'parameter {name}: expected {expected}, got {value!r}')
+    return float(value)

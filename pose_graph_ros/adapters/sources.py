@@ -1,0 +1,169 @@
+# Copyright 2026 The pose_graph_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""
+The sources of measurements by the ROS parameters, and the settings of the engine for them.
+
+No rclpy.
+"""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from enum import Enum
+from typing import Any
+
+from pose_graph_ros.core.config import (
+    AlignmentPolicy,
+    BackendConfig,
+    Correlation,
+    CovariancePolicy,
+    Heading,
+    Loss,
+    MeasurementSource,
+    NodePolicy,
+    NoiseFrom,
+    OdometryNoise,
+    OdometrySource,
+)
+from pose_graph_ros.core.exceptions import ConfigError
+
+NANOSECONDS = 1_000_000_000
+_POSE = 'geometry_msgs/msg/PoseWithCovarianceStamped'
+
+
+class Kind(Enum):
+    """Kind of a source; the value of its parameter `type`."""
+
+    ODOMETRY = 'odometry'
+    GLOBAL_POSE = 'global_pose'
+    FIX = 'fix'
+    IMU = 'imu'
+    LOOP_CLOSURE = 'loop_closure'
+
+    @property
+    def message_type(self) -> str:
+        """Type of the messages."""
+        return MESSAGE_TYPES[self]
+
+
+MESSAGE_TYPES = {
+    Kind.ODOMETRY: 'nav_msgs/msg/Odometry', Kind.GLOBAL_POSE: _POSE,
+    Kind.FIX: 'sensor_msgs/msg/NavSatFix', Kind.IMU: 'sensor_msgs/msg/Imu',
+    Kind.LOOP_CLOSURE: _POSE}
+
+CLOSURES = 'loop_closure'
+"""Name of the source of loop closures that always exists."""
+KNOWN_SOURCES = {
+    'odom': (Kind.ODOMETRY, 'odom'), 'global_pose': (Kind.GLOBAL_POSE, 'global_pose'),
+    'fix': (Kind.FIX, 'gps/fix'), 'imu': (Kind.IMU, 'imu/data'),
+    CLOSURES: (Kind.LOOP_CLOSURE, 'loop_closure')}
+"""Default kind and topic of the predefined sources."""
+DEFAULT_SOURCES = ('odom', 'global_pose', 'fix')
+
+
+@dataclass(frozen=True, slots=True)
+class Source:
+    """One source of measurements, by its parameters."""
+
+    name: str
+    kind: Kind
+    topic: str
+    """Topic to which the node subscribes."""
+    time_offset_ns: int = 0
+    """Added to the stamps of its messages [ns]."""
+    lever_arm: tuple[float, ...] = (0.0, 0.0)
+    """Antenna of fixes in the frame of the robot (x, y) [m]; zero if not given."""
+    yaw_offset: float = 0.0
+    """Added to the yaw of an IMU [rad]."""
+
+
+def source_list(values: Mapping[str, Any]) -> tuple[Source, ...]:
+    """Return the sources by the checked parameters, odometry in the order of preference."""
+    return tuple(
+        Source(name, Kind(values[f'{name}.type']), values[f'{name}.topic'],
+               round(values[f'{name}.time_offset'] * NANOSECONDS),
+               tuple(values.get(f'{name}.lever_arm', (0.0, 0.0))),
+               values.get(f'{name}.yaw_offset', 0.0))
+        for name in source_names(values['sources']))
+
+
+def source_names(listed: list[str]) -> list[str]:
+    """Return the names of all sources: the listed ones and `loop_closure`."""
+    return [*listed, *([] if CLOSURES in listed else [CLOSURES])]
+
+
+# Parameters of a source by the setting that the error messages of the engine name.
+_SETTINGS = {'CovariancePolicy.position_ceiling': 'sigma_ceiling',
+             'CovariancePolicy.heading_floor': 'sigma_floor'}
+
+
+def backend_config(values: Mapping[str, Any]) -> BackendConfig:
+    """
+    Return the settings of the engine by the checked parameters.
+
+    Raises
+    ------
+    ConfigError
+        If parameters contradict each other, or there is no source of odometry.
+
+    """
+    odometry: dict[str, OdometrySource] = {}
+    measurements: dict[str, MeasurementSource] = {}
+    for source in source_list(values):
+        own = {name.removeprefix(f'{source.name}.'): value for name, value in values.items()
+               if name.startswith(f'{source.name}.')}
+        try:
+            if source.kind is Kind.ODOMETRY:
+                odometry[source.name] = _odometry_source(own)
+            else:
+                measurements[source.name] = _measurement_source(own)
+        except ConfigError as error:
+            setting, _, rest = str(error).partition(': ')
+            raise ConfigError(
+                f'parameter {source.name}.{_SETTINGS.get(setting, setting)}: {rest}') from error
+    if len(odometry) == 0:
+        raise ConfigError('parameter sources: expected at least one of type odometry, got '
+                          f'{values["sources"]}')
+    return BackendConfig(
+        nodes=NodePolicy(
+            minimum_travel_distance=values['minimum_travel_distance'],
+            minimum_travel_heading=values['minimum_travel_heading'],
+            minimum_interval=values['minimum_node_interval'],
+            moving_interval=values['moving_node_interval'],
+            heartbeat=values['node_heartbeat']),
+        alignment=AlignmentPolicy(
+            sigma_heading=values['alignment.sigma_heading'],
+            minimum_baseline=values['alignment.minimum_baseline'],
+            baseline_in_sigmas=values['alignment.baseline_in_sigmas']),
+        odometry=odometry, measurements=measurements,
+        odometry_patience=values['odometry_patience'])
+
+
+def _odometry_source(own: Mapping[str, Any]) -> OdometrySource:
+    position, heading = own['sigma_floor']
+    return OdometrySource(
+        noise=OdometryNoise(
+            sigma_distance=own['sigma_distance'], sigma_lateral=own['sigma_lateral'],
+            sigma_heading_distance=own['sigma_heading_distance'],
+            sigma_heading_turn=own['sigma_heading_turn'],
+            sigma_floor_position=position, sigma_floor_heading=heading),
+        noise_from=NoiseFrom(own['noise']), covariance_scale=own['covariance_scale'],
+        reorder_window=own['reorder_window'], maximum_speed=own['maximum_speed'],
+        loss=Loss(own['robust_loss']), rejection_threshold=own['rejection_threshold'])
+
+
+def _measurement_source(own: Mapping[str, Any]) -> MeasurementSource:
+    position_floor, heading_floor = own['sigma_floor']
+    default_position, default_heading = own['default_sigma']
+    return MeasurementSource(
+        covariance=CovariancePolicy(
+            repair=own['covariance_policy'] == 'repair',
+            override=tuple(own['covariance_override']), scale=own['covariance_scale'],
+            position_floor=position_floor, heading_floor=heading_floor,
+            position_ceiling=own['sigma_ceiling'], default_position=default_position,
+            default_heading=default_heading, heading=Heading(own.get('heading', 'auto'))),
+        loss=Loss(own['robust_loss']), rejection_threshold=own['rejection_threshold'],
+        # sources of loop closures have neither a minimum period nor correlated errors
+        **{} if 'correlation_time' not in own else {
+            'minimum_period': own['minimum_period'], 'correlation_time': own['correlation_time'],
+            'correlation': Correlation(own['correlation_model']),
+            'white_share': own['white_share']})

@@ -1,0 +1,355 @@
+# Copyright 2026 The pose_graph_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""
+A motion from the odometry frame into the map that most positions agree on, and its sigma.
+
+Points of the plane are complex numbers. Positions p_k in the odometry frame (where the antenna
+was) and q_k in the map are related by q = z p + s. With both centred on their weighted means the
+least squares of sum w_k |q_k - z p_k - s|^2 is z = sum w conj(p) q / sum w |p|^2. Its angle is
+that of the rigid motion (the planar case of Horn 1987 and Umeyama 1991); its length is the scale,
+which differs from 1 if wheels slip or their radius is wrong.
+
+Wrong positions are excluded by consensus: pairs of positions make hypotheses, which are scored by
+a truncated quadratic of the residuals, and the best are refined by the closed form on their
+inliers. Nothing is drawn at random and positions are sorted first, so the result does not depend
+on their order.
+"""
+
+from dataclasses import dataclass, fields
+from typing import NamedTuple, Self
+
+import numpy as np
+import numpy.typing as npt
+
+from pose_graph_ros.core.config import OdometryNoise
+from pose_graph_ros.core.geometry import se2
+from pose_graph_ros.core.geometry.se2 import FloatArray, IntArray
+from pose_graph_ros.core.graph.constraints import ObservedKind, ObservedNodes
+
+BoolArray = npt.NDArray[np.bool_]
+ComplexArray = npt.NDArray[np.complex128]
+
+# Least fraction of positions that must agree on a motion, or of parts of a drive on an angle.
+LEAST_AGREEMENT = 0.6
+# Squared residual of an outlier; 0.25 % of a Gaussian in the plane are beyond [sigma^2].
+TRUNCATION = 12.0
+# Greatest factor by which the stated variances may be too small; with K positions it is at most K.
+LARGEST_INFLATION = 100.0
+# Cost of inflated variances for each position, as a factor on the logarithm of the inflation. The
+# likelihood has a factor of 2; it is larger as outliers are likelier than understated variances.
+PRICE = 4.0
+# Greatest scale of a motion, or of its inverse.
+LARGEST_SCALE = 2.0
+# Number of sections of the path, and of positions that a fit uses of each.
+PLACES, PER_PLACE = 25, 4
+# Number of positions whose pairs make hypotheses, of best hypotheses that are refined, and of
+# iterations of that.
+ANCHORS, REFINED, ITERATIONS = 20, 6, 10
+# Magnitude of z below which the rotation is undefined.
+LEAST_SCALE = 1e-6
+# Lower bound of sums of weights and of spreads, against division by zero.
+TINY = 1e-300
+
+
+@dataclass(frozen=True, slots=True)
+class Positions:
+    """K observed positions in the order of the drive, one row of each array per position."""
+
+    odometry: ComplexArray
+    """Position of the antenna in the odometry frame [m]."""
+    observed: ComplexArray
+    """Observed position in the map [m]."""
+    root: FloatArray
+    """Cholesky factor of the covariance of `observed` in map axes, shape (K, 2, 2) [m]."""
+    direction: ComplexArray
+    """Heading of the robot in the odometry frame, a complex number of length 1."""
+    node: IntArray
+    """Row of the hidden node in the table of poses."""
+    path: FloatArray
+    """Path length so far [m]."""
+    walk: FloatArray
+    """Variance of the heading by odometry so far [rad^2]."""
+    stamp: FloatArray
+    """Stamp [s]."""
+    correlation_time: FloatArray
+    """Correlation time of the error of `observed` [s]; 0 for white noise."""
+
+    def rows(self, index: IntArray | BoolArray) -> Self:
+        """Return the chosen positions, in order."""
+        return type(self)(*(getattr(self, item.name)[index] for item in fields(self)))
+
+    @property
+    def baseline(self) -> float:
+        """Diagonal of the box around the positions in the odometry frame [m]."""
+        return float(np.hypot(np.ptp(self.odometry.real), np.ptp(self.odometry.imag)))
+
+    @property
+    def variance(self) -> FloatArray:
+        """Mean variance of the two coordinates of the observed positions, shape (K,) [m^2]."""
+        return np.asarray(0.5 * np.sum(self.root**2, axis=(1, 2)))
+
+    def thinned(self) -> Self:
+        """Return some positions of each section of the path, so that no standstill dominates."""
+        along = self.path - self.path[0]
+        place = np.floor(along * (PLACES / max(float(along[-1]), 1e-9)))
+        _, start, size = np.unique(place, return_index=True, return_counts=True)
+        n, rank = np.repeat(size, size), np.arange(len(place)) - np.repeat(start, size)
+        return self.rows((n <= PER_PLACE)
+                         | (rank * PER_PLACE // n != (rank - 1) * PER_PLACE // n))
+
+
+class TimeCorrelation(NamedTuple):
+    """Correlation in time of the errors of K positions: exp(-t / time) after t."""
+
+    stamps: FloatArray
+    """Stamps of the positions, shape (K,) [s]; only differences matter."""
+    time: float | FloatArray
+    """
+    Correlation time, shape () or (K,) [s]; 0 for white noise. Errors with different correlation
+    times are taken to be independent, as those of different receivers.
+    """
+
+
+def positions_along(
+    poses: FloatArray, observed: ObservedNodes, noise: OdometryNoise,
+    correlation: TimeCorrelation | None,
+) -> Positions:
+    """
+    Return the positions of observed nodes in the order of the drive.
+
+    Parameters
+    ----------
+    poses : ndarray, shape (N, 3)
+        Poses of the hidden nodes by odometry [m, m, rad].
+    observed : ObservedNodes
+        K >= 1 positions or global poses, whose headings are not used.
+    noise : OdometryNoise
+    correlation : TimeCorrelation, optional
+        Correlation of the errors; None for white noise.
+
+    """
+    none = np.zeros(len(observed))
+    stamp, time = (none, none) if correlation is None else correlation
+    tau = np.broadcast_to(np.asarray(time, dtype=np.float64), (len(observed),))
+    # by all columns, so that the order of the result does not depend on that of the input
+    order = np.lexsort((tau, *observed.information.reshape(-1, 9).T, *observed.mean.T,
+                        *observed.offset.T, stamp, observed.node))
+    table = observed.rows(order)
+    predicted = se2.compose(poses[table.node], table.offset)
+    first = int(table.node[0])
+    steps = np.diff(poses[first:table.node[-1] + 1], axis=0)
+    length, turn = np.hypot(steps[:, 0], steps[:, 1]), np.abs(se2.wrap(steps[:, 2]))
+    walk = noise.sigma_heading_distance**2 * length + noise.sigma_heading_turn**2 * turn
+    # the heading of a global pose is marginalised; that of a position has no information
+    information = table.information.copy()
+    information[:, 2, 2] += table.kind == ObservedKind.POSITION
+    axes = se2.rotation(table.mean[:, 2])
+    covariance = axes @ np.linalg.inv(information)[:, :2, :2] @ np.swapaxes(axes, 1, 2)
+    rows = table.node - first
+    return Positions(
+        odometry=_points(predicted), observed=_points(table.mean),
+        root=np.asarray(np.linalg.cholesky(covariance), dtype=np.float64),
+        direction=np.exp(1j * predicted[:, 2]), node=table.node,
+        path=np.append(0.0, np.cumsum(length))[rows], walk=np.append(0.0, np.cumsum(walk))[rows],
+        stamp=stamp[order], correlation_time=tau[order])
+
+
+def _points(poses: FloatArray) -> ComplexArray:
+    return np.asarray(poses[:, 0] + 1j * poses[:, 1])
+
+
+@dataclass(frozen=True, slots=True)
+class Consensus:
+    """The motion that most positions agree on."""
+
+    T_map_odom: FloatArray
+    """Shape (3,) [m, m, rad]."""
+    sigma_heading: float
+    """Standard deviation of the angle at the node, with the drift of odometry [rad]."""
+    node: int
+    """Hidden node at which the angle has the least variance."""
+    walk: float
+    """Variance of the heading by odometry up to the node [rad^2]."""
+    baseline: float
+    """Diagonal of the box around the inliers in the odometry frame [m]."""
+    sigma_position: float
+    """Standard deviation of a position, by the mean weight, inflated by the residuals [m]."""
+    scale: float
+    """Ratio of lengths in the map to lengths by odometry."""
+    count: int
+    """Number of inliers."""
+    inlier_fraction: float
+    """Number of inliers over the number of positions."""
+    cost: float
+    """Minus twice the log likelihood of all positions, truncated for outliers."""
+
+
+def consensus(positions: Positions, noise: OdometryNoise) -> Consensus | None:
+    """
+    Return the motion that most positions agree on; None if there is no angle that two agree on.
+
+    Parameters
+    ----------
+    positions : Positions
+    noise : OdometryNoise
+
+    """
+    variance = positions.variance + _drift(positions, noise)
+    inlier, cost = _inliers(positions.odometry, positions.observed, variance)
+    n = int(np.count_nonzero(inlier))
+    if n < 2:
+        return None
+    chosen, weight = positions.rows(inlier), 1.0 / variance[inlier]
+    p_mean = np.average(chosen.odometry, weights=weight)
+    q_mean = np.average(chosen.observed, weights=weight)
+    p, q = chosen.odometry - p_mean, chosen.observed - q_mean
+    spread = float(np.sum(weight * np.abs(p)**2))
+    z = complex(np.sum(weight * p.conj() * q)) / spread if spread > 0.0 else 0j
+    if abs(z) < LEAST_SCALE:
+        return None
+    chi2 = float(np.sum(weight * np.abs(q - z * p)**2))
+    inflation = max(1.0, chi2 / (2.0 * n - 4.0)) if n > 2 else 1.0
+    variance_heading, best = _heading_variance(chosen, weight * p / spread, z, noise)
+    shift = q_mean - z / abs(z) * p_mean
+    return Consensus(
+        T_map_odom=np.array([shift.real, shift.imag, np.angle(z)]),
+        sigma_heading=float(np.sqrt(inflation * variance_heading)),
+        node=int(chosen.node[best]), walk=float(chosen.walk[best]), baseline=chosen.baseline,
+        sigma_position=float(np.sqrt(inflation / np.mean(1.0 / chosen.variance))),
+        scale=abs(z), count=n, inlier_fraction=n / len(inlier), cost=cost)
+
+
+def _drift(positions: Positions, noise: OdometryNoise) -> FloatArray:
+    """Return the variance of a coordinate by odometry from the middle of the path, (K,) [m^2]."""
+    middle = int(np.argmin(np.abs(positions.path - np.mean(positions.path))))
+    far, along, walk = (np.abs(column - column[middle]) for column in (
+        positions.odometry, positions.path, positions.walk))
+    slip = noise.sigma_distance**2 + noise.sigma_lateral**2
+    return np.asarray(walk * far**2 / 6.0 + 0.5 * slip * along)
+
+
+def mirrored(positions: Positions, found: Consensus, noise: OdometryNoise) -> bool:
+    """
+    Tell whether the mirror image of odometry fits better, as with a left-handed frame.
+
+    Parameters
+    ----------
+    positions : Positions
+    found : Consensus
+        Result of `consensus` for the same positions.
+    noise : OdometryNoise
+
+    """
+    variance = positions.variance + _drift(positions, noise)
+    inlier, cost = _inliers(positions.odometry.conj(), positions.observed, variance)
+    return cost < found.cost - TRUNCATION and bool(np.mean(inlier) >= LEAST_AGREEMENT)
+
+
+def _inliers(
+    p: ComplexArray, q: ComplexArray, variance: FloatArray,
+) -> tuple[BoolArray, float]:
+    """Return which positions are inliers of the best motion, shape (K,), and its cost."""
+    # near the origin, as products of large coordinates would lose digits
+    p, q = p - np.median(p.real) - 1j * np.median(p.imag), q - q[0]
+    anchors = np.unique(np.linspace(0, len(p) - 1, ANCHORS).round().astype(np.int64))
+    i, j = (anchors[index] for index in np.triu_indices(len(anchors), 1))
+    length = np.abs(p[j] - p[i])
+    # no short pairs; a quarter, as the inliers may all lie on a part of the path
+    far = length >= max(0.25 * np.max(length, initial=0.0), 1e-9)
+    i, j = i[far], j[far]
+    z = (q[j] - q[i]) / (p[j] - p[i])
+    likely = (np.abs(z) <= LARGEST_SCALE) & (np.abs(z) >= 1.0 / LARGEST_SCALE)
+    i, j, z = i[likely], j[likely], z[likely]
+    # without outliers the fit to all positions is the best hypothesis
+    all_z, all_shift = _fitted(1.0 / variance[None], p, q)
+    z = np.append(all_z, z)
+    shift = np.append(all_shift, 0.5 * (q[i] + q[j] - z[1:] * (p[i] + p[j])))
+    inlier, cost = _scored(z, shift, p, q, variance)
+    inlier = inlier[np.argsort(cost, kind='stable')[:REFINED]]
+    for _ in range(ITERATIONS):
+        before = inlier
+        inlier, cost = _scored(*_fitted(before / variance, p, q), p, q, variance)
+        if np.array_equal(before, inlier):
+            break
+    chosen = int(np.argmin(cost))
+    return inlier[chosen], float(cost[chosen])
+
+
+def _fitted(
+    weight: FloatArray, p: ComplexArray, q: ComplexArray,
+) -> tuple[ComplexArray, ComplexArray]:
+    """Return the least-squares z and s for each row of weights, shape (H, K)."""
+    total = np.maximum(np.sum(weight, axis=1), TINY)
+    p_mean, q_mean = weight @ p / total, weight @ q / total
+    p_off, q_off = p - p_mean[:, None], q - q_mean[:, None]
+    spread = np.sum(weight * np.abs(p_off)**2, axis=1)
+    z = np.sum(weight * p_off.conj() * q_off, axis=1) / np.maximum(spread, TINY)
+    return z, q_mean - z * p_mean
+
+
+def _scored(
+    z: ComplexArray, shift: ComplexArray, p: ComplexArray, q: ComplexArray, variance: FloatArray,
+) -> tuple[BoolArray, FloatArray]:
+    """
+    Return the inliers of each of H motions, shape (H, K), and its cost, shape (H,).
+
+    The cost is minus twice the log likelihood, truncated for outliers, with variances inflated to
+    fit the residuals of the likely inliers.
+    """
+    n = len(p)
+    energy = np.abs(q - z[:, None] * p - shift[:, None])**2 / variance
+    rank = int(np.ceil(LEAST_AGREEMENT * n - 1e-9))
+    # expected value at this rank of n draws of a chi2 with 2 degrees of freedom
+    expected = -2.0 * np.log1p(-rank / (n + 1.0))
+    inflation = np.partition(energy, rank - 1, axis=1)[:, rank - 1] / expected
+    inflation = np.clip(inflation, 1.0, min(LARGEST_INFLATION, n))
+    energy /= inflation[:, None]
+    cost = np.sum(np.minimum(energy, TRUNCATION), axis=1) + PRICE * n * np.log(inflation)
+    return energy <= TRUNCATION, np.asarray(cost)
+
+
+def _heading_variance(
+    positions: Positions, lever: ComplexArray, z: complex, noise: OdometryNoise,
+) -> tuple[float, int]:
+    """
+    Return the least variance of the fitted angle along the drive, and the position where it is.
+
+    An error e_k of position k, seen in the odometry frame, changes the angle by
+    Im(sum conj(lever_k) e_k). The errors of the observed positions are white or correlated in
+    time, whichever gives the larger variance. An error of odometry between two positions moves all
+    positions after it, by a turn about the middle of the step and a shift.
+
+    Parameters
+    ----------
+    positions : Positions
+        The inliers.
+    lever : ndarray, shape (K,)
+        w p / sum w |p|^2 with p centred, complex [1/m].
+    z : complex
+        Rotation and scale of the fitted motion.
+    noise : OdometryNoise
+
+    """
+    c = lever.conj() / z
+    errors = np.einsum('kij,ki->kj', positions.root, np.column_stack((c.imag, c.real)))
+    white = float(np.sum(errors**2))
+    tau = positions.correlation_time
+    # positions with different correlation times are those of different receivers
+    alike = (tau[:, None] == tau) & (tau > 0.0) | np.eye(len(tau), dtype=np.bool_)
+    apart = np.abs(positions.stamp[:, None] - positions.stamp) / np.maximum(tau, 1e-9)
+    correlated = float(np.sum(errors @ errors.T * np.where(alike, np.exp(-apart), 0.0)))
+    p = positions.odometry - positions.odometry[0]
+    # derivative of the angle by a shift, and by a turn, of all positions after each step
+    shifted = np.cumsum(lever.conj()[::-1])[::-1][1:]
+    turned = np.cumsum((lever.conj() * p).real[::-1])[::-1][1:]
+    turned = turned - (shifted * 0.5 * (p[1:] + p[:-1])).real
+    length, walk, step = np.diff(positions.path), np.diff(positions.walk), np.diff(p)
+    along = shifted * positions.direction[1:]
+    slip = float(np.sum(
+        length * (noise.sigma_distance**2 * along.imag**2 + noise.sigma_lateral**2 * along.real**2)
+        + walk / 12.0 * (shifted * step).real**2))
+    # the turns of odometry between position r and the others act on the angle at r and on the fit
+    before = np.append(0.0, np.cumsum(walk * (1.0 - turned)**2))
+    after = np.append(np.cumsum((walk * turned**2)[::-1])[::-1], 0.0)
+    best = int(np.argmin(before + after))
+    return max(white, correlated) + slip + float(before[best] + after[best]), best

@@ -1,0 +1,330 @@
+# Copyright 2026 The pose_graph_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""
+The pose of the odometry frame in the map, and when it counts as known.
+
+One global pose with a good heading is enough; positions must span a baseline. As odometry drifts,
+a fit of positions is only valid near them: each stretch of the drive gets its own fit
+(`consensus`), and most of the fits must agree up to the drift between them. An angle found from
+the first few positions is checked again when there are more.
+"""
+
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+
+from pose_graph_ros.core.alignment.consensus import (
+    Consensus,
+    consensus,
+    LARGEST_SCALE,
+    LEAST_AGREEMENT,
+    mirrored,
+    Positions,
+    positions_along,
+    TimeCorrelation,
+)
+from pose_graph_ros.core.config import AlignmentPolicy, OdometryNoise
+from pose_graph_ros.core.geometry import se2
+from pose_graph_ros.core.geometry.covariance import UNKNOWN_HEADING_VARIANCE
+from pose_graph_ros.core.geometry.se2 import FloatArray
+from pose_graph_ros.core.graph.constraints import ObservedKind, ObservedNodes
+from pose_graph_ros.core.graph.error_functions import observed_errors
+
+# Greatest sigma of the heading of a global pose that aligns the graph alone [rad].
+ALIGNING_SIGMA = 0.5
+# Standard deviation of the scale between two positions without noise. Two positions alone are only
+# used if the scale is within 2 sigma of 1, as no third one could show an error.
+SCALE_OF_TWO = 0.05
+# Greatest drift of the heading by odometry, 1 sigma, within a stretch of the drive [rad].
+STRETCH = 0.3
+# Factors by which stretches are shortened, one after the other, until their fits agree.
+SHORTENINGS = (1.0, 3.0, 9.0, 27.0)
+# Greatest number of stretches that are used.
+MOST_STRETCHES = 8
+# Least number of positions of a shortened stretch, as three may fit a wrong motion by chance.
+LEAST_OF_SHORTENED = 5
+# The newest angle is preferred unless its sigma is greater than the least one by this factor.
+COMPARABLE_SIGMA = 2.0
+# Two angles disagree if they differ by more than both of these [sigma, rad]; the solver corrects
+# smaller differences.
+DISAGREEMENT = 4.0
+LEAST_CORRECTION = 0.3
+
+
+@dataclass(frozen=True, slots=True)
+class Alignment:
+    """Pose of the odometry frame in the map, fitted to positions."""
+
+    T_map_odom: FloatArray
+    """Shape (3,) [m, m, rad]."""
+    sigma_heading: float
+    """Standard deviation of the heading [rad]; infinite without a baseline."""
+    baseline: float
+    """Diagonal of the box around the positions in the odometry frame [m]."""
+    sigma_position: float
+    """Standard deviation of a position, by the mean weight: few poor ones hardly raise it [m]."""
+    scale: float
+    """Ratio of lengths in the map to lengths by odometry."""
+
+
+def align(odometry: FloatArray, observed: FloatArray, variance: FloatArray) -> Alignment:
+    """
+    Return the least-squares pose of the odometry frame in the map, without outlier rejection.
+
+    Parameters
+    ----------
+    odometry, observed : ndarray, shape (K, 2)
+        The same positions in the odometry frame and in the map [m]; K >= 1.
+    variance : ndarray, shape (K,)
+        Variance of each coordinate of the observed positions, as white noise [m^2].
+
+    """
+    weight = 1.0 / variance
+    p_mean = np.average(odometry, axis=0, weights=weight)
+    q_mean = np.average(observed, axis=0, weights=weight)
+    p, q = odometry - p_mean, observed - q_mean
+    cross = np.sum(weight * (p[:, 0] * q[:, 1] - p[:, 1] * q[:, 0]))
+    dot = np.sum(weight * np.sum(p * q, axis=1))
+    theta = float(np.arctan2(cross, dot))
+    spread = float(np.sum(weight * np.sum(p**2, axis=1)))
+    shift = q_mean - se2.rotation(theta) @ p_mean
+    return Alignment(
+        T_map_odom=np.array([shift[0], shift[1], theta]),
+        sigma_heading=1.0 / np.sqrt(spread) if spread > 0.0 else np.inf,
+        baseline=float(np.hypot(*np.ptp(odometry, axis=0))),
+        sigma_position=float(np.sqrt(1.0 / np.mean(weight))),
+        scale=float(np.hypot(cross, dot)) / spread if spread > 0.0 else 0.0)
+
+
+class GraphAlignment(NamedTuple):
+    """Pose of a graph in the map, from observed nodes."""
+
+    T_map_graph: FloatArray | None
+    """Shape (3,) [m, m, rad]; None while the angle is not known well enough."""
+    sigma: float
+    """Standard deviation of the angle at the node, with the drift of odometry [rad]."""
+    node: int = -1
+    """Hidden node at which the angle has the least variance; -1 without an angle."""
+
+
+def find_alignment(
+    poses: FloatArray, observed: ObservedNodes, policy: AlignmentPolicy,
+    noise: OdometryNoise | None = None, correlation: TimeCorrelation | None = None,
+) -> GraphAlignment:
+    """
+    Return the rigid motion that takes a graph into the map, if it is known well enough.
+
+    Parameters
+    ----------
+    poses : ndarray, shape (N, 3)
+        Hidden nodes in the frame of the graph [m, m, rad].
+    observed : ObservedNodes
+        Positions and global poses on these hidden nodes, in any order; K >= 1.
+    policy : AlignmentPolicy
+    noise : OdometryNoise, optional
+        Noise of the odometry between the nodes.
+    correlation : TimeCorrelation, optional
+        Correlation of the errors of the positions; None for white noise.
+
+    """
+    sigma = np.full(len(observed), np.inf)
+    full = observed.kind == ObservedKind.GLOBAL_POSE
+    sigma[full] = np.sqrt(np.linalg.inv(observed.information[full])[:, 2, 2])
+    best = int(np.argmin(sigma))
+    if sigma[best] <= ALIGNING_SIGMA:
+        predicted = se2.compose(poses[observed.node[best]], observed.offset[best])
+        return GraphAlignment(se2.compose(observed.mean[best], se2.inverse(predicted)),
+                              float(sigma[best]), int(observed.node[best]))
+    noise = OdometryNoise() if noise is None else noise
+    positions = positions_along(poses, observed, noise, correlation)
+    return _from_positions(positions, policy, noise)
+
+
+def recheck(
+    solved: FloatArray, odometry: FloatArray, observed: ObservedNodes, policy: AlignmentPolicy,
+    noise: OdometryNoise | None = None, *, correlation: TimeCorrelation | None = None,
+    sigma: float = 0.0,
+) -> GraphAlignment | None:
+    """
+    Return a new alignment if more positions show that the angle in use is wrong.
+
+    The angle found from the positions alone, as by `find_alignment`, is compared with the angle
+    between the solved graph and odometry at the same node. The result is the motion from the
+    odometry frame into the map; None if the angle in use is right, or none is determined.
+
+    Parameters
+    ----------
+    solved : ndarray, shape (N, 3)
+        Hidden nodes in the map by the present solution [m, m, rad].
+    odometry : ndarray, shape (N, 3)
+        The same nodes by odometry alone, in the odometry frame [m, m, rad].
+    observed : ObservedNodes
+        All positions and global poses so far, on these nodes; K >= 1.
+    policy, noise, correlation
+        As in `find_alignment`.
+    sigma : float
+        Standard deviation of the angle in use [rad].
+
+    """
+    noise = OdometryNoise() if noise is None else noise
+    positions = positions_along(odometry, observed, noise, correlation)
+    found = _from_positions(positions, policy, noise)
+    if found.T_map_graph is None:
+        return None
+    in_use = solved[found.node, 2] - odometry[found.node, 2]
+    difference = abs(float(se2.wrap(found.T_map_graph[2] - in_use)))
+    limit = max(LEAST_CORRECTION, DISAGREEMENT * float(np.hypot(found.sigma, sigma)))
+    return found if difference > limit else None
+
+
+def certain(found: Consensus, policy: AlignmentPolicy) -> bool:
+    """
+    Tell whether the angle of a fit is known well enough to align the graph.
+
+    Parameters
+    ----------
+    found : Consensus
+    policy : AlignmentPolicy
+
+    """
+    sigmas = policy.baseline_in_sigmas
+    if found.count < 3:
+        # only a third position could show that one of the two is wrong
+        tolerance = 2.0 * float(np.hypot(found.sigma_heading, SCALE_OF_TWO))
+        if found.inlier_fraction < 1.0 or abs(found.scale - 1.0) > tolerance:
+            return False
+        sigmas *= 2.0
+    # with a scale far from 1, odometry or positions do not follow the robot (spinning wheels, a
+    # frozen receiver), and the angle is meaningless
+    return (found.sigma_heading <= policy.sigma_heading
+            and found.baseline >= policy.minimum_baseline
+            and found.baseline >= sigmas * found.sigma_position
+            and 1.0 / LARGEST_SCALE <= found.scale <= LARGEST_SCALE
+            and found.inlier_fraction >= LEAST_AGREEMENT - 1e-9)
+
+
+def _from_positions(
+    positions: Positions, policy: AlignmentPolicy, noise: OdometryNoise,
+) -> GraphAlignment:
+    """Return the motion that most stretches of the drive agree on."""
+    if positions.baseline < policy.minimum_baseline:
+        return GraphAlignment(None, np.inf)
+    sigma, sparse = np.inf, True
+    for shortening in SHORTENINGS:
+        least = LEAST_OF_SHORTENED if shortening > 1.0 else min(3, len(positions.node))
+        stretches = _stretches(positions, shortening)
+        found = [consensus(stretch, noise) if len(stretch.node) >= least else None
+                 for stretch in stretches]
+        sparse = sparse and all(len(stretch.node) < least for stretch in stretches)
+        if shortening == 1.0 and _left_handed(stretches, found, noise):
+            return GraphAlignment(None, np.inf)
+        sigma = min([sigma, *(item.sigma_heading for item in found if item is not None)])
+        best = _supported(stretches, found, policy, noise, least)
+        if best is not None:
+            return GraphAlignment(best.T_map_odom, best.sigma_heading, best.node)
+    if sparse:
+        # every stretch of the long drive has too few positions
+        stretches = [positions.thinned()]
+        found = [consensus(stretches[0], noise)]
+        best = _supported(stretches, found, policy, noise, 3)
+        if best is not None:
+            return GraphAlignment(best.T_map_odom, best.sigma_heading, best.node)
+    return GraphAlignment(None, sigma)
+
+
+def _stretches(positions: Positions, shortening: float) -> list[Positions]:
+    """Return stretches of the drive with about the same drift of odometry, newest first."""
+    # the path length decides where odometry has no noise of the heading
+    to_come = positions.walk[-1] - positions.walk + 1e-9 * (positions.path[-1] - positions.path)
+    n = shortening * np.ceil(to_come[0] / STRETCH**2)
+    if n == 0.0:
+        return [positions.thinned()]
+    number = np.minimum(np.floor(to_come * (n / to_come[0])), n - 1.0)
+    used = np.unique(number)
+    # the newest, the oldest, and some evenly in between
+    used = used[np.unique(np.linspace(0, len(used) - 1, MOST_STRETCHES).round().astype(np.int64))]
+    return [positions.rows(number == k).thinned() for k in used]
+
+
+def _left_handed(
+    stretches: list[Positions], found: list[Consensus | None], noise: OdometryNoise,
+) -> bool:
+    """Tell whether most stretches with a fit are mirrored; short ones may be too straight."""
+    left = [mirrored(stretch, item, noise)
+            for stretch, item in zip(stretches, found, strict=True) if item is not None]
+    return any(left) and sum(left) >= LEAST_AGREEMENT * len(left)
+
+
+def _supported(
+    stretches: list[Positions], found: list[Consensus | None], policy: AlignmentPolicy,
+    noise: OdometryNoise, least: int,
+) -> Consensus | None:
+    """Return the newest certain fit that enough stretches agree with, up to odometry's drift."""
+    candidates, n_relevant = [], 0
+    for stretch, item in zip(stretches, found, strict=True):
+        if (item is not None and certain(item, policy)
+                and not mirrored(stretch, item, noise)):
+            candidates.append(item)
+            n_relevant += 1
+        else:
+            # a long stretch without a certain fit counts as one that disagrees
+            sigma = float(np.sqrt(np.median(stretch.variance)))
+            far = max(policy.minimum_baseline, policy.baseline_in_sigmas * sigma)
+            n_relevant += len(stretch.node) >= least and (
+                stretch.path[-1] - stretch.path[0] >= far if least == LEAST_OF_SHORTENED
+                else stretch.baseline >= 2.0 * far)
+    if len(candidates) == 0:
+        return None
+    theta, variance, walk = np.array([
+        (item.T_map_odom[2], item.sigma_heading**2, item.walk) for item in candidates]).T
+    allowed = variance[:, None] + variance + np.abs(walk[:, None] - walk)
+    agree = np.abs(se2.wrap(theta[:, None] - theta)) <= np.maximum(
+        DISAGREEMENT * np.sqrt(allowed), LEAST_CORRECTION)
+    # also through fits in between, as odometry may drift more than its noise allows
+    reached = np.linalg.matrix_power(agree.astype(np.int64), len(theta)) > 0
+    supported = np.sum(reached, axis=1) >= LEAST_AGREEMENT * n_relevant - 1e-9
+    if not np.any(supported):
+        return None
+    # the newest, as receivers converge over time, unless it is much less certain
+    good = supported & (variance <= COMPARABLE_SIGMA**2 * np.min(variance[supported]))
+    return candidates[int(np.argmax(good))]
+
+
+class Guess(NamedTuple):
+    """Pose of the robot while the angle is not known."""
+
+    shift: FloatArray
+    """Shift of the graph into the map, shape (3,) [m, m, rad]; that of the heading is 0."""
+    covariance: FloatArray
+    """Covariance of the shifted pose of the robot in map axes, shape (3, 3)."""
+
+
+def guess(poses: FloatArray, newest: FloatArray, observed: ObservedNodes) -> Guess:
+    """
+    Return a shift of the graph into the map and a covariance while the angle is not known.
+
+    The graph is shifted onto the most certain position. With d the distance from there and an
+    angle that is uniform on the circle, the mean square error of each coordinate is d^2, that of
+    the heading pi^2 / 3.
+
+    Parameters
+    ----------
+    poses : ndarray, shape (N, 3)
+        Hidden nodes in the frame of the graph [m, m, rad].
+    newest : ndarray, shape (3,)
+        Pose of the robot in the same frame [m, m, rad].
+    observed : ObservedNodes
+        Positions or global poses on these hidden nodes; K >= 1.
+
+    """
+    certainty = np.trace(observed.information[:, :2, :2], axis1=1, axis2=2)
+    best = int(np.argmax(certainty))
+    first = observed.rows(slice(best, best + 1))
+    turn = np.eye(3)
+    turn[:2, :2] = se2.rotation(first.mean[0, 2])
+    shift = -(turn @ observed_errors(poses, first)[0])
+    shift[2] = 0.0
+    where = se2.compose(poses[first.node], first.offset)[0]
+    variance = float(np.sum((newest[:2] - where[:2])**2) + 2.0 / certainty[best])
+    return Guess(shift, np.diag((variance, variance, UNKNOWN_HEADING_VARIANCE)))

@@ -1,0 +1,244 @@
+# Copyright 2026 The pose_graph_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""
+Decision when to align the graph with the map, and when to correct that.
+
+The graph is aligned as soon as measurements determine the angle. Whenever the number of
+measurements has doubled, the angle is checked with all of them, as the first few may be wrong.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from enum import Enum
+from typing import NamedTuple
+
+import numpy as np
+
+from pose_graph_ros.core.alignment import estimator
+from pose_graph_ros.core.alignment.consensus import TimeCorrelation
+from pose_graph_ros.core.alignment.estimator import ALIGNING_SIGMA, GraphAlignment
+from pose_graph_ros.core.config import BackendConfig, MeasurementSource, OdometryNoise
+from pose_graph_ros.core.geometry import se2
+from pose_graph_ros.core.geometry.se2 import FloatArray
+from pose_graph_ros.core.graph.constraints import full, ObservedKind, ObservedNodes, upper
+from pose_graph_ros.core.odometry.hidden_nodes import HiddenNodes
+from pose_graph_ros.core.saved_columns import Integers, Rows3, Rows6
+from pose_graph_ros.core.sources.factor_builder import AttachedMeasurement
+
+# Number of measurements beyond which the angle is not checked any more.
+LAST_RECHECK = 4096
+# Number of measurements at which the angle is checked for the first time.
+FIRST_RECHECK = 8
+
+
+class AlignmentState(Enum):
+    """Whether the pose of the odometry frame in the map is known."""
+
+    LOCAL = 'local'
+    """No positions in the map yet: the map is the odometry frame of the start."""
+    UNALIGNED = 'unaligned'
+    """There are positions, but the angle between odometry and map is not known yet."""
+    ALIGNED = 'aligned'
+    """The graph lies in the map."""
+
+
+@dataclass(frozen=True, slots=True)
+class SavedAlignment:
+    """Saved state of the alignment, and the M measurements for the next check."""
+
+    state: str
+    sigma: float | None
+    """Standard deviation of the angle [rad]; None for infinite."""
+    next_verdict: int
+    """Number of measurements at which the angle is checked next."""
+    sources: tuple[str, ...]
+    """Names of the sources."""
+    source: Integers
+    """Index of each measurement's source, shape (M,)."""
+    stamps_ns: Integers
+    """Shape (M,) [ns]."""
+    node: Integers
+    """Columns of `ObservedNodes`, as the four below; shape (M,)."""
+    offset: Rows3
+    mean: Rows3
+    information: Rows6
+    """Upper triangles, shape (M, 6)."""
+    kind: Integers
+
+
+class Evidence(NamedTuple):
+    """A measurement for the next check of the angle."""
+
+    source: str
+    stamp_ns: int
+    observed: ObservedNodes
+
+
+class AlignmentMonitor:
+    """Aligns the graph with the map, and checks the alignment as measurements are added."""
+
+    def __init__(self, config: BackendConfig) -> None:
+        self._config = config
+        self.state = AlignmentState.LOCAL
+        self.sigma = np.inf
+        """Standard deviation of the angle when it was found [rad]."""
+        self._evidence: list[Evidence] = []
+        self._next_recheck = FIRST_RECHECK
+
+    def configure(self, config: BackendConfig) -> None:
+        """Set the settings for checks from now on, which use all measurements so far."""
+        self._config = config
+
+    def find(
+        self, poses: FloatArray, waiting: list[AttachedMeasurement], primary: str,
+    ) -> FloatArray | None:
+        """
+        Return the motion of the graph into the map if it is found, and update the state.
+
+        It has the shape (3,), and is None if the graph is aligned already, or the angle is not
+        known well enough.
+
+        Parameters
+        ----------
+        poses : ndarray, shape (N, 3)
+            Hidden nodes in the frame of the graph [m, m, rad].
+        waiting : list of AttachedMeasurement
+            Measurements on these nodes that are not in the graph yet.
+        primary : str
+            Name of the primary odometry source.
+
+        """
+        if self.state is AlignmentState.ALIGNED or len(waiting) == 0:
+            return None
+        positions = placed(waiting)
+        if len(positions) == 0:
+            return None
+        found = estimator.find_alignment(
+            poses, _table(positions), self._config.alignment, self._noise(primary),
+            self._correlation([_evidence_of(each) for each in positions]))
+        headings = [each for each in waiting if each.observed.kind[0] == ObservedKind.HEADING]
+        if len(headings) > 0:
+            by_heading = _by_heading(poses, _table(headings), _table(positions))
+            if by_heading.sigma < min(found.sigma, ALIGNING_SIGMA):
+                found = by_heading
+        self.state = (AlignmentState.UNALIGNED if found.T_map_graph is None
+                      else AlignmentState.ALIGNED)
+        self.sigma = found.sigma
+        return found.T_map_graph
+
+    def add(self, added: list[AttachedMeasurement]) -> None:
+        """Store the measurements that were added to the graph for the next check."""
+        if self._next_recheck <= LAST_RECHECK:
+            self._evidence += map(_evidence_of, placed(added))
+
+    def stop_rechecking(self) -> None:
+        """Stop checking the angle, because the path is not that of odometry any more."""
+        self._evidence.clear()
+        self._next_recheck = LAST_RECHECK + 1
+
+    def recheck(self, solved: FloatArray, nodes: HiddenNodes) -> FloatArray | None:
+        """
+        Return the motion from the odometry frame into the map if the angle in use is wrong.
+
+        The check is only made when the number of measurements has doubled since the last one. The
+        motion has the shape (3,), and is None if the angle is not checked or not wrong.
+
+        Parameters
+        ----------
+        solved : ndarray, shape (N, 3)
+            All rows of the graph in the map, by the present solution.
+        nodes : HiddenNodes
+
+        """
+        if self.state is not AlignmentState.ALIGNED or len(self._evidence) < self._next_recheck:
+            return None
+        self._next_recheck = 2 * len(self._evidence)
+        table = _table(self._evidence)
+        table = ObservedNodes(np.searchsorted(nodes.rows, table.node), *table.columns[1:])
+        found = estimator.recheck(
+            solved[nodes.rows], nodes.odometry, table, self._config.alignment,
+            self._noise(nodes.primary), correlation=self._correlation(self._evidence),
+            sigma=self.sigma)
+        if self._next_recheck > LAST_RECHECK:
+            self._evidence.clear()
+        if found is None:
+            return None
+        self.sigma = found.sigma
+        return found.T_map_graph
+
+    def _noise(self, primary: str) -> OdometryNoise:
+        return self._config.odometry_source(primary).noise
+
+    def _correlation(self, evidence: list[Evidence]) -> TimeCorrelation:
+        times = {name: source.correlation_time
+                 for name, source in self._config.measurements.items()}
+        default = MeasurementSource().correlation_time
+        return TimeCorrelation(
+            np.array([each.stamp_ns for each in evidence]) * 1e-9,
+            np.array([times.get(each.source, default) for each in evidence]))
+
+    @property
+    def is_aligned(self) -> bool:
+        """Whether the graph lies in the map."""
+        return self.state is AlignmentState.ALIGNED
+
+    def copy(self) -> tuple[AlignmentState, float]:
+        """Return the state for `restore`."""
+        return self.state, self.sigma
+
+    def restore(self, state: tuple[AlignmentState, float]) -> None:
+        """Set the state to one returned by `copy`, if the graph could not be aligned."""
+        self.state, self.sigma = state
+
+    def saved(self) -> SavedAlignment:
+        """Return the state and the stored measurements."""
+        table = _table(self._evidence)
+        names = tuple(dict.fromkeys(each.source for each in self._evidence))
+        source, stamps = (np.array(numbers, dtype=np.int64) for numbers in (
+            [names.index(each.source) for each in self._evidence],
+            [each.stamp_ns for each in self._evidence]))
+        return SavedAlignment(
+            self.state.value, float(self.sigma) if np.isfinite(self.sigma) else None,
+            self._next_recheck, names, source, stamps, table.node, table.offset, table.mean,
+            upper(table.information), table.kind.astype(np.int64))
+
+    def load(self, saved: SavedAlignment) -> None:
+        """Set state and measurements to saved ones."""
+        self.state = AlignmentState(saved.state)
+        self.sigma = np.inf if saved.sigma is None else saved.sigma
+        self._next_recheck = saved.next_verdict
+        table = ObservedNodes(saved.node, saved.offset, saved.mean, full(saved.information),
+                              saved.kind)
+        self._evidence = [
+            Evidence(saved.sources[source], stamp_ns, table.rows(slice(k, k + 1)))
+            for k, (source, stamp_ns) in enumerate(
+                zip(saved.source.tolist(), saved.stamps_ns.tolist(), strict=True))]
+
+
+def placed(attached: list[AttachedMeasurement]) -> list[AttachedMeasurement]:
+    """Return the measurements that contain a position: all but headings."""
+    return [each for each in attached if each.observed.kind[0] != ObservedKind.HEADING]
+
+
+def _evidence_of(attached: AttachedMeasurement) -> Evidence:
+    return Evidence(attached.source, attached.measurement.stamp_ns, attached.observed)
+
+
+def _table(measurements: Sequence[AttachedMeasurement | Evidence]) -> ObservedNodes:
+    return ObservedNodes.joined([each.observed for each in measurements])
+
+
+def _by_heading(
+    poses: FloatArray, headings: ObservedNodes, positions: ObservedNodes,
+) -> GraphAlignment:
+    """Return the alignment with the most certain heading as angle and positions for the shift."""
+    best = int(np.argmax(headings.information[:, 2, 2]))
+    node = int(headings.node[best])
+    theta = float(se2.wrap(
+        headings.mean[best, 2] - poses[node, 2] - headings.offset[best, 2]))
+    weight = np.trace(positions.information[:, :2, :2], axis1=1, axis2=2)
+    predicted = se2.compose(poses[positions.node], positions.offset)[:, :2]
+    shift = np.average(
+        positions.mean[:, :2] - predicted @ se2.rotation(theta).T, axis=0, weights=weight)
+    return GraphAlignment(np.array((*shift, theta)),
+                          float(1.0 / np.sqrt(headings.information[best, 2, 2])), node)

@@ -1,0 +1,136 @@
+# Copyright 2026 The pose_graph_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""
+The optimisation of the whole graph at the end of a stream.
+
+Its result must not depend on the earlier updates. So the graph is optimised from two starts, and
+the weights of constraints with a robust loss are computed from initial values.
+"""
+
+from collections.abc import Mapping
+from dataclasses import replace
+
+import numpy as np
+
+from pose_graph_ros.core.batch.optimizer import (
+    BatchResult,
+    optimize_from_two_starts,
+    SAME_MINIMUM,
+    Solve,
+    Status,
+)
+from pose_graph_ros.core.config import SolverConfig
+from pose_graph_ros.core.geometry.se2 import FloatArray
+from pose_graph_ros.core.graph.graph import Graph, GraphUpdate
+from pose_graph_ros.core.graph.reweighting import Reweighting
+
+# Maximum number of reweighting iterations.
+REWEIGHTINGS = 200
+# Largest change of a weight at which the reweighting has converged.
+SAME_WEIGHT = 1e-12
+# Successive factors on the thresholds of the losses, after plain least squares.
+WIDENED = (32.0, 16.0, 8.0, 4.0, 2.0)
+# Initial weight of constraints with a loss in the start from the constraints without one.
+SMALL_WEIGHT = 1e-4
+
+
+def optimize(
+    graph: Graph, reweighting: Reweighting, config: SolverConfig, solve: Solve,
+) -> BatchResult:
+    """
+    Optimise a whole graph in place, with the weights of robust losses.
+
+    All poses and weights are restored if it fails, by an exception too.
+
+    Parameters
+    ----------
+    graph : Graph
+    reweighting : Reweighting
+        Constraints of the graph that have a robust loss.
+    config : SolverConfig
+    solve : callable
+        Optimises a graph in place.
+
+    Returns
+    -------
+    BatchResult
+        With robust losses, chi2 is the robust cost. FAILED after an exception of `solve`.
+
+    """
+    poses, weights = graph.poses.copy(), graph.weights
+    try:
+        if len(reweighting) == 0:
+            result = optimize_from_two_starts(graph, config, solve, both=True)
+        else:
+            result = _optimize_robustly(graph, reweighting, config, solve)
+    except Exception as error:
+        # whatever the error is, the poses and weights must be restored
+        reason = f'{type(error).__name__}: {error}'
+        result = BatchResult(Status.FAILED, reason, 0, float('nan'), float('nan'))
+    if result.status is Status.FAILED:
+        if len(reweighting) > 0:
+            _restore_weights(graph, weights)
+        graph.set_poses(poses)
+    return result
+
+
+def _optimize_robustly(
+    graph: Graph, reweighting: Reweighting, config: SolverConfig, solve: Solve,
+) -> BatchResult:
+    """
+    Reweight from two starts and keep the result with the lower robust cost.
+
+    The first start is plain least squares, followed by wide thresholds that are narrowed in steps.
+    The second start is determined by the constraints without a loss. Neither uses the present
+    weights, because these depend on the order in which the measurements were received.
+    """
+    best, poses, weights = None, graph.poses, graph.weights
+    for weight, widened in ((1.0, WIDENED), (SMALL_WEIGHT, ())):
+        _set_weights(graph, *reweighting.all_alike(weight))
+        result = optimize_from_two_starts(graph, config, solve, both=True)
+        for factor in widened:
+            if result.status is not Status.FAILED:
+                _set_weights(graph, *reweighting.all_changes(graph, factor))
+                result = solve(graph, config)
+        if result.status is not Status.FAILED:
+            result = _reweighted(graph, reweighting, config, solve)
+        failed = result.status is Status.FAILED
+        if best is None or best.status is Status.FAILED or (
+                not failed and result.chi2 < best.chi2 * (1.0 - SAME_MINIMUM)):
+            best, poses, weights = result, graph.poses.copy(), graph.weights
+    assert best is not None
+    _restore_weights(graph, weights)
+    graph.set_poses(poses)
+    return best
+
+
+def _reweighted(
+    graph: Graph, reweighting: Reweighting, config: SolverConfig, solve: Solve,
+) -> BatchResult:
+    """Reweight and solve until the weights converge; chi2 of the result is the robust cost."""
+    iterations, largest = 0, 1.0
+    for _ in range(REWEIGHTINGS):
+        before = graph.weights
+        _set_weights(graph, *reweighting.all_changes(graph))
+        largest = max(float(np.max(np.abs(new - old), initial=0.0))
+                      for new, old in zip(graph.weights, before, strict=True))
+        result = solve(graph, config)
+        iterations += result.iterations
+        if result.status is Status.FAILED or largest < SAME_WEIGHT:
+            break
+    if result.status is Status.FAILED:
+        return result
+    if largest >= SAME_WEIGHT:
+        result = replace(result, status=Status.MAX_ITERATIONS)
+    return replace(result, iterations=iterations, chi2=result.chi2 + reweighting.cost(graph))
+
+
+def _restore_weights(graph: Graph, weights: tuple[FloatArray, FloatArray]) -> None:
+    """Set the weights of all edges and observed nodes to those of `Graph.weights`."""
+    _set_weights(graph, *(
+        {int(row): float(wanted[row]) for row in np.flatnonzero(wanted != present)}
+        for wanted, present in zip(weights, graph.weights, strict=True)))
+
+
+def _set_weights(graph: Graph, edges: Mapping[int, float], observed: Mapping[int, float]) -> None:
+    graph.apply(GraphUpdate(weigh_edges=edges, weigh_observed=observed))

@@ -1,0 +1,346 @@
+# Copyright 2026 The pose_graph_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""
+The parts of a Gauss-Newton iteration over all cliques of a graph: linearize, eliminate, solve.
+
+The reference of each node is set to its pose before all constraints are linearized at the poses,
+so the solution of the linear system is the step itself.
+
+A chord step (`chord_step`) reuses the factorisation of an earlier iteration, so it only needs the
+gradient at the new poses, a forward and a backward substitution. It takes a quarter of the time of
+a whole iteration. Near the minimum it converges nearly as fast as Gauss-Newton; far from it, where
+the Jacobians change fast, it does not converge.
+"""
+
+import math
+
+from pose_graph_ros.core.compiled.jit import kernel
+from pose_graph_ros.core.elimination.assembly import eliminate_clique
+from pose_graph_ros.core.elimination.fronts import backward_rows, forward_rows, solve_rows
+from pose_graph_ros.core.graph import factors, tables as tb
+
+# Relative rounding error of a sum of many numbers, and of a coordinate.
+SUM_ROUNDING = 1e-12
+COORDINATE_ROUNDING = 2.0**-52
+
+
+@kernel
+def keep_poses(head, poses):  # type: ignore[no-untyped-def]
+    """Copy the poses of all nodes into an array, shape (N, 3)."""
+    node_f = tb.node_f(head)
+    for v in range(head[tb.N_NODES]):
+        for k in range(3):
+            poses[v, k] = node_f[v, tb.POSE + k]
+
+
+@kernel
+def put_poses(head, poses):  # type: ignore[no-untyped-def]
+    """Write the poses of all nodes, shape (N, 3), unchanged, and make them the references."""
+    node_f = tb.node_f(head)
+    for v in range(head[tb.N_NODES]):
+        for k in range(3):
+            node_f[v, tb.POSE + k] = poses[v, k]
+    refer_to_poses(head)
+
+
+@kernel
+def refer_to_poses(head):  # type: ignore[no-untyped-def]
+    """Make the poses the references of the unknowns."""
+    node_f = tb.node_f(head)
+    for v in range(head[tb.N_NODES]):
+        factors.refer_to_pose(node_f[v])
+
+
+@kernel
+def linearize(head):  # type: ignore[no-untyped-def]
+    """Make the poses the references and linearize all constraints there."""
+    refer_to_poses(head)
+    for e in range(head[tb.N_EDGES]):
+        factors.linearize_edge(head, e)
+    for k in range(head[tb.N_OBSERVED]):
+        factors.linearize_observed(head, k)
+
+
+@kernel
+def eliminate(head, damping):  # type: ignore[no-untyped-def]
+    """
+    Eliminate all cliques.
+
+    Parameters
+    ----------
+    damping : float
+        Lambda of Levenberg-Marquardt; 0 for a Gauss-Newton step.
+
+    Returns
+    -------
+    bool
+        False if a node is not determined, which is `BAD_NODE` of the head.
+
+    """
+    scalars = tb.scalars(head)
+    scalars[tb.DAMPING] = damping
+    bad = -1
+    for c in range(head[tb.N_CLIQUES]):
+        bad = eliminate_clique(head, c, False)
+        if bad >= 0:
+            head[tb.BAD_NODE] = bad
+            break
+    scalars[tb.DAMPING] = 0.0
+    return bad < 0
+
+
+@kernel
+def _update_pose(f):  # type: ignore[no-untyped-def]
+    """Set the pose of a node, given as its row, to reference plus solution."""
+    f[tb.POSE] = f[tb.REF] + f[tb.DELTA]
+    f[tb.POSE + 1] = f[tb.REF + 1] + f[tb.DELTA + 1]
+    f[tb.POSE + 2] = factors.wrap(f[tb.REF + 2] + f[tb.DELTA + 2])
+
+
+@kernel
+def gauss_newton_step(head):  # type: ignore[no-untyped-def]
+    """Solve for all nodes and move them; return the largest change of a coordinate [m, rad]."""
+    node_f = tb.node_f(head)
+    pool_f = tb.pool_f(head)
+    work_f = tb.work_f(head)
+    node_i = tb.node_i(head)
+    clique_i = tb.clique_i(head)
+    pool_i = tb.pool_i(head)
+    largest = 0.0
+    for c in range(head[tb.N_CLIQUES] - 1, -1, -1):
+        row = clique_i[c]
+        n_frontal, n_all = row[tb.N_FRONTAL], row[tb.N_FRONTAL] + row[tb.N_SEPARATOR]
+        nodes = pool_i[row[tb.NODES]:row[tb.NODES] + n_all]
+        n = 3 * n_all
+        x = work_f[:n]
+        for k in range(n_frontal, n_all):
+            f = node_f[nodes[k]]
+            x[3 * k], x[3 * k + 1], x[3 * k + 2] = f[tb.DELTA], f[tb.DELTA + 1], f[tb.DELTA + 2]
+        at = row[tb.VALUES]
+        solve_rows(pool_f[at:], 3 * n_frontal, n, x)
+        for k in range(n_frontal):
+            v = nodes[k]
+            if node_i[v, tb.FIXED] != 0:
+                continue
+            f = node_f[v]
+            for m in range(3):
+                f[tb.DELTA + m] = x[3 * k + m]
+                largest = _larger(largest, x[3 * k + m])
+            _update_pose(f)
+    return largest
+
+
+@kernel
+def chord_step(head, right):  # type: ignore[no-untyped-def]
+    """
+    Move all nodes by a step from the present poses, with the factorisation of an earlier step.
+
+    Parameters
+    ----------
+    right : ndarray, shape (N, 3)
+        -b at the poses, from `evaluate`; overwritten by the step.
+
+    Returns
+    -------
+    float
+        Largest change of a coordinate [m, rad].
+
+    """
+    node_f = tb.node_f(head)
+    pool_f = tb.pool_f(head)
+    work_f = tb.work_f(head)
+    node_i = tb.node_i(head)
+    clique_i = tb.clique_i(head)
+    pool_i = tb.pool_i(head)
+    n_cliques = head[tb.N_CLIQUES]
+    for c in range(n_cliques):
+        row = clique_i[c]
+        n_frontal, n_all = row[tb.N_FRONTAL], row[tb.N_FRONTAL] + row[tb.N_SEPARATOR]
+        nodes = pool_i[row[tb.NODES]:row[tb.NODES] + n_all]
+        n = 3 * n_all
+        x = work_f[:n]
+        for k in range(n_all):
+            v = nodes[k]
+            for m in range(3):
+                x[3 * k + m] = right[v, m]
+        at = row[tb.VALUES]
+        forward_rows(pool_f[at:], 3 * n_frontal, n, x)
+        for k in range(n_all):
+            v = nodes[k]
+            for m in range(3):
+                right[v, m] = x[3 * k + m]
+    largest = 0.0
+    for c in range(n_cliques - 1, -1, -1):
+        row = clique_i[c]
+        n_frontal, n_all = row[tb.N_FRONTAL], row[tb.N_FRONTAL] + row[tb.N_SEPARATOR]
+        nodes = pool_i[row[tb.NODES]:row[tb.NODES] + n_all]
+        rows, n = 3 * n_frontal, 3 * n_all
+        x = work_f[:n]
+        for k in range(n_all):
+            v = nodes[k]
+            for m in range(3):
+                x[3 * k + m] = right[v, m]
+        at = row[tb.VALUES]
+        backward_rows(pool_f[at:], rows, n, x)
+        for k in range(n_frontal):
+            v = nodes[k]
+            f = node_f[v]
+            fixed = node_i[v, tb.FIXED] != 0
+            for m in range(3):
+                right[v, m] = 0.0 if fixed else x[3 * k + m]
+                f[tb.DELTA + m] += right[v, m]
+                largest = _larger(largest, right[v, m])
+            if not fixed:
+                _update_pose(f)
+    return largest
+
+
+@kernel
+def _larger(largest, number):  # type: ignore[no-untyped-def]
+    """Return the larger of `largest` and the magnitude of a number, NaN if one of them is NaN."""
+    number = abs(number)
+    return largest if number <= largest else number
+
+
+@kernel
+def evaluate(head, right):  # type: ignore[no-untyped-def]
+    """
+    Compute chi2 and its gradient at the poses.
+
+    Parameters
+    ----------
+    right : ndarray, shape (N, 3)
+        Receives -b: half the gradient of chi2, with negative sign.
+
+    Returns
+    -------
+    chi2 : float
+    rounding : float
+        Estimate of the rounding error of chi2.
+
+    """
+    node_f = tb.node_f(head)
+    edge_f = tb.edge_f(head)
+    observed_f = tb.observed_f(head)
+    edge_i = tb.edge_i(head)
+    observed_i = tb.observed_i(head)
+    right[:] = 0.0
+    chi2 = gradient_sum = reach = 0.0
+    for e in range(head[tb.N_EDGES]):
+        f = edge_f[e]
+        w = f[tb.WEIGHT]
+        if w > 0.0:
+            i, j = edge_i[e, tb.END_I], edge_i[e, tb.END_J]
+            start, end = node_f[i], node_f[j]
+            if edge_i[e, tb.EDGE_KIND] == factors.BIAS:
+                ex, ey, eth, dx, dy = factors.error_to_bias(f, start, end)
+                gx, gy, gth, energy = _weighted_error(f, ex, ey, eth)
+                chi2 += energy
+                gradient_sum += abs(gx) + abs(gy)
+                right[i, 0] += gx
+                right[i, 1] += gy
+                right[i, 2] += dx * gy - dy * gx + gth
+                right[j, 0] -= f[tb.FACTOR_T] * gx
+                right[j, 1] -= f[tb.FACTOR_T] * gy
+                right[j, 2] -= f[tb.FACTOR_TH] * gth
+                continue
+            phi = start[tb.POSE + 2] + f[tb.MEAN + 2]
+            c, s = math.cos(phi), math.sin(phi)
+            dx, dy = end[tb.POSE] - start[tb.POSE], end[tb.POSE + 1] - start[tb.POSE + 1]
+            ex, ey = c * dx + s * dy - f[tb.OWN_T], c * dy - s * dx - f[tb.OWN_T + 1]
+            eth = factors.wrap(end[tb.POSE + 2] - start[tb.POSE + 2] - f[tb.MEAN + 2])
+            gx, gy, gth, energy = _weighted_error(f, ex, ey, eth)
+            chi2 += energy
+            gx, gy = c * gx - s * gy, s * gx + c * gy
+            gradient_sum += abs(gx) + abs(gy)
+            right[i, 0] += gx
+            right[i, 1] += gy
+            right[i, 2] += dx * gy - dy * gx + gth
+            right[j, 0] -= gx
+            right[j, 1] -= gy
+            right[j, 2] -= gth
+    for k in range(head[tb.N_OBSERVED]):
+        f = observed_f[k]
+        if f[tb.WEIGHT] > 0.0:
+            v = observed_i[k, tb.OBS_NODE]
+            node = node_f[v]
+            c, s = math.cos(node[tb.POSE + 2]), math.sin(node[tb.POSE + 2])
+            ax = c * f[tb.OBS_OFFSET] - s * f[tb.OBS_OFFSET + 1]
+            ay = s * f[tb.OBS_OFFSET] + c * f[tb.OBS_OFFSET + 1]
+            c, s = math.cos(f[tb.MEAN + 2]), math.sin(f[tb.MEAN + 2])
+            dx, dy = node[tb.POSE] + ax - f[tb.MEAN], node[tb.POSE + 1] + ay - f[tb.MEAN + 1]
+            eth = factors.wrap(node[tb.POSE + 2] + f[tb.OBS_OFFSET + 2] - f[tb.MEAN + 2])
+            gx, gy, gth, energy = _weighted_error(f, c * dx + s * dy, c * dy - s * dx, eth)
+            chi2 += energy
+            gx, gy = c * gx - s * gy, s * gx + c * gy
+            gradient_sum += abs(gx) + abs(gy)
+            right[v, 0] -= gx
+            right[v, 1] -= gy
+            right[v, 2] -= ax * gy - ay * gx + gth
+    for v in range(head[tb.N_NODES]):
+        reach = max(reach, abs(node_f[v, tb.POSE]), abs(node_f[v, tb.POSE + 1]))
+    return chi2, SUM_ROUNDING * max(chi2, 1.0) + COORDINATE_ROUNDING * reach * gradient_sum
+
+
+@kernel
+def _weighted_error(f, ex, ey, eth):  # type: ignore[no-untyped-def]
+    """Return W e and e^T W e of a constraint, given as its row and its error e."""
+    i, w = tb.INFO, f[tb.WEIGHT]
+    gx = w * (f[i] * ex + f[i + 1] * ey + f[i + 2] * eth)
+    gy = w * (f[i + 1] * ex + f[i + 3] * ey + f[i + 4] * eth)
+    gth = w * (f[i + 2] * ex + f[i + 4] * ey + f[i + 5] * eth)
+    return gx, gy, gth, ex * gx + ey * gy + eth * gth
+
+
+@kernel
+def product_with_step(head, right):  # type: ignore[no-untyped-def]
+    """Return the scalar product of an array, shape (N, 3), and the last step (DELTA)."""
+    node_f = tb.node_f(head)
+    total = 0.0
+    for v in range(head[tb.N_NODES]):
+        for k in range(3):
+            total += right[v, k] * node_f[v, tb.DELTA + k]
+    return total
+
+
+@kernel
+def settle(head):  # type: ignore[no-untyped-def]
+    """
+    Evaluate all constraints and bring the tables into the state after a step of the smoother.
+
+    If the sum of the squared linearization errors exceeds the smoother's budget, the constraints
+    with large errors are listed in `waiting`, to be linearized again in its next step.
+    """
+    node_f, edge_f, observed_f = tb.node_f(head), tb.edge_f(head), tb.observed_f(head)
+    edge_i, observed_i = tb.edge_i(head), tb.observed_i(head)
+    scalars, waiting = tb.scalars(head), tb.waiting(head)
+    for v in range(head[tb.N_NODES]):
+        f = node_f[v]
+        for k in range(3):
+            f[tb.SEEN + k] = f[tb.DELTA + k]
+    chi2 = error2 = 0.0
+    for e in range(head[tb.N_EDGES]):
+        factors.check_edge(head, e, 0.0)
+        chi2 += edge_f[e, tb.ENERGY]
+        error2 += edge_f[e, tb.ERROR2]
+        edge_i[e, tb.EDGE_WAITS] = 0
+    for k in range(head[tb.N_OBSERVED]):
+        factors.check_observed(head, k)
+        chi2 += observed_f[k, tb.OBS_ENERGY]
+        error2 += observed_f[k, tb.OBS_ERROR2]
+        observed_i[k, tb.OBS_WAITS] = 0
+    scalars[tb.CHI2] = chi2
+    head[tb.N_WAITING] = head[tb.N_TURNED] = 0
+    if not 0.0 < scalars[tb.SETTING_BUDGET] < error2:
+        return
+    threshold = factors.LEAST_FRACTION * scalars[tb.SETTING_SHARE]
+    for e in range(head[tb.N_EDGES]):
+        if edge_f[e, tb.ERROR2] > threshold:
+            edge_i[e, tb.EDGE_WAITS] = 1
+            waiting[head[tb.N_WAITING]] = e
+            head[tb.N_WAITING] += 1
+    for k in range(head[tb.N_OBSERVED]):
+        if observed_f[k, tb.OBS_ERROR2] > threshold:
+            observed_i[k, tb.OBS_WAITS] = 1
+            waiting[head[tb.N_WAITING]] = -1 - k
+            head[tb.N_WAITING] += 1

@@ -1,0 +1,185 @@
+# Copyright 2026 The pose_graph_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""
+The loop of the batch optimisation: Gauss-Newton, with Levenberg-Marquardt damping if needed.
+
+Every iteration solves `(H + lambda D) dx = -b`. D is diagonal and holds the information that the
+constraints of a node have on its position and on its heading, which makes the damping independent
+of units (Marquardt 1963). With lambda = 0 the step is that of Gauss-Newton.
+
+chi2 may rise for up to `UPHILL_STEPS` Gauss-Newton steps in a row, since the path to a minimum can
+cross a ridge that no damped step crosses. If chi2 is not below its lowest value after these, the
+best poses are restored and lambda grows until a step lowers chi2. Each step that lowers chi2
+reduces lambda, which is set to 0 below `LEAST_DAMPING`.
+"""
+
+from enum import Enum
+import math
+from typing import NamedTuple
+
+import numpy as np
+
+from pose_graph_ros.core.batch import gauss_newton as gn
+from pose_graph_ros.core.config import SolverConfig
+from pose_graph_ros.core.geometry.se2 import FloatArray
+from pose_graph_ros.core.graph import tables as tb
+
+# Damping lambda after the first rejected step, its factor of growth after each further one and of
+# decay after each accepted one, the value below which it is set to 0, and the largest value.
+FIRST_DAMPING = 1e-5
+DAMPING_GROWTH = 10.0
+DAMPING_DECAY = 0.1
+LEAST_DAMPING = 1e-9
+LARGEST_DAMPING = 1e12
+# Number of steps in a row for which chi2 may exceed the lowest so far, and by what factor.
+UPHILL_STEPS = 2
+UPHILL_LIMIT = 2.0
+# Where no step lowers chi2, the optimisation has stalled if the linear model predicts a decrease
+# by more than this fraction of chi2 (of 1 if chi2 is smaller), and has converged otherwise.
+STALL = 1e-6
+# A step that is no shorter than the last one but below this is rounding noise [m, rad].
+NOISE_STEP = 1e-7
+# Limit of the predicted sum of all further steps at convergence [fraction of the tolerance].
+SURE = 0.1
+# Largest ratio of the lengths of two steps after which the next one is a chord step: after a step
+# with a new factorisation, and after a chord step.
+KEEP_RATIO = 0.1
+CHORD_RATIO = 0.4
+
+
+class Termination(Enum):
+    """Why the iterations ended."""
+
+    CONVERGED = 0
+    MAX_ITERATIONS = 1
+    STALLED = 2
+    UNDETERMINED = 3
+    """H is singular: a node is not determined."""
+
+
+class Minimum(NamedTuple):
+    """Result of `minimize`."""
+
+    termination: Termination
+    iterations: int
+    """Number of steps."""
+    chi2: float
+
+
+def minimize(head: tb.IntHead, chi2: float, config: SolverConfig) -> Minimum:
+    """
+    Move all nodes to a local minimum of chi2.
+
+    Unless the result is UNDETERMINED, the poses are those of the lowest chi2 found and the tables
+    are in the state after a step of the smoother.
+
+    Parameters
+    ----------
+    head : ndarray
+        Head of tables that hold the cliques of the whole graph (`symbolic.plant`).
+    chi2 : float
+        chi2 at the present poses.
+    config : SolverConfig
+
+    Returns
+    -------
+    Minimum
+
+    """
+    n_nodes = int(head[tb.N_NODES])
+    right, best = np.empty((n_nodes, 3)), np.empty((n_nodes, 3))
+    gn.keep_poses(head, best)
+    end, iterations, uphill = Termination.MAX_ITERATIONS, 0, 0
+    solved = False  # whether any factorisation succeeded
+    chord = False  # whether the next step is a chord step
+    current = False  # whether the tree is that of the best poses, without damping
+    damping = 0.0
+    previous, last_damping = math.inf, 0.0
+    while iterations < config.max_iterations:
+        trial, rounding = math.inf, 0.0
+        length = _step(head, damping, right, chord=chord)
+        if length < math.inf:
+            solved = True
+            trial, rounding = gn.evaluate(head, right)
+        lower = trial <= chi2 + rounding
+        current = lower and damping == 0.0
+        if lower:
+            chi2 = trial
+            gn.keep_poses(head, best)
+            iterations += 1
+            # an uphill step or stronger damping before this step changes its length
+            comparable = uphill == 0 and damping <= last_damping
+            if comparable and _has_converged(length, previous, config.step_tolerance):
+                end = Termination.CONVERGED
+                break
+            chord = comparable and damping == 0.0 and previous < math.inf and (
+                length < (CHORD_RATIO if chord else KEEP_RATIO) * previous)
+            last_damping = damping
+            damping *= DAMPING_DECAY
+            if damping < LEAST_DAMPING:
+                damping = 0.0
+            uphill, previous = 0, length
+        elif (damping == 0.0 and not chord and trial < UPHILL_LIMIT * chi2
+              and uphill < UPHILL_STEPS and iterations + 1 < config.max_iterations):
+            iterations += 1
+            uphill, previous = uphill + 1, length
+        else:
+            gn.put_poses(head, best)
+            if not chord:
+                damping = max(FIRST_DAMPING, damping * DAMPING_GROWTH)
+                if damping > LARGEST_DAMPING:
+                    end = Termination.STALLED if solved else Termination.UNDETERMINED
+                    break
+            # a rejected chord step is repeated with a new factorisation before any damping
+            chord, uphill = False, 0
+    if not current and end is not Termination.UNDETERMINED:
+        gn.put_poses(head, best)
+        end = _refactorized(head, best, end, chi2)
+    if end is not Termination.UNDETERMINED:
+        gn.settle(head)
+    return Minimum(end, iterations, chi2)
+
+
+def _step(head: tb.IntHead, damping: float, right: FloatArray, *, chord: bool) -> float:
+    """Move all nodes; return the largest change of a coordinate, infinite if H is singular."""
+    if chord:
+        return float(gn.chord_step(head, right))
+    gn.linearize(head)
+    if not gn.eliminate(head, damping):
+        return math.inf
+    return float(gn.gauss_newton_step(head))
+
+
+def _refactorized(
+    head: tb.IntHead, best: FloatArray, end: Termination, chi2: float,
+) -> Termination:
+    """Eliminate all cliques at the best poses without damping; return the final termination."""
+    gn.linearize(head)
+    if not gn.eliminate(head, 0.0):
+        return Termination.UNDETERMINED
+    if end is Termination.STALLED:
+        right = np.empty_like(best)
+        gn.evaluate(head, right)
+        gn.gauss_newton_step(head)
+        # b^T H^-1 b, the decrease of a quadratic chi2
+        predicted = gn.product_with_step(head, right)
+        gn.put_poses(head, best)
+        if not predicted > STALL * max(chi2, 1.0):
+            return Termination.CONVERGED
+    return end
+
+
+def _has_converged(length: float, previous: float, tolerance: float) -> bool:
+    """
+    Tell whether the sum of all further steps is below the tolerance.
+
+    Gauss-Newton converges linearly if errors remain at the minimum. If r is the ratio of the
+    lengths of the last two steps and remains so, the further steps add up to r / (1 - r) times the
+    last one.
+    """
+    if length >= previous:
+        return length < NOISE_STEP
+    if previous == math.inf:
+        return length < tolerance
+    ratio = length / previous
+    return length * ratio < SURE * tolerance * (1.0 - ratio)

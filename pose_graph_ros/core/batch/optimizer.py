@@ -1,0 +1,251 @@
+# Copyright 2026 The pose_graph_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""
+Batch optimisation of a whole graph in place, from the present poses or from a linear start.
+
+The order of elimination and the cliques are computed once (`symbolic`), the iterations run over
+these cliques (`levenberg_marquardt`). Afterwards the tables hold the cliques of the optimised
+poses, with which the incremental smoother can continue.
+"""
+
+from collections.abc import Callable
+import contextlib
+from dataclasses import dataclass, replace
+from enum import Enum
+
+import numpy as np
+
+from pose_graph_ros.core.batch import chordal_start, gauss_newton
+from pose_graph_ros.core.batch.levenberg_marquardt import minimize, Termination
+from pose_graph_ros.core.config import SolverConfig
+from pose_graph_ros.core.elimination import symbolic
+from pose_graph_ros.core.exceptions import LinearSolveError
+from pose_graph_ros.core.geometry.se2 import FloatArray
+from pose_graph_ros.core.graph import editing, tables as tb
+from pose_graph_ros.core.graph.graph import Graph
+
+
+class Status(Enum):
+    """Outcome of an optimisation or of an update."""
+
+    CONVERGED = 'converged'
+    MAX_ITERATIONS = 'max_iterations'
+    STALLED = 'stalled'
+    """
+    No step lowers chi2 although the linear model predicts a decrease: a heading error is at pi.
+    """
+    FAILED = 'failed'
+
+
+@dataclass(frozen=True, slots=True)
+class BatchResult:
+    """Result of an optimisation."""
+
+    status: Status
+    reason: str
+    """One sentence when the status is FAILED, else empty."""
+    iterations: int
+    """Number of steps."""
+    chi2_before: float
+    """chi2 at the poses before the call."""
+    chi2: float
+    """chi2 at the poses after the call."""
+
+
+Solve = Callable[[Graph, SolverConfig], BatchResult]
+"""Function that optimises a graph in place, such as `optimize`."""
+
+# Relative difference of chi2 below which two minima count as the same.
+SAME_MINIMUM = 1e-9
+
+_STATUS = {Termination.CONVERGED: Status.CONVERGED, Termination.STALLED: Status.STALLED,
+           Termination.MAX_ITERATIONS: Status.MAX_ITERATIONS}
+
+
+def optimize(graph: Graph, config: SolverConfig) -> BatchResult:
+    """
+    Move the hidden nodes from their present poses to a local minimum of chi2.
+
+    If the optimisation fails numerically, the result says so, the poses are as before the call,
+    and the smoother eliminates everything anew at its next step. All cliques are replaced, so this
+    must not be called between `Graph.begin` and `Graph.rollback`.
+
+    Parameters
+    ----------
+    graph : Graph
+    config : SolverConfig
+
+    Returns
+    -------
+    BatchResult
+
+    """
+    chi2, answer = _check_before(graph)
+    if answer is not None:
+        return answer
+    poses = graph.poses.copy()
+    return _finished(graph, poses, chi2, _minimize(graph, config, _analysed(graph), chi2))
+
+
+def optimize_from_linear_start(graph: Graph, config: SolverConfig) -> BatchResult:
+    """
+    Move the hidden nodes to a local minimum of chi2, from a start that needs no initial poses.
+
+    If the linear start leads to a higher chi2 than that of the present poses, the optimisation
+    starts from the present poses instead. Failures are treated as in `optimize`.
+
+    Parameters
+    ----------
+    graph : Graph
+    config : SolverConfig
+
+    Returns
+    -------
+    BatchResult
+
+    """
+    chi2, answer = _check_before(graph)
+    if answer is not None:
+        return answer
+    poses, cliques = graph.poses.copy(), _analysed(graph)
+    head = graph.memory.head
+    result = None
+    with contextlib.suppress(LinearSolveError):
+        gauss_newton.put_poses(head, linear_start(graph, cliques))
+        result = _minimize(graph, config, cliques, _chi2(graph))
+    if result is None or result.status is Status.FAILED or not result.chi2 <= chi2:
+        gauss_newton.put_poses(head, poses)
+        result = _minimize(graph, config, cliques, chi2)
+    return _finished(graph, poses, chi2, result)
+
+
+def optimize_from_two_starts(
+    graph: Graph, config: SolverConfig, solve: Solve = optimize, *, both: bool,
+) -> BatchResult:
+    """
+    Optimise a graph from the present poses and, if that does not converge, from a linear start.
+
+    After a long time without a position the heading may have drifted far. Gauss-Newton can then
+    converge to a minimum with the heading wrapped the wrong way round, which takes many
+    iterations. The lower of the two minima is kept.
+
+    Parameters
+    ----------
+    graph : Graph
+        Is optimised in place; without observed nodes, from the present poses only.
+    config : SolverConfig
+    solve : callable
+        Optimises a graph in place.
+    both : bool
+        Always use both starts, so that the result does not depend on earlier updates.
+
+    Returns
+    -------
+    BatchResult
+
+    """
+    before = graph.poses.copy()
+    result = solve(graph, config)
+    not_converged = result.status in (Status.MAX_ITERATIONS, Status.STALLED)
+    if len(graph.observed) == 0 or not (not_converged or both):
+        return result
+    poses = graph.poses.copy()
+    try:
+        graph.set_poses(_joint(graph))
+        other = solve(graph, config)
+    except LinearSolveError:
+        other = None
+    if (other is None or other.status is Status.FAILED
+            or not other.chi2 < result.chi2 * (1.0 - SAME_MINIMUM)):
+        graph.set_poses(before if result.status is Status.FAILED else poses)
+        return result
+    return other
+
+
+def linear_start(graph: Graph, cliques: symbolic.Cliques | None = None) -> FloatArray:
+    """
+    Return initial poses, shape (N, 3), from the constraints and the poses of fixed nodes alone.
+
+    The chordal start is used if the constraints determine the headings; otherwise the joint start,
+    which solves for headings and positions together.
+
+    Parameters
+    ----------
+    graph : Graph
+    cliques : Cliques, optional
+        Cliques of the whole graph, if they are known.
+
+    Raises
+    ------
+    LinearSolveError
+        If the poses are not determined.
+
+    """
+    head = graph.memory.head
+    try:
+        return chordal_start.chordal_poses(
+            head, symbolic.analyse(head).cliques if cliques is None else cliques)
+    except LinearSolveError:
+        return _joint(graph)
+
+
+def _joint(graph: Graph) -> FloatArray:
+    """Return the joint start; its module is imported here because it loads SciPy."""
+    from pose_graph_ros.core.batch.joint_start import joint  # noqa: PLC0415
+
+    return joint(graph)
+
+
+def _check_before(graph: Graph) -> tuple[float, BatchResult | None]:
+    """Return chi2, and a result if there is nothing to optimise or the poses are undetermined."""
+    head = graph.memory.head
+    chi2 = _chi2(graph)
+    if not np.isfinite(chi2):
+        return chi2, _failed('chi2 is not finite', chi2)
+    if np.all(graph.fixed):
+        return chi2, BatchResult(Status.CONVERGED, '', 0, chi2, chi2)
+    node, count = symbolic.loose_part(head)
+    if node >= 0:
+        return chi2, _failed(
+            f'hidden node {node} and {count - 1} others are connected to no fixed and no '
+            f'observed node: their poses are not determined', chi2)
+    return chi2, None
+
+
+def _chi2(graph: Graph) -> float:
+    return float(gauss_newton.evaluate(graph.memory.head, np.empty((graph.n_nodes, 3)))[0])
+
+
+def _analysed(graph: Graph) -> symbolic.Cliques:
+    """Return the cliques of the whole graph, with memory allocated for them."""
+    memory = graph.memory
+    analysis = symbolic.analyse(memory.head)
+    memory.ensure('pool_f', analysis.need_f)
+    memory.ensure('pool_i', analysis.need_i)
+    memory.ensure('work_f', analysis.largest)
+    return analysis.cliques
+
+
+def _minimize(
+    graph: Graph, config: SolverConfig, cliques: symbolic.Cliques, chi2: float,
+) -> BatchResult:
+    """Optimise from the present poses; the poses after a failure have no meaning."""
+    head = graph.memory.head
+    symbolic.plant(head, cliques)
+    termination, iterations, after = minimize(head, chi2, config)
+    if termination is Termination.UNDETERMINED:
+        return _failed(f'hidden node {head[tb.BAD_NODE]} is not determined', chi2)
+    return BatchResult(_STATUS[termination], '', iterations, chi2, after)
+
+
+def _finished(graph: Graph, poses: FloatArray, chi2: float, result: BatchResult) -> BatchResult:
+    """Return the result of the whole call; restore the poses if it has failed."""
+    if result.status is Status.FAILED:
+        gauss_newton.put_poses(graph.memory.head, poses)
+        editing.restart(graph.memory.head)
+        return _failed(result.reason, chi2)
+    return replace(result, chi2_before=chi2)
+
+
+def _failed(reason: str, chi2: float) -> BatchResult:
+    return BatchResult(Status.FAILED, reason, 0, chi2, chi2)

@@ -1,0 +1,61 @@
+# Copyright 2026 The pose_graph_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""An array that rows are appended to, at amortised constant cost per row."""
+
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+
+class GrowingArray:
+    """
+    Array of rows that doubles its capacity when it is full.
+
+    Parameters
+    ----------
+    row_shape : tuple of int
+        Shape of one row; `()` for numbers.
+    dtype : dtype
+        Type of the elements.
+
+    """
+
+    def __init__(self, row_shape: tuple[int, ...], dtype: npt.DTypeLike) -> None:
+        self._data = np.empty((16, *row_shape), dtype=dtype)
+        self._size = 0
+
+    def __len__(self) -> int:
+        return self._size
+
+    @property
+    def values(self) -> npt.NDArray[Any]:
+        """Writeable view of all rows; invalid after the next `append`."""
+        return self._data[:self._size]
+
+    @property
+    def read_only(self) -> npt.NDArray[Any]:
+        """Read-only view of all rows; invalid after the next `append`."""
+        view = self.values
+        view.flags.writeable = False
+        return view
+
+    def append(self, rows: npt.ArrayLike) -> None:
+        """Append rows, shape (M, *row_shape)."""
+        rows = np.asarray(rows)
+        end = self._size + len(rows)
+        if end > len(self._data):
+            grown = np.empty((max(end, 2 * len(self._data)), *self._data.shape[1:]),
+                             dtype=self._data.dtype)
+            grown[:self._size] = self.values
+            self._data = grown
+        self._data[self._size:end] = rows
+        self._size = end
+
+    def append_one(self, row: npt.ArrayLike) -> None:
+        """Append a single row, shape `row_shape`."""
+        if self._size == len(self._data):
+            self.append(np.asarray(row)[None])
+        else:
+            self._data[self._size] = row
+            self._size += 1

@@ -1,0 +1,314 @@
+# Copyright 2026 The pose_graph_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""
+The cache of compiled kernels on disk: where it is, and when an entry is valid.
+
+Numba's own cache has four faults on a robot. It raises at import where it finds no writeable
+folder (a package that belongs to root, a service without a home directory). It raises at a call if
+a power failure has truncated a file. It does not detect that a function which the kernel calls has
+changed. Two processes that compile different signatures at once can store the code of one under
+the name of the other. The cache in this module uses Numba's files with these differences:
+
+- The folder is the first writeable one of: `NUMBA_CACHE_DIR` if it is set, `__pycache__` beside
+  the source, `pose_graph_ros` in the user's cache, a private folder in the temporary directory.
+  If none is writeable, a warning is logged and every start compiles again.
+- Each entry contains a fingerprint of everything that its code was made from, and a check sum. It
+  is used only if both are correct.
+- A cache that cannot be read or written costs time, but never raises an exception.
+
+Only the dispatchers of our kernels are changed. Numba's settings and the environment belong to the
+whole process and stay as they are.
+"""
+
+from collections.abc import Iterator
+from enum import Enum
+import functools
+import hashlib
+import logging
+import os
+from pathlib import Path
+import pickle
+import stat
+import tempfile
+from types import CodeType, FunctionType, ModuleType
+from typing import Any, ClassVar
+
+import numba
+from numba.core import serialize, sigutils
+from numba.core.caching import CompileResultCacheImpl, FunctionCache
+from numba.core.dispatcher import Dispatcher
+import numpy as np
+
+logger = logging.getLogger(__name__)
+
+OWNER = 'pose_graph_ros'
+# Settings of Numba that change the generated code, but are not part of Numba's key in the cache.
+SETTINGS = ('OPT', 'LOOP_VECTORIZE', 'SLP_VECTORIZE', 'BOUNDSCHECK', 'DEBUGINFO_DEFAULT')
+
+
+# --- the folder ---------------------------------------------------------------------------------
+
+@functools.cache
+def find_folder(source: Path) -> Path | None:
+    """Return the cache folder for the modules in a source folder; None if none is writeable."""
+    tried = []
+    for folder in _candidates(source):
+        try:
+            _make_writable(folder)
+        except OSError as error:
+            tried.append(f'{folder} ({error.strerror or error})')
+        else:
+            return folder
+    logger.warning(
+        'compiled kernels cannot be kept, every start compiles them again; set NUMBA_CACHE_DIR to '
+        'a folder that can be written to; tried: %s', ', '.join(tried))
+    return None
+
+
+def _candidates(source: Path) -> Iterator[Path]:
+    # one folder per installation, with a readable name
+    own = f'{source.name}_{hashlib.sha256(os.fsencode(source)).hexdigest()[:16]}'
+    if numba.config.CACHE_DIR:
+        yield Path(numba.config.CACHE_DIR) / own
+    yield source / '__pycache__'
+    caches = Path(os.environ.get('XDG_CACHE_HOME', '')), Path(os.path.expanduser('~')) / '.cache'
+    for cache in caches:
+        if cache.is_absolute():     # '~' is not expanded if the user has no home directory
+            yield cache / OWNER / own
+    yield _private_folder() / own
+
+
+def _private_folder() -> Path:
+    return Path(tempfile.gettempdir()) / f'{OWNER}-{os.getuid()}'
+
+
+def _make_writable(folder: Path) -> None:
+    """Create a folder if it does not exist; raise OSError if files cannot be written in it."""
+    private = _private_folder()
+    if folder.is_relative_to(private):
+        # Code in this folder is executed, and any user may create folders in /tmp.
+        private.mkdir(mode=0o700, exist_ok=True)
+        found = private.lstat()
+        if (not stat.S_ISDIR(found.st_mode) or found.st_uid != os.getuid()
+                or stat.S_IMODE(found.st_mode) & 0o077):
+            raise PermissionError(None, 'not a folder of this user alone')
+    folder.mkdir(parents=True, exist_ok=True)
+    tempfile.TemporaryFile(dir=folder).close()
+
+
+# --- the fingerprint ----------------------------------------------------------------------------
+
+def fingerprint(dispatcher: Dispatcher) -> bytes:
+    """Return a digest of all inputs of a kernel's machine code except its signature."""
+    parts: list[object] = [
+        numba.__version__, dispatcher.targetctx.codegen().magic_tuple(),
+        [(name, getattr(numba.config, name, None)) for name in SETTINGS]]
+    ours = {_top(__name__), _top(dispatcher.py_func.__module__)}
+    todo: list[Any] = [dispatcher]
+    seen: set[FunctionType] = set()
+    while len(todo) > 0:
+        value = todo.pop()
+        is_kernel = isinstance(value, Dispatcher)
+        if is_kernel:
+            options = value.targetoptions
+            parts += [(name, _ordered(options[name])) for name in sorted(options)]
+            value = value.py_func
+        value = getattr(value, '_defn', value)      # the function that defines an intrinsic
+        if isinstance(value, FunctionType):
+            if value not in seen and (is_kernel or _top(value.__module__) in ours):
+                seen.add(value)
+                codes = list(_codes(value.__code__))
+                parts += [value.__module__, value.__qualname__, *map(_code_parts, codes)]
+                cells = value.__closure__ or ()
+                todo += [value.__defaults__, [cell.cell_contents for cell in cells]]
+                todo += _globals(value, {name for code in codes for name in code.co_names}, ours)
+        elif isinstance(value, tuple | list):
+            parts.append(len(value))
+            todo += value
+        elif isinstance(value, np.ndarray | np.generic):
+            parts += [str(value.dtype), value.shape, value.tobytes().hex()]
+        elif isinstance(value, numba.types.Type):
+            parts.append(str(value))
+        elif isinstance(value, type):
+            members = value if issubclass(value, Enum) else ()
+            parts += [getattr(value, '_fields', ()),
+                      [(member.name, member.value) for member in members]]
+        elif isinstance(value, int | float | complex | str | bytes | None):
+            parts.append(value)
+    return hashlib.sha256(repr(parts).encode()).digest()
+
+
+def _top(module: str) -> str:
+    return module.partition('.')[0]
+
+
+def _codes(code: CodeType) -> Iterator[CodeType]:
+    """Yield a code object and those of the functions inside it."""
+    yield code
+    for item in code.co_consts:
+        if isinstance(item, CodeType):
+            yield from _codes(item)
+
+
+def _code_parts(code: CodeType) -> tuple[object, ...]:
+    constants = [_ordered(item) for item in code.co_consts if not isinstance(item, CodeType)]
+    return code.co_code.hex(), code.co_names, code.co_varnames, code.co_freevars, constants
+
+
+def _ordered(value: object) -> str:
+    """Return a value as text; sets are sorted, as their order differs between processes."""
+    return repr(sorted(map(repr, value)) if isinstance(value, set | frozenset) else value)
+
+
+def _globals(function: FunctionType, names: set[str], ours: set[str]) -> Iterator[object]:
+    """Yield the global names of a function and their values, also from modules of this package."""
+    spaces = [function.__globals__]
+    for name in sorted(names):
+        value = function.__globals__.get(name)
+        if isinstance(value, ModuleType) and _top(value.__name__) in ours:
+            spaces.append(vars(value))
+    for space in spaces:
+        for name in sorted(names & space.keys()):
+            yield name
+            yield space[name]
+
+
+# --- Numba's cache with this folder and fingerprint ---------------------------------------------
+
+class _Locator:
+    """Location of the cached code of a function, with the interface of Numba's locators."""
+
+    def __init__(self, source: Path, folder: Path) -> None:
+        self._py_file = str(source)     # for Numba's warnings
+        self._folder = folder
+        # constant: the fingerprint detects changes, also those in other files
+        self._stamp = hashlib.sha256(OWNER.encode()).digest()
+
+    @classmethod
+    def from_function(cls, _: FunctionType, py_file: str) -> '_Locator | None':
+        source = Path(py_file).absolute()
+        if not source.is_file():
+            _warn_once(f'compiled kernels of {py_file} cannot be kept: it is no file')
+            return None
+        folder = find_folder(source.parent)
+        return None if folder is None else cls(source, folder)
+
+    def ensure_cache_path(self) -> None:
+        _make_writable(self._folder)
+
+    def get_cache_path(self) -> str:
+        return str(self._folder)
+
+    def get_source_stamp(self) -> bytes:
+        return self._stamp
+
+    def get_disambiguator(self) -> str:
+        """Return a suffix for the function's name instead of its line number, which may change."""
+        return OWNER
+
+
+class _Contents(CompileResultCacheImpl):  # type: ignore[misc]  # Numba is untyped
+    """Conversion of compiled code to a cache entry (fingerprint, check sum, code) and back."""
+
+    _locator_classes: ClassVar = [_Locator]
+    dispatcher: Dispatcher
+
+    def reduce(self, result: Any) -> tuple[bytes, bytes, bytes]:
+        code = serialize.dumps(super().reduce(result))
+        return fingerprint(self.dispatcher), hashlib.sha256(code).digest(), code
+
+    def rebuild(self, target_context: Any, kept: tuple[bytes, bytes, bytes]) -> Any:
+        made_from, check_sum, code = kept
+        if made_from != fingerprint(self.dispatcher):
+            return None
+        if check_sum != hashlib.sha256(code).digest():
+            raise ValueError('the check sum is wrong')
+        return super().rebuild(target_context, pickle.loads(code))
+
+
+class KernelCache(FunctionCache):  # type: ignore[misc]
+    """
+    The cache of one kernel.
+
+    Parameters
+    ----------
+    dispatcher : Dispatcher
+        The kernel.
+
+    Raises
+    ------
+    RuntimeError
+        If no folder is writeable.
+
+    """
+
+    _impl_class = _Contents
+
+    def __init__(self, dispatcher: Dispatcher) -> None:
+        super().__init__(dispatcher.py_func)
+        self._impl.dispatcher = dispatcher
+        self._dispatcher = dispatcher
+
+    def load_overload(self, signature: Any, target_context: Any) -> Any:
+        """
+        Return the cached code for a signature; None if there is no valid entry.
+
+        Parameters
+        ----------
+        signature, target_context
+            As Numba passes them.
+
+        """
+        try:
+            found = super().load_overload(signature, target_context)
+            wanted, _ = sigutils.normalize_signature(signature)
+            if found is not None and tuple(found.signature.args) == tuple(wanted):
+                return found
+        except Exception as error:
+            _warn('read', self.cache_path, error)
+            self._forget()
+        return None
+
+    def save_overload(self, signature: Any, result: Any) -> None:
+        """
+        Store the code for a signature; log a warning if that fails.
+
+        Parameters
+        ----------
+        signature, result
+            As Numba passes them.
+
+        """
+        try:
+            super().save_overload(signature, result)
+        except Exception as error:
+            _warn('written', self.cache_path, error)
+
+    def holds_code(self) -> bool:
+        """Tell whether the cache has a valid entry for at least one signature."""
+        # Numba has no public method that checks an entry without loading its code
+        file = self._cache_file
+        try:
+            names = file._load_index().values()  # noqa: SLF001
+            kept = [file._load_data(name) for name in names]  # noqa: SLF001
+            current = fingerprint(self._dispatcher)
+            return any(made_from == current for made_from, _, _ in kept)
+        except Exception:
+            return False
+
+    def _forget(self) -> None:
+        """Replace the index by an empty one, so that the next start does not fail on it again."""
+        try:
+            self.flush()
+        except OSError as error:
+            _warn('emptied', self.cache_path, error)
+
+
+@functools.cache
+def _warn_once(text: str) -> None:
+    logger.warning('%s', text)
+
+
+def _warn(what: str, folder: str, error: Exception) -> None:
+    _warn_once(f'the compiled kernels in {folder} could not be {what}: '
+               f'{type(error).__name__}: {error}; they are compiled again')

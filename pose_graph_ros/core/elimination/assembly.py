@@ -1,0 +1,230 @@
+# Copyright 2026 The pose_graph_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""Numeric elimination of one clique: assemble its front, factorise it and store the result."""
+
+from pose_graph_ros.core.compiled.jit import kernel
+from pose_graph_ros.core.compiled.simd import add, copy
+from pose_graph_ros.core.elimination import clique_frames
+from pose_graph_ros.core.elimination.fronts import factorize, LEAST_PIVOT, padded
+from pose_graph_ros.core.graph import factors, tables as tb, transaction_log
+from pose_graph_ros.core.graph.pools import row_start, triangle_size
+
+
+@kernel
+def eliminate_clique(head, c, relinearize):  # type: ignore[no-untyped-def]
+    """
+    Assemble the front of a clique, factorise it, and store the rows of R and the update matrix.
+
+    Parameters
+    ----------
+    c : int
+        Row of the clique.
+    relinearize : bool
+        Linearize the constraints at the present estimate before they are added: the frame in which
+        they were linearized may have turned since. Their rows are logged for a rollback.
+
+    Returns
+    -------
+    int
+        Node with a bad pivot, or -1.
+
+    """
+    node_f = tb.node_f(head)
+    edge_f = tb.edge_f(head)
+    observed_f = tb.observed_f(head)
+    pool_f = tb.pool_f(head)
+    work_f = tb.work_f(head)
+    scalars = tb.scalars(head)
+    node_i = tb.node_i(head)
+    edge_i = tb.edge_i(head)
+    observed_i = tb.observed_i(head)
+    clique_f = tb.clique_f(head)
+    clique_i = tb.clique_i(head)
+    pool_i = tb.pool_i(head)
+    row = clique_i[c]
+    n_frontal, n_separator = row[tb.N_FRONTAL], row[tb.N_SEPARATOR]
+    n_all = n_frontal + n_separator
+    rows, n = 3 * n_frontal, 3 * n_all
+    ld = padded(n)
+    nodes = pool_i[row[tb.NODES]:row[tb.NODES] + n_all]
+    front = work_f[:n * ld]
+    least = work_f[n * ld:n * ld + rows]
+    front[:] = 0.0
+    serial = head[tb.FRONT_SERIAL] + 1
+    head[tb.FRONT_SERIAL] = serial
+    for k in range(n_all):
+        node_i[nodes[k], tb.INDEX] = 3 * k
+        node_i[nodes[k], tb.FRONT] = serial
+    any_fixed, anchored = False, 0
+    for k in range(n_frontal):
+        v = nodes[k]
+        entry = node_i[v, tb.EDGE_LIST]
+        while entry >= 0:
+            e, side = entry >> 1, entry & 1
+            other = edge_i[e, tb.END_I if side == 1 else tb.END_J]
+            if node_i[other, tb.FRONT] == serial and edge_f[e, tb.WEIGHT] > 0.0:
+                at = node_i[other, tb.INDEX]
+                # an edge between two frontal nodes is in both lists: added from its start
+                if at >= rows or side == 0:
+                    if relinearize:
+                        transaction_log.log_edge(head, e)
+                        factors.linearize_edge(head, e)
+                    edge_i[e, tb.OWNER] = c
+                    if edge_i[e, tb.EDGE_KIND] == factors.BIAS:
+                        anchored = 1    # its error changes if both ends move together
+                    if side == 0:
+                        factors.add_edge(head, e, 3 * k, at, front, ld)
+                    else:
+                        factors.add_edge(head, e, at, 3 * k, front, ld)
+            entry = edge_i[e, tb.NEXT_J if side == 1 else tb.NEXT_I]
+        entry = node_i[v, tb.OBSERVED_LIST]
+        while entry >= 0:
+            if observed_f[entry, tb.WEIGHT] > 0.0:
+                anchored = 1
+                if relinearize:
+                    transaction_log.log_observed(head, entry)
+                    factors.linearize_observed(head, entry)
+                factors.add_observed(head, entry, 3 * k, front, ld)
+            entry = observed_i[entry, tb.OBS_NEXT]
+        scale_t = node_f[v, tb.SCALE_T] * node_f[v, tb.SCALE_T]
+        scale_r = node_f[v, tb.SCALE_R] * node_f[v, tb.SCALE_R]
+        least[3 * k] = least[3 * k + 1] = LEAST_PIVOT * scale_t
+        least[3 * k + 2] = LEAST_PIVOT * scale_r
+        damping = scalars[tb.DAMPING]
+        if damping > 0.0:
+            for m in range(3):
+                more = damping * (scale_t if m < 2 else scale_r)
+                front[(3 * k + m) * ld + 3 * k + m] += more
+                front[(3 * k + m + 1) * ld - 1] += more * node_f[v, tb.DELTA + m]
+        if node_i[v, tb.FIXED] != 0:
+            any_fixed, anchored = True, 1
+    child = row[tb.CHILD]
+    while child >= 0:
+        _extend_add(head, child, front, ld)
+        anchored |= clique_i[child, tb.ANCHORED]
+        child = clique_i[child, tb.SIBLING]
+    row[tb.ANCHORED] = anchored
+    clique_f[c, tb.TURN_SEEN] = 0.0
+    clique_f[c, tb.TURN_ZERO] = clique_frames.mean_turn(head, c)
+    if any_fixed:
+        for k in range(n_frontal):
+            if node_i[nodes[k], tb.FIXED] != 0:
+                _substitute_fixed(head, nodes[k], 3 * k, front, n, ld)
+                least[3 * k:3 * k + 3] = 0.0
+    bad = factorize(front, rows, n, ld, least)
+    if bad >= 0:
+        return nodes[bad // 3]
+    # the rows of R, directly followed by the update matrix
+    at = row[tb.VALUES]
+    for k in range(n):
+        copy(front, k * (ld + 1), pool_f, at, n - k)
+        at += n - k + 1
+        pool_f[at - 1] = front[(k + 1) * ld - 1]
+    # the squared error of the parent's linear model of a slip beta is about SLIP_SCALE beta^4
+    scale, first = 0.0, node_f[nodes[n_frontal]] if n_separator > 0 else node_f[nodes[0]]
+    for k in range(n_frontal + 1, n_all):
+        f, i = node_f[nodes[k]], 3 * k * ld + 3 * k
+        arm2 = (f[tb.POSE] - first[tb.POSE]) ** 2 + (f[tb.POSE + 1] - first[tb.POSE + 1]) ** 2
+        scale += arm2 * (front[i] + front[i + ld + 1])
+    clique_f[c, tb.SLIP_SCALE] = 0.25 * scale
+    return -1
+
+
+@kernel
+def _extend_add(head, child, front, ld):  # type: ignore[no-untyped-def]
+    """Add the update matrix of a child to the front; INDEX of the front's nodes must be set."""
+    pool_f = tb.pool_f(head)
+    node_i = tb.node_i(head)
+    clique_f = tb.clique_f(head)
+    node_f = tb.node_f(head)
+    work_f = tb.work_f(head)
+    clique_i = tb.clique_i(head)
+    pool_i = tb.pool_i(head)
+    row = clique_i[child]
+    n_frontal, n_separator = row[tb.N_FRONTAL], row[tb.N_SEPARATOR]
+    size = 3 * n_separator
+    if n_separator == 0:
+        return
+    update = pool_f[row[tb.VALUES] + triangle_size(3 * n_frontal, 3 * n_frontal + size):]
+    nodes = pool_i[row[tb.NODES] + n_frontal:row[tb.NODES] + n_frontal + n_separator]
+    phi = clique_frames.present_turn(head, child)
+    if phi != clique_f[child, tb.TURN_SEEN]:
+        transaction_log.log_clique(head, child)
+    clique_f[child, tb.TURN_SEEN] = phi
+    if phi != 0.0:
+        turned = work_f[len(front) + len(front) // ld:]
+        clique_frames.turned_update(update, n_separator, nodes, node_f, phi, turned)
+        update = turned
+    index = tb.work_i(head)[head[tb.NODE_ROOM]:]
+    in_order = True
+    for a in range(n_separator):
+        index[a] = node_i[nodes[a], tb.INDEX]
+        in_order = in_order and (a == 0 or index[a] > index[a - 1])
+    for k in range(size):
+        front[(index[k // 3] + k % 3) * ld + ld - 1] += update[row_start(k, size) + size]
+    if not in_order:
+        _add_in_other_order(update, n_separator, index, front, ld)
+        return
+    # add runs of columns that are contiguous both in the update matrix and in the front
+    begin = 0
+    while begin < n_separator:
+        end = begin + 1
+        while end < n_separator and index[end] == index[end - 1] + 3:
+            end += 1
+        width, column = 3 * (end - begin), index[begin]
+        for a in range(begin):
+            target = index[a] * ld + column
+            for k in range(3 * a, 3 * a + 3):
+                add(update, row_start(k, size) + 3 * begin, front, target, width)
+                target += ld
+        target = column * (ld + 1)
+        for k in range(3 * begin, 3 * end):
+            add(update, row_start(k, size) + k, front, target, 3 * end - k)
+            target += ld + 1
+        begin = end
+
+
+@kernel
+def _add_in_other_order(update, n_separator, index, front, ld):  # type: ignore[no-untyped-def]
+    """Add an update matrix whose nodes are ordered differently in the parent's front."""
+    size = 3 * n_separator
+    for a in range(n_separator):
+        i = index[a]
+        for m in range(3):
+            source = update[row_start(3 * a + m, size):]
+            for q in range(m, 3):
+                front[(i + m) * ld + i + q] += source[3 * a + q]
+            for b in range(a + 1, n_separator):
+                j = index[b]
+                if j > i:   # else the entry is below the diagonal there: add its transpose
+                    to, step = (i + m) * ld + j, 1
+                else:
+                    to, step = j * ld + i + m, ld
+                front[to] += source[3 * b]
+                front[to + step] += source[3 * b + 1]
+                front[to + 2 * step] += source[3 * b + 2]
+
+
+@kernel
+def _substitute_fixed(head, v, at, front, n, ld):  # type: ignore[no-untyped-def]
+    """Substitute the known solution of a fixed node: move its columns to the right-hand side."""
+    node_f = tb.node_f(head)
+    right = ld - 1
+    for m in range(3):
+        r = at + m
+        x = node_f[v, tb.DELTA + m]
+        for k in range(r):
+            front[k * ld + right] -= front[k * ld + r] * x
+            front[k * ld + r] = 0.0
+        for k in range(r + 1, n):
+            front[k * ld + right] -= front[r * ld + k] * x
+            front[r * ld + k] = 0.0
+        front[r * ld + r] = 1.0
+        front[r * ld + right] = x
+
+
+@kernel
+def work_size(n_nodes):  # type: ignore[no-untyped-def]
+    """Return the size of the work space for a front of n nodes and a turned update matrix."""
+    n = 3 * n_nodes
+    return n * padded(n) + n + triangle_size(n, n)

@@ -1,0 +1,193 @@
+# Copyright 2026 The pose_graph_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""Quotient graph for the ordering of nodes, and amalgamation of the resulting cliques."""
+
+import numpy as np
+
+from pose_graph_ros.core.compiled.jit import kernel
+from pose_graph_ros.core.graph import tables as tb
+
+# Number of the newest nodes that are eliminated last, since the next constraints involve them.
+NEWEST_LAST = 10
+
+
+@kernel
+def newest_last(affected, newest):  # type: ignore[no-untyped-def]
+    """
+    Return how many of the newest nodes were moved to the end of the list, in order of age.
+
+    The very last is the newest pose, if it is affected: biases may have been added after it, but
+    the next odometry edge starts at it.
+
+    Parameters
+    ----------
+    affected : ndarray of int32
+        Nodes to be ordered; sorted in place.
+    newest : int
+        Newest node that is a pose, or -1.
+
+    """
+    n = len(affected)
+    n_last = min(NEWEST_LAST, n)
+    for k in range(n_last):
+        best = 0
+        for i in range(1, n - k):
+            if affected[best] != newest and (
+                    affected[i] > affected[best] or affected[i] == newest):
+                best = i
+        last = n - k - 1
+        affected[best], affected[last] = affected[last], affected[best]
+    return n_last
+
+
+@kernel(allocates=True)
+def structure(head, marked, affected):  # type: ignore[no-untyped-def]
+    """
+    Return the quotient graph of the affected nodes, with the orphans as elements.
+
+    Parameters
+    ----------
+    marked : ndarray of int32
+        Cliques that are to be replaced, with FRONT_SERIAL of the head in their column MARKED.
+    affected : ndarray of int32
+        Nodes to be ordered.
+
+    Returns
+    -------
+    orphans : ndarray of int32
+        Children of marked cliques that are not marked themselves.
+    start, adjacency : ndarray of int32
+        Lists of neighbours as for `ordering.minimum_degree`; node k is `affected[k]`.
+
+    """
+    edge_f = tb.edge_f(head)
+    node_i = tb.node_i(head)
+    edge_i = tb.edge_i(head)
+    clique_i = tb.clique_i(head)
+    pool_i = tb.pool_i(head)
+    n = len(affected)
+    serial = head[tb.FRONT_SERIAL] + 1
+    head[tb.FRONT_SERIAL] = serial
+    for k in range(n):
+        node_i[affected[k], tb.INDEX] = k
+        node_i[affected[k], tb.FRONT] = serial
+    stamp = serial - 1
+    # count the orphans, and an upper bound of the entries in the list of each node
+    n_orphans = 0
+    count = np.zeros(n + 1, np.int32)
+    for k in range(len(marked)):
+        c = clique_i[marked[k], tb.CHILD]
+        while c >= 0:
+            if clique_i[c, tb.MARKED] != stamp:
+                n_orphans += 1
+                row = clique_i[c]
+                begin = row[tb.NODES] + row[tb.N_FRONTAL]
+                for m in range(begin, begin + row[tb.N_SEPARATOR]):
+                    count[node_i[pool_i[m], tb.INDEX]] += 1
+            c = clique_i[c, tb.SIBLING]
+    orphans = np.empty(n_orphans, np.int32)
+    for k in range(n):
+        entry = node_i[affected[k], tb.EDGE_LIST]
+        while entry >= 0:
+            e, side = entry >> 1, entry & 1
+            other = edge_i[e, tb.END_I if side == 1 else tb.END_J]
+            if node_i[other, tb.FRONT] == serial and edge_f[e, tb.WEIGHT] > 0.0:
+                count[k] += 1
+            entry = edge_i[e, tb.NEXT_J if side == 1 else tb.NEXT_I]
+    start = np.empty(n + n_orphans + 1, np.int32)
+    start[0] = 0
+    for k in range(n):
+        start[k + 1] = start[k] + count[k]
+    position = start[:n].copy()
+    adjacency = np.empty(2 * start[n] + 16, np.int32)
+    end = start[n]
+    n_orphans = 0
+    for k in range(len(marked)):
+        c = clique_i[marked[k], tb.CHILD]
+        while c >= 0:
+            if clique_i[c, tb.MARKED] != stamp:
+                orphans[n_orphans] = c
+                row = clique_i[c]
+                begin = row[tb.NODES] + row[tb.N_FRONTAL]
+                for m in range(begin, begin + row[tb.N_SEPARATOR]):
+                    i = node_i[pool_i[m], tb.INDEX]
+                    adjacency[end] = i
+                    end += 1
+                    adjacency[position[i]] = n + n_orphans
+                    position[i] += 1
+                n_orphans += 1
+                start[n + n_orphans] = end
+            c = clique_i[c, tb.SIBLING]
+    # add each neighbour once
+    last_seen = np.full(n, -1, np.int32)
+    to = 0
+    for k in range(n):
+        begin, begin_neighbours = start[k], position[k]
+        entry = node_i[affected[k], tb.EDGE_LIST]
+        end = begin_neighbours
+        while entry >= 0:
+            e, side = entry >> 1, entry & 1
+            other = edge_i[e, tb.END_I if side == 1 else tb.END_J]
+            if node_i[other, tb.FRONT] == serial and edge_f[e, tb.WEIGHT] > 0.0:
+                i = node_i[other, tb.INDEX]
+                if last_seen[i] != k:
+                    last_seen[i] = k
+                    adjacency[end] = i
+                    end += 1
+            entry = edge_i[e, tb.NEXT_J if side == 1 else tb.NEXT_I]
+        # close the gaps left by repeated neighbours
+        for m in range(begin, end):
+            adjacency[to + m - begin] = adjacency[m]
+        start[k], to = to, to + end - begin
+    if to < start[n]:
+        gap = start[n] - to
+        for m in range(start[n], start[n + n_orphans]):
+            adjacency[m - gap] = adjacency[m]
+        for k in range(n, n + n_orphans + 1):
+            start[k] -= gap
+    return orphans, start, adjacency
+
+
+@kernel(allocates=True)
+def amalgamate(  # type: ignore[no-untyped-def]
+    n_cliques, n_frontal, offset, parent, most_zeros, most_frontal,
+):
+    """
+    Merge cliques into their parents where that stores few explicit zero blocks.
+
+    Nothing is merged into the last clique, that of the newest pose: the next edge changes it.
+
+    Parameters
+    ----------
+    n_cliques, n_frontal, offset, parent
+        As returned by `ordering.minimum_degree`.
+    most_zeros : int
+        Largest number of explicit zero blocks in a merged clique.
+    most_frontal : int
+        Largest number of frontal nodes of a merged clique.
+
+    Returns
+    -------
+    into : ndarray of int32
+        For each clique the one that it is merged into: itself, or a later one.
+    frontal : ndarray of int32
+        Number of frontal nodes after merging.
+
+    """
+    into = np.arange(n_cliques).astype(np.int32)
+    frontal = n_frontal[:n_cliques].copy()
+    zeros = np.zeros(n_cliques, np.int32)
+    for k in range(n_cliques - 1):
+        q = parent[k]
+        if q < 0 or q == n_cliques - 1:
+            continue
+        separator = offset[k + 1] - offset[k] - n_frontal[k]
+        width = frontal[q] + offset[q + 1] - offset[q] - n_frontal[q]
+        added = zeros[k] + zeros[q] + frontal[k] * (width - separator)
+        if added <= most_zeros and frontal[k] + frontal[q] <= most_frontal:
+            into[k] = q
+            frontal[q] += frontal[k]
+            zeros[q] = added
+    for k in range(n_cliques - 1, -1, -1):
+        into[k] = into[into[k]]
+    return into, frontal

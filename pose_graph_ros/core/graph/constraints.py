@@ -1,0 +1,301 @@
+# Copyright 2026 The pose_graph_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""
+The two types of constraints, as struct of arrays: edges and observed nodes.
+
+An *edge* leads from hidden node i to hidden node j and has the measured pose of j in i. An
+*observed node* is a pose measured in the map; it constrains one hidden node. A position is an
+observed node whose information on the heading and whose mean heading are zero, so its error lies
+in map axes. A heading is an observed node whose information on the position is zero.
+
+A *bias* is a hidden node that is not a pose but the time-correlated error of a source of
+measurements, in units of its sigma. Edges of the kind `BIAS` lead to it.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, fields
+from enum import IntEnum
+from operator import attrgetter
+from typing import Any, Self
+
+import numpy as np
+import numpy.typing as npt
+
+from pose_graph_ros.core.exceptions import GraphUpdateError
+from pose_graph_ros.core.geometry.se2 import FloatArray, IntArray
+
+KindArray = npt.NDArray[np.uint8]
+
+# How far, with its diagonal scaled to 1, the smallest eigenvalue of an information matrix may be
+# below zero and its triangles may differ, because files print few digits.
+SEMIDEFINITE_TOLERANCE = 1e-5
+
+
+class EdgeKind(IntEnum):
+    """Where an edge comes from."""
+
+    ODOMETRY = 0
+    LOOP_CLOSURE = 1
+    BIAS = 2
+    """
+    Leads to a bias j, from the pose i that was measured with it or from the next bias i; the error
+    is `F x_j + mean - x_i * offset` in map axes, F = diag(f_t, f_t, f_th).
+    """
+
+
+class ObservedKind(IntEnum):
+    """What was measured of an observed node."""
+
+    GLOBAL_POSE = 0
+    POSITION = 1
+    HEADING = 2
+
+
+@dataclass(frozen=True, slots=True)
+class _Table:
+    """A table of constraints: columns of equal length."""
+
+    @classmethod
+    def joined(cls, tables: Sequence[Self]) -> Self:
+        """Return one table with the rows of several, in order."""
+        if len(tables) == 0:
+            return cls()
+        return cls(*map(np.concatenate, zip(*(table.columns for table in tables), strict=True)))
+
+    @property
+    def columns(self) -> tuple[npt.NDArray[Any], ...]:
+        """All columns, in the order of the constructor's arguments."""
+        columns: tuple[npt.NDArray[Any], ...] = _COLUMNS[type(self)](self)
+        return columns
+
+    @property
+    def weighted_information(self) -> FloatArray:
+        """Information times weight, shape (M, 3, 3)."""
+        information, weight = getattr(self, 'information'), getattr(self, 'weight')  # noqa: B009
+        return np.asarray(weight[:, None, None] * information)
+
+    def rows(self, index: IntArray | npt.NDArray[np.bool_] | slice) -> Self:
+        """Return a table of some rows."""
+        return type(self)(*(column[index] for column in self.columns))
+
+
+# The constructors of the frozen tables set columns by this.
+_set = object.__setattr__
+
+
+_NO_ROWS, _NO_MATRICES = np.empty((0, 3)), np.empty((0, 3, 3))
+_FLOAT, _INT, _KIND = (np.dtype(kind) for kind in (np.float64, np.int64, np.uint8))
+
+
+def _numbers(values: npt.ArrayLike) -> FloatArray:
+    """Return an array of floats."""
+    if type(values) is np.ndarray and values.dtype is _FLOAT:
+        return values   # the usual case, in a third of the time
+    return np.asarray(values, dtype=_FLOAT)
+
+
+def _integers(values: npt.ArrayLike, dtype: np.dtype[Any]) -> npt.NDArray[Any]:
+    """Return an array of integers; raise for numbers of another type instead of rounding them."""
+    if type(values) is np.ndarray and values.dtype is dtype:
+        return values
+    array = np.asarray(values)
+    if array.size > 0 and array.dtype.kind not in 'iu':
+        raise GraphUpdateError(f'expected integers, got {array.dtype} {array.tolist()}')
+    return array.astype(dtype, copy=False)
+
+
+def _weights(weight: npt.ArrayLike | None, size: int) -> FloatArray:
+    if weight is not None:
+        return _numbers(weight)
+    ones = np.empty(size)
+    ones.fill(1.0)  # np.ones takes three times as long for short arrays
+    return ones
+
+
+@dataclass(frozen=True, slots=True)
+class Edges(_Table):
+    """
+    M directed edges.
+
+    Parameters
+    ----------
+    i, j : array_like of int, shape (M,)
+        Nodes that the edges start from and lead to.
+    mean : array_like, shape (M, 3)
+        Measured poses of j in i [m, m, rad]; of edges to a bias those of i in the map.
+    information : array_like, shape (M, 3, 3)
+        Inverse covariances of the errors (3.48), in the frames of the measured poses; of edges to
+        a bias in map axes.
+    kind : array_like of int, shape (M,)
+        `EdgeKind`.
+    weight : array_like, shape (M,), optional
+        Factors on the information, 1 by default; 0 for a removed edge.
+    bias : array_like, shape (M, 4), optional
+        Measured offset in i and factors of the bias, `(o_x, o_y, f_t, f_th)` [m, m, m, rad]; used
+        for edges to a bias only.
+
+    """
+
+    i: IntArray
+    j: IntArray
+    mean: FloatArray
+    information: FloatArray
+    kind: KindArray
+    weight: FloatArray
+    bias: FloatArray
+
+    def __init__(
+        self, i: npt.ArrayLike = (), j: npt.ArrayLike = (), mean: npt.ArrayLike = _NO_ROWS,
+        information: npt.ArrayLike = _NO_MATRICES, kind: npt.ArrayLike = (),
+        weight: npt.ArrayLike | None = None, bias: npt.ArrayLike | None = None,
+    ) -> None:
+        i = _integers(i, _INT)
+        _set(self, 'i', i)
+        _set(self, 'j', _integers(j, _INT))
+        _set(self, 'mean', _numbers(mean))
+        _set(self, 'information', _numbers(information))
+        _set(self, 'kind', _integers(kind, _KIND))
+        _set(self, 'weight', _weights(weight, len(i)))
+        _set(self, 'bias', np.zeros((len(i), 4)) if bias is None else _numbers(bias))
+
+    def __len__(self) -> int:
+        return len(self.i)
+
+
+@dataclass(frozen=True, slots=True)
+class ObservedNodes(_Table):
+    """
+    K observed nodes, each with one constraint.
+
+    Parameters
+    ----------
+    node : array_like of int, shape (K,)
+        Hidden nodes that are observed.
+    offset : array_like, shape (K, 3), optional
+        Poses of the observed frames in the hidden nodes [m, m, rad]: motion by odometry since the
+        hidden node, then the lever arm. The identity, which is the default, makes the error that
+        of (3.52).
+    mean : array_like, shape (K, 3)
+        Observed poses in the map [m, m, rad].
+    information : array_like, shape (K, 3, 3)
+        Inverse covariances of the errors (3.52), in the frames of the observed poses.
+    kind : array_like of int, shape (K,)
+        `ObservedKind`.
+    weight : array_like, shape (K,), optional
+        Factors on the information, 1 by default; 0 for a removed observed node.
+
+    """
+
+    node: IntArray
+    offset: FloatArray
+    mean: FloatArray
+    information: FloatArray
+    kind: KindArray
+    weight: FloatArray
+
+    def __init__(
+        self, node: npt.ArrayLike = (), offset: npt.ArrayLike | None = None,
+        mean: npt.ArrayLike = _NO_ROWS, information: npt.ArrayLike = _NO_MATRICES,
+        kind: npt.ArrayLike = (), weight: npt.ArrayLike | None = None,
+    ) -> None:
+        node = _integers(node, _INT)
+        _set(self, 'node', node)
+        _set(self, 'offset', _numbers(np.zeros((len(node), 3)) if offset is None else offset))
+        _set(self, 'mean', _numbers(mean))
+        _set(self, 'information', _numbers(information))
+        _set(self, 'kind', _integers(kind, _KIND))
+        _set(self, 'weight', _weights(weight, len(node)))
+
+    def __len__(self) -> int:
+        return len(self.node)
+
+
+_FULL: IntArray = np.array((0, 1, 2, 1, 3, 4, 2, 4, 5))
+
+
+def full(triangles: FloatArray) -> FloatArray:
+    """Return symmetric matrices, shape (M, 3, 3), from their upper triangles, shape (M, 6)."""
+    return triangles[:, _FULL].reshape(-1, 3, 3)
+
+
+def upper(matrices: FloatArray) -> FloatArray:
+    """Return upper triangles, (M, 6), row by row, of nearly symmetric matrices, (M, 3, 3)."""
+    both = 0.5 * (matrices + np.swapaxes(matrices, 1, 2))
+    return np.asarray(both[:, (0, 0, 0, 1, 1, 2), (0, 1, 2, 1, 2, 2)])
+
+
+_COLUMNS: dict[type, Any] = {
+    table: attrgetter(*(item.name for item in fields(table))) for table in (Edges, ObservedNodes)}
+# Shapes of the rows of columns that are not of numbers.
+_ROW_SHAPES = {'mean': (3,), 'offset': (3,), 'information': (3, 3), 'bias': (4,)}
+
+
+def check(table: Edges | ObservedNodes, is_bias: npt.NDArray[np.bool_]) -> None:
+    """
+    Validate constraints.
+
+    Parameters
+    ----------
+    table : Edges or ObservedNodes
+    is_bias : ndarray of bool, shape (N,)
+        Which of the hidden nodes are biases.
+
+    Raises
+    ------
+    GraphUpdateError
+        With the row, what was expected and the value: wrong shapes, kinds or nodes, negative
+        weights, an edge from a node to itself, an edge to a bias that is not of the kind BIAS or
+        an edge of that kind to a pose, numbers that are not finite, an information matrix that is
+        zero, not symmetric or not positive semidefinite.
+
+    """
+    name, n_nodes = type(table).__name__, len(is_bias)
+    columns = {item.name: getattr(table, item.name) for item in fields(table)}
+    for key, column in columns.items():
+        expected = (len(table), *_ROW_SHAPES.get(key, ()))
+        if column.shape != expected:
+            raise GraphUpdateError(
+                f'{name}.{key}: expected shape {expected}, got {column.shape}')
+    for key, column in columns.items():
+        _refuse_rows(~np.isfinite(column), f'{name}.{key} is not finite', column)
+    ends = (table.i, table.j) if isinstance(table, Edges) else (table.node,)
+    for end in ends:
+        _refuse_rows((end < 0) | (end >= n_nodes),
+                     f'{name}: expected a hidden node in 0..{n_nodes - 1}', end)
+    kinds = EdgeKind if isinstance(table, Edges) else ObservedKind
+    _refuse_rows(table.kind >= len(kinds), f'{name}.kind is no {kinds.__name__}', table.kind)
+    _refuse_rows(table.weight < 0.0, f'{name}.weight is negative', table.weight)
+    if isinstance(table, Edges):
+        _refuse_rows(table.i == table.j, f'{name}: an edge leads from a node to itself', table.i)
+        to_bias = table.kind == EdgeKind.BIAS
+        _refuse_rows(to_bias & ~is_bias[table.j],
+                     f'{name}: expected an edge of kind BIAS to lead to a bias', table.j)
+        _refuse_rows(~to_bias & (is_bias[table.i] | is_bias[table.j]),
+                     f'{name}: an edge of another kind than BIAS has a bias for an end',
+                     np.column_stack((table.i, table.j)))
+    _check_information(f'{name}.information', table.information)
+
+
+def _check_information(name: str, matrix: FloatArray) -> None:
+    """Raise unless matrices are symmetric and positive semidefinite, whatever units they have."""
+    diagonal = np.diagonal(matrix, axis1=1, axis2=2)
+    root = np.sqrt(np.where(diagonal > 0.0, diagonal, 1.0))
+    with np.errstate(over='ignore'):
+        scaled = matrix / root[:, :, None] / root[:, None, :]
+    # correlations beyond 1 are invalid however large they are, and might overflow
+    scaled = np.clip(scaled, -2.0, 2.0)
+    skew = np.max(np.abs(scaled - np.swapaxes(scaled, 1, 2)), axis=(1, 2), initial=0.0)
+    _refuse_rows(skew > SEMIDEFINITE_TOLERANCE, f'{name} is not symmetric', matrix)
+    smallest = np.min(np.linalg.eigvalsh(scaled), axis=-1, initial=np.inf)
+    negative = np.any(diagonal < 0.0, axis=-1) | (smallest < -SEMIDEFINITE_TOLERANCE)
+    _refuse_rows(negative | ~np.any(matrix, axis=(1, 2)),
+                 f'{name} is not positive semidefinite, or zero', matrix)
+
+
+def _refuse_rows(
+    bad: npt.NDArray[np.bool_], reason: str, values: npt.NDArray[np.generic],
+) -> None:
+    """Raise GraphUpdateError with the first bad row, if there is one."""
+    if np.any(bad):
+        row = int(np.flatnonzero(bad.reshape(len(bad), -1).any(axis=1))[0])
+        raise GraphUpdateError(f'{reason}; row {row}: {values[row].tolist()}')

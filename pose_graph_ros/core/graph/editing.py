@@ -1,0 +1,391 @@
+# Copyright 2026 The pose_graph_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""
+Edit the graph in its tables: new rows, new weights, fixed nodes.
+
+Each edit keeps the lists, the diagonal scales and chi2 up to date, and touches the nodes that have
+to be eliminated again. Edits of existing rows are not checked here; `graph.Graph` has done so.
+"""
+
+import math
+
+from pose_graph_ros.core.compiled.jit import kernel
+from pose_graph_ros.core.graph import factors, rows, tables as tb, transaction_log
+
+# Results of `add_rows`.
+ADDED, NO_ROOM, UNSOUND = range(3)
+# Kinds of edits of `edit`.
+WEIGH_EDGE, WEIGH_OBSERVED, FIX = range(3)
+
+
+@kernel
+def touch(head, v):  # type: ignore[no-untyped-def]
+    """Mark a node for elimination in the next iteration; the caller has logged its row."""
+    node_i, touched = tb.node_i(head), tb.touched(head)
+    if node_i[v, tb.TOUCHED] == 0:
+        node_i[v, tb.TOUCHED] = 1
+        touched[head[tb.N_TOUCHED]] = v
+        head[tb.N_TOUCHED] += 1
+
+
+@kernel
+def start_nodes(head, first, first_bias, last):  # type: ignore[no-untyped-def]
+    """
+    Initialise new hidden nodes whose poses have been written.
+
+    Parameters
+    ----------
+    first, first_bias, last : int
+        The new poses are the rows from `first` to `first_bias` - 1, the new biases those from
+        `first_bias` to `last` - 1.
+
+    """
+    node_f, node_i = tb.node_f(head), tb.node_i(head)
+    for v in range(first, last):
+        f, i = node_f[v], node_i[v]
+        factors.refer_to_pose(f)
+        f[tb.SCALE_T] = f[tb.SCALE_R] = 0.0
+        i[:] = 0
+        i[tb.CLIQUE] = i[tb.EDGE_LIST] = i[tb.OBSERVED_LIST] = -1
+        i[tb.NODE_LOGGED] = head[tb.UPDATE]
+        i[tb.IS_BIAS] = 1 if v >= first_bias else 0
+        touch(head, v)
+        head[tb.STRUCTURE] = 1
+    if first_bias > first:
+        head[tb.NEWEST] = first_bias - 1
+
+
+@kernel
+def _add_to_scale(head, v, position, heading):  # type: ignore[no-untyped-def]
+    """Add information on position and heading to the squared diagonal scales of a node."""
+    node_f = tb.node_f(head)
+    f = node_f[v]
+    f[tb.SCALE_T] = math.sqrt(max(f[tb.SCALE_T] * f[tb.SCALE_T] + position, 0.0))
+    f[tb.SCALE_R] = math.sqrt(max(f[tb.SCALE_R] * f[tb.SCALE_R] + heading, 0.0))
+
+
+@kernel
+def scale_by_edge(head, e, weight):  # type: ignore[no-untyped-def]
+    """
+    Add the information of an edge to the diagonal scales of its ends.
+
+    Parameters
+    ----------
+    e : int
+    weight : float
+        Its weight, or the change of it.
+
+    """
+    edge_f, edge_i = tb.edge_f(head), tb.edge_i(head)
+    f = edge_f[e]
+    position = 0.5 * weight * (f[tb.INFO] + f[tb.INFO + 3])
+    heading = weight * f[tb.INFO + 5]
+    # for an edge to a bias, OWN_T is BIAS_OFFSET
+    arm2 = f[tb.OWN_T] * f[tb.OWN_T] + f[tb.OWN_T + 1] * f[tb.OWN_T + 1]
+    _add_to_scale(head, edge_i[e, tb.END_I], position, heading + position * arm2)
+    if edge_i[e, tb.EDGE_KIND] == factors.BIAS:
+        position *= f[tb.FACTOR_T] * f[tb.FACTOR_T]
+        heading *= f[tb.FACTOR_TH] * f[tb.FACTOR_TH]
+    _add_to_scale(head, edge_i[e, tb.END_J], position, heading)
+
+
+@kernel
+def scale_by_observed(head, k, weight):  # type: ignore[no-untyped-def]
+    """
+    Add the information of an observed node to the diagonal scales of its hidden node.
+
+    Parameters
+    ----------
+    k : int
+    weight : float
+        Its weight, or the change of it.
+
+    """
+    observed_f, observed_i = tb.observed_f(head), tb.observed_i(head)
+    f = observed_f[k]
+    position = 0.5 * weight * (f[tb.INFO] + f[tb.INFO + 3])
+    arm2 = (f[tb.OBS_OFFSET] * f[tb.OBS_OFFSET]
+            + f[tb.OBS_OFFSET + 1] * f[tb.OBS_OFFSET + 1])
+    _add_to_scale(head, observed_i[k, tb.OBS_NODE], position,
+                  weight * f[tb.INFO + 5] + position * arm2)
+
+
+@kernel
+def _have_common_clique(head, a, b):  # type: ignore[no-untyped-def]
+    """Tell whether one of two nodes is in the clique that the other is frontal in."""
+    node_i, clique_i, pool_i = tb.node_i(head), tb.clique_i(head), tb.pool_i(head)
+    for _ in range(2):
+        c = node_i[a, tb.CLIQUE]
+        if c < 0:
+            return False
+        row = clique_i[c]
+        for m in range(row[tb.NODES], row[tb.NODES] + row[tb.N_FRONTAL] + row[tb.N_SEPARATOR]):
+            if pool_i[m] == b:
+                return True
+        a, b = b, a
+    return False
+
+
+@kernel
+def _touch_edge(head, e):  # type: ignore[no-untyped-def]
+    """Log and touch the ends of an edge; ask for a new ordering if no clique has both."""
+    edge_i = tb.edge_i(head)
+    i, j = edge_i[e, tb.END_I], edge_i[e, tb.END_J]
+    transaction_log.log_node(head, i)
+    transaction_log.log_node(head, j)
+    if head[tb.STRUCTURE] == 0 and not _have_common_clique(head, i, j):
+        head[tb.STRUCTURE] = 1
+    touch(head, i)
+    touch(head, j)
+
+
+@kernel
+def start_edges(head, first, last):  # type: ignore[no-untyped-def]
+    """
+    Add new edges to the lists of their ends, and linearize them.
+
+    Parameters
+    ----------
+    first, last : int
+        The new edges are the rows from `first` to `last` - 1.
+
+    """
+    edge_f = tb.edge_f(head)
+    scalars = tb.scalars(head)
+    node_i = tb.node_i(head)
+    edge_i = tb.edge_i(head)
+    for e in range(first, last):
+        f, row = edge_f[e], edge_i[e]
+        if row[tb.EDGE_KIND] != factors.BIAS:
+            c, s = math.cos(f[tb.MEAN + 2]), math.sin(f[tb.MEAN + 2])
+            f[tb.OWN_T] = c * f[tb.MEAN] + s * f[tb.MEAN + 1]
+            f[tb.OWN_T + 1] = c * f[tb.MEAN + 1] - s * f[tb.MEAN]
+        row[tb.EDGE_CHECKED] = row[tb.EDGE_WAITS] = 0
+        row[tb.EDGE_LOGGED] = head[tb.UPDATE]
+        _touch_edge(head, e)
+        i, j = row[tb.END_I], row[tb.END_J]
+        row[tb.NEXT_I], node_i[i, tb.EDGE_LIST] = node_i[i, tb.EDGE_LIST], 2 * e
+        row[tb.NEXT_J], node_i[j, tb.EDGE_LIST] = node_i[j, tb.EDGE_LIST], 2 * e + 1
+        scale_by_edge(head, e, f[tb.WEIGHT])
+        factors.linearize_edge(head, e)
+        factors.check_edge(head, e, 0.0)
+        scalars[tb.CHI2] += f[tb.ENERGY]
+
+
+@kernel
+def start_observed(head, first, last):  # type: ignore[no-untyped-def]
+    """
+    Add new observed nodes to the lists of their hidden nodes, and linearize them.
+
+    Parameters
+    ----------
+    first, last : int
+        The new observed nodes are the rows from `first` to `last` - 1.
+
+    """
+    observed_f = tb.observed_f(head)
+    scalars = tb.scalars(head)
+    node_i = tb.node_i(head)
+    observed_i = tb.observed_i(head)
+    for k in range(first, last):
+        f, row = observed_f[k], observed_i[k]
+        v = row[tb.OBS_NODE]
+        transaction_log.log_node(head, v)
+        row[tb.OBS_NEXT], node_i[v, tb.OBSERVED_LIST] = node_i[v, tb.OBSERVED_LIST], k
+        row[tb.OBS_CHECKED] = row[tb.OBS_WAITS] = 0
+        row[tb.OBS_LOGGED] = head[tb.UPDATE]
+        scale_by_observed(head, k, f[tb.WEIGHT])
+        factors.linearize_observed(head, k)
+        factors.check_observed(head, k)
+        scalars[tb.CHI2] += f[tb.OBS_ENERGY]
+        touch(head, v)
+
+
+@kernel
+def weigh_edge(head, e, weight):  # type: ignore[no-untyped-def]
+    """
+    Set the weight of an edge.
+
+    Parameters
+    ----------
+    e : int
+    weight : float
+        0 removes the edge.
+
+    """
+    edge_f, scalars = tb.edge_f(head), tb.scalars(head)
+    f = edge_f[e]
+    transaction_log.log_edge(head, e)
+    _touch_edge(head, e)
+    scale_by_edge(head, e, weight - f[tb.WEIGHT])
+    scalars[tb.CHI2] -= f[tb.ENERGY]
+    f[tb.WEIGHT] = weight
+    factors.linearize_edge(head, e)
+    factors.check_edge(head, e, 0.0)
+    scalars[tb.CHI2] += f[tb.ENERGY]
+
+
+@kernel
+def weigh_observed(head, k, weight):  # type: ignore[no-untyped-def]
+    """
+    Set the weight of an observed node.
+
+    Parameters
+    ----------
+    k : int
+    weight : float
+        0 removes the observed node.
+
+    """
+    observed_f, scalars, observed_i = tb.observed_f(head), tb.scalars(head), tb.observed_i(head)
+    f, v = observed_f[k], observed_i[k, tb.OBS_NODE]
+    transaction_log.log_observed(head, k)
+    transaction_log.log_node(head, v)
+    scale_by_observed(head, k, weight - f[tb.WEIGHT])
+    scalars[tb.CHI2] -= f[tb.OBS_ENERGY]
+    f[tb.WEIGHT] = weight
+    factors.linearize_observed(head, k)
+    factors.check_observed(head, k)
+    scalars[tb.CHI2] += f[tb.OBS_ENERGY]
+    touch(head, v)
+
+
+@kernel
+def set_fixed(head, v, fixed):  # type: ignore[no-untyped-def]
+    """
+    Fix a hidden node at its present pose, or free it.
+
+    Parameters
+    ----------
+    v : int
+    fixed : int
+        1 or 0.
+
+    """
+    node_i = tb.node_i(head)
+    if node_i[v, tb.FIXED] != fixed:
+        transaction_log.log_node(head, v)
+        node_i[v, tb.FIXED] = fixed
+        touch(head, v)
+
+
+@kernel
+def edit(head, what, number, value):  # type: ignore[no-untyped-def]
+    """
+    Edit one row.
+
+    Parameters
+    ----------
+    what : int
+        WEIGH_EDGE, WEIGH_OBSERVED or FIX.
+    number : int
+        Row of the edge, the observed node or the hidden node.
+    value : float
+        The weight, or 1 to fix and 0 to free a hidden node.
+
+    """
+    if what == WEIGH_EDGE:
+        weigh_edge(head, number, value)
+    elif what == WEIGH_OBSERVED:
+        weigh_observed(head, number, value)
+    else:
+        set_fixed(head, number, value)
+
+
+@kernel
+def _lengths_agree(n, mean, information, kind, weight):  # type: ignore[no-untyped-def]
+    return (mean.shape == (n, 3) and information.shape == (n, 3, 3) and len(kind) == n
+            and len(weight) == n)
+
+
+@kernel
+def add_rows(  # type: ignore[no-untyped-def]
+    head, hidden, biases, i, j, mean, information, kind, weight, bias, node, offset,
+    observed_mean, observed_information, observed_kind, observed_weight, checked,
+):
+    """
+    Add hidden nodes, edges and observed nodes, all of them or none.
+
+    Parameters
+    ----------
+    hidden, biases : ndarray, shapes (N, 3) and (S, 3)
+        Poses of new hidden nodes, then values of new biases.
+    i, j, mean, information, kind, weight, bias : ndarray
+        Columns of `Edges`.
+    node, offset, observed_mean, observed_information, observed_kind, observed_weight : ndarray
+        Columns of `ObservedNodes`.
+    checked : bool
+        Whether `constraints.check` has accepted the rows.
+
+    Returns
+    -------
+    int
+        ADDED; NO_ROOM: a table is full; UNSOUND: the rows fail the quick validation of `rows`, and
+        were not checked.
+
+    """
+    first = head[tb.N_NODES]
+    first_bias = first + len(hidden)
+    n_nodes = first_bias + len(biases)
+    n_edges = head[tb.N_EDGES] + len(i)
+    n_observed = head[tb.N_OBSERVED] + len(node)
+    if (hidden.shape[1] != 3 or biases.shape[1] != 3 or len(j) != len(i)
+            or not _lengths_agree(len(i), mean, information, kind, weight)
+            or bias.shape != (len(i), 4)
+            or offset.shape != (len(node), 3)
+            or not _lengths_agree(len(node), observed_mean, observed_information, observed_kind,
+                                  observed_weight)):
+        return UNSOUND
+    if (n_nodes > head[tb.NODE_ROOM] or n_edges > head[tb.EDGE_ROOM]
+            or n_observed > head[tb.OBSERVED_ROOM]):
+        return NO_ROOM
+    # rows behind the ends are not part of the graph yet
+    valid = rows.write_nodes(head, first, hidden)
+    valid = rows.write_nodes(head, first_bias, biases) and valid
+    valid = rows.write_edges(head, n_nodes, first_bias, i, j, mean, information, kind, weight,
+                             bias) and valid
+    valid = rows.write_all_observed(
+        head, n_nodes, node, offset, observed_mean, observed_information, observed_kind,
+        observed_weight) and valid
+    if not valid and not checked:
+        return UNSOUND
+    head[tb.N_NODES] = n_nodes
+    start_nodes(head, first, first_bias, n_nodes)
+    first, head[tb.N_EDGES] = head[tb.N_EDGES], n_edges
+    start_edges(head, first, n_edges)
+    first, head[tb.N_OBSERVED] = head[tb.N_OBSERVED], n_observed
+    start_observed(head, first, n_observed)
+    return ADDED
+
+
+@kernel
+def restart(head):  # type: ignore[no-untyped-def]
+    """Remove all cliques, linearize all constraints at the present poses and touch all nodes."""
+    node_f = tb.node_f(head)
+    edge_f = tb.edge_f(head)
+    observed_f = tb.observed_f(head)
+    scalars = tb.scalars(head)
+    node_i = tb.node_i(head)
+    edge_i = tb.edge_i(head)
+    observed_i = tb.observed_i(head)
+    head[tb.N_CLIQUES] = head[tb.POOL_F_END] = head[tb.POOL_I_END] = 0
+    head[tb.FREE_CLIQUE] = -1
+    head[tb.FREE_F:] = -1
+    head[tb.N_FREED] = head[tb.N_TOUCHED] = head[tb.N_WAITING] = 0
+    scalars[tb.CHI2] = 0.0
+    head[tb.STRUCTURE] = 1
+    for v in range(head[tb.N_NODES]):
+        factors.refer_to_pose(node_f[v])
+        node_i[v, tb.CLIQUE] = -1
+        node_i[v, tb.TOUCHED] = 0
+        touch(head, v)
+    for e in range(head[tb.N_EDGES]):
+        factors.linearize_edge(head, e)
+        factors.check_edge(head, e, 0.0)
+        edge_i[e, tb.EDGE_WAITS] = 0
+        scalars[tb.CHI2] += edge_f[e, tb.ENERGY]
+    for k in range(head[tb.N_OBSERVED]):
+        factors.linearize_observed(head, k)
+        factors.check_observed(head, k)
+        observed_i[k, tb.OBS_WAITS] = 0
+        scalars[tb.CHI2] += observed_f[k, tb.OBS_ENERGY]

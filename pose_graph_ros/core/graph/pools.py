@@ -1,0 +1,150 @@
+# Copyright 2026 The pose_graph_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""
+Memory for the values and the node lists of cliques, from two pools with free lists by size.
+
+A clique holds its rows of R and its update matrix, both as upper triangles by rows, without gaps.
+"""
+
+from typing import Final
+
+import numpy as np
+
+from pose_graph_ros.core.compiled.jit import kernel
+from pose_graph_ros.core.graph import tables as tb
+
+_SIZES: Final = np.array(tb.SIZES, dtype=np.int64)
+
+
+@kernel
+def row_start(k, n):  # type: ignore[no-untyped-def]
+    """
+    Return the index at which column 0 of row k would be in an upper triangle stored by rows.
+
+    A row holds its columns from k on, and its right-hand side as column n.
+
+    Parameters
+    ----------
+    k : int
+    n : int
+        Number of columns, without the right-hand side.
+
+    """
+    return k * n - k * (k - 1) // 2
+
+
+@kernel
+def triangle_size(rows, n):  # type: ignore[no-untyped-def]
+    """
+    Return the number of values in the first rows of an upper triangle with right-hand side.
+
+    Parameters
+    ----------
+    rows : int
+    n : int
+        Number of columns, without the right-hand side.
+
+    """
+    return rows * (n + 1) - rows * (rows - 1) // 2
+
+
+@kernel
+def size_class(n):  # type: ignore[no-untyped-def]
+    """Return the smallest size class (index in `SIZES`) whose blocks hold n numbers."""
+    if n <= 64:
+        return n
+    low, high = 64, len(_SIZES) - 1
+    while low < high:
+        middle = (low + high) // 2
+        if _SIZES[middle] < n:
+            low = middle + 1
+        else:
+            high = middle
+    return low
+
+
+@kernel
+def rounded(n):  # type: ignore[no-untyped-def]
+    """Return the size of the block that n numbers take from a pool."""
+    return _SIZES[size_class(n)]
+
+
+@kernel
+def take_values(head, n):  # type: ignore[no-untyped-def]
+    """Take a block for n numbers from pool_f and return its index; the pool must have room."""
+    pool_f = tb.pool_f(head)
+    size = size_class(n)
+    at = head[tb.FREE_F + size]
+    if at >= 0:
+        head[tb.FREE_F + size] = np.int64(pool_f[at])
+        return at
+    at = head[tb.POOL_F_END]
+    head[tb.POOL_F_END] = at + _SIZES[size]
+    return at
+
+
+@kernel
+def give_values(head, at, n):  # type: ignore[no-untyped-def]
+    """
+    Give a block back to pool_f.
+
+    Parameters
+    ----------
+    at : int
+        Index of the block.
+    n : int
+        The number that it was taken for.
+
+    """
+    pool_f = tb.pool_f(head)
+    size = size_class(n)
+    pool_f[at] = head[tb.FREE_F + size]
+    head[tb.FREE_F + size] = at
+
+
+@kernel
+def take_nodes(head, n):  # type: ignore[no-untyped-def]
+    """Take a block for n nodes from pool_i and return its index; the pool must have room."""
+    pool_i = tb.pool_i(head)
+    size = size_class(n)
+    at = head[tb.FREE_I + size]
+    if at >= 0:
+        head[tb.FREE_I + size] = pool_i[at]
+        return at
+    at = head[tb.POOL_I_END]
+    head[tb.POOL_I_END] = at + _SIZES[size]
+    return at
+
+
+@kernel
+def give_nodes(head, at, n):  # type: ignore[no-untyped-def]
+    """
+    Give a block back to pool_i.
+
+    Parameters
+    ----------
+    at : int
+        Index of the block.
+    n : int
+        The number that it was taken for.
+
+    """
+    pool_i = tb.pool_i(head)
+    size = size_class(n)
+    pool_i[at] = head[tb.FREE_I + size]
+    head[tb.FREE_I + size] = at
+
+
+@kernel
+def n_values(n_frontal, n_separator):  # type: ignore[no-untyped-def]
+    """
+    Return how many numbers a clique holds: rows of R, then the update matrix.
+
+    Parameters
+    ----------
+    n_frontal, n_separator : int
+        Numbers of nodes.
+
+    """
+    rows, rest = 3 * n_frontal, 3 * n_separator
+    return triangle_size(rows, rows + rest) + triangle_size(rest, rest)

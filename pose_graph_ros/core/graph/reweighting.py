@@ -1,0 +1,232 @@
+# Copyright 2026 The pose_graph_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""
+Iteratively reweighted least squares over the constraints of sources with a robust loss.
+
+At each update the weights of the newest constraints and of some older ones in turn are computed
+anew, so that the work does not grow with the graph. The final optimisation computes all of them
+repeatedly, starting from weights that do not depend on earlier updates.
+
+The *base weight* of a constraint is its weight without the loss: 1, or less where the errors of
+several measurements are correlated.
+"""
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from pose_graph_ros.core.compiled.growing_array import GrowingArray
+from pose_graph_ros.core.config import Loss
+from pose_graph_ros.core.geometry.se2 import FloatArray, IntArray
+from pose_graph_ros.core.graph import losses
+from pose_graph_ros.core.graph.constraints import Edges, ObservedNodes
+from pose_graph_ros.core.graph.error_functions import edge_errors, energies, observed_errors
+from pose_graph_ros.core.graph.graph import Graph
+from pose_graph_ros.core.saved_columns import Integers, Numbers
+
+# Number of the newest constraints that are reweighted at each update; as many older ones are, too.
+WINDOW = 200
+# Smallest relative change of a weight that is applied at an update.
+LEAST_CHANGE = 0.005
+
+_LOSSES = tuple(Loss)
+
+
+@dataclass(frozen=True, slots=True)
+class SavedLosses:
+    """Saved state of the constraints of one table that have a robust loss."""
+
+    rows: Integers
+    """Rows in the graph."""
+    losses: Integers
+    """0 none, 1 Huber, 2 Cauchy."""
+    thresholds: Numbers
+    """[sigma]."""
+    shares: Numbers
+    """Base weights."""
+    cursor: int
+    """Index of the older constraint that is reweighted next."""
+
+
+@dataclass
+class _Rows:
+    """Constraints of one table that have a robust loss, in the order in which they were added."""
+
+    edges: bool
+    """Whether they are edges; else they are observed nodes."""
+    rows: GrowingArray = field(default_factory=lambda: GrowingArray((), np.int64))
+    """Rows in the graph."""
+    losses: GrowingArray = field(default_factory=lambda: GrowingArray((2,), np.float64))
+    """Index of the loss in `Loss`, and its threshold [sigma]."""
+    base_weights: GrowingArray = field(default_factory=lambda: GrowingArray((), np.float64))
+    cursor: int = 0
+
+    def alike(self, weight: float) -> Mapping[int, float]:
+        """Return the base weights times a weight, by row."""
+        weights = weight * self.base_weights.values
+        return dict(zip(self.rows.values.tolist(), weights.tolist(), strict=True))
+
+    def saved(self) -> SavedLosses:
+        losses = self.losses.values
+        return SavedLosses(
+            self.rows.values.copy(), losses[:, 0].astype(np.int64), losses[:, 1].copy(),
+            self.base_weights.values.copy(), self.cursor)
+
+    def restore(self, saved: SavedLosses) -> None:
+        self.rows.append(saved.rows)
+        self.losses.append(np.column_stack((saved.losses, saved.thresholds)))
+        self.base_weights.append(saved.shares)
+        self.cursor = saved.cursor
+
+    def some(self) -> IntArray:
+        """Return the indices of the newest ones and, in turn, of some older ones."""
+        size = len(self.rows)
+        begin = max(size - WINDOW, 0)
+        if begin == 0:
+            return np.arange(size)
+        older = (self.cursor + np.arange(min(WINDOW, begin))) % begin
+        self.cursor = int(older[-1] + 1) % begin
+        return np.concatenate((older, np.arange(begin, size)))
+
+    def changes(
+        self, graph: Graph, index: IntArray, *, least: float = 0.0, widened: float = 1.0,
+    ) -> Mapping[int, float]:
+        """Return the new weights of indexed constraints that change by more than `least`."""
+        if len(index) == 0:
+            return {}
+        rows = self.rows.values[index]
+        energy, weight = self.energies(graph, rows)
+        wanted = np.empty(len(index))
+        for loss, threshold, chosen in self.groups(index):
+            wanted[chosen] = losses.weights(loss, energy[chosen], widened * threshold)
+        wanted *= self.base_weights.values[index]
+        changed = np.abs(wanted - weight) > least * np.minimum(wanted, weight)
+        return dict(zip(rows[changed].tolist(), wanted[changed].tolist(), strict=True))
+
+    def groups(self, index: IntArray) -> list[tuple[Loss, float, IntArray]]:
+        """Return each pair of loss and threshold with the positions in `index` that have it."""
+        kinds, which = np.unique(self.losses.values[index], axis=0, return_inverse=True)
+        return [(_LOSSES[int(kind)], float(threshold), np.flatnonzero(which.ravel() == k))
+                for k, (kind, threshold) in enumerate(kinds)]
+
+    def energies(self, graph: Graph, rows: IntArray) -> tuple[FloatArray, FloatArray]:
+        """Return unweighted energies and weights of rows of the graph, shape (M,) each."""
+        some: Edges | ObservedNodes
+        if self.edges:
+            some = graph.edges_at(rows)
+            errors = edge_errors(graph.poses, some)
+        else:
+            some = graph.observed_at(rows)
+            errors = observed_errors(graph.poses, some)
+        return energies(errors, some.information), some.weight
+
+
+class Reweighting:
+    """Computes the weights of constraints with a robust loss."""
+
+    def __init__(self) -> None:
+        self._edges, self._observed = _Rows(edges=True), _Rows(edges=False)
+
+    def __len__(self) -> int:
+        return len(self._edges.rows) + len(self._observed.rows)
+
+    def add(self, row: int, loss: Loss, threshold: float, *, edge: bool) -> None:
+        """
+        Add an edge or an observed node with the base weight 1; one without a loss is ignored.
+
+        Parameters
+        ----------
+        row : int
+            Row in the graph, above those of its kind that were added before.
+        loss : Loss
+        threshold : float
+            Threshold of the loss [sigma].
+        edge : bool
+            Whether it is an edge.
+
+        """
+        if loss is not Loss.NONE:
+            table = self._edges if edge else self._observed
+            table.rows.append_one(row)
+            table.losses.append_one((_LOSSES.index(loss), threshold))
+            table.base_weights.append_one(1.0)
+
+    def set_base_weight(self, row: int, weight: float) -> None:
+        """
+        Set the base weight of an observed node, if it was added.
+
+        Parameters
+        ----------
+        row : int
+            Row in the graph.
+        weight : float
+
+        """
+        table = self._observed
+        at = int(np.searchsorted(table.rows.values, row))
+        if at < len(table.rows) and table.rows.values[at] == row:
+            table.base_weights.values[at] = weight
+
+    def saved(self) -> tuple[SavedLosses, SavedLosses]:
+        """Return the state of the edges and of the observed nodes."""
+        return self._edges.saved(), self._observed.saved()
+
+    def restore(self, edges: SavedLosses, observed: SavedLosses) -> None:
+        """
+        Restore the state that `saved` returned; nothing may have been added before.
+
+        Parameters
+        ----------
+        edges, observed : SavedLosses
+
+        """
+        self._edges.restore(edges)
+        self._observed.restore(observed)
+
+    def changes(self, graph: Graph) -> tuple[Mapping[int, float], Mapping[int, float]]:
+        """
+        Return new weights of edges and of observed nodes, by row, for the next update.
+
+        At most 2 `WINDOW` constraints of each kind are considered, and only weights that change
+        by more than the fraction `LEAST_CHANGE` are returned.
+        """
+        return (self._edges.changes(graph, self._edges.some(), least=LEAST_CHANGE),
+                self._observed.changes(graph, self._observed.some(), least=LEAST_CHANGE))
+
+    def all_changes(
+        self, graph: Graph, widened: float = 1.0,
+    ) -> tuple[Mapping[int, float], Mapping[int, float]]:
+        """
+        Return the new weights of all edges and observed nodes whose weight changes, by row.
+
+        Parameters
+        ----------
+        graph : Graph
+        widened : float
+            Factor on all thresholds.
+
+        """
+        edges, observed = (
+            table.changes(graph, np.arange(len(table.rows)), widened=widened)
+            for table in (self._edges, self._observed))
+        return edges, observed
+
+    def all_alike(self, weight: float) -> tuple[Mapping[int, float], Mapping[int, float]]:
+        """
+        Return the base weights of all edges and observed nodes times a weight, by row.
+
+        The weight 1 makes it a plain least-squares problem.
+        """
+        return self._edges.alike(weight), self._observed.alike(weight)
+
+    def cost(self, graph: Graph) -> float:
+        """Return the sum of the robust costs minus the sum of the weighted energies."""
+        total = 0.0
+        for table in (self._edges, self._observed):
+            energy, weight = table.energies(graph, table.rows.values)
+            for loss, threshold, chosen in table.groups(np.arange(len(table.rows))):
+                costs = losses.costs(loss, energy[chosen], threshold)
+                total += float(np.sum(table.base_weights.values[chosen] * costs
+                                      - weight[chosen] * energy[chosen]))
+        return total

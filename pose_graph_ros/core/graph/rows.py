@@ -1,0 +1,231 @@
+# Copyright 2026 The pose_graph_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""
+Write new rows behind the ends of the tables, with a quick validation.
+
+A row is *valid* if it passes the quick checks in here. Rows that do not are checked again by
+`constraints.check`, which accepts them or raises an exception with the reason.
+"""
+
+import math
+
+from pose_graph_ros.core.compiled.jit import kernel
+from pose_graph_ros.core.graph import factors, tables as tb
+
+# Tolerance of the symmetry and the eigenvalues of an information matrix whose diagonal is scaled
+# to 1; a tenth of that in `constraints.check`.
+_TOLERANCE = 1e-6
+
+
+@kernel
+def is_finite(x):  # type: ignore[no-untyped-def]
+    """Tell whether the magnitude of a number is at most 1e300; neither infinite nor NaN is."""
+    return abs(x) <= 1e300
+
+
+@kernel
+def pack_information(to, w):  # type: ignore[no-untyped-def]
+    """
+    Write the upper triangle of an information matrix to a row.
+
+    Parameters
+    ----------
+    to : ndarray
+        Row of edge_f or observed_f.
+    w : ndarray, shape (3, 3)
+
+    Returns
+    -------
+    bool
+        Whether it is finite, symmetric, positive semidefinite and not zero.
+
+    """
+    at = tb.INFO
+    xx, yy, tt = w[0, 0], w[1, 1], w[2, 2]
+    xy, xt, yt = 0.5 * (w[0, 1] + w[1, 0]), 0.5 * (w[0, 2] + w[2, 0]), 0.5 * (w[1, 2] + w[2, 1])
+    to[at], to[at + 1], to[at + 2] = xx, xy, xt
+    to[at + 3], to[at + 4], to[at + 5] = yy, yt, tt
+    total = xx + yy + tt
+    if not (is_finite(total) and xx >= 0.0 and yy >= 0.0 and tt >= 0.0 and total > 0.0):
+        return False
+    sx, sy, st = math.sqrt(xx), math.sqrt(yy), math.sqrt(tt)
+    skew = max(abs(w[0, 1] - w[1, 0]) - _TOLERANCE * sx * sy,
+               abs(w[0, 2] - w[2, 0]) - _TOLERANCE * sx * st,
+               abs(w[1, 2] - w[2, 1]) - _TOLERANCE * sy * st)
+    if not skew <= 0.0:
+        return False
+    # leading minors of the correlation matrix, with the tolerance added to its diagonal
+    a = xy / (sx * sy) if xy != 0.0 else 0.0
+    b = xt / (sx * st) if xt != 0.0 else 0.0
+    c = yt / (sy * st) if yt != 0.0 else 0.0
+    d = 1.0 + _TOLERANCE
+    return (d * d - a * a > 0.0
+            and d * (d * d - c * c) - a * (a * d - b * c) + b * (a * c - b * d) > 0.0)
+
+
+@kernel
+def _copy_pose(to, at, pose):  # type: ignore[no-untyped-def]
+    """Write a pose to three columns of a row; return whether it is finite."""
+    to[at], to[at + 1], to[at + 2] = pose[0], pose[1], pose[2]
+    return is_finite(pose[0]) and is_finite(pose[1]) and is_finite(pose[2])
+
+
+@kernel
+def write_edge(head, e, i, j, mean, information, kind, weight):  # type: ignore[no-untyped-def]
+    """
+    Write one edge.
+
+    Parameters
+    ----------
+    e : int
+        Row.
+    i, j, mean, information, kind, weight : int, ndarray or float
+        Values of the columns of `Edges`.
+
+    Returns
+    -------
+    bool
+        Whether the row is valid; its nodes, its kind and its bias are not checked.
+
+    """
+    edge_f, edge_i = tb.edge_f(head), tb.edge_i(head)
+    f, row = edge_f[e], edge_i[e]
+    row[tb.END_I], row[tb.END_J], row[tb.EDGE_KIND] = i, j, kind
+    f[tb.WEIGHT] = weight
+    valid = _copy_pose(f, tb.MEAN, mean) and is_finite(weight) and weight >= 0.0 and i != j
+    return pack_information(f, information) and valid
+
+
+@kernel
+def write_observed(  # type: ignore[no-untyped-def]
+    head, k, node, offset, mean, information, kind, weight,
+):
+    """
+    Write one observed node.
+
+    Parameters
+    ----------
+    k : int
+        Row.
+    node, offset, mean, information, kind, weight : int, ndarray or float
+        Values of the columns of `ObservedNodes`.
+
+    Returns
+    -------
+    bool
+        Whether the row is valid; its node and its kind are not checked.
+
+    """
+    observed_f, observed_i = tb.observed_f(head), tb.observed_i(head)
+    f, row = observed_f[k], observed_i[k]
+    row[tb.OBS_NODE], row[tb.OBS_KIND] = node, kind
+    f[tb.WEIGHT] = weight
+    valid = _copy_pose(f, tb.MEAN, mean) and is_finite(weight) and weight >= 0.0
+    valid = _copy_pose(f, tb.OBS_OFFSET, offset) and valid
+    return pack_information(f, information) and valid
+
+
+@kernel
+def write_nodes(head, first, poses):  # type: ignore[no-untyped-def]
+    """
+    Write the poses of hidden nodes, with wrapped headings.
+
+    Parameters
+    ----------
+    first : int
+        First row.
+    poses : ndarray, shape (N, 3)
+        [m, m, rad].
+
+    Returns
+    -------
+    bool
+        Whether all are finite.
+
+    """
+    node_f = tb.node_f(head)
+    valid = True
+    for k in range(len(poses)):
+        f = node_f[first + k]
+        if not _copy_pose(f, tb.POSE, poses[k]):
+            valid = False
+        f[tb.POSE + 2] = factors.wrap(f[tb.POSE + 2])
+    return valid
+
+
+@kernel
+def _is_bias(head, v, first_bias):  # type: ignore[no-untyped-def]
+    """Tell whether a node is a bias; new biases are the rows from `first_bias` on."""
+    if v < head[tb.N_NODES]:
+        return tb.node_i(head)[v, tb.IS_BIAS] != 0
+    return v >= first_bias
+
+
+@kernel
+def write_edges(  # type: ignore[no-untyped-def]
+    head, n_nodes, first_bias, i, j, mean, information, kind, weight, bias,
+):
+    """
+    Write edges behind the last row.
+
+    Parameters
+    ----------
+    n_nodes : int
+        Number of hidden nodes, with the new ones.
+    first_bias : int
+        First row of the new biases.
+    i, j, mean, information, kind, weight, bias : ndarray
+        Columns of `Edges`.
+
+    Returns
+    -------
+    bool
+        Whether all are valid.
+
+    """
+    edge_f = tb.edge_f(head)
+    valid = True
+    for k in range(len(i)):
+        e = head[tb.N_EDGES] + k
+        inside = 0 <= i[k] < n_nodes and 0 <= j[k] < n_nodes and kind[k] <= factors.BIAS
+        valid = write_edge(
+            head, e, i[k], j[k], mean[k], information[k], kind[k], weight[k]) and inside and valid
+        if kind[k] == factors.BIAS:
+            f = edge_f[e]
+            f[tb.BIAS_OFFSET], f[tb.BIAS_OFFSET + 1] = bias[k, 0], bias[k, 1]
+            f[tb.FACTOR_T], f[tb.FACTOR_TH] = bias[k, 2], bias[k, 3]
+            for m in range(4):
+                valid = is_finite(bias[k, m]) and valid
+            valid = valid and _is_bias(head, j[k], first_bias)
+        elif valid:
+            valid = not (_is_bias(head, i[k], first_bias) or _is_bias(head, j[k], first_bias))
+    return valid
+
+
+@kernel
+def write_all_observed(  # type: ignore[no-untyped-def]
+    head, n_nodes, node, offset, mean, information, kind, weight,
+):
+    """
+    Write observed nodes behind the last row.
+
+    Parameters
+    ----------
+    n_nodes : int
+        Number of hidden nodes, with the new ones.
+    node, offset, mean, information, kind, weight : ndarray
+        Columns of `ObservedNodes`.
+
+    Returns
+    -------
+    bool
+        Whether all are valid.
+
+    """
+    valid = True
+    for k in range(len(node)):
+        inside = 0 <= node[k] < n_nodes and kind[k] <= 2
+        if not (write_observed(head, head[tb.N_OBSERVED] + k, node[k], offset[k], mean[k],
+                               information[k], kind[k], weight[k]) and inside):
+            valid = False
+    return valid

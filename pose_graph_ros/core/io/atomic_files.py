@@ -1,0 +1,96 @@
+# Copyright 2026 The pose_graph_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""
+Writing of several files at once, either all of them completely or none.
+
+Each file is written under a temporary name in its folder and synchronised to the disk. Then all
+are renamed in order; if that fails, the previous files are put back. Only if the machine stops
+during the renaming may new files lie beside old ones. A reader can detect that if the file with
+the checksums of the others comes last.
+"""
+
+from collections.abc import Mapping
+import contextlib
+import os
+from pathlib import Path
+import secrets
+
+from pose_graph_ros.core.exceptions import FileWriteError
+
+
+def write_files(contents: Mapping[Path, bytes]) -> None:
+    """
+    Write files of one folder, all of them or none; missing folders are created.
+
+    They are renamed in the order of `contents`.
+
+    Raises
+    ------
+    FileWriteError
+        If that fails. Previous files are then unchanged, and no temporary ones are left.
+
+    """
+    suffix = f'.{secrets.token_hex(4)}'
+    fresh = {path: path.with_name(f'.{path.name}{suffix}.new') for path in contents}
+    old = {path: path.with_name(f'.{path.name}{suffix}.old') for path in contents}
+    renamed: list[Path] = []
+    try:
+        for path in contents:
+            path.parent.mkdir(parents=True, exist_ok=True)
+            if path.is_dir():
+                raise IsADirectoryError(f'{path} is a folder')
+        for path, content in contents.items():
+            _write(fresh[path], content)
+        for path in contents:
+            if path.exists():
+                _back_up(path, old[path])
+        for path in contents:
+            os.replace(fresh[path], path)
+            renamed.append(path)
+        _sync_folder(next(iter(contents)).parent)
+    except (OSError, ValueError) as error:
+        _put_back(renamed, old)
+        names = ', '.join(str(path) for path in contents)
+        raise FileWriteError(f'{names}: cannot be written: {error}') from error
+    except BaseException:
+        _put_back(renamed, old)
+        raise
+    finally:
+        for path in (*fresh.values(), *old.values()):
+            with contextlib.suppress(OSError, ValueError):
+                path.unlink(missing_ok=True)
+
+
+def _write(path: Path, content: bytes) -> None:
+    with path.open('xb') as file:
+        file.write(content)
+        file.flush()
+        os.fsync(file.fileno())
+
+
+def _back_up(path: Path, name: Path) -> None:
+    """Give a file a second name, or copy it where the file system has no hard links."""
+    try:
+        os.link(path, name)
+    except OSError:
+        _write(name, path.read_bytes())
+
+
+def _put_back(renamed: list[Path], old: Mapping[Path, Path]) -> None:
+    """Replace new files by the previous ones; remove those without a previous one."""
+    for path in renamed:
+        with contextlib.suppress(OSError):
+            if old[path].exists():
+                os.replace(old[path], path)
+            else:
+                path.unlink()
+
+
+def _sync_folder(folder: Path) -> None:
+    """Synchronise the names in a folder to the disk, where folders can be opened."""
+    with contextlib.suppress(OSError):
+        handle = os.open(folder, os.O_RDONLY)
+        try:
+            os.fsync(handle)
+        finally:
+            os.close(handle)

@@ -1,0 +1,117 @@
+# Copyright 2026 The pose_graph_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""
+Conversion of dataclasses and named tuples of numbers and arrays to JSON values, and back.
+
+Decoding follows the annotations of the fields. Values of other types are rejected, as are numbers
+that are not finite.
+"""
+
+from collections.abc import Mapping
+from dataclasses import is_dataclass
+import math
+from types import UnionType
+from typing import Annotated, Any, get_args, get_origin, get_type_hints
+
+import numpy as np
+import numpy.typing as npt
+
+from pose_graph_ros.core.saved_columns import Column
+
+_KINDS = {int: ('i', np.int64), float: ('fi', np.float64), bool: ('b', np.bool_)}
+
+
+def encoded(value: Any) -> Any:
+    """Return a value as lists, dictionaries, strings and numbers."""
+    if _has_fields(type(value)):
+        return {name: encoded(getattr(value, name)) for name in annotations(type(value))}
+    if isinstance(value, Mapping):
+        return {key: encoded(item) for key, item in value.items()}
+    return value.tolist() if isinstance(value, np.ndarray) else value
+
+
+def _has_fields(kind: Any) -> bool:
+    return is_dataclass(kind) or hasattr(kind, '_fields')
+
+
+def annotations(kind: Any) -> Mapping[str, Any]:
+    """Return the annotations of the fields of a class."""
+    return get_type_hints(kind, include_extras=True)
+
+
+def decoded(kind: Any, plain: Any, where: str) -> Any:
+    """
+    Return the value that `encoded` was given.
+
+    Parameters
+    ----------
+    kind : type
+        Annotation of the value.
+    plain : object
+        Value of the JSON file.
+    where : str
+        Name of the value in error messages.
+
+    Raises
+    ------
+    ValueError
+        If the value is not of that kind; the message names the place, what was expected and what
+        was found.
+
+    """
+    origin, arguments = get_origin(kind), get_args(kind)
+    if origin is Annotated:
+        return _array(arguments[1], plain, where)
+    if origin is UnionType:     # of something and None
+        return None if plain is None else decoded(arguments[0], plain, where)
+    if origin is tuple:
+        _expect(isinstance(plain, list), where, 'a list', plain)
+        items = [arguments[0]] * len(plain) if arguments[-1] is Ellipsis else arguments
+        _expect(len(plain) == len(items), where, f'{len(items)} items', plain)
+        return tuple(decoded(item, each, where)
+                     for item, each in zip(items, plain, strict=True))
+    if origin is not None:      # a mapping of names
+        _expect(isinstance(plain, dict), where, 'an object', plain)
+        return {name: decoded(arguments[1], each, f'{where}.{name}')
+                for name, each in plain.items()}
+    if _has_fields(kind):
+        _expect(isinstance(plain, dict), where, 'an object', plain)
+        hints = annotations(kind)
+        _expect(plain.keys() == hints.keys(), where, f'the fields {sorted(hints)}', plain)
+        return kind(**{name: decoded(hint, plain[name], f'{where}.{name}'.lstrip('.'))
+                       for name, hint in hints.items()})
+    return _single(kind, plain, where)
+
+
+def _single(kind: type, plain: Any, where: str) -> Any:
+    if kind is float and type(plain) is int:
+        plain = float(plain) if abs(plain) < 2**63 else math.inf
+    _expect(type(plain) is kind, where, f'a value of kind {kind.__name__}', plain)
+    if kind is float:
+        _expect(math.isfinite(plain), where, 'a finite number', plain)
+    if kind is int:
+        _expect(abs(plain) < 2**63, where, 'an integer of 64 bits', plain)
+    return plain
+
+
+def _array(column: Column, plain: Any, where: str) -> npt.NDArray[Any]:
+    """Return an array with any number of rows."""
+    codes, dtype = _KINDS[column.kind]
+    _expect(isinstance(plain, list), where, 'a list', plain)
+    if len(plain) == 0:
+        return np.empty((0, *column.shape), dtype=dtype)
+    try:
+        array = np.array(plain)
+    except (ValueError, OverflowError) as error:
+        raise ValueError(f'{where}: expected rows of equal length ({error})') from error
+    _expect(array.dtype.kind in codes and array.shape[1:] == column.shape, where,
+            f'{column.kind.__name__}s in rows of shape {column.shape}', plain)
+    _expect(bool(np.all(np.isfinite(array))), where, 'finite numbers', plain)
+    return array.astype(dtype)
+
+
+def _expect(valid: bool, where: str, expected: str, plain: Any) -> None:
+    if not valid:
+        text = repr(plain)
+        raise ValueError(f'{where}: expected {expected}, got '
+                         f'{text if len(text) <= 60 else text[:60] + "..."}')

@@ -1,0 +1,214 @@
+# Copyright 2026 The pose_graph_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""
+The whole state of an engine as a value, for files.
+
+`capture` makes it from the parts of the engine and restores them from it; `graph_files` writes and
+reads it. Settings are not part of it: a loaded graph has those of the engine that loads it.
+"""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from pose_graph_ros.core.alignment.monitor import AlignmentState, SavedAlignment
+from pose_graph_ros.core.config import Loss
+from pose_graph_ros.core.geometry.geodesy import distances, MapOrigin, TangentPlane
+from pose_graph_ros.core.geometry.se2 import IntArray, wrap
+from pose_graph_ros.core.graph.constraints import check as check_table, EdgeKind
+from pose_graph_ros.core.graph.graph import GraphRows
+from pose_graph_ros.core.graph.reweighting import SavedLosses
+from pose_graph_ros.core.odometry.hidden_nodes import SavedNodes
+from pose_graph_ros.core.saved_columns import Matrix
+from pose_graph_ros.core.sources.factor_builder import SavedEdges, SavedSource
+
+# Tolerances within which a datum equals that of the saved graph [m], [rad].
+SAME_PLACE = 0.01
+SAME_YAW = 1e-6
+# Maximum distance of a fix from the nearest node of a saved graph of the same site [m].
+SAME_SITE = 10_000.0
+STATES = tuple(state.value for state in AlignmentState)
+
+
+@dataclass(frozen=True, slots=True)
+class SavedGraph:
+    """The state of an engine; a copy that does not change with it."""
+
+    rows: GraphRows
+    nodes: SavedNodes
+    sources: Mapping[str, SavedSource]
+    edge_losses: SavedLosses
+    observed_losses: SavedLosses
+    alignment: SavedAlignment
+    waiting: SavedEdges
+    """Edges for the next update."""
+    set_aside: SavedEdges
+    """Edges set aside after a failed solve, for the next full optimisation."""
+    newest_covariance: Matrix
+    """Covariance of the newest hidden node, in map axes."""
+    chi2: float
+    n_left_out: int
+    """Number of received measurements that are neither in the graph nor saved."""
+    datum: MapOrigin | None
+    """Datum of the map, if it has one."""
+
+    def check(self) -> None:
+        """
+        Check that all sizes, indices and stamps are consistent.
+
+        Raises
+        ------
+        ValueError
+            If they are not; the message names the place. For rows of the graph it is the subclass
+            GraphUpdateError.
+
+        """
+        rows, nodes = self.rows, self.nodes
+        for table in (rows.edges, rows.observed):
+            if len(table) > 0:
+                check_table(table, rows.is_bias)
+        sizes = {'nodes': len(rows.poses), 'edges': len(rows.edges),
+                 'observed': len(rows.observed)}
+        _require(len(nodes.rows) > 0, 'nodes: expected at least one')
+        _same_length('nodes', nodes, 'stamps_ns', 'rows', 'odometry')
+        _increasing('nodes.stamps_ns', nodes.stamps_ns)
+        _increasing('nodes.rows', nodes.rows)
+        _inside('nodes.rows', nodes.rows, sizes['nodes'])
+        _require(np.array_equal(np.flatnonzero(~rows.is_bias), nodes.rows),
+                 'nodes.rows: expected all hidden nodes of the graph that are no biases')
+        self._check_odometry()
+        if self.datum is not None:
+            TangentPlane(*self.datum)   # raises if it is no point on the Earth
+        for name, source in self.sources.items():
+            self._check_source(f'sources.{name}', source, sizes)
+        for name, losses in (('edges', self.edge_losses), ('observed', self.observed_losses)):
+            where = f'{name} losses'
+            _same_length(where, losses, 'rows', 'losses', 'thresholds', 'shares')
+            _inside(where, losses.rows, sizes[name])
+            _increasing(where, losses.rows)
+            _inside(where, losses.losses, len(Loss))
+            _require(np.all(losses.thresholds > 0.0) and losses.cursor >= 0,
+                     f'{where}: expected positive thresholds and a cursor')
+        alignment = self.alignment
+        _same_length('alignment', alignment, 'source', 'stamps_ns', 'node', 'offset', 'mean',
+                     'information', 'kind')
+        _inside('alignment.source', alignment.source, len(alignment.sources))
+        _inside('alignment.kind', alignment.kind, 3)
+        _require(np.isin(alignment.node, nodes.rows), 'alignment.node: expected hidden nodes')
+        _require(alignment.state in STATES, f'alignment.state: expected one of {STATES}')
+        _require(alignment.next_verdict > 0, 'alignment.next_verdict: expected a positive number')
+        for name, edges in (('waiting', self.waiting), ('set_aside', self.set_aside)):
+            _same_length(name, edges, 'sources', 'i', 'j', 'mean', 'information', 'kind')
+            _inside(name, edges.kind, EdgeKind.BIAS)
+            _require(np.isin((edges.i, edges.j), nodes.rows),
+                     f'{name}: expected edges between hidden nodes')
+
+    def _check_odometry(self) -> None:
+        nodes = self.nodes
+        _same_length('nodes', nodes, 'leads', 'leads_after_ns')
+        _require(len(nodes.leads) > 0 and nodes.leads_after_ns[0] < nodes.stamps_ns[0],
+                 'nodes.leads: expected at least one source, since before the first node')
+        for name in nodes.leads:
+            _require(name in nodes.streams and nodes.streams[name].last is not None,
+                     f'nodes.leads: there is no odometry of {name!r}')
+        for name, stream in nodes.streams.items():
+            where = f'nodes.streams.{name}'
+            _same_length(where, stream, 'stamps_ns', 'samples', 'dense')
+            _same_length(where, stream, 'waiting_ns', 'waiting')
+            _increasing(where, np.append(stream.stamps_ns, stream.waiting_ns))
+            _require(all(-1 <= k <= len(nodes.rows) for k in (stream.tied, stream.next_to_tie))
+                     and stream.tied < len(nodes.rows) and stream.next_to_tie >= 0,
+                     f'{where}: expected nodes for its edges')
+            _require((stream.last is not None) == (len(stream.stamps_ns) > 0),
+                     f'{where}: expected the state at the newest sample, if there is one')
+            _require(stream.tied < 0 or (
+                len(stream.stamps_ns) > 0
+                and stream.stamps_ns[0] <= nodes.stamps_ns[stream.tied]),
+                f'{where}: expected samples before the node of its next edge')
+        covered = nodes.streams[nodes.leads[-1]].stamps_ns
+        _require(covered[0] <= nodes.base_ns <= covered[-1],
+                 'nodes.base_ns: expected an instant that the primary odometry covers')
+
+    def _check_source(self, where: str, source: SavedSource, sizes: Mapping[str, int]) -> None:
+        _same_length(where, source, 'seen_ns', 'seen_references')
+        _require(np.diff(source.seen_ns) >= 0, f'{where}.seen_ns: must not decrease')
+        _require(source.n_otherwise >= 0, f'{where}.n_otherwise: expected a count')
+        _inside(f'{where}.ties', source.ties, sizes['edges'])
+        constraints = source.rows[:, 1]
+        _inside(f'{where}.rows', constraints,
+                sizes['observed' if source.bins is None else 'edges'])
+        if source.bins is None:
+            return
+        bins, rows = source.bins, self.rows
+        _require(rows.edges.kind[constraints] == EdgeKind.BIAS,
+                 f'{where}.rows: expected edges to biases')
+        _same_length(f'{where}.bins', bins, 'numbers', 'rows', 'ties')
+        _increasing(f'{where}.bins.numbers', bins.numbers)
+        _inside(f'{where}.bins.rows', bins.rows, sizes['nodes'])
+        _inside(f'{where}.bins.ties', bins.ties[:1], sizes['observed'])
+        _inside(f'{where}.bins.ties', bins.ties[1:], sizes['edges'])
+        _require(bins.width_ns > 0 and np.all(rows.is_bias[bins.rows]),
+                 f'{where}.bins: expected biases, and a width')
+
+
+def site_refusal(
+    saved: SavedGraph, datum: MapOrigin | None = None, fix: MapOrigin | None = None,
+) -> str | None:
+    """
+    Return why a saved graph cannot belong to the site of the robot; None if it can.
+
+    Parameters
+    ----------
+    saved : SavedGraph
+    datum : MapOrigin, optional
+        The current datum, if the user has set it. It must equal that of the saved graph, except
+        for the altitude.
+    fix : MapOrigin, optional
+        The fix that the current datum comes from, or any other. It must be near the saved graph.
+
+    """
+    if saved.datum is None:
+        return None
+    if datum is not None:
+        metres = float(distances(saved.datum, datum.latitude, datum.longitude)[0])
+        turned = abs(wrap(datum.yaw - saved.datum.yaw))
+        if metres > SAME_PLACE or turned > SAME_YAW:
+            return (f'the saved graph is of another site: its datum is {saved.datum}, the present '
+                    f'one {datum}; they are {metres:.2f} m and {turned:.6f} rad apart')
+    if fix is not None:
+        metres = _distance_to(saved, fix)
+        if not metres <= SAME_SITE:
+            return (f'the saved graph is of another site: its datum is {saved.datum}, the present '
+                    f'one {fix}, which is {metres / 1000.0:.1f} km from the nearest node')
+    return None
+
+
+def _distance_to(saved: SavedGraph, fix: MapOrigin) -> float:
+    """Return the distance of a fix to the datum or the nearest node, whichever is less [m]."""
+    assert saved.datum is not None
+    least = float(distances(fix, saved.datum.latitude, saved.datum.longitude)[0])
+    if saved.alignment.state != AlignmentState.ALIGNED.value:
+        return least  # the nodes are not in the map
+    points = TangentPlane(*saved.datum).to_geodetic(saved.rows.poses[saved.nodes.rows, :2])
+    return min(least, float(np.min(distances(fix, points[:, 0], points[:, 1]))))
+
+
+def _require(valid: npt.ArrayLike, reason: str) -> None:
+    if not np.all(valid):
+        raise ValueError(reason)
+
+
+def _same_length(where: str, value: Any, *names: str) -> None:
+    lengths = {name: len(getattr(value, name)) for name in names}
+    _require(len(set(lengths.values())) == 1, f'{where}: expected equal lengths, got {lengths}')
+
+
+def _increasing(where: str, numbers: IntArray) -> None:
+    _require(numbers[1:] > numbers[:-1], f'{where}: expected increasing numbers')
+
+
+def _inside(where: str, numbers: IntArray, size: int) -> None:
+    _require((numbers >= 0) & (numbers < size), f'{where}: expected indices in 0..{size - 1}')

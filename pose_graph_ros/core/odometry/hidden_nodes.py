@@ -1,0 +1,414 @@
+# Copyright 2026 The pose_graph_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""
+Hidden nodes, which are made from odometry alone.
+
+A settled sample of the primary source (`primary_source`) makes a node if one is due by the node
+policy, with an edge from the node before. The other sources add edges between the nodes
+(`secondary_edges`). A stamp between two nodes is given by the node before it and the motion since.
+"""
+
+from collections.abc import Callable, Iterable, Mapping
+from dataclasses import dataclass
+import math
+
+import numpy as np
+
+from pose_graph_ros.core.compiled.growing_array import GrowingArray
+from pose_graph_ros.core.config import BackendConfig
+from pose_graph_ros.core.geometry import covariance, se2
+from pose_graph_ros.core.geometry.scalar_se2 import Pose, wrap_one
+from pose_graph_ros.core.geometry.se2 import FloatArray, IntArray
+from pose_graph_ros.core.graph.constraints import Edges
+from pose_graph_ros.core.measurements import Answer, OdometrySample
+from pose_graph_ros.core.odometry.gaps import gap_motion
+from pose_graph_ros.core.odometry.motion import Attachment
+from pose_graph_ros.core.odometry.primary_source import (
+    choose_first,
+    find_silence,
+    first_with_sample,
+    in_order_of_preference,
+    Silence,
+)
+from pose_graph_ros.core.odometry.secondary_edges import SecondaryEdges
+from pose_graph_ros.core.odometry.stream import OdometryStream, SavedStream
+from pose_graph_ros.core.saved_columns import as_matrix, as_pose, Integers, Matrix, Rows3
+
+
+@dataclass(frozen=True, slots=True)
+class SavedSpan:
+    """Saved motion from the newest node to the first stamp of a new primary source."""
+
+    mean: Pose
+    covariance: Matrix
+    """In the frame at its end."""
+
+
+@dataclass(frozen=True, slots=True)
+class SavedNodes:
+    """Saved hidden nodes, and the state of the odometry sources."""
+
+    stamps_ns: Integers
+    """Shape (H,) [ns]."""
+    rows: Integers
+    """Rows of the nodes in the graph, shape (H,)."""
+    odometry: Rows3
+    """Poses of the nodes by odometry alone, shape (H, 3) [m, m, rad]."""
+    leads: tuple[str, ...]
+    """Primary sources one after the other, P of them."""
+    leads_after_ns: Integers
+    """Stamps after which each of them is the primary source, shape (P,) [ns]."""
+    lead_ns: int
+    """Stamp up to which everything is settled [ns]."""
+    base_ns: int
+    """Stamp from which the motion to the next node is measured [ns]."""
+    base: Pose
+    """Pose of the primary source at `base_ns`."""
+    bridge: SavedSpan | None
+    """Motion from the newest node to `base_ns`; None if that is the stamp of the node."""
+    streams: Mapping[str, SavedStream]
+    """By the name of the source."""
+
+
+MakeNode = Callable[[FloatArray, FloatArray | None, str], int]
+"""Argument `make_node` of `HiddenNodes`."""
+
+
+class HiddenNodes:
+    """
+    The hidden nodes by stamp, and the odometry that makes them.
+
+    Parameters
+    ----------
+    config : BackendConfig
+    make_node : callable
+        Takes the mean of the edge to a new node, shape (3,), its information, shape (3, 3), and
+        the name of the source; for the first node its pose and None. Returns the row of the node
+        in the graph, or -1 if there is none: it is then tried again at the next sample.
+
+    """
+
+    def __init__(self, config: BackendConfig, make_node: MakeNode) -> None:
+        self._config = config
+        self._make_node = make_node
+        self._stamps = GrowingArray((), np.int64)
+        self._rows = GrowingArray((), np.int64)
+        self._odometry = GrowingArray((3,), np.float64)
+        self.streams: dict[str, OdometryStream] = {}
+        """By the name of the source."""
+        self._primaries: list[tuple[int, str]] = []
+        """Stamp after which a source is the primary one [ns], and its name, by stamp."""
+        self.covered_ns = -1
+        """
+        Stamp of the newest sample of the primary source that was checked for a node [ns]: up to
+        there everything is settled; -1 before the first odometry.
+        """
+        self._base_ns, self._base = -1, (0.0, 0.0, 0.0)
+        """Stamp and odometry pose from which the motion to the next node is measured."""
+        self._span: tuple[FloatArray, FloatArray] | None = None
+        """
+        Motion from the newest node to `_base_ns`, shape (3,), and covariance, shape (3, 3), where
+        the primary source has no sample as old as that node; else None.
+        """
+        self._secondary = SecondaryEdges()
+
+    def __len__(self) -> int:
+        return len(self._stamps)
+
+    @property
+    def stamps_ns(self) -> IntArray:
+        """Stamps of the hidden nodes [ns], shape (N,), a read-only view."""
+        return self._stamps.read_only
+
+    @property
+    def rows(self) -> IntArray:
+        """Rows of the hidden nodes in the graph, shape (N,), a read-only view."""
+        return self._rows.read_only
+
+    @property
+    def odometry(self) -> FloatArray:
+        """Poses of the nodes by odometry alone, shape (N, 3), a read-only view."""
+        return self._odometry.read_only
+
+    @property
+    def primary(self) -> str:
+        """Source that makes the nodes; empty before the first one."""
+        return self._primaries[-1][1] if self._primaries else ''
+
+    @property
+    def n_primaries(self) -> int:
+        """Number of times that a source became the primary one."""
+        return len(self._primaries)
+
+    @property
+    def newest_ns(self) -> int:
+        """Stamp of the newest sample of the primary source [ns]; -1 before the first."""
+        return self.streams[self.primary].newest_ns if self._primaries else -1
+
+    def configure(self, config: BackendConfig) -> None:
+        """
+        Set the settings for nodes and edges that are made from now on.
+
+        The next edge has the new noise over all of the motion since the newest node.
+        """
+        self._config = config
+        for name, stream in self.streams.items():
+            stream.configure(config.odometry_source(name))
+
+    @property
+    def _patience_ns(self) -> int:
+        return round(self._config.odometry_patience * 1e9)
+
+    @property
+    def _names(self) -> list[str]:
+        return in_order_of_preference(self.streams, self._config.odometry)
+
+    def add_sample(self, sample: OdometrySample, source: str) -> Answer:
+        """
+        Add an odometry sample, and make the nodes and edges that are due.
+
+        Parameters
+        ----------
+        sample : OdometrySample
+        source : str
+            Name of the odometry source.
+
+        Returns
+        -------
+        Answer
+            Accepted, or rejected with the reason.
+
+        """
+        stream = self.streams.get(source) or self._make_stream(source)
+        answer = stream.add(sample)
+        self._process(source, stream.settle())
+        return answer
+
+    def finish(self) -> None:
+        """Settle all samples, and make the nodes and edges that are due."""
+        for source, stream in list(self.streams.items()):
+            self._process(source, stream.settle(stream.newest_ns))
+        ready = [name for name in self._names if self.streams[name].first_after(-1) is not None]
+        if not self._primaries and len(ready) > 0:
+            self._make_first_node(ready[0])
+            self._add_secondary_edges()
+
+    def take_secondary_edges(self) -> list[tuple[str, Edges]]:
+        """Return the new edges of the other sources with their sources' names; forget them."""
+        edges, self._secondary.new = self._secondary.new, []
+        return edges
+
+    def _make_stream(self, source: str) -> OdometryStream:
+        stream = OdometryStream(self._config.odometry_source(source))
+        self.streams[source] = stream
+        self._secondary.skip_to(source, 0, reached=False)
+        return stream
+
+    def _process(self, source: str, settled: Iterable[tuple[int, Pose]]) -> None:
+        """Make the nodes and edges that are due after settling samples of a source."""
+        for stamp_ns, pose in settled:
+            if not self._primaries:
+                names = self._names
+                preferred = next(iter(self._config.odometry), names[0])
+                first = choose_first(self.streams, names, preferred, stamp_ns, self._patience_ns)
+                if first is not None:
+                    self._make_first_node(first)
+            elif stamp_ns - self.covered_ns > self._patience_ns:
+                self._replace_silent_primary(source, stamp_ns)
+            if self._primaries and source == self.primary and stamp_ns > self.covered_ns:
+                self._extend(stamp_ns, pose)
+        self._add_secondary_edges()
+
+    def _make_first_node(self, source: str) -> None:
+        """Make a source the primary one, and the first node at its first sample."""
+        stream = self.streams[source]
+        first_ns = stream.first_after(-1)
+        assert first_ns is not None
+        stream.settle_all(first_ns)
+        pose = stream.timeline.poses[0]
+        self._primaries.append((-1, source))
+        self.covered_ns = self._base_ns = first_ns
+        self._append(
+            first_ns, self._make_node(pose.copy(), None, source), as_pose(pose), pose.copy())
+        self._catch_up()
+
+    def _replace_silent_primary(self, source: str, settled_ns: int) -> None:
+        """Replace the primary source if it was silent before a settled sample of a source."""
+        others = [name for name in self._names if name != self.primary]
+        silence = find_silence(
+            self.streams, [self.primary, *others], self.covered_ns, (source, settled_ns),
+            self._patience_ns)
+        if silence is not None:
+            self._switch(silence, others)
+
+    def _switch(self, silence: Silence, others: list[str]) -> None:
+        """Make another source the primary one after the last sample before a silence."""
+        old, last_ns = self.streams[self.primary], silence.last_ns
+        for stamp_ns, pose in old.settle(last_ns):
+            self._extend(stamp_ns, pose)
+        source = first_with_sample(self.streams, others, last_ns, silence.known_ns)
+        stream = self.streams[source]
+        stream.settle_all(silence.known_ns)
+        self._add_secondary_edges()
+        timeline, node_ns = stream.timeline, int(self.stamps_ns[-1])
+        self._primaries.append((last_ns, source))
+        if self._span is None and timeline.covers(node_ns):
+            self._base_ns = node_ns
+        else:
+            # the new primary source has no sample at the newest node
+            begin_ns = int(timeline.stamps_ns[0])
+            self._span = self._motion_since_node(old, min(begin_ns, last_ns))
+            self._base_ns = begin_ns
+            if begin_ns > last_ns:
+                self._span = self._after_span(
+                    *gap_motion(old.timeline, last_ns, begin_ns, old.saved_ns))
+        self._base, self.covered_ns = as_pose(timeline.pose(self._base_ns)), last_ns
+        self._catch_up()
+
+    def relocate(self, mean: FloatArray, noise: FloatArray) -> int:
+        """
+        Make a node 1 ns after the newest odometry, for a robot that was moved by hand.
+
+        All odometry must be settled. The motion by odometry since the newest node is not used.
+        Returns the row of the new node in the graph, or -1 if it could not be made.
+
+        Parameters
+        ----------
+        mean : ndarray, shape (3,)
+            Pose of the robot in the newest node [m, m, rad].
+        noise : ndarray, shape (3, 3)
+            Covariance of that pose, in the frame at its end.
+
+        """
+        timeline = self.streams[self.primary].timeline
+        moved = self._motion_since_node(self.streams[self.primary], self.covered_ns)[0]
+        row = self._make_node(mean, covariance.information(noise), self.primary)
+        if row < 0:
+            return row
+        stamp_ns = max(self.covered_ns, int(self.stamps_ns[-1])) + 1
+        self._append(
+            stamp_ns, row, as_pose(timeline.poses[-1]), se2.compose(self.odometry[-1], moved))
+        self._base_ns = self.covered_ns
+        # no secondary edge spans the step to the new pose
+        for source in self.streams:
+            if source != self.primary:
+                self._secondary.skip_to(source, len(self) - 1, reached=False)
+        return row
+
+    def _catch_up(self) -> None:
+        """Make the nodes that are due at the settled samples of a new primary source."""
+        source = self.primary
+        timeline = self.streams[source].timeline
+        begin = int(np.searchsorted(timeline.stamps_ns, self.covered_ns, side='right'))
+        samples = zip(timeline.stamps_ns[begin:].tolist(), timeline.poses[begin:].tolist(),
+                      strict=True)
+        for stamp_ns, (x, y, theta) in list(samples):
+            if stamp_ns - self.covered_ns > self._patience_ns:
+                self._replace_silent_primary(source, stamp_ns)
+            if self.primary != source:
+                return  # the nodes of the source that replaced it are made
+            self._extend(stamp_ns, (x, y, theta))
+
+    def _append(self, stamp_ns: int, row: int, base: Pose, odometry: FloatArray) -> None:
+        self._odometry.append_one(odometry)
+        self._stamps.append_one(stamp_ns)
+        self._rows.append_one(row)
+        self._base_ns, self._base, self._span = stamp_ns, base, None
+        self._secondary.skip_to(self.primary, len(self) - 1, reached=True)
+
+    def _extend(self, stamp_ns: int, pose: Pose) -> None:
+        """Make a node at a settled sample of the primary source, if one is due."""
+        self.covered_ns, base = stamp_ns, self._base
+        if self._span is None and not self._config.nodes.due(
+                math.hypot(pose[0] - base[0], pose[1] - base[1]),
+                abs(wrap_one(pose[2] - base[2])), (stamp_ns - self._base_ns) * 1e-9):
+            return
+        mean, noise = self._motion_since_node(self.streams[self.primary], stamp_ns)
+        row = self._make_node(mean, covariance.information(noise), self.primary)
+        if row >= 0:
+            self._append(stamp_ns, row, pose, se2.compose(self.odometry[-1], mean))
+
+    def _motion_since_node(
+        self, stream: OdometryStream, stamp_ns: int,
+    ) -> tuple[FloatArray, FloatArray]:
+        """Return the motion from the newest node to a stamp [ns], and its covariance."""
+        motion = stream.timeline.motion(self._base_ns, stamp_ns)
+        return self._after_span(motion.increment, stream.covariance(motion))
+
+    def _after_span(self, mean: FloatArray, noise: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Append a motion and its covariance to those from the newest node to `_base_ns`."""
+        if self._span is None:
+            return mean, noise
+        adjoint = se2.adjoint(se2.inverse(mean))
+        return (se2.compose(self._span[0], mean),
+                adjoint @ self._span[1] @ adjoint.T + noise)
+
+    def _add_secondary_edges(self) -> None:
+        if len(self.streams) == 1 or not self._primaries:
+            return
+        stamps_ns, rows, primary = self.stamps_ns, self.rows, self.primary
+        for source, stream in self.streams.items():
+            if source != primary:
+                self._secondary.extend(source, stream, stamps_ns, rows)
+
+    def primary_at(self, stamp_ns: int) -> str:
+        """Return the source that was the primary one at a stamp [ns]."""
+        return next(name for after_ns, name in reversed(self._primaries) if after_ns < stamp_ns)
+
+    def attach(self, stamp_ns: int) -> Attachment | None:
+        """
+        Return the last hidden node before a stamp and the motion from there to the stamp.
+
+        The motion is that of the source that was the primary one at the stamp, so the result does
+        not depend on later samples; None if that source does not cover the node and the stamp. The
+        stamp is not before the first node, and not after `covered_ns` [ns].
+        """
+        node = int(np.searchsorted(self.stamps_ns, stamp_ns, side='right')) - 1
+        node_ns, row = int(self.stamps_ns[node]), int(self.rows[node])
+        stream = self.streams[self.primary_at(stamp_ns)]
+        if not (stream.timeline.covers(node_ns) and stream.timeline.covers(stamp_ns)):
+            return None
+        motion = stream.timeline.motion(node_ns, stamp_ns)
+        return Attachment(row, motion.increment, stream.covariance(motion, floor=False))
+
+    def newest(self) -> tuple[FloatArray, FloatArray, FloatArray]:
+        """
+        Return the motion since the newest node.
+
+        Returns
+        -------
+        motion : ndarray, shape (3,)
+            From the newest node to the newest sample [m, m, rad].
+        noise : ndarray, shape (3, 3)
+            Its covariance, in the frame at its end.
+        odometry : ndarray, shape (3,)
+            Newest pose of the primary source as received [m, m, rad].
+
+        """
+        stream = self.streams[self.primary]
+        motion, raw = stream.newest(self._base_ns)
+        return *self._after_span(motion.increment, stream.covariance(motion, floor=False)), raw
+
+    def saved(self) -> SavedNodes:
+        """Return the state, with the odometry samples that are needed; there must be a node."""
+        span = None if self._span is None else SavedSpan(
+            as_pose(self._span[0]), as_matrix(self._span[1]))
+        after_ns, primaries = zip(*self._primaries, strict=True)
+        return SavedNodes(
+            self.stamps_ns.copy(), self.rows.copy(), self.odometry.copy(),
+            primaries, np.array(after_ns), self.covered_ns, self._base_ns, self._base, span,
+            {name: stream.saved(self.stamps_ns, self._secondary.progress[name])
+             for name, stream in self.streams.items()})
+
+    def restore(self, saved: SavedNodes) -> None:
+        """Set the state of this empty object to a saved one."""
+        self._stamps.append(saved.stamps_ns)
+        self._rows.append(saved.rows)
+        self._odometry.append(saved.odometry)
+        self._primaries = list(zip(saved.leads_after_ns.tolist(), saved.leads, strict=True))
+        self.covered_ns, self._base_ns, self._base = saved.lead_ns, saved.base_ns, saved.base
+        if saved.bridge is not None:
+            self._span = np.array(saved.bridge.mean), np.array(saved.bridge.covariance)
+        for name, stream in saved.streams.items():
+            self._make_stream(name).restore(stream)
+            self._secondary.progress[name] = stream.tied, stream.next_to_tie

@@ -1,0 +1,126 @@
+# Copyright 2026 The pose_graph_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""
+Choice of the primary odometry source, whose samples make the hidden nodes.
+
+The preferred source becomes the primary one unless it begins later than another by more than the
+patience. A primary source that is silent for longer than the patience is replaced by the most
+preferred source that has samples then.
+
+The choice depends on the stamps alone if all sources deliver samples in the order of stamps, up to
+the reorder window: when one source settles a stamp, the earlier samples of all sources are known.
+"""
+
+from collections.abc import Iterable, Mapping, Sequence
+from typing import NamedTuple
+
+from pose_graph_ros.core.odometry.stream import OdometryStream
+
+Streams = Mapping[str, OdometryStream]
+
+
+class Silence(NamedTuple):
+    """A silence of the primary source during which another source has samples."""
+
+    last_ns: int
+    """Stamp of the last sample before the silence [ns]."""
+    known_ns: int
+    """Stamp of the sample of another source that proves the silence too long [ns]."""
+
+
+def in_order_of_preference(streams: Streams, configured: Iterable[str]) -> list[str]:
+    """
+    Return the names of all sources, the preferred one first.
+
+    Parameters
+    ----------
+    streams : mapping of str to OdometryStream
+    configured : iterable of str
+        Names in the order of preference; other sources follow in the order of `streams`.
+
+    """
+    named = [name for name in configured if name in streams]
+    return named + [name for name in streams if name not in named]
+
+
+def choose_first(
+    streams: Streams, names: Sequence[str], preferred: str, settled_ns: int, patience_ns: int,
+) -> str | None:
+    """
+    Return the source that becomes the first primary one, or None if that is not decided yet.
+
+    Parameters
+    ----------
+    streams : mapping of str to OdometryStream
+    names : sequence of str
+        Sources in the order of preference.
+    preferred : str
+        Source that becomes the primary one without waiting; it may have no samples yet.
+    settled_ns : int
+        Stamp up to which the samples of all sources are known [ns].
+    patience_ns : int
+        Time by which another source must have begun before the preferred one [ns].
+
+    """
+    ready_ns = []
+    for name in names:
+        begin_ns = streams[name].first_after(-1)
+        if begin_ns is not None and name != preferred:
+            begin_ns = streams[name].first_after(begin_ns + patience_ns - 1)
+        if begin_ns is not None and begin_ns <= settled_ns:
+            ready_ns.append(begin_ns)
+    return first_with_sample(streams, names, -1, min(ready_ns)) if len(ready_ns) > 0 else None
+
+
+def first_with_sample(
+    streams: Streams, names: Sequence[str], after_ns: int, until_ns: int,
+) -> str:
+    """
+    Return the first source that has a sample in (after_ns, until_ns]; at least one must have.
+
+    Parameters
+    ----------
+    streams : mapping of str to OdometryStream
+    names : sequence of str
+        Sources in the order of preference.
+    after_ns, until_ns : int
+        Stamps [ns].
+
+    """
+    return next(name for name in names
+                if (streams[name].first_after(after_ns) or until_ns + 1) <= until_ns)
+
+
+def find_silence(
+    streams: Streams, names: Sequence[str], last_ns: int, settled: tuple[str, int],
+    patience_ns: int,
+) -> Silence | None:
+    """
+    Return the first silence of the primary source that is longer than the patience, if any.
+
+    Parameters
+    ----------
+    streams : mapping of str to OdometryStream
+    names : sequence of str
+        The primary source, then the others in the order of preference.
+    last_ns : int
+        Stamp of the sample of the primary source from which the search starts [ns].
+    settled : tuple of str and int
+        Source and stamp [ns] of a settled sample: the samples before it are known.
+    patience_ns : int
+        Longest silence that is tolerated [ns].
+
+    """
+    primary, *others = names
+    source, settled_ns = settled
+    while True:
+        # the next sample of the primary source ends its silence
+        next_ns = settled_ns if source == primary else streams[primary].first_after(last_ns)
+        until_ns = settled_ns + 1 if next_ns is None else min(next_ns, settled_ns + 1)
+        after = (streams[name].first_after(last_ns + patience_ns) for name in others)
+        known = [stamp_ns for stamp_ns in after if stamp_ns is not None and stamp_ns < until_ns]
+        if len(known) > 0:
+            return Silence(last_ns, min(known))
+        if next_ns is None or next_ns >= settled_ns:
+            return None
+        last_ns = next_ns

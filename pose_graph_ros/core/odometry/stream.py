@@ -1,0 +1,431 @@
+# Copyright 2026 The pose_graph_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""
+One source of odometry: its samples in the order of their stamps, without jumps.
+
+A sample is settled when it is older than the newest one by the reorder window; older samples are
+rejected then. Where odometry jumps farther than the robot can have moved, it was reset: the motion
+of that step is predicted from the speeds before, with a large covariance, and the later samples
+are appended to the predicted pose.
+"""
+
+import bisect
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+import math
+from typing import NamedTuple
+
+import numpy as np
+
+from pose_graph_ros.core.config import NoiseFrom, OdometrySource
+from pose_graph_ros.core.geometry.scalar_se2 import between_one, compose_one, Pose, wrap_one
+from pose_graph_ros.core.geometry.se2 import FloatArray, IntArray
+from pose_graph_ros.core.measurements import (
+    ACCEPTED,
+    Answer,
+    LARGEST_COORDINATE,
+    LARGEST_STAMP,
+    OdometrySample,
+    rejected,
+    value_defect,
+)
+from pose_graph_ros.core.odometry.gaps import JUMP_SIGMA, restart_variance, RESUMED_WITHIN
+from pose_graph_ros.core.odometry.jumps import is_jump, MEMORY_TIME, Speeds, SpeedWindow, UNKNOWN
+from pose_graph_ros.core.odometry.motion import Motion, odometry_covariance
+from pose_graph_ros.core.odometry.timeline import (
+    next_row,
+    NOTHING,
+    OdometryTimeline,
+    Row,
+    Variances,
+)
+from pose_graph_ros.core.saved_columns import Flags, Integers, Rows7, Rows8
+
+# Largest variance of a twist that is used; those beyond, and zero, stand for unknown
+# [m^2/s^2, rad^2/s^2].
+LARGEST_TWIST_VARIANCE = 1e4
+# A sample is dropped if its stamp is farther ahead, by this and the reorder window [ns], than the
+# stamps of this number of consecutive samples that came after it.
+FAR_AHEAD_NS = 10_000_000_000
+MANY_BEHIND = 5
+# Time before the newest sample whose samples are all saved with a graph, for measurements that
+# come late [ns].
+RECENT_NS = 60_000_000_000
+
+
+@dataclass(frozen=True, slots=True)
+class SavedInstant:
+    """Saved state of a source at its newest settled sample, see `Row` and `SpeedWindow`."""
+
+    raw: Pose
+    """Pose as received [m, m, rad]."""
+    offset: Pose | None
+    """Pose of the odometry frame in the frame without jumps; None before the first jump."""
+    counted: Pose
+    counted_ns: int
+    held: Pose
+    rate: tuple[float, float, float, float, float, float, float] | None
+    """Velocity, recent and greatest speeds; None before they are known."""
+    since_ns: int
+    since: Pose
+    way: tuple[float, float]
+    """Path length [m] and sum of absolute turns [rad] since then."""
+    jumped: bool
+    """Whether odometry jumped to this sample."""
+
+
+@dataclass(frozen=True, slots=True)
+class SavedStream:
+    """Saved odometry source: its samples next to the hidden nodes, and its newest ones."""
+
+    stamps_ns: Integers
+    """Stamps of settled samples, shape (T,) [ns]."""
+    samples: Rows8
+    """Their rows, as returned by `OdometryTimeline.thinned`, shape (T, 8)."""
+    dense: Flags
+    """As `OdometryTimeline.dense`, shape (T,)."""
+    resting: bool
+    """As `OdometryTimeline.resting`."""
+    last: SavedInstant | None
+    waiting_ns: Integers
+    """Stamps of samples that are not settled, shape (W,) [ns]."""
+    waiting: Rows7
+    """As received: pose, speed, variances of the twist (zero where unknown), shape (W, 7)."""
+    restarted_ns: int
+    """As `OdometryStream.restarted_ns`."""
+    tied: int
+    """Newest node that the samples cover, where the next secondary edge begins; -1 for none."""
+    next_to_tie: int
+    """Next node to check for a secondary edge."""
+
+
+class _Sample(NamedTuple):
+    """An odometry sample as received."""
+
+    stamp_ns: int
+    pose: Pose
+    speed: float
+    variance: Variances | None
+
+
+class _Instant(NamedTuple):
+    """The state of a source at a sample."""
+
+    raw: Pose
+    """Pose as received [m, m, rad]."""
+    row: Row
+    """The sample in a frame without jumps, with its sums."""
+    offset: Pose | None
+    """Pose of the odometry frame in the frame without jumps; None before the first jump."""
+    window: SpeedWindow
+    """Speeds of the robot by this odometry."""
+    jumped: bool
+    """Whether odometry jumped to this sample."""
+    restarted: bool = False
+    """Whether odometry restarted at this sample, after a graph was loaded."""
+
+
+class OdometryStream:
+    """The samples of one source of odometry."""
+
+    def __init__(self, source: OdometrySource) -> None:
+        self.timeline = OdometryTimeline()
+        """Settled samples, in a frame without jumps."""
+        self.n_jumps = 0
+        """Number of jumps among the settled samples."""
+        self.n_sorted = 0
+        """Number of samples that were received after newer ones and sorted in before them."""
+        self.n_dropped = 0
+        """Number of accepted samples that were dropped later as their stamps were far ahead."""
+        self._waiting: list[_Sample] = []
+        """Samples that are not settled, by stamp."""
+        self._ahead: list[_Instant] = []
+        """States at the first of them, computed in advance."""
+        self._last: _Instant | None = None
+        """State at the newest settled sample."""
+        self._n_behind = 0
+        """Number of consecutive received samples that are far behind the newest one."""
+        self.saved_ns = -1
+        """Stamp of the newest sample of a graph that was loaded; -1 if none was [ns]."""
+        self.restarted_ns = -1
+        """Stamp at which odometry restarted after a graph was loaded; -1 if it did not [ns]."""
+        self.configure(source)
+
+    def configure(self, source: OdometrySource) -> None:
+        """
+        Set the settings for samples that are not settled yet and for covariances from now on.
+
+        `noise_from` must not change, as settled samples keep their variances from the twist.
+        """
+        self._source = source
+        self._noise = source.noise
+        if source.noise_from is NoiseFrom.TWIST:
+            # the variances of the timeline contain all of the noise
+            self._noise = replace(source.noise, sigma_distance=0.0, sigma_lateral=0.0,
+                                  sigma_heading_distance=0.0, sigma_heading_turn=0.0)
+        self._window_ns = round(source.reorder_window * 1e9)
+        # samples not settled yet get the new settings, even if their states were computed before
+        self._ahead.clear()
+
+    @property
+    def newest_ns(self) -> int:
+        """Stamp of the newest sample [ns], settled or not; -1 before the first."""
+        return self._waiting[-1].stamp_ns if self._waiting else self.settled_ns
+
+    @property
+    def settled_ns(self) -> int:
+        """Stamp of the newest settled sample [ns]; -1 before the first."""
+        return -1 if self._last is None else self._last.row.stamp_ns
+
+    @property
+    def n_jumps_seen(self) -> int:
+        """Number of jumps among all samples, settled or not."""
+        self._compute_ahead()
+        return self.n_jumps + sum(instant.jumped for instant in self._ahead)
+
+    def add(self, sample: OdometrySample) -> Answer:
+        """Add a sample; return whether it is accepted, or the reason for its rejection."""
+        if not 0 < sample.stamp_ns <= LARGEST_STAMP:
+            return rejected('zero_stamp' if sample.stamp_ns <= 0 else 'no_stamp',
+                            f'odometry at {sample.stamp_ns}')
+        x, y, theta = sample.pose.tolist()
+        if not (abs(x) <= LARGEST_COORDINATE and abs(y) <= LARGEST_COORDINATE
+                and abs(theta) <= LARGEST_COORDINATE):
+            return rejected(value_defect(sample.pose) or '', f'odometry pose {[x, y, theta]}')
+        if sample.stamp_ns <= self.settled_ns:
+            return rejected(*self._late(sample.stamp_ns))
+        at = len(self._waiting)
+        if at > 0 and sample.stamp_ns <= self._waiting[-1].stamp_ns:
+            at = bisect.bisect_left(self._waiting, sample.stamp_ns, key=_stamp)
+            if self._waiting[at].stamp_ns == sample.stamp_ns:
+                return rejected('duplicate_stamp', f'odometry at {sample.stamp_ns} came before')
+            del self._ahead[at:]
+            self.n_sorted += 1
+        variance = sample.twist_variance
+        self._waiting.insert(at, _Sample(
+            sample.stamp_ns, (x, y, wrap_one(theta)), sample.speed,
+            None if variance is None else tuple(variance.tolist())))
+        behind = self._waiting[-1].stamp_ns - sample.stamp_ns > FAR_AHEAD_NS + self._window_ns
+        self._n_behind = self._n_behind + 1 if behind else 0
+        if self._n_behind >= MANY_BEHIND:
+            self._drop_far_ahead(sample.stamp_ns)
+        return ACCEPTED
+
+    def _drop_far_ahead(self, now_ns: int) -> None:
+        """Remove the samples that are far ahead of a stamp [ns]."""
+        kept = bisect.bisect_right(
+            self._waiting, now_ns + FAR_AHEAD_NS + self._window_ns, key=_stamp)
+        self.n_dropped += len(self._waiting) - kept
+        del self._waiting[kept:], self._ahead[kept:]
+        self._n_behind = 0
+
+    def _late(self, stamp_ns: int) -> tuple[str, str]:
+        """Return reason and detail of the rejection of a stamp that is not after `settled_ns`."""
+        stamps = self.timeline.stamps_ns
+        at = int(np.searchsorted(stamps, stamp_ns))
+        came = at < len(stamps) and (stamps[at] == stamp_ns or self.timeline.dense(at))
+        return ('duplicate_stamp' if came else 'out_of_order',
+                f'odometry at {stamp_ns} after {self.settled_ns}')
+
+    def settle(self, until_ns: int | None = None) -> Iterator[tuple[int, Pose]]:
+        """
+        Settle samples one by one, and yield each after it was appended to the timeline.
+
+        What is yielded are its stamp [ns] and its pose in a frame without jumps. The newest stamp
+        to settle [ns] is by default that of the newest sample minus the reorder window.
+        """
+        if until_ns is None:
+            until_ns = self.newest_ns - self._window_ns
+        while self._waiting and self._waiting[0].stamp_ns <= until_ns:
+            if not self._ahead:
+                self._ahead.append(self._next_instant(self._last, self._waiting[0]))
+            del self._waiting[0]
+            self._last = self._ahead.pop(0)
+            self.n_jumps += self._last.jumped
+            if self._last.restarted:
+                self.restarted_ns = self._last.row.stamp_ns
+            self.timeline.append(self._last.row)
+            yield self._last.row.stamp_ns, self._last.row.pose
+
+    def settle_all(self, until_ns: int) -> None:
+        """Settle all samples up to a stamp [ns]."""
+        for _ in self.settle(until_ns):
+            pass
+
+    def first_after(self, stamp_ns: int) -> int | None:
+        """
+        Return the stamp of the first sample after an instant [ns], settled or not; None without.
+
+        Between samples at rest, of which the timeline keeps two, it is `stamp_ns + 1`.
+        """
+        if self.settled_ns > stamp_ns:
+            stamps = self.timeline.stamps_ns
+            at = int(np.searchsorted(stamps, stamp_ns, side='right'))
+            # samples at rest that the timeline left out lie in between
+            return stamp_ns + 1 if self.timeline.dense(at) and at > 0 else int(stamps[at])
+        at = bisect.bisect_right(self._waiting, stamp_ns, key=_stamp)
+        return self._waiting[at].stamp_ns if at < len(self._waiting) else None
+
+    def saved(self, nodes_ns: IntArray, tied: tuple[int, int]) -> SavedStream:
+        """
+        Return the state, with the samples next to the hidden nodes and the newest ones.
+
+        Parameters
+        ----------
+        nodes_ns : ndarray of int64, shape (N,)
+            Stamps of the hidden nodes [ns]; N >= 1.
+        tied : tuple of int
+            Progress of the secondary edges of this source, see `SecondaryEdges.progress`.
+
+        """
+        stamps, rows, dense = self.timeline.thinned(
+            nodes_ns, min(int(nodes_ns[-1]), self.settled_ns - RECENT_NS))
+        waiting = np.array([(*sample.pose, sample.speed, *(sample.variance or NOTHING))
+                            for sample in self._waiting]).reshape(-1, 7)
+        waiting[~np.isfinite(waiting)] = 0.0    # stands for unknown, too
+        return SavedStream(
+            stamps, rows, dense, self.timeline.resting,
+            None if self._last is None else _saved_instant(self._last),
+            np.array([sample.stamp_ns for sample in self._waiting], dtype=np.int64), waiting,
+            self.restarted_ns, *tied)
+
+    def restore(self, saved: SavedStream) -> None:
+        """Set the state of this empty stream to a saved one."""
+        if saved.last is not None:
+            self._last = _restored_instant(saved, saved.last)
+            self.timeline.restore(
+                saved.stamps_ns, saved.samples, saved.dense, self._last.row,
+                resting=saved.resting)
+        for stamp_ns, (x, y, theta, speed, *variance) in zip(
+                saved.waiting_ns.tolist(), saved.waiting.tolist(), strict=True):
+            self._waiting.append(_Sample(stamp_ns, (x, y, theta), speed, tuple(variance)))
+        self.restarted_ns = saved.restarted_ns
+        self.saved_ns = self.newest_ns
+
+    def covariance(self, motion: Motion, *, floor: bool = True) -> FloatArray:
+        """
+        Return the covariance, shape (3, 3), of a motion by this odometry in the frame at its end.
+
+        Parameters
+        ----------
+        motion, floor
+            As in `odometry_covariance`.
+
+        """
+        return np.asarray(self._source.covariance_scale * odometry_covariance(
+            self._noise, motion, floor=floor))
+
+    def newest(self, since_ns: int) -> tuple[Motion, FloatArray]:
+        """
+        Return the motion from a settled instant [ns] to the newest sample, settled or not.
+
+        Returns
+        -------
+        motion : Motion
+        raw : ndarray, shape (3,)
+            Pose of the newest sample as received [m, m, rad].
+
+        Raises
+        ------
+        ValueError
+            If there are no samples, or they do not cover the instant.
+
+        """
+        self._compute_ahead()
+        last = self._ahead[-1] if self._ahead else self._last
+        if last is None:
+            raise ValueError('there is no odometry')
+        return self.timeline.motion_to(since_ns, last.row), np.array(last.raw)
+
+    def _compute_ahead(self) -> None:
+        """Compute the states at all samples that are not settled."""
+        for sample in self._waiting[len(self._ahead):]:
+            self._ahead.append(self._next_instant(
+                self._ahead[-1] if self._ahead else self._last, sample))
+
+    def _next_instant(self, before: _Instant | None, sample: _Sample) -> _Instant:
+        """Return the state at a sample from the state at the sample before."""
+        stamp_ns, raw = sample.stamp_ns, sample.pose
+        if before is None:
+            return _Instant(raw, next_row(None, stamp_ns, raw), None,
+                            SpeedWindow(UNKNOWN, stamp_ns, raw), jumped=False)
+        motion = between_one(before.raw, raw)
+        elapsed = (stamp_ns - before.row.stamp_ns) * 1e-9
+        step = math.hypot(motion[0], motion[1]), abs(motion[2])
+        jump = is_jump(
+            before.window.speeds, step, elapsed, sample.speed, self._source.maximum_speed)
+        if before.row.stamp_ns <= self.saved_ns < stamp_ns and (jump or elapsed > RESUMED_WITHIN):
+            return _after_restart(before, stamp_ns, raw)
+        if jump:
+            return _after_jump(before, stamp_ns, raw, elapsed)
+        pose = raw if before.offset is None else compose_one(before.offset, raw)
+        row = next_row(before.row, stamp_ns, pose, self._step_variance(sample, step, elapsed))
+        return _Instant(
+            raw, row, before.offset, before.window.moved(stamp_ns, pose, step), jumped=False)
+
+    def _step_variance(
+        self, sample: _Sample, step: tuple[float, float], elapsed: float,
+    ) -> Variances:
+        """Return the variance of (x, y, theta) of a step by the twist; zero with other models."""
+        if self._source.noise_from is not NoiseFrom.TWIST:
+            return NOTHING
+        noise = self._source.noise
+        by_model = (
+            noise.sigma_distance**2 * step[0], noise.sigma_lateral**2 * step[0],
+            noise.sigma_heading_distance**2 * step[0] + noise.sigma_heading_turn**2 * step[1])
+        if sample.variance is None:
+            return by_model
+        x, y, theta = (
+            variance * elapsed if 0.0 < variance <= LARGEST_TWIST_VARIANCE else instead
+            for variance, instead in zip(sample.variance, by_model, strict=True))
+        return x, y, theta
+
+
+def _after_jump(before: _Instant, stamp_ns: int, raw: Pose, elapsed: float) -> _Instant:
+    """Return the state at a sample to which odometry has jumped."""
+    time = min(elapsed, MEMORY_TIME)
+    speeds = before.window.speeds
+    x, y, theta = speeds.velocity
+    pose = compose_one(before.row.pose, (x * time, y * time, wrap_one(theta * time)))
+    way, turn = (rate * elapsed if math.isfinite(rate) else 0.0 for rate in speeds.recent)
+    position, heading = (JUMP_SIGMA[0] + way)**2, (JUMP_SIGMA[1] + turn)**2
+    row = next_row(before.row, stamp_ns, pose, loose=(position, position, heading))
+    offset = compose_one(pose, between_one(raw, (0.0, 0.0, 0.0)))
+    return _Instant(raw, row, offset, SpeedWindow(speeds, stamp_ns, pose), jumped=True)
+
+
+def _after_restart(before: _Instant, stamp_ns: int, raw: Pose) -> _Instant:
+    """Return the state at a sample at which odometry restarts after a graph was loaded."""
+    pose = before.row.pose
+    row = next_row(before.row, stamp_ns, pose, loose=restart_variance())
+    offset = compose_one(pose, between_one(raw, (0.0, 0.0, 0.0)))
+    return _Instant(
+        raw, row, offset, SpeedWindow(UNKNOWN, stamp_ns, pose), jumped=True, restarted=True)
+
+
+def _saved_instant(last: _Instant) -> SavedInstant:
+    speeds, since_ns, since, path = last.window
+    rate = None if speeds is UNKNOWN else (
+        *speeds.velocity, *speeds.recent, *speeds.greatest)
+    return SavedInstant(
+        last.raw, last.offset, last.row.counted, last.row.counted_ns, last.row.held, rate,
+        since_ns, since, path, last.jumped)
+
+
+def _restored_instant(saved: SavedStream, last: SavedInstant) -> _Instant:
+    x, y, theta, distance, turn, *variance = saved.samples[-1].tolist()
+    row = Row(int(saved.stamps_ns[-1]), (x, y, theta), distance, turn, _nothing(tuple(variance)),
+              last.counted, last.counted_ns, _nothing(last.held))
+    speeds = UNKNOWN if last.rate is None else Speeds(
+        last.rate[:3], last.rate[3:5], last.rate[5:])
+    return _Instant(last.raw, row, last.offset,
+                    SpeedWindow(speeds, last.since_ns, last.since, last.way), last.jumped)
+
+
+def _nothing(variance: Variances) -> Variances:
+    """Return `NOTHING` itself for a variance of zero, as `next_row` compares by identity."""
+    return variance if any(variance) else NOTHING
+
+
+def _stamp(sample: _Sample) -> int:
+    return sample.stamp_ns

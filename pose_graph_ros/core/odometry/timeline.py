@@ -1,0 +1,332 @@
+# Copyright 2026 The pose_graph_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""Odometry samples by stamp, and the motion between any two instants that they cover."""
+
+import math
+from typing import NamedTuple
+
+import numpy as np
+import numpy.typing as npt
+
+from pose_graph_ros.core.compiled.growing_array import GrowingArray
+from pose_graph_ros.core.geometry import se2
+from pose_graph_ros.core.geometry.scalar_se2 import Pose, wrap_one
+from pose_graph_ros.core.geometry.se2 import FloatArray, IntArray
+from pose_graph_ros.core.odometry.motion import Motion, NO_MOTION
+
+# Motions below both of these are not added to path length and turns: odometry jitters at rest,
+# and the sum of its jitter at 50 Hz would be a long path [m, rad].
+JITTER_DISTANCE = 0.01
+JITTER_HEADING = 0.01
+# A robot that stays within the jitter for longer stands still: its odometry has no noise [ns].
+STANDING_NS = 1_000_000_000
+
+# Largest time between two samples that cover the instants in between closely, and between equal
+# samples at rest of which some are left out [ns].
+LARGEST_GAP_NS = 1_000_000_000
+
+# Accelerations that interpolation between two samples must allow for [m/s^2, rad/s^2]: an
+# acceleration a moves the pose away from uniform motion by a t1 t2 / 2, with t1 and t2 the times
+# to the two samples.
+UNIFORM_WITHIN = (1.0, 0.5)
+
+Variances = tuple[float, float, float]
+NOTHING: Variances = (0.0, 0.0, 0.0)
+
+
+class Row(NamedTuple):
+    """A sample, with the sums of path length, turns and variances up to it."""
+
+    stamp_ns: int
+    pose: Pose
+    """`T_odom_base` in a frame without jumps [m, m, rad]."""
+    distance: float
+    """Path length so far [m]."""
+    turn: float
+    """Sum of absolute turns so far [rad]."""
+    variance: Variances
+    """Sums of the variances of (x, y, theta) so far [m^2, m^2, rad^2]."""
+    counted: Pose
+    """Pose up to which path length and turns have been added."""
+    counted_ns: int
+    """Stamp of `counted`, or a later one up to which the robot stood still [ns]."""
+    held: Variances
+    """Sums of the variances since then; they are added to `variance` once the robot moves."""
+
+
+def next_row(
+    before: Row | None, stamp_ns: int, pose: Pose, variance: Variances = NOTHING,
+    loose: Variances = NOTHING,
+) -> Row:
+    """
+    Return the row of the next sample.
+
+    Parameters
+    ----------
+    before : Row, optional
+        Row of the sample before; None for the first sample.
+    stamp_ns : int
+    pose : tuple
+        `T_odom_base` [m, m, rad].
+    variance : tuple
+        Variance of (x, y, theta) of the motion since the sample before, in the robot's frame; it
+        is added only if the robot moves.
+    loose : tuple
+        Variance that is added in any case.
+
+    """
+    if before is None:
+        return Row(stamp_ns, pose, 0.0, 0.0, NOTHING, pose, stamp_ns, NOTHING)
+    _, _, distance, turn, total, counted, counted_ns, held = before
+    step = math.hypot(pose[0] - counted[0], pose[1] - counted[1])
+    bend = abs(wrap_one(pose[2] - counted[2]))
+    if variance is not NOTHING:
+        held = held[0] + variance[0], held[1] + variance[1], held[2] + variance[2]
+    if step >= JITTER_DISTANCE or bend >= JITTER_HEADING:
+        distance, turn, counted, counted_ns = distance + step, turn + bend, pose, stamp_ns
+        if held is not NOTHING:
+            total = total[0] + held[0], total[1] + held[1], total[2] + held[2]
+            held = NOTHING
+    elif held is not NOTHING and stamp_ns - counted_ns > STANDING_NS:
+        held, counted_ns = NOTHING, stamp_ns
+    if loose is not NOTHING:
+        total = total[0] + loose[0], total[1] + loose[1], total[2] + loose[2]
+    return Row(stamp_ns, pose, distance, turn, total, counted, counted_ns, held)
+
+
+class OdometryTimeline:
+    """
+    Odometry samples with increasing stamps.
+
+    A sample takes 49 bytes, 73 with variances. Of consecutive equal samples only the first and
+    the last are kept.
+    """
+
+    def __init__(self) -> None:
+        self._stamps = GrowingArray((), np.int64)
+        self._samples = GrowingArray((5,), np.float64)
+        """x, y, theta, path length, sum of absolute turns."""
+        self._variances = GrowingArray((3,), np.float64)
+        """Sums of the variances of x, y, theta; empty while all are zero."""
+        self._dense = GrowingArray((), np.bool_)
+        """Whether equal samples between the one before and this one were left out."""
+        self._last: Row | None = None
+        self.resting = False
+        """Whether the newest two samples are equal: an equal one would replace the newest."""
+
+    def __len__(self) -> int:
+        return len(self._stamps)
+
+    @property
+    def stamps_ns(self) -> IntArray:
+        """Stamps of all samples [ns], a read-only view."""
+        return self._stamps.read_only
+
+    @property
+    def poses(self) -> FloatArray:
+        """Poses of all samples in the odometry frame, shape (N, 3), a read-only view."""
+        return self._samples.read_only[:, :3]
+
+    def append(self, row: Row) -> None:
+        """
+        Append a sample as returned by `next_row`.
+
+        Raises
+        ------
+        ValueError
+            If the stamp is not newer than the newest one.
+
+        """
+        last, same = self._last, False
+        if last is not None:
+            if row.stamp_ns <= last.stamp_ns:
+                raise ValueError(f'expected a stamp after {last.stamp_ns}, got {row.stamp_ns}')
+            same = row[1:5] == last[1:5] and row.stamp_ns - last.stamp_ns <= LARGEST_GAP_NS
+        self._last = row
+        if same and self.resting:
+            # the newest of the equal samples replaces the one before
+            self._stamps.values[-1] = row.stamp_ns
+            self._dense.values[-1] = True
+            return
+        self.resting = same
+        self._stamps.append_one(row.stamp_ns)
+        if len(self._variances) == 0 and any(row.variance):
+            self._variances.append(np.zeros((len(self._samples), 3)))
+        if len(self._variances) == len(self._samples) > 0:
+            self._variances.append_one(row.variance)
+        self._samples.append_one((*row.pose, row.distance, row.turn))
+        self._dense.append_one(False)
+
+    def covers(self, stamp_ns: int, *, closely: bool = False) -> bool:
+        """
+        Tell whether there is a sample at an instant, or one before and one after it.
+
+        Parameters
+        ----------
+        stamp_ns : int
+        closely : bool
+            Whether the two samples must be at most `LARGEST_GAP_NS` apart, or equal samples
+            between them must have been left out.
+
+        """
+        stamps = self._stamps.values
+        if len(stamps) == 0 or not stamps[0] <= stamp_ns <= stamps[-1]:
+            return False
+        if not closely:
+            return True
+        after = int(np.searchsorted(stamps, stamp_ns))
+        return (bool(stamps[after] == stamp_ns) or self.dense(after)
+                or int(stamps[after] - stamps[after - 1]) <= LARGEST_GAP_NS)
+
+    def dense(self, sample: int) -> bool:
+        """Tell whether equal samples between the one before and this one were left out."""
+        return bool(self._dense.values[sample])
+
+    def thinned(
+        self, instants_ns: IntArray, since_ns: int,
+    ) -> tuple[IntArray, FloatArray, npt.NDArray[np.bool_]]:
+        """
+        Return the samples that are needed for the motions between some instants.
+
+        These are the first sample, those at the instants or else on both sides of them, and all
+        from a later instant on. Motions between these instants do not depend on other samples.
+
+        Parameters
+        ----------
+        instants_ns : ndarray of int64, shape (N,)
+            Covered instants [ns].
+        since_ns : int
+            Stamp from which all samples are returned [ns].
+
+        Returns
+        -------
+        stamps_ns : ndarray of int64, shape (T,)
+        rows : ndarray, shape (T, 8)
+            Pose, path length, sum of absolute turns, sums of variances.
+        dense : ndarray of bool, shape (T,)
+            As `dense`.
+
+        """
+        stamps = self.stamps_ns
+        keep = np.zeros(len(stamps), dtype=bool)
+        keep[:1] = True
+        keep[np.searchsorted(stamps, since_ns):] = True
+        after = np.searchsorted(stamps, instants_ns)
+        inside = after < len(stamps)
+        keep[after[inside]] = True
+        inside[inside] = stamps[after[inside]] != instants_ns[inside]
+        keep[after[inside] - 1] = True  # (-1, the last sample, for an instant before the first)
+        return (stamps[keep], self._rows(keep),
+                (self._dense.values & np.append(False, keep[:-1]))[keep])
+
+    def restore(
+        self, stamps_ns: IntArray, rows: FloatArray, dense: npt.NDArray[np.bool_], last: Row, *,
+        resting: bool,
+    ) -> None:
+        """
+        Fill this empty timeline with the result of `thinned`.
+
+        Parameters
+        ----------
+        stamps_ns, rows, dense
+            As returned by `thinned`.
+        last : Row
+            The newest sample.
+        resting : bool
+            As `resting`.
+
+        """
+        self._stamps.append(stamps_ns)
+        self._samples.append(rows[:, :5])
+        if np.any(rows[:, 5:]):
+            self._variances.append(rows[:, 5:])
+        self._dense.append(dense)
+        self._last, self.resting = last, resting
+
+    def motion(self, start_ns: int, end_ns: int) -> Motion:
+        """
+        Return the motion between two covered instants.
+
+        Parameters
+        ----------
+        start_ns, end_ns : int
+            Stamps [ns], the start not after the end.
+
+        Raises
+        ------
+        ValueError
+            If an instant is not covered, or they are in the wrong order.
+
+        """
+        if start_ns > end_ns:
+            raise ValueError(f'expected start <= end, got {start_ns} and {end_ns}')
+        start, start_variance = self._at(start_ns)
+        if start_ns == end_ns:
+            return NO_MOTION
+        end, end_variance = self._at(end_ns)
+        return Motion(se2.between(start[:3], end[:3]), float(end[3] - start[3]),
+                      float(end[4] - start[4]),
+                      end[5:] - start[5:] + start_variance + end_variance)
+
+    def motion_to(self, start_ns: int, end: Row) -> Motion:
+        """
+        Return the motion from a covered instant to a row that is not in the timeline yet.
+
+        Parameters
+        ----------
+        start_ns : int
+        end : Row
+            The newest row of the timeline, or one made from it by `next_row`.
+
+        Raises
+        ------
+        ValueError
+            If the instant is not covered.
+
+        """
+        start, start_variance = self._at(start_ns)
+        return Motion(se2.between(start[:3], np.array(end.pose)), float(end.distance - start[3]),
+                      float(end.turn - start[4]),
+                      np.array(end.variance) - start[5:] + start_variance)
+
+    def pose(self, stamp_ns: int) -> FloatArray:
+        """
+        Return the interpolated pose in the odometry frame at an instant, shape (3,) [m, m, rad].
+
+        Raises
+        ------
+        ValueError
+            If the instant is not covered.
+
+        """
+        return self._at(stamp_ns)[0][:3]
+
+    def _rows(self, which: int | slice | npt.NDArray[np.bool_]) -> FloatArray:
+        """Return some samples with their sums, shape (..., 8)."""
+        samples = self._samples.values[which]
+        rows = np.zeros((*samples.shape[:-1], 8))
+        rows[..., :5] = samples
+        if len(self._variances) > 0:
+            rows[..., 5:] = self._variances.values[which]
+        return rows
+
+    def _at(self, stamp_ns: int) -> tuple[FloatArray, FloatArray]:
+        """Return the interpolated row at an instant, and the variance of interpolation, (3,)."""
+        if not self.covers(stamp_ns):
+            raise ValueError(f'no odometry at {stamp_ns}')
+        stamps = self._stamps.values
+        after = int(np.searchsorted(stamps, stamp_ns))
+        if stamps[after] == stamp_ns:
+            return self._rows(after), np.zeros(3)
+        before = after - 1
+        start, end = int(stamps[before]), int(stamps[after])
+        fraction = (stamp_ns - start) / (end - start)
+        first, second = self._rows(slice(before, after + 1))
+        row = first + fraction * (second - first)
+        row[:3] = se2.interpolate(first[:3], second[:3], fraction)
+        # the error of interpolation is at most the path between the samples
+        way, turn = second[3:5] - first[3:5]
+        bend = 0.5 * fraction * (1.0 - fraction) * ((end - start) * 1e-9)**2
+        position = min(UNIFORM_WITHIN[0] * bend, float(way))
+        heading = min(UNIFORM_WITHIN[1] * bend, float(turn))
+        return row, np.array((position**2, position**2, heading**2))

@@ -1,0 +1,13 @@
+# Copyright 2026 The pose_graph_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""
+The incremental smoother: an update of the graph goes in, the estimate of all poses comes out.
+
+`incremental` is the module to read first: its `IncrementalSmoother` owns the graph, applies each
+update as a transaction and returns covariances of the nodes. `step` repeats three stages until
+the linearization error is within a budget: `tree_update` eliminates the affected cliques of the
+Bayes tree again, `back_substitution` (with `rigid_propagation`) solves as far as values change,
+and `relinearization` selects the constraints to linearize again. `chain` appends a node to a chain
+in constant time, and `batch_fallback` optimises the whole graph if a step diverges. `covariances`
+and `sparse_inverse` compute marginal covariances from the tree.
+"""

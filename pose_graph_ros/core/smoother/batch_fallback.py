@@ -1,0 +1,48 @@
+# Copyright 2026 The pose_graph_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""
+Batch optimisation of a copy of the graph, for a step whose iterations diverge.
+
+Gauss-Newton converges from a good estimate. A loop closure that contradicts the estimate by
+radians, over a part of the graph with little information, can make it diverge. That is rare and
+detected at once, so steps are not damped. The batch optimiser begins at a linear start, and begins
+again at the poses before the step if the result has a higher chi2 than these. The minimum that it
+finds is better than the result of a damped step, at the cost of a few steps.
+"""
+
+import numpy as np
+
+from pose_graph_ros.core.batch import optimizer
+from pose_graph_ros.core.batch.optimizer import Status
+from pose_graph_ros.core.config import SolverConfig
+from pose_graph_ros.core.graph import transaction_log
+from pose_graph_ros.core.graph.graph import Graph
+
+_CONFIG = SolverConfig(max_iterations=50, step_tolerance=1e-6)
+
+
+def optimize_copy(graph: Graph, copy: Graph) -> bool:
+    """
+    Copy a graph into an empty one, and optimise the copy.
+
+    Parameters
+    ----------
+    graph : Graph
+        In the middle of an update; not changed.
+    copy : Graph
+        Empty; afterwards all its nodes are touched, to be eliminated at the next step.
+
+    Returns
+    -------
+    bool
+        Whether the batch optimiser found a solution.
+
+    """
+    poses = np.empty((graph.n_nodes, 3))
+    # the start if the linear start leads to a higher chi2
+    transaction_log.poses_before(graph.memory.head, poses)
+    copy.fill(graph.rows()._replace(poses=poses))
+    if optimizer.optimize_from_linear_start(copy, _CONFIG).status is Status.FAILED:
+        return False
+    copy.set_poses(copy.poses)
+    return True

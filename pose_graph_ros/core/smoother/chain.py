@@ -1,0 +1,242 @@
+# Copyright 2026 The pose_graph_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""
+Extension of a chain by a node behind the newest pose, in constant time.
+
+The newest pose is alone in the root clique. Its rows of R give its equations `R^T R` and `R^T d`,
+which make a front of two nodes with the new edge. The old root is eliminated from it, and the new
+node becomes the root. Without an observed node the solution is known: the new node lies where
+odometry predicts it, and no other node moves.
+"""
+
+import math
+
+from pose_graph_ros.core.compiled.jit import kernel
+from pose_graph_ros.core.elimination.fronts import LEAST_PIVOT
+from pose_graph_ros.core.graph import factors, pools, rows, tables as tb, transaction_log
+from pose_graph_ros.core.graph.editing import scale_by_edge, scale_by_observed
+
+# Return codes of `extend`.
+EXTENDED, NO_ROOM, NOT_A_CHAIN = range(3)
+
+# Numbers in a clique of one frontal and one separator node, and in a root of one frontal node.
+_PAIR = 27
+_ROOT = 9
+
+
+@kernel
+def _write_node(head, v, last, mean):  # type: ignore[no-untyped-def]
+    """Write a new node at the pose that an edge from the last one predicts."""
+    node_f, node_i = tb.node_f(head), tb.node_i(head)
+    f, i, p = node_f[v], node_i[v], node_f[last]
+    c, s = math.cos(p[tb.POSE + 2]), math.sin(p[tb.POSE + 2])
+    f[tb.POSE] = p[tb.POSE] + c * mean[0] - s * mean[1]
+    f[tb.POSE + 1] = p[tb.POSE + 1] + s * mean[0] + c * mean[1]
+    f[tb.POSE + 2] = factors.wrap(p[tb.POSE + 2] + mean[2])
+    factors.refer_to_pose(f)
+    f[tb.SCALE_T] = f[tb.SCALE_R] = 0.0
+    i[:] = 0
+    i[tb.CLIQUE] = i[tb.EDGE_LIST] = i[tb.OBSERVED_LIST] = -1
+    i[tb.NODE_LOGGED] = head[tb.UPDATE]
+
+
+@kernel
+def _root_equations(head, v, values, front, ld):  # type: ignore[no-untyped-def]
+    """Write the equations of a node that is alone in a root, from its rows of R."""
+    pool_f, node_i = tb.pool_f(head), tb.node_i(head)
+    if node_i[v, tb.FIXED] != 0:
+        return  # `_insert_fixed` writes the rows of a fixed node
+    r = pool_f[values:values + _ROOT]
+    a, b, c, x = 1.0 / r[0], r[1], r[2], r[3]
+    d, e, y = 1.0 / r[4], r[5], r[6]
+    g, z = 1.0 / r[7], r[8]
+    right = ld - 1
+    front[0], front[1], front[2], front[right] = a * a, a * b, a * c, a * x
+    front[ld + 1], front[ld + 2] = b * b + d * d, b * c + d * e
+    front[ld + right] = b * x + d * y
+    front[2 * ld + 2] = c * c + e * e + g * g
+    front[2 * ld + right] = c * x + e * y + g * z
+
+
+@kernel
+def _set_least_pivots(head, v, least):  # type: ignore[no-untyped-def]
+    node_f = tb.node_f(head)
+    f = node_f[v]
+    least[0] = least[1] = LEAST_PIVOT * f[tb.SCALE_T] * f[tb.SCALE_T]
+    least[2] = LEAST_PIVOT * f[tb.SCALE_R] * f[tb.SCALE_R]
+
+
+@kernel
+def _eliminate_3(front, n, least):  # type: ignore[no-untyped-def]
+    """
+    Factorise the first three of n rows of n + 1 numbers, and subtract them from the others.
+
+    Returns
+    -------
+    int
+        First row with a bad pivot, or -1.
+
+    """
+    ld = n + 1
+    for k in range(3):
+        pivot = front[k * ld + k]
+        if not pivot > least[k]:
+            return k
+        inverse = 1.0 / math.sqrt(pivot)
+        front[k * ld + k] = inverse
+        for c in range(k + 1, ld):
+            front[k * ld + c] *= inverse
+        for i in range(k + 1, n):
+            a = front[k * ld + i]
+            for c in range(i, ld):
+                front[i * ld + c] -= a * front[k * ld + c]
+    return -1
+
+
+@kernel
+def _copy_rows(front, ld, begin, end, at, pool_f):  # type: ignore[no-untyped-def]
+    """Copy the upper triangle of rows of a front and their right-hand sides, without gaps."""
+    for k in range(begin, end):
+        for c in range(k, ld):
+            pool_f[at] = front[k * ld + c]
+            at += 1
+
+
+@kernel
+def extend(  # type: ignore[no-untyped-def]
+    head, mean, information, observed_mean, observed_information, with_observed,
+):
+    """
+    Append a node to the newest pose, by an edge and optionally with an observed node.
+
+    Parameters
+    ----------
+    mean, information : ndarray, shapes (3,) and (3, 3)
+        Of the edge.
+    observed_mean, observed_information : ndarray, shapes (3,) and (3, 3)
+        Of the observed node; any numbers if there is none.
+    with_observed : bool
+
+    Returns
+    -------
+    int
+        EXTENDED: done, except for the back-substitution if there is an observed node, for which
+        the new root is on the stack; NO_ROOM: a table is full; NOT_A_CHAIN: a general update is
+        necessary. After the last two the graph is unchanged.
+
+    """
+    clique_f = tb.clique_f(head)
+    node_f = tb.node_f(head)
+    edge_f = tb.edge_f(head)
+    observed_f = tb.observed_f(head)
+    pool_f = tb.pool_f(head)
+    work_f = tb.work_f(head)
+    scalars = tb.scalars(head)
+    node_i = tb.node_i(head)
+    edge_i = tb.edge_i(head)
+    observed_i = tb.observed_i(head)
+    clique_i = tb.clique_i(head)
+    pool_i = tb.pool_i(head)
+    work_i = tb.work_i(head)
+    v, e, k = head[tb.N_NODES], head[tb.N_EDGES], head[tb.N_OBSERVED]
+    if (v >= head[tb.NODE_ROOM] or e >= head[tb.EDGE_ROOM] or k >= head[tb.OBSERVED_ROOM]
+            or head[tb.POOL_F_END] + _PAIR + _ROOT > len(pool_f)
+            or head[tb.POOL_I_END] + 3 > len(pool_i) or len(work_f) < 256):
+        return NO_ROOM
+    if (len(mean) != 3 or information.shape != (3, 3) or len(observed_mean) != 3
+            or observed_information.shape != (3, 3)):
+        return NOT_A_CHAIN
+    last = head[tb.NEWEST]
+    if (last < 0 or head[tb.N_TOUCHED] > 0 or head[tb.UPDATE] > tb.LAST_STAMP
+            or node_i[last, tb.CLIQUE] < 0):
+        return NOT_A_CHAIN
+    c = node_i[last, tb.CLIQUE]
+    old = clique_i[c]
+    if old[tb.N_FRONTAL] != 1 or old[tb.N_SEPARATOR] != 0:
+        return NOT_A_CHAIN
+    if not rows.write_edge(head, e, last, v, mean, information, 0, 1.0):
+        return NOT_A_CHAIN
+    if with_observed and not rows.write_observed(
+            head, k, v, scalars[tb.ZEROS:tb.ZEROS + 3], observed_mean, observed_information, 0,
+            1.0):
+        return NOT_A_CHAIN
+    transaction_log.begin(head)
+    _write_node(head, v, last, mean)
+    f = edge_f[e]
+    cos, sin = math.cos(mean[2]), math.sin(mean[2])
+    f[tb.OWN_T], f[tb.OWN_T + 1] = cos * mean[0] + sin * mean[1], cos * mean[1] - sin * mean[0]
+    edge_i[e, tb.EDGE_CHECKED] = edge_i[e, tb.EDGE_WAITS] = 0
+    edge_i[e, tb.OWNER] = c
+    edge_i[e, tb.EDGE_LOGGED] = head[tb.UPDATE]
+    factors.linearize_edge(head, e)
+    f[tb.ERROR2] = f[tb.ENERGY] = 0.0
+    # the front of the old root and the new node, in work space that holds the new root as well
+    front, least = work_f[:42], work_f[42:45]
+    front[:] = 0.0
+    _root_equations(head, last, old[tb.VALUES], front, 7)
+    factors.add_edge(head, e, 0, 3, front, 7)
+    scale_t, scale_r = node_f[last, tb.SCALE_T], node_f[last, tb.SCALE_R]
+    scale_by_edge(head, e, 1.0)
+    _set_least_pivots(head, last, least)
+    if node_i[last, tb.FIXED] != 0:
+        _insert_fixed(head, last, front)
+        least[:] = 0.0
+    bad = _eliminate_3(front, 6, least)
+    root = work_f[45:57]
+    for m in range(3):
+        for n in range(4):
+            root[4 * m + n] = front[7 * (m + 3) + n + 3]
+    if with_observed:
+        factors.linearize_observed(head, k)
+        factors.add_observed(head, k, 0, root, 4)
+        scale_by_observed(head, k, 1.0)
+    _set_least_pivots(head, v, least)
+    if bad < 0:
+        bad = _eliminate_3(root, 3, least)
+    if bad >= 0:
+        node_f[last, tb.SCALE_T], node_f[last, tb.SCALE_R] = scale_t, scale_r
+        return NOT_A_CHAIN
+    # nothing can fail from here on
+    values, nodes = old[tb.VALUES], old[tb.NODES]
+    pools.give_values(head, values, _ROOT)
+    pools.give_nodes(head, nodes, 1)
+    r = transaction_log.take_clique(head, 1, 0)
+    pool_i[clique_i[r, tb.NODES]] = v
+    _copy_rows(root, 4, 0, 3, clique_i[r, tb.VALUES], pool_f)
+    clique_i[r, tb.CHILD] = c
+    clique_i[r, tb.ANCHORED] = 1 if with_observed else old[tb.ANCHORED]
+    for m in range(tb.CLIQUE_F):
+        clique_f[r, m] = clique_f[c, m] = 0.0  # SLIP_SCALE is 0 with one separator node
+    old[tb.PARENT], old[tb.SIBLING], old[tb.N_SEPARATOR] = r, -1, 1
+    old[tb.NODES], old[tb.VALUES] = pools.take_nodes(head, 2), pools.take_values(head, _PAIR)
+    pool_i[old[tb.NODES]], pool_i[old[tb.NODES] + 1] = last, v
+    _copy_rows(front, 7, 0, 6, old[tb.VALUES], pool_f)
+    node_i[v, tb.CLIQUE] = r
+    edge_i[e, tb.NEXT_I], node_i[last, tb.EDGE_LIST] = node_i[last, tb.EDGE_LIST], 2 * e
+    edge_i[e, tb.NEXT_J], node_i[v, tb.EDGE_LIST] = -1, 2 * e + 1
+    head[tb.N_NODES], head[tb.N_EDGES], head[tb.NEWEST] = v + 1, e + 1, v
+    if with_observed:
+        observed_i[k, tb.OBS_NEXT], node_i[v, tb.OBSERVED_LIST] = -1, k
+        observed_i[k, tb.OBS_CHECKED] = observed_i[k, tb.OBS_WAITS] = 0
+        observed_i[k, tb.OBS_LOGGED] = head[tb.UPDATE]
+        factors.check_observed(head, k)
+        scalars[tb.CHI2] += observed_f[k, tb.OBS_ENERGY]
+        head[tb.N_OBSERVED] = k + 1
+        head[tb.ITERATION] += 1
+        clique_i[r, tb.BUILT] = head[tb.ITERATION]
+        work_i[0] = r
+        head[tb.N_ROOTS] = 1
+    return EXTENDED
+
+
+@kernel
+def _insert_fixed(head, v, front):  # type: ignore[no-untyped-def]
+    """Write the solution of a fixed node into a front of two nodes, of which it is the first."""
+    node_f = tb.node_f(head)
+    for m in range(3):
+        x = node_f[v, tb.DELTA + m]
+        for n in range(3, 6):
+            front[7 * n + 6] -= front[7 * m + n] * x
+        front[7 * m:7 * m + 6] = 0.0
+        front[7 * m + m] = 1.0
+        front[7 * m + 6] = x

@@ -1,0 +1,297 @@
+# Copyright 2026 The pose_graph_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""
+The incremental smoother, which keeps the estimate of all poses at the minimum of chi2.
+
+The cost of an update is proportional to what it changes. The cliques from the edited nodes up to
+the root of the Bayes tree are eliminated again (`tree_update`); back-substitution descends as far
+as values change (`back_substitution`); constraints with a large linearization error are
+linearized again (`relinearization`); and `step` repeats this until the error that remains is
+within a budget. Appending a node to a chain takes constant time (`chain`). `docs/solver.md`
+describes the method.
+"""
+
+from typing import Any, NamedTuple
+
+from numba import types
+import numpy as np
+
+from pose_graph_ros.core.batch import gauss_newton
+from pose_graph_ros.core.batch.optimizer import Status
+from pose_graph_ros.core.compiled.jit import compile_only
+from pose_graph_ros.core.config import SmootherConfig
+from pose_graph_ros.core.exceptions import GraphUpdateError
+from pose_graph_ros.core.geometry import se2
+from pose_graph_ros.core.geometry.se2 import FloatArray
+from pose_graph_ros.core.graph import tables as tb
+from pose_graph_ros.core.graph.constraints import EdgeKind, Edges, ObservedKind, ObservedNodes
+from pose_graph_ros.core.graph.graph import Graph, GraphUpdate
+from pose_graph_ros.core.smoother import batch_fallback, chain, covariances, step
+from pose_graph_ros.core.smoother.sparse_inverse import all_covariances
+
+
+class UpdateResult(NamedTuple):
+    """Status and statistics of an update."""
+
+    status: Status
+    """
+    CONVERGED; MAX_ITERATIONS if linearization errors above the budget remain for the next update;
+    FAILED if the update was rolled back.
+    """
+    reason: str
+    """
+    Cause of a failure in one sentence, else empty. `IncrementalSmoother.extend` returns it with
+    MAX_ITERATIONS where only iterations after the first were rolled back.
+    """
+    relinearized: int
+    """Constraints and turned clique frames that were linearized again."""
+    eliminated: int
+    """Nodes whose cliques were eliminated again, summed over the iterations."""
+    visited: int
+    """Cliques that were solved for, summed over the iterations."""
+    iterations: int
+    """Back-substitutions of the update."""
+
+
+_EXTENDED_RESULT = UpdateResult(Status.CONVERGED, '', 0, 1, 1, 1)
+_NO_POSE: FloatArray = np.zeros(3)
+_NO_MATRIX: FloatArray = np.zeros((3, 3))
+_EXTEND_SIGNATURE = (
+    types.int64[::1], types.float64[::1], types.float64[:, ::1], types.float64[::1],
+    types.float64[:, ::1], types.boolean)
+
+
+class IncrementalSmoother:
+    """
+    Keep the estimate of a growing pose graph at the minimum of chi2, within a budget.
+
+    Every connected part of the graph needs a fixed or an observed node. An update that leaves a
+    node undetermined is rolled back, bit for bit.
+    """
+
+    def __init__(self, config: SmootherConfig | None = None) -> None:
+        self._config = SmootherConfig() if config is None else config
+        self.graph = Graph()
+        """The pose graph; only this object edits it."""
+        self._memory = self.graph.memory
+        scalars = self._memory['scalars']
+        scalars[tb.SETTING_ALPHA] = self._config.alpha
+        scalars[tb.SETTING_BUDGET] = self._config.budget
+        scalars[tb.SETTING_SHARE] = self._config.budget_share
+        compile_only(chain.extend, _EXTEND_SIGNATURE)  # `extend` converts other arguments
+
+    @property
+    def poses(self) -> FloatArray:
+        """Estimates of all hidden nodes in the map, shape (N, 3), as a view that stays current."""
+        return self.graph.poses
+
+    def update(self, update: GraphUpdate) -> UpdateResult:
+        """
+        Edit the graph and bring the estimate up to date.
+
+        Raises
+        ------
+        GraphUpdateError
+            If a part of the update does not fit the graph. The graph is unchanged then, as after
+            any other exception.
+
+        """
+        self.graph.begin()
+        try:
+            self.graph.apply(update)
+            result = self._step(step.FIRST)
+        except BaseException:
+            self.graph.rollback()
+            raise
+        return result
+
+    def extend(
+        self, mean: FloatArray, information: FloatArray,
+        observed_mean: FloatArray | None = None, observed_information: FloatArray | None = None,
+    ) -> UpdateResult:
+        """
+        Append a hidden node to the newest pose by an odometry edge, and update the estimate.
+
+        Equal to an update with one hidden node at the pose that odometry predicts, one edge and
+        at most one observed node, at a fraction of the cost.
+
+        Parameters
+        ----------
+        mean : ndarray, shape (3,)
+            Pose of the new node in the newest one [m, m, rad].
+        information : ndarray, shape (3, 3)
+            In the frame of the new node.
+        observed_mean : ndarray, shape (3,), optional
+            Observed pose of the new node in the map [m, m, rad].
+        observed_information : ndarray, shape (3, 3), optional
+            In the frame of the observed pose.
+
+        Returns
+        -------
+        UpdateResult
+
+        Raises
+        ------
+        GraphUpdateError
+            As in `update`, and if the graph has no hidden node.
+
+        """
+        head = self._memory.head
+        with_observed = observed_mean is not None
+        if observed_mean is None or observed_information is None:
+            observed_mean, observed_information = _NO_POSE, _NO_MATRIX
+        try:
+            code = chain.extend(
+                head, mean, information, observed_mean, observed_information, with_observed)
+        except TypeError:
+            # the kernel is compiled for contiguous arrays of float64 only
+            mean, information, observed_mean, observed_information = (
+                np.array(argument, dtype=np.float64, order='C')
+                for argument in (mean, information, observed_mean, observed_information))
+            code = chain.NO_ROOM
+        if code == chain.EXTENDED:
+            return self._solve_extended() if with_observed else _EXTENDED_RESULT
+        arguments = (mean, information, observed_mean, observed_information)
+        shapes = tuple(map(np.shape, arguments))
+        if shapes != ((3,), (3, 3), (3,), (3, 3)):
+            raise GraphUpdateError(
+                f'extend: expected arrays of shapes (3,) and (3, 3), got {shapes}')
+        if code == chain.NO_ROOM:
+            self.graph.ensure(*(int(count) + 1 for count in head[tb.N_NODES:tb.N_OBSERVED + 1]))
+            self._make_room(int(head[tb.POOL_F_END]) + 256, int(head[tb.POOL_I_END]) + 8, 256)
+            return self.extend(*(arguments if with_observed else arguments[:2]))
+        return self._extend_in_general(arguments, with_observed=with_observed)
+
+    def newest_covariance(self) -> FloatArray:
+        """Return the covariance of the newest pose in map axes, shape (3, 3)."""
+        covariance = np.empty((3, 3))
+        if not covariances.newest_covariance(self._memory.head, covariance):
+            # raises an error with the cause
+            return self.covariance(self.graph.newest_pose)
+        return covariance
+
+    def covariance(self, node: int) -> FloatArray:
+        """
+        Return the covariance of a hidden node in map axes, shape (3, 3).
+
+        Raises
+        ------
+        ValueError
+            If there is no such node, or edits of the graph are not solved for.
+
+        """
+        self._require_eliminated(node)
+        out = np.empty((3, 3))
+        covariances.node_covariance(self._memory.head, node, out)
+        return out
+
+    def joint_covariance(self, i: int, j: int) -> FloatArray:
+        """
+        Return the joint covariance of two hidden nodes in map axes, i's coordinates first, (6, 6).
+
+        Parameters
+        ----------
+        i, j : int
+
+        Raises
+        ------
+        ValueError
+            As in `covariance`.
+
+        """
+        self._require_eliminated(i, j)
+        out = np.zeros((6, 6))
+        covariances.pair_covariance(self._memory.head, i, j, out)
+        return out
+
+    def covariances(self) -> FloatArray:
+        """Return those of all hidden nodes, shape (N, 3, 3); raises as `covariance`."""
+        self._require_eliminated()
+        out = np.zeros((self.graph.n_nodes, 3, 3))
+        all_covariances(self._memory.head, out)
+        return out
+
+    def _require_eliminated(self, *nodes: Any) -> None:
+        waiting, n_nodes = int(self._memory.head[tb.N_TOUCHED]), self.graph.n_nodes
+        if waiting > 0:
+            raise ValueError(
+                f'covariances: expected a graph whose edits have all been solved for, got one '
+                f'with {waiting} hidden nodes that wait for the solver')
+        for node in nodes:
+            if not (isinstance(node, int | np.integer) and 0 <= node < n_nodes):
+                expected = (
+                    f'a hidden node in 0..{n_nodes - 1}' if n_nodes > 0 else 'a graph with nodes')
+                raise ValueError(f'covariances: expected {expected}, got {node}')
+
+    def chi2(self) -> float:
+        """Return the energy of all constraints, in time proportional to the size of the graph."""
+        gradient = np.empty((self.graph.n_nodes, 3))
+        return float(gauss_newton.evaluate(self._memory.head, gradient)[0])
+
+    def _solve_extended(self) -> UpdateResult:
+        """Solve after a chain was extended by an observed node; a failure keeps the new node."""
+        try:
+            result = self._step(step.EXTENDED)
+        except BaseException:
+            self.graph.rollback()
+            raise
+        return result._replace(status=Status.MAX_ITERATIONS) if result.reason else result
+
+    def _extend_in_general(
+        self, arguments: tuple[FloatArray, ...], *, with_observed: bool,
+    ) -> UpdateResult:
+        mean, information, observed_mean, observed_information = arguments
+        node, last = self.graph.n_nodes, self.graph.newest_pose
+        if last < 0:
+            raise GraphUpdateError('extend: expected a graph with a hidden node to go on from')
+        observed = ObservedNodes()
+        if with_observed:
+            observed = ObservedNodes([node], None, observed_mean[None], observed_information[None],
+                                     [ObservedKind.GLOBAL_POSE])
+        return self.update(GraphUpdate(
+            hidden=se2.compose(self.graph.poses[last], mean)[None],
+            edges=Edges([last], [node], mean[None], information[None], [EdgeKind.ODOMETRY]),
+            observed=observed))
+
+    def _step(self, entered: int) -> UpdateResult:
+        """Bring the estimate up to date, growing the memory as needed, or roll the update back."""
+        head = self._memory.head
+        code = step.run(head, self._config.max_iterations, entered)
+        while code == step.MORE_MEMORY:
+            self._make_room(*head[tb.NEED_F:tb.NEED_WORK + 1].tolist())
+            entered = step.AFTER_BATCH if entered == step.AFTER_BATCH else step.RESUMED
+            code = step.run(head, self._config.max_iterations, entered)
+        if code == step.DIVERGED:
+            return self._fall_back_to_batch()
+        if code == step.BAD_PIVOT:
+            reason = f'hidden node {head[tb.BAD_NODE]} is not determined'
+            self.graph.rollback()
+            return UpdateResult(Status.FAILED, reason, 0, 0, 0, 0)
+        status = Status.CONVERGED if code == step.SETTLED else Status.MAX_ITERATIONS
+        relinearized, eliminated, visited, iterations = (
+            head[tb.N_RELINEARIZED:tb.N_ITERATIONS + 1].tolist())
+        return UpdateResult(status, '', relinearized, eliminated, visited, iterations)
+
+    def _make_room(self, floats: int, integers: int, work: int) -> None:
+        memory, head = self._memory, self._memory.head
+        memory.ensure('pool_f', floats, keep=int(head[tb.POOL_F_END]))
+        memory.ensure('pool_i', integers, keep=int(head[tb.POOL_I_END]))
+        memory.ensure('work_f', work)
+
+    def _fall_back_to_batch(self) -> UpdateResult:
+        """
+        Restart from the poses that the batch optimiser finds, with all nodes eliminated anew.
+
+        This is done on a copy, which replaces the graph on success.
+        """
+        other = IncrementalSmoother(self._config)
+        if batch_fallback.optimize_copy(self.graph, other.graph):
+            other.graph.begin()
+            result = other._step(step.AFTER_BATCH)
+            if result.status is not Status.FAILED:
+                self.graph.memory = self._memory = other.graph.memory
+                return result
+        self.graph.rollback()
+        return UpdateResult(
+            Status.FAILED, 'the iterations do not converge, and there is no batch solution',
+            0, 0, 0, 0)

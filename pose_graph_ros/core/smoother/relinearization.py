@@ -1,0 +1,238 @@
+# Copyright 2026 The pose_graph_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""
+Fluid relinearization: which constraints are linearized again after a solve.
+
+The constraints of nodes that have turned are checked, and so are the frames of cliques that have
+turned against their parents' frames. If their squared linearization errors add up to more than the
+budget of the step, the largest of them are linearized again, and their nodes are touched for the
+next iteration (M. Kaess et al., "iSAM2", IJRR 2012, here with whitened errors).
+"""
+
+import math
+
+from pose_graph_ros.core.compiled.jit import kernel
+from pose_graph_ros.core.elimination import clique_frames
+from pose_graph_ros.core.graph import factors, tables as tb, transaction_log
+from pose_graph_ros.core.graph.editing import touch
+from pose_graph_ros.core.smoother.back_substitution import back_substitute
+
+# Fraction of the budget that may remain when the worst constraints are linearized again.
+LEFT_OVER = 0.4
+
+
+@kernel
+def _append_waiting(head, entry):  # type: ignore[no-untyped-def]
+    """Append an edge e as e, or an observed node k as -1 - k, to the list of the waiting."""
+    waiting = tb.waiting(head)
+    waiting[head[tb.N_WAITING]] = entry
+    head[tb.N_WAITING] += 1
+
+
+@kernel
+def _check_edge(head, e):  # type: ignore[no-untyped-def]
+    """Evaluate an edge at the present estimate; it waits if its linearization error is large."""
+    edge_f, scalars, edge_i = tb.edge_f(head), tb.scalars(head), tb.edge_i(head)
+    transaction_log.log_energy(head, e)
+    f = edge_f[e]
+    scalars[tb.CHI2] -= f[tb.ENERGY]
+    factors.check_edge(head, e, clique_frames.present_turn(head, edge_i[e, tb.OWNER]))
+    scalars[tb.CHI2] += f[tb.ENERGY]
+    scalars[tb.ERROR2_SUM] += f[tb.ERROR2]
+    if (f[tb.ERROR2] > factors.LEAST_FRACTION * scalars[tb.SETTING_SHARE]
+            and edge_i[e, tb.EDGE_WAITS] == 0):
+        edge_i[e, tb.EDGE_WAITS] = 1
+        _append_waiting(head, e)
+
+
+@kernel
+def _check_observed(head, k):  # type: ignore[no-untyped-def]
+    """Evaluate an observed node at the present estimate, as `_check_edge` does an edge."""
+    observed_f, scalars, observed_i = tb.observed_f(head), tb.scalars(head), tb.observed_i(head)
+    transaction_log.log_observed(head, k)
+    f = observed_f[k]
+    scalars[tb.CHI2] -= f[tb.OBS_ENERGY]
+    factors.check_observed(head, k)
+    scalars[tb.CHI2] += f[tb.OBS_ENERGY]
+    scalars[tb.ERROR2_SUM] += f[tb.OBS_ERROR2]
+    if (f[tb.OBS_ERROR2] > factors.LEAST_FRACTION * scalars[tb.SETTING_SHARE]
+            and observed_i[k, tb.OBS_WAITS] == 0):
+        observed_i[k, tb.OBS_WAITS] = 1
+        _append_waiting(head, -1 - k)
+
+
+@kernel
+def _check(head):  # type: ignore[no-untyped-def]
+    """Check the constraints of all listed nodes, each constraint once."""
+    edge_f = tb.edge_f(head)
+    observed_f = tb.observed_f(head)
+    scalars = tb.scalars(head)
+    node_i = tb.node_i(head)
+    edge_i = tb.edge_i(head)
+    observed_i = tb.observed_i(head)
+    work_i = tb.work_i(head)
+    iteration = head[tb.ITERATION]
+    checks = work_i[head[tb.NODE_ROOM]:]
+    scalars[tb.ERROR2_SUM] = 0.0
+    for n in range(head[tb.N_CHECKS]):
+        v = checks[n]
+        entry = node_i[v, tb.EDGE_LIST]
+        while entry >= 0:
+            e, side = entry >> 1, entry & 1
+            if edge_i[e, tb.EDGE_CHECKED] != iteration:
+                edge_i[e, tb.EDGE_CHECKED] = iteration
+                if edge_f[e, tb.WEIGHT] > 0.0:
+                    _check_edge(head, e)
+            entry = edge_i[e, tb.NEXT_J if side == 1 else tb.NEXT_I]
+        k = node_i[v, tb.OBSERVED_LIST]
+        while k >= 0:
+            if observed_f[k, tb.WEIGHT] > 0.0:
+                _check_observed(head, k)
+            k = observed_i[k, tb.OBS_NEXT]
+
+
+@kernel
+def _check_turned(head):  # type: ignore[no-untyped-def]
+    """Add the errors of the listed turned frames to the sum, and keep the large ones listed."""
+    scalars, clique_f, work_i = tb.scalars(head), tb.clique_f(head), tb.work_i(head)
+    turned = work_i[2 * head[tb.NODE_ROOM]:]
+    kept = 0
+    for k in range(head[tb.N_TURNED]):
+        c = turned[k]
+        slip = clique_frames.frame_slip(head, c)
+        error2 = clique_frames.interface_error2(head, c, slip, tb.work_f(head))
+        scalars[tb.ERROR2_SUM] += error2
+        if error2 > factors.LEAST_FRACTION * scalars[tb.SETTING_SHARE]:
+            clique_f[c, tb.SLIP_ERROR2] = error2
+            turned[kept] = c
+            kept += 1
+    head[tb.N_TURNED] = kept
+
+
+@kernel
+def forget_waiting(head):  # type: ignore[no-untyped-def]
+    """Empty the lists of waiting constraints and turned frames without linearizing them again."""
+    edge_i, observed_i, waiting = tb.edge_i(head), tb.observed_i(head), tb.waiting(head)
+    for n in range(head[tb.N_WAITING]):
+        entry = waiting[n]
+        if entry >= 0:
+            edge_i[entry, tb.EDGE_WAITS] = 0
+        else:
+            observed_i[-1 - entry, tb.OBS_WAITS] = 0
+    head[tb.N_WAITING] = head[tb.N_TURNED] = 0
+
+
+@kernel
+def _error2(head, entry):  # type: ignore[no-untyped-def]
+    edge_f, observed_f = tb.edge_f(head), tb.observed_f(head)
+    if entry >= 0:
+        return edge_f[entry, tb.ERROR2]
+    return observed_f[-1 - entry, tb.OBS_ERROR2]
+
+
+@kernel
+def _relinearize_worst(head, allowed):  # type: ignore[no-untyped-def]
+    """
+    Linearize the worst waiting constraints again, so that the errors of the rest are small.
+
+    The squared linearization errors of the rest add up to `allowed` at most. The nodes of the
+    relinearized constraints are touched, and the lists of the waiting are emptied.
+    """
+    work_f = tb.work_f(head)
+    edge_i = tb.edge_i(head)
+    observed_i = tb.observed_i(head)
+    waiting = tb.waiting(head)
+    clique_f, clique_i, pool_i = tb.clique_f(head), tb.clique_i(head), tb.pool_i(head)
+    work_i = tb.work_i(head)
+    # sums of the errors by powers of two of their ratio to `allowed`, largest first
+    bins = work_f[:64]
+    bins[:] = 0.0
+    left, cut = 0.0, 0
+    for n in range(head[tb.N_WAITING]):
+        error2 = _error2(head, waiting[n])
+        bins[_bin(error2 / allowed)] += error2
+        left += error2
+    turned = work_i[2 * head[tb.NODE_ROOM]:]
+    for n in range(head[tb.N_TURNED]):
+        error2 = clique_f[turned[n], tb.SLIP_ERROR2]
+        bins[_bin(error2 / allowed)] += error2
+        left += error2
+    while cut < 64 and left > allowed:
+        left -= bins[cut]
+        cut += 1
+    for n in range(head[tb.N_WAITING]):
+        entry = waiting[n]
+        worst = _bin(_error2(head, entry) / allowed) < cut
+        if entry >= 0:
+            transaction_log.log_edge(head, entry)
+            edge_i[entry, tb.EDGE_WAITS] = 0
+            if worst:
+                head[tb.N_RELINEARIZED] += 1
+                factors.linearize_edge(head, entry)
+                _touch(head, edge_i[entry, tb.END_I])
+                _touch(head, edge_i[entry, tb.END_J])
+        else:
+            k = -1 - entry
+            transaction_log.log_observed(head, k)
+            observed_i[k, tb.OBS_WAITS] = 0
+            if worst:
+                head[tb.N_RELINEARIZED] += 1
+                factors.linearize_observed(head, k)
+                _touch(head, observed_i[k, tb.OBS_NODE])
+    for n in range(head[tb.N_TURNED]):
+        c = turned[n]
+        if _bin(clique_f[c, tb.SLIP_ERROR2] / allowed) < cut:
+            # the parent adds the update matrix again, at the present angle of the frame
+            head[tb.N_RELINEARIZED] += 1
+            _touch(head, pool_i[clique_i[clique_i[c, tb.PARENT], tb.NODES]])
+    head[tb.N_WAITING] = head[tb.N_TURNED] = 0
+
+
+@kernel
+def _touch(head, v):  # type: ignore[no-untyped-def]
+    transaction_log.log_node(head, v)
+    touch(head, v)
+
+
+@kernel
+def _bin(ratio):  # type: ignore[no-untyped-def]
+    """Return 0 for a ratio of 2 or more, and 1 more for each halving, up to 63."""
+    if ratio <= 0.0:
+        return 63
+    return min(max(int(1.0 - math.floor(math.log2(ratio))), 0), 63)
+
+
+@kernel
+def _budget(head):  # type: ignore[no-untyped-def]
+    """Return the squared linearization error that a step may leave [sigma^2]."""
+    scalars = tb.scalars(head)
+    return min(scalars[tb.SETTING_BUDGET], scalars[tb.SETTING_SHARE] * scalars[tb.N_MOVED])
+
+
+@kernel
+def solve(head):  # type: ignore[no-untyped-def]
+    """
+    Solve from the roots on the stack down, and check the linearization errors.
+
+    Returns
+    -------
+    bool
+        Whether their sum is within the budget. If not, the constraints with large errors wait to
+        be linearized again.
+
+    """
+    scalars = tb.scalars(head)
+    back_substitute(head)
+    _check(head)
+    _check_turned(head)
+    head[tb.N_ITERATIONS] += 1
+    if scalars[tb.ERROR2_SUM] <= _budget(head):
+        forget_waiting(head)
+        return True
+    return False
+
+
+@kernel
+def relinearize(head):  # type: ignore[no-untyped-def]
+    """Linearize the worst waiting constraints again, and touch their nodes."""
+    _relinearize_worst(head, LEFT_OVER * _budget(head))

@@ -1,0 +1,274 @@
+# Copyright 2026 The pose_graph_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""
+Update of the Bayes tree: the cliques that an update affects are eliminated again.
+
+Each clique holds the rows of R of its frontal nodes and the update matrix for its parent: a Bayes
+tree (M. Kaess et al., "iSAM2", IJRR 2012) with its intermediate results. An update affects the
+cliques from the touched nodes up to the roots. The other children of these cliques, the *orphans*,
+keep all their values, including their update matrices.
+"""
+
+import numpy as np
+
+from pose_graph_ros.core.compiled.jit import kernel
+from pose_graph_ros.core.elimination.assembly import eliminate_clique, work_size
+from pose_graph_ros.core.elimination.ordering import minimum_degree
+from pose_graph_ros.core.elimination.quotient_graph import amalgamate, newest_last, structure
+from pose_graph_ros.core.graph import pools, tables as tb, transaction_log
+
+# Return codes of the kernels.
+DONE, MORE_MEMORY, BAD_PIVOT = range(3)
+# Limits of amalgamated cliques: stored zero blocks (3x3) and frontal nodes.
+RELAXED_ZEROS = 16
+RELAXED_FRONTAL = 16
+
+
+@kernel(allocates=True)
+def mark(head):  # type: ignore[no-untyped-def]
+    """
+    Mark the cliques from all touched nodes up to the roots.
+
+    Returns
+    -------
+    marked : ndarray of int32
+        These cliques, in no particular order.
+    affected : ndarray of int32
+        Their frontal nodes and the touched nodes without a clique.
+
+    """
+    node_i = tb.node_i(head)
+    clique_i = tb.clique_i(head)
+    pool_i = tb.pool_i(head)
+    touched = tb.touched(head)
+    stamp = head[tb.FRONT_SERIAL] + 1
+    head[tb.FRONT_SERIAL] = stamp
+    marked = np.empty(64, np.int32)
+    n_marked = 0
+    n_affected = 0
+    for s in range(head[tb.N_TOUCHED]):
+        c = node_i[touched[s], tb.CLIQUE]
+        if c < 0:
+            n_affected += 1
+        while c >= 0 and clique_i[c, tb.MARKED] != stamp:
+            clique_i[c, tb.MARKED] = stamp
+            if n_marked == len(marked):
+                longer = np.empty(2 * n_marked, np.int32)
+                for k in range(n_marked):
+                    longer[k] = marked[k]
+                marked = longer
+            marked[n_marked] = c
+            n_marked += 1
+            n_affected += clique_i[c, tb.N_FRONTAL]
+            c = clique_i[c, tb.PARENT]
+    affected = np.empty(n_affected, np.int32)
+    n_affected = 0
+    for k in range(n_marked):
+        row = clique_i[marked[k]]
+        for m in range(row[tb.NODES], row[tb.NODES] + row[tb.N_FRONTAL]):
+            affected[n_affected] = pool_i[m]
+            n_affected += 1
+    for s in range(head[tb.N_TOUCHED]):
+        v = touched[s]
+        if node_i[v, tb.CLIQUE] < 0:
+            affected[n_affected] = v
+            n_affected += 1
+    return marked[:n_marked], affected
+
+
+@kernel(allocates=True, inline='always')    # callees compile once
+def rebuild(head, marked, affected):  # type: ignore[no-untyped-def]
+    """
+    Replace the marked cliques: order the affected nodes anew and eliminate them.
+
+    Parameters
+    ----------
+    marked, affected : ndarray of int32
+        From `mark`; `affected` is reordered.
+
+    Returns
+    -------
+    int
+        DONE; MORE_MEMORY: no clique was changed, the pools and the work space must grow to
+        `NEED_F`, `NEED_I` and `NEED_WORK` of the head; BAD_PIVOT: node `BAD_NODE` of the head is
+        not determined.
+
+    """
+    pool_f = tb.pool_f(head)
+    work_f = tb.work_f(head)
+    node_i = tb.node_i(head)
+    clique_i = tb.clique_i(head)
+    pool_i = tb.pool_i(head)
+    n_last = newest_last(affected, head[tb.NEWEST])
+    orphans, start, adjacency = structure(head, marked, affected)
+    n_cliques, offset, n_frontal, parent, nodes = minimum_degree(
+        len(affected), len(orphans), n_last, start, adjacency)
+    into, frontal = amalgamate(
+        n_cliques, n_frontal, offset, parent, RELAXED_ZEROS, RELAXED_FRONTAL)
+    need_f, need_i, largest = np.int64(0), np.int64(0), np.int64(0)
+    for k in range(n_cliques):
+        if into[k] == k:
+            n_separator = offset[k + 1] - offset[k] - n_frontal[k]
+            need_f += pools.rounded(pools.n_values(frontal[k], n_separator))
+            need_i += pools.rounded(frontal[k] + n_separator)
+            largest = max(largest, work_size(frontal[k] + n_separator))
+    head[tb.NEED_F] = head[tb.POOL_F_END] + need_f
+    head[tb.NEED_I] = head[tb.POOL_I_END] + need_i
+    head[tb.NEED_WORK] = largest
+    if (head[tb.NEED_F] > len(pool_f) or head[tb.NEED_I] > len(pool_i)
+            or largest > len(work_f)):
+        return MORE_MEMORY
+    _push_drift_down(head, marked, orphans)
+    for k in range(len(marked)):
+        transaction_log.drop_clique(head, marked[k])
+    # the rows of the new cliques; an amalgamated child's frontal nodes precede its parent's
+    clique = np.full(n_cliques, -1, np.int32)
+    filled = np.zeros(n_cliques, np.int32)
+    for k in range(n_cliques):
+        q = into[k]
+        n_separator = offset[q + 1] - offset[q] - n_frontal[q]
+        if clique[q] < 0:
+            clique[q] = transaction_log.take_clique(head, frontal[q], n_separator)
+        at = clique_i[clique[q], tb.NODES] + filled[q]
+        filled[q] += n_frontal[k]
+        for m in range(n_frontal[k]):
+            v = affected[nodes[offset[k] + m]]
+            pool_i[at + m] = v
+            transaction_log.log_node(head, v)
+            node_i[v, tb.CLIQUE] = clique[q]
+        if q == k:
+            at += n_frontal[k]
+            for m in range(n_separator):
+                pool_i[at + m] = affected[nodes[offset[k] + n_frontal[k] + m]]
+    for k in range(n_cliques):
+        if into[k] == k and parent[k] >= 0:
+            _attach_child(head, clique[into[parent[k]]], clique[k])
+    for k in range(len(orphans)):
+        transaction_log.log_clique(head, orphans[k])
+        _attach_child(head, clique[into[parent[n_cliques + k]]], orphans[k])
+    for k in range(n_cliques):
+        if into[k] == k:
+            bad = eliminate_clique(head, clique[k], True)
+            if bad >= 0:
+                head[tb.BAD_NODE] = bad
+                return BAD_PIVOT
+    _find_roots(head, clique)
+    return DONE
+
+
+@kernel
+def _push_drift_down(head, marked, orphans):  # type: ignore[no-untyped-def]
+    """Add to each orphan the drift of all cliques above it, which are about to be dropped."""
+    clique_i, clique_f = tb.clique_i(head), tb.clique_f(head)
+    drifting = False
+    for k in range(len(marked)):
+        drifting = drifting or clique_f[marked[k], tb.DRIFT] > 0.0
+    if not drifting:
+        return
+    for k in range(len(orphans)):
+        drift, c = 0.0, clique_i[orphans[k], tb.PARENT]
+        while c >= 0:
+            drift += clique_f[c, tb.DRIFT]
+            c = clique_i[c, tb.PARENT]
+        if drift > 0.0:
+            transaction_log.log_clique(head, orphans[k])
+            clique_f[orphans[k], tb.DRIFT] += drift
+
+
+@kernel
+def _attach_child(head, parent, child):  # type: ignore[no-untyped-def]
+    clique_i = tb.clique_i(head)
+    clique_i[child, tb.PARENT] = parent
+    clique_i[child, tb.SIBLING] = clique_i[parent, tb.CHILD]
+    clique_i[parent, tb.CHILD] = child
+
+
+@kernel(inline='always')
+def refresh(head, marked):  # type: ignore[no-untyped-def]
+    """
+    Eliminate the marked cliques again with the same structure, as only values have changed.
+
+    Return codes are those of `rebuild`.
+    """
+    pool_f = tb.pool_f(head)
+    work_f = tb.work_f(head)
+    clique_i = tb.clique_i(head)
+    work_i = tb.work_i(head)
+    need, largest = np.int64(0), np.int64(0)
+    for k in range(len(marked)):
+        row = clique_i[marked[k]]
+        row[tb.MARKED] = 0
+        largest = max(largest, work_size(row[tb.N_FRONTAL] + row[tb.N_SEPARATOR]))
+        if row[tb.VALUES_BORN] != head[tb.UPDATE]:
+            need += pools.rounded(pools.n_values(row[tb.N_FRONTAL], row[tb.N_SEPARATOR]))
+    head[tb.NEED_F], head[tb.NEED_I] = head[tb.POOL_F_END] + need, 0
+    head[tb.NEED_WORK] = largest
+    if head[tb.NEED_F] > len(pool_f) or largest > len(work_f):
+        return MORE_MEMORY
+    for k in range(len(marked)):
+        parent = clique_i[marked[k], tb.PARENT]
+        if parent >= 0:
+            clique_i[parent, tb.MARKED] += 1
+    # children first; MARKED counts the marked children that are still to be eliminated
+    n_ready = 0
+    ready = work_i
+    for k in range(len(marked)):
+        if clique_i[marked[k], tb.MARKED] == 0:
+            ready[n_ready] = marked[k]
+            n_ready += 1
+    k = 0
+    while k < n_ready:
+        c = ready[k]
+        k += 1
+        transaction_log.renew_values(head, c)
+        bad = eliminate_clique(head, c, True)
+        if bad >= 0:
+            head[tb.BAD_NODE] = bad
+            return BAD_PIVOT
+        clique_i[c, tb.BUILT] = head[tb.ITERATION]
+        parent = clique_i[c, tb.PARENT]
+        if parent >= 0:
+            clique_i[parent, tb.MARKED] -= 1
+            if clique_i[parent, tb.MARKED] == 0:
+                ready[n_ready] = parent
+                n_ready += 1
+    _find_roots(head, marked)
+    return DONE
+
+
+@kernel
+def _find_roots(head, cliques):  # type: ignore[no-untyped-def]
+    """Put those of the cliques that are roots on the stack for the back-substitution."""
+    clique_i, work_i = tb.clique_i(head), tb.work_i(head)
+    n_roots = 0
+    for k in range(len(cliques)):
+        if cliques[k] >= 0 and clique_i[cliques[k], tb.PARENT] < 0:
+            work_i[n_roots] = cliques[k]
+            n_roots += 1
+    head[tb.N_ROOTS] = n_roots
+
+
+@kernel(allocates=True, inline='always')
+def eliminate(head):  # type: ignore[no-untyped-def]
+    """
+    Eliminate all cliques from the touched nodes up to the roots again.
+
+    Returns
+    -------
+    int
+        DONE: no node is touched any more, and the roots are on the stack for the
+        back-substitution; MORE_MEMORY or BAD_PIVOT as in `rebuild`.
+
+    """
+    node_i, touched = tb.node_i(head), tb.touched(head)
+    marked, affected = mark(head)
+    head[tb.ITERATION] += 1
+    changed = head[tb.STRUCTURE] != 0
+    code = rebuild(head, marked, affected) if changed else refresh(head, marked)
+    if code == DONE:
+        head[tb.STRUCTURE] = 0
+        for k in range(head[tb.N_TOUCHED]):
+            node_i[touched[k], tb.TOUCHED] = 0
+        head[tb.N_TOUCHED] = 0
+        head[tb.N_ELIMINATED] += len(affected)
+    return code

@@ -1,0 +1,106 @@
+# Copyright 2026 The pose_graph_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""Names of the constraints with the largest energies: source, stamp and hidden nodes."""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from pose_graph_ros.core.geometry.se2 import FloatArray
+from pose_graph_ros.core.graph import tables as tb
+from pose_graph_ros.core.graph.constraints import EdgeKind
+from pose_graph_ros.core.graph.graph import Graph
+from pose_graph_ros.core.graph.graph_view import constraint_tables, ConstraintTable, DIAGONAL
+from pose_graph_ros.core.odometry.hidden_nodes import HiddenNodes
+from pose_graph_ros.core.sources.factor_builder import ConstraintOrigin, FactorBuilder
+
+
+@dataclass(frozen=True, slots=True)
+class ConstraintEnergy:
+    """One constraint and its energy."""
+
+    energy: float
+    """Weighted energy, its part of chi2."""
+    unweighted: float
+    """Energy without the weight, by the covariance alone."""
+    freedom: int
+    """Degrees of freedom, which is the expected value of the unweighted energy."""
+    source: str
+    """Source of the measurement; empty if unknown."""
+    kind: str
+    """`odometry`, `loop_closure`, `global_pose`, `position`, `heading`, or `bias`."""
+    name: str
+    """Readable name, such as `odom x12 - x13` or `fix at 1695.250 s near x812`."""
+
+
+def largest(
+    graph: Graph, nodes: HiddenNodes, factors: FactorBuilder, n: int,
+) -> list[ConstraintEnergy]:
+    """
+    Return the constraints with the largest weighted energies, in descending order.
+
+    Parameters
+    ----------
+    graph : Graph
+    nodes : HiddenNodes
+    factors : FactorBuilder
+        Knows the sources of the constraints.
+    n : int
+        Number of constraints at most; those without energy are left out.
+
+    """
+    tables = constraint_tables(graph)
+    energies = np.concatenate([table.weights * table.energies for table in tables])
+    n = min(n, int(np.count_nonzero(energies > 0.0)))
+    if n <= 0:
+        return []
+    rows = np.flatnonzero(energies >= np.partition(energies, len(energies) - n)[-n])
+    rows = rows[np.argsort(-energies[rows], kind='stable')][:n]
+    named = []
+    for row in rows.tolist():
+        edge = row < graph.n_edges
+        number, table = (row, tables[0]) if edge else (row - graph.n_edges, tables[1])
+        names = _names(number, table, nodes, factors, edge=edge)
+        named.append(ConstraintEnergy(float(energies[row]), float(table.energies[number]),
+                                      int(table.freedom[number]), *names))
+    return named
+
+
+def _names(
+    row: int, table: ConstraintTable, nodes: HiddenNodes, factors: FactorBuilder, *, edge: bool,
+) -> tuple[str, str, str]:
+    """Return source, kind and name of a constraint, given its row in the graph."""
+    integers, origin = table.integers[row], factors.origin(row, edge=edge)
+    if not edge or integers[tb.EDGE_KIND] == EdgeKind.BIAS:
+        node = int(integers[tb.END_I if edge else tb.OBS_NODE])
+        return _measurement_name(origin, node, table.numbers[row], nodes, factors)
+    kind = EdgeKind(int(integers[tb.EDGE_KIND]))
+    i, j = np.searchsorted(nodes.rows, integers[[tb.END_I, tb.END_J]]).tolist()
+    source = '' if origin is None else origin.source
+    if origin is None and kind == EdgeKind.ODOMETRY:
+        source = nodes.primary_at(int(nodes.stamps_ns[j]))
+    name = kind.name.lower()
+    return source, name, f'{source or name} x{i} - x{j}'
+
+
+def _measurement_name(
+    origin: ConstraintOrigin | None, node: int, numbers: FloatArray, nodes: HiddenNodes,
+    factors: FactorBuilder,
+) -> tuple[str, str, str]:
+    """
+    Return source, kind and name of a constraint that was made from a measurement in the map.
+
+    `node` is the row of its hidden node in the graph, `numbers` its row of the constraint table. A
+    constraint on a bias alone comes from no measurement and is named after the bias.
+    """
+    number = int(np.searchsorted(nodes.rows, node))
+    if number == len(nodes) or nodes.rows[number] != node:
+        origin, kind, where = factors.bias_origin(node), 'bias', ''
+    else:
+        position, _, heading = numbers[DIAGONAL] > 0.0
+        kind = 'heading' if not position else 'global_pose' if heading else 'position'
+        where = f' near x{number}'
+    if origin is None:
+        return '', kind, f'{kind}{where}'
+    what = f'error of {origin.source}' if kind == 'bias' else origin.source
+    return origin.source, kind, f'{what} at {origin.stamp_ns * 1e-9:.3f} s{where}'

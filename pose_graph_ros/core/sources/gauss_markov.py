@@ -1,0 +1,309 @@
+# Copyright 2026 The pose_graph_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""
+Sources whose errors are correlated in time, such as GNSS receivers.
+
+The error of a measurement at time t is `f m(t)` plus a small white part. f^2 is the variance that
+the sender gives; m is a first-order Gauss-Markov process with variance 1 and time constant tau in
+each coordinate. `GaussMarkovBias` estimates m as a *bias*: time is divided into bins of
+tau / `BINS`, each bin with measurements has one state, and consecutive states are connected by
+
+    m_k = phi m_{k-1} + w,   phi = exp(-gap / tau),   Var w = 1 - phi^2.
+
+The first state has a prior of variance 1. Within a bin `m(t) = phi' m_k + w'`, where phi' follows
+from the time between t and the middle of the bin. The bin of a measurement depends on its stamp
+alone, and the state of a bin that is filled later is inserted between its neighbours, so the order
+of arrival does not matter.
+
+`InflatedWeights` is a cheap approximation: each of n measurements within 2 tau has the weight
+1 / n, because together they are worth about one measurement with an independent error.
+"""
+
+import bisect
+from dataclasses import dataclass, field
+import math
+from typing import NamedTuple
+
+import numpy as np
+
+from pose_graph_ros.core.config import MeasurementSource
+from pose_graph_ros.core.geometry import covariance, se2
+from pose_graph_ros.core.geometry.se2 import FloatArray, IntArray
+from pose_graph_ros.core.graph.constraints import EdgeKind, Edges, ObservedKind, ObservedNodes
+from pose_graph_ros.core.measurements import Absolute, HeadingOnly, Position
+from pose_graph_ros.core.odometry.motion import Attachment
+from pose_graph_ros.core.saved_columns import Integers
+from pose_graph_ros.core.sources.measurement_constraints import swept_variance
+
+# Number of bins in one time constant.
+BINS = 64
+# Lower bound of the white share of the variance; 0 would make the system singular.
+LEAST_WHITE = 1e-3
+# Unit of the third number of a state, the error of the heading, in sigmas. Its variance is then
+# 1 / STRETCH^2: the number is wrapped like an angle and must stay well below pi.
+STRETCH = 10.0
+_INFORMATION = np.diag((1.0, 1.0, STRETCH**2))
+
+
+@dataclass(frozen=True, slots=True)
+class SavedBins:
+    """The states of the bias of one source."""
+
+    width_ns: int
+    numbers: Integers
+    """Bin numbers, increasing: bin k begins at the stamp k `width_ns`."""
+    rows: Integers
+    """Row of each state in the graph."""
+    ties: Integers
+    """
+    Row of the edge from each state to the one before; for the first state the row of the observed
+    node that is its prior.
+    """
+
+
+class GraphSizes(NamedTuple):
+    """Numbers of rows in the graph before an update, which are the first new row numbers."""
+
+    n_nodes: int
+    n_edges: int
+    n_observed: int
+
+
+@dataclass(slots=True)
+class Additions:
+    """Changes of one update, collected row by row; for the fields see `GraphUpdate`."""
+
+    sizes: GraphSizes
+    biases: list[FloatArray] = field(default_factory=list)
+    edges: list[Edges] = field(default_factory=list)
+    observed: list[ObservedNodes] = field(default_factory=list)
+    remove_edges: list[int] = field(default_factory=list)
+    remove_observed: list[int] = field(default_factory=list)
+    weigh_observed: dict[int, float] = field(default_factory=dict)
+
+    def add_bias(self) -> int:
+        """Add a bias state and return its row in the graph."""
+        self.biases.append(np.zeros(3))
+        return self.sizes.n_nodes + len(self.biases) - 1
+
+    def add_edge(self, edge: Edges) -> int:
+        """Add an edge and return its row in the graph."""
+        self.edges.append(edge)
+        return self.sizes.n_edges + len(self.edges) - 1
+
+    def add_observed(self, observed: ObservedNodes) -> int:
+        """Add an observed node and return its row in the graph."""
+        self.observed.append(observed)
+        return self.sizes.n_observed + len(self.observed) - 1
+
+
+@dataclass(slots=True)
+class _Bin:
+    """One state of a bias."""
+
+    row: int
+    """Row of the state in the graph."""
+    transition: int
+    """Row of the edge to the state before; for the first state that of its prior."""
+
+
+class GaussMarkovBias:
+    """The bias of one source with a positive correlation time: a chain of states in the graph."""
+
+    def __init__(self, source: MeasurementSource) -> None:
+        self._source = source
+        self._width_ns = max(round(source.correlation_time * 1e9 / BINS), 1)
+        self._numbers: list[int] = []
+        self._bins: dict[int, _Bin] = {}
+        self._log: list[tuple[int, int | None, int]] = []
+        """
+        Numbers of the bins made since `begin`, each with the number of the next bin and the
+        transition that the next bin had.
+        """
+
+    def begin(self) -> None:
+        """Begin an update that `rollback` can revert."""
+        self._log.clear()
+
+    def rollback(self) -> None:
+        """Remove what was added since `begin`."""
+        for number, after, transition in reversed(self._log):
+            self._numbers.remove(number)
+            del self._bins[number]
+            if after is not None:
+                self._bins[after].transition = transition
+        self._log.clear()
+
+    def saved(self) -> SavedBins:
+        """Return the states of all bins."""
+        numbers, rows, ties = np.array(
+            [(number, self._bins[number].row, self._bins[number].transition)
+             for number in self._numbers], dtype=np.int64).reshape(-1, 3).T.copy()
+        return SavedBins(self._width_ns, numbers, rows, ties)
+
+    def restore(self, saved: SavedBins) -> bool:
+        """Restore saved states; return False if their bins have another width."""
+        if saved.width_ns != self._width_ns:
+            return False
+        self._numbers = saved.numbers.tolist()
+        for number, row, transition in zip(
+                self._numbers, saved.rows.tolist(), saved.ties.tolist(), strict=True):
+            self._bins[number] = _Bin(row, transition)
+        return True
+
+    def add(self, measurement: Absolute, attachment: Attachment, additions: Additions) -> int:
+        """
+        Add a measurement, and the state of its bin if it is new.
+
+        Parameters
+        ----------
+        measurement : GlobalPose, Position or HeadingOnly
+        attachment : Attachment
+        additions : Additions
+            Receives the new rows.
+
+        Returns
+        -------
+        int
+            Row of the edge from the measurement's hidden node to the state.
+
+        """
+        number, rest_ns = divmod(measurement.stamp_ns, self._width_ns)
+        if number not in self._bins:
+            self._make_bin(number, additions)
+        phi = self._phi(abs(rest_ns - self._width_ns / 2))
+        return additions.add_edge(_biased_constraint(
+            measurement, attachment, self._bins[number].row, phi,
+            max(self._source.white_share, LEAST_WHITE)))
+
+    def begin_ns(self, row: int) -> int | None:
+        """Return when the bin of a state begins [ns], by its row; None for another source's."""
+        return next((number * self._width_ns for number, made in self._bins.items()
+                     if made.row == row), None)
+
+    def _phi(self, gap_ns: float) -> float:
+        return math.exp(-gap_ns * 1e-9 / self._source.correlation_time)
+
+    def _make_bin(self, number: int, additions: Additions) -> None:
+        """Add the state of a bin between its neighbours in time."""
+        at = bisect.bisect(self._numbers, number)
+        before = self._numbers[at - 1] if at > 0 else None
+        after = self._numbers[at] if at < len(self._numbers) else None
+        row = additions.add_bias()
+        made = _Bin(row, self._add_transition(row, number, before, additions))
+        self._log.append((number, after, -1 if after is None else self._bins[after].transition))
+        self._numbers.insert(at, number)
+        self._bins[number] = made
+        if after is not None:
+            old = self._bins[after]
+            if before is None:
+                additions.remove_observed.append(old.transition)
+            else:
+                additions.remove_edges.append(old.transition)
+            old.transition = self._add_transition(old.row, after, number, additions)
+
+    def _add_transition(
+        self, row: int, number: int, before: int | None, additions: Additions,
+    ) -> int:
+        """Add the edge from a state to that of the bin before, or its prior if it is first."""
+        if before is None:
+            return additions.add_observed(ObservedNodes(
+                [row], None, np.zeros((1, 3)), _INFORMATION[None], [ObservedKind.GLOBAL_POSE]))
+        phi = self._phi((number - before) * self._width_ns)
+        return additions.add_edge(Edges(
+            [row], [self._bins[before].row], np.zeros((1, 3)),
+            _INFORMATION[None] / (1.0 - phi * phi), [EdgeKind.BIAS],
+            bias=np.array([(0.0, 0.0, phi, phi)])))
+
+
+class InflatedWeights:
+    """Weights of the measurements of one source, lower the more of them lie within 2 tau."""
+
+    def __init__(self, source: MeasurementSource) -> None:
+        self._width_ns = max(round(2e9 * source.correlation_time), 1)
+        self._bins: dict[int, list[int]] = {}
+        self._log: list[int] = []
+
+    def begin(self) -> None:
+        """Begin an update that `rollback` can revert."""
+        self._log.clear()
+
+    def rollback(self) -> None:
+        """Remove what was added since `begin`."""
+        for number in reversed(self._log):
+            self._bins[number].pop()
+        self._log.clear()
+
+    def restore(self, rows: IntArray) -> None:
+        """Restore the measurements of a loaded graph: stamps [ns] and rows, shape (K, 2)."""
+        for stamp_ns, row in rows.tolist():
+            self._bins.setdefault(stamp_ns // self._width_ns, []).append(row)
+
+    def add(self, stamp_ns: int, observed: ObservedNodes, additions: Additions) -> int:
+        """
+        Add a measurement, and set the weights of all measurements in its bin.
+
+        Parameters
+        ----------
+        stamp_ns : int
+        observed : ObservedNodes
+            One row.
+        additions : Additions
+            Receives the new row and the weights.
+
+        Returns
+        -------
+        int
+            Row of the observed node.
+
+        """
+        row = additions.add_observed(observed)
+        number = stamp_ns // self._width_ns
+        rows = self._bins.setdefault(number, [])
+        rows.append(row)
+        self._log.append(number)
+        additions.weigh_observed |= dict.fromkeys(rows, 1.0 / len(rows))
+        return row
+
+
+def _biased_constraint(
+    measurement: Absolute, attachment: Attachment, bias: int, phi: float, white_share: float,
+) -> Edges:
+    """
+    Return the edge from a hidden node x to a state of the bias that holds a measurement.
+
+    The error of the edge in map axes is `f m + z - x * o`. o is the motion since the node and the
+    lever arm; z is the measured pose; f is the standard deviation of the correlated part, from the
+    mean of the variances of x and y. m is phi times the state plus a white rest of variance
+    1 - phi^2.
+    """
+    factors, information, mean = np.zeros(2), np.zeros((3, 3)), np.zeros(3)
+    offset = attachment.motion
+    if isinstance(measurement, HeadingOnly):
+        variance = measurement.variance
+        factors[1], rest = _split(variance, phi)
+        mean[2] = measurement.heading - offset[2]
+        information[2, 2] = 1.0 / (white_share * variance + rest + attachment.noise[2, 2])
+    elif isinstance(measurement, Position):
+        cov = measurement.covariance
+        factors[0], rest = _split(0.5 * float(np.trace(cov)), phi)
+        mean[:2] = measurement.position
+        offset = se2.compose(offset, np.append(measurement.lever_arm, 0.0))
+        information[:2, :2] = covariance.information(
+            white_share * cov + (rest + swept_variance(measurement, attachment)) * np.eye(2))
+    else:
+        cov = measurement.covariance
+        factors[0], rest = _split(0.5 * float(np.trace(cov[:2, :2])), phi)
+        factors[1], rest_heading = _split(float(cov[2, 2]), phi)
+        mean = measurement.pose - (0.0, 0.0, offset[2])
+        information = covariance.information(
+            white_share * cov + np.diag((rest, rest, rest_heading))
+            + covariance.turned(attachment.noise, -float(measurement.pose[2])))
+    mean[2] = se2.wrap(mean[2])
+    return Edges([attachment.node], [bias], [mean], [information], [EdgeKind.BIAS],
+                 bias=[(offset[0], offset[1], phi * factors[0], STRETCH * phi * factors[1])])
+
+
+def _split(variance: float, phi: float) -> tuple[float, float]:
+    """Return f, and the variance of the part of `f m(t)` that the state does not explain."""
+    return math.sqrt(variance), variance * (1.0 - phi * phi)

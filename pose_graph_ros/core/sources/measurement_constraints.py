@@ -1,0 +1,146 @@
+# Copyright 2026 The pose_graph_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""
+Constraints on hidden nodes from measurements with stamps of their own.
+
+A measurement at stamp t constrains the last hidden node a before t through T_at, the motion by
+odometry from a to t. The noise of that motion is added to that of the measurement. Measurements
+make no hidden nodes, and a constraint depends neither on the order of arrival nor on the estimate.
+"""
+
+import numpy as np
+
+from pose_graph_ros.core.geometry import covariance, se2
+from pose_graph_ros.core.graph.constraints import EdgeKind, Edges, ObservedKind, ObservedNodes
+from pose_graph_ros.core.measurements import (
+    Absolute,
+    Answer,
+    HeadingOnly,
+    LoopClosure,
+    Position,
+    rejected,
+)
+from pose_graph_ros.core.odometry.hidden_nodes import HiddenNodes
+from pose_graph_ros.core.odometry.motion import Attachment
+
+
+def attach(nodes: HiddenNodes, stamp_ns: int) -> Attachment | Answer:
+    """
+    Return the motion from the last hidden node before a stamp, or why there is none.
+
+    Parameters
+    ----------
+    nodes : HiddenNodes
+        With at least one node.
+    stamp_ns : int
+        Not later than what odometry covers.
+
+    """
+    first_ns = int(nodes.stamps_ns[0])
+    if stamp_ns < first_ns:
+        return rejected('before_odometry', f'stamp {stamp_ns}, odometry begins at {first_ns}')
+    attachment = nodes.attach(stamp_ns)
+    if attachment is None:
+        return rejected('no_odometry', f'no odometry covers the motion up to {stamp_ns}')
+    return attachment
+
+
+def attach_reference(nodes: HiddenNodes, closure: LoopClosure) -> Attachment | Answer:
+    """
+    Return the attachment of the reference pose of a loop closure, or why it has none.
+
+    Parameters
+    ----------
+    nodes : HiddenNodes
+    closure : LoopClosure
+        Names its reference by stamp or by number of the hidden node.
+
+    """
+    if closure.reference_ns is not None:
+        return attach(nodes, closure.reference_ns)
+    node = closure.reference_node
+    if node is None or not 0 <= node < len(nodes):
+        return rejected('unknown_node', f'there is no hidden node {node}')
+    return Attachment(int(nodes.rows[node]), np.zeros(3), np.zeros((3, 3)))
+
+
+def absolute_constraint(measurement: Absolute, attachment: Attachment) -> ObservedNodes:
+    """
+    Return the observed node of a measurement.
+
+    That of a position has no information on the heading and lies in map axes; that of a heading
+    has none on the position; that of a global pose is (3.51)-(3.53).
+
+    Parameters
+    ----------
+    measurement : GlobalPose, Position or HeadingOnly
+    attachment : Attachment
+        Its motion is the offset of the observed node.
+
+    """
+    offset, noise, information = attachment.motion, attachment.noise, np.zeros((3, 3))
+    if isinstance(measurement, Position):
+        kind, mean = ObservedKind.POSITION, np.append(measurement.position, 0.0)
+        offset = se2.compose(offset, np.append(measurement.lever_arm, 0.0))
+        information[:2, :2] = covariance.information(
+            measurement.covariance + swept_variance(measurement, attachment) * np.eye(2))
+    elif isinstance(measurement, HeadingOnly):
+        kind, mean = ObservedKind.HEADING, np.array((0.0, 0.0, measurement.heading))
+        information[2, 2] = 1.0 / (measurement.variance + noise[2, 2])
+    else:
+        kind, mean = ObservedKind.GLOBAL_POSE, measurement.pose
+        information = covariance.information(
+            covariance.turned(measurement.covariance, float(mean[2])) + noise)
+    return ObservedNodes([attachment.node], [offset], [mean], [information], [kind])
+
+
+def swept_variance(measurement: Position, attachment: Attachment) -> float:
+    """
+    Return the variance that the motion since the node adds to a position [m^2].
+
+    The noise of the motion, including the effect of its heading on the end of the lever arm, is
+    given in the frame of the robot, whose heading in the map is unknown. The largest eigenvalue of
+    its covariance is therefore used in all directions.
+
+    Parameters
+    ----------
+    measurement : Position
+    attachment : Attachment
+
+    """
+    jacobian = np.eye(2, 3)
+    jacobian[:, 2] = -measurement.lever_arm[1], measurement.lever_arm[0]
+    return float(np.linalg.eigvalsh(jacobian @ attachment.noise @ jacobian.T)[-1])
+
+
+def loop_closure_constraint(
+    measurement: LoopClosure, reference: Attachment, attachment: Attachment,
+) -> Edges:
+    """
+    Return the edge of a loop closure between the hidden nodes before its two stamps.
+
+    With T_i and T_j the motions from the nodes to the stamps, the edge measures
+    `z' = T_i z T_j^-1`. A small error at the end of z is mapped to the end of z' by the adjoint of
+    T_j, an error at its start by that of T_j z^-1. If the variances of x and y are infinite, the
+    edge constrains the headings alone.
+
+    Parameters
+    ----------
+    measurement : LoopClosure
+    reference, attachment : Attachment
+        Of the reference pose and of the later pose.
+
+    """
+    z = measurement.pose
+    mean = se2.compose(se2.compose(reference.motion, z), se2.inverse(attachment.motion))
+    if not np.isfinite(measurement.covariance[0, 0]):
+        information = np.zeros((3, 3))
+        information[2, 2] = 1.0 / float(
+            measurement.covariance[2, 2] + attachment.noise[2, 2] + reference.noise[2, 2])
+    else:
+        cov = covariance.turned(measurement.covariance, float(z[2])) + attachment.noise
+        back, out = se2.adjoint(se2.inverse(z)), se2.adjoint(attachment.motion)
+        cov = out @ (cov + back @ reference.noise @ back.T) @ out.T
+        information = covariance.information(cov)
+    return Edges([reference.node], [attachment.node], [mean], [information],
+                 [EdgeKind.LOOP_CLOSURE])

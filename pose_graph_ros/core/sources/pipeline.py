@@ -1,0 +1,200 @@
+# Copyright 2026 The pose_graph_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""
+From a received measurement to a constraint in the queue, in any order of stamps.
+
+A measurement is validated by the policy of its source, waits until odometry has reached its stamp,
+and is attached to the hidden node before that stamp. Its outcome is counted.
+"""
+
+from collections import Counter
+
+import numpy as np
+
+from pose_graph_ros.core.config import BackendConfig
+from pose_graph_ros.core.measurements import (
+    Absolute,
+    ACCEPTED,
+    Answer,
+    AnswerStatus,
+    LoopClosure,
+    Measurement,
+    rejected,
+)
+from pose_graph_ros.core.odometry.hidden_nodes import HiddenNodes
+from pose_graph_ros.core.odometry.motion import Attachment
+from pose_graph_ros.core.sources.factor_builder import AttachedMeasurement, Queue
+from pose_graph_ros.core.sources.measurement_constraints import (
+    absolute_constraint,
+    attach,
+    attach_reference,
+    loop_closure_constraint,
+)
+from pose_graph_ros.core.sources.validation import validate
+from pose_graph_ros.core.sources.waiting import (
+    due_ns,
+    MAX_WAITING,
+    SeenStamps,
+    WaitingMeasurements,
+)
+
+# Maximum number of measurements that wait for the alignment; the oldest are dropped.
+MOST_UNALIGNED = 5000
+
+
+class MeasurementPipeline:
+    """
+    Measurements between their arrival and the update that adds them to the graph.
+
+    Parameters
+    ----------
+    nodes : HiddenNodes
+        What measurements are attached to.
+    config : BackendConfig
+
+    """
+
+    def __init__(self, nodes: HiddenNodes, config: BackendConfig) -> None:
+        self._nodes, self._config = nodes, config
+        self.waiting = WaitingMeasurements()
+        """Measurements that wait for odometry to reach their stamps."""
+        self.seen = SeenStamps()
+        """Stamps of the measurements that were accepted or wait."""
+        self.queue = Queue()
+        """Constraints for the next update."""
+        self.counts: Counter[tuple[str, str]] = Counter()
+        """How often each source got each answer: (source, 'accepted' or the reason)."""
+
+    def configure(self, config: BackendConfig) -> None:
+        """Set the settings for later measurements."""
+        self._config = config
+
+    def add(self, measurement: Measurement, source: str) -> Answer:
+        """
+        Add a measurement and count the answer.
+
+        Parameters
+        ----------
+        measurement : Measurement
+        source : str
+
+        Returns
+        -------
+        Answer
+            Accepted, pending, or rejected with the reason.
+
+        """
+        return self.count(source, self._add(measurement, source))
+
+    def _add(self, measurement: Measurement, source: str) -> Answer:
+        settings = self._config.measurement_source(source, type(measurement))
+        validated = validate(measurement, settings.covariance)
+        if isinstance(validated, Answer):
+            return validated
+        checked = validated.measurement
+        if self.seen.has(source, checked):
+            return rejected(
+                'duplicate_stamp', f'{source} at {checked.stamp_ns} was received before')
+        if settings.minimum_period > 0.0 and self.seen.near(
+                source, checked.stamp_ns, round(settings.minimum_period * 1e9)):
+            return rejected('thinned', f'less than {settings.minimum_period} s from another')
+        answer = (self._attach(checked, source) if due_ns(checked) <= self._nodes.covered_ns
+                  else self._wait(checked, source))
+        if answer.status is not AnswerStatus.REJECTED:
+            self.seen.add(source, checked)
+            for repair in validated.repairs:
+                self.counts[source, repair] += 1
+        return answer
+
+    def _wait(self, measurement: Measurement, source: str) -> Answer:
+        """Let a measurement wait for odometry; if too many wait, drop the one due last."""
+        excess = self.waiting.push(source, measurement)
+        if excess is not None:
+            answer = rejected('too_many_pending', f'{MAX_WAITING} measurements wait for odometry')
+            if excess.measurement is measurement:
+                return answer
+            self.count(excess.source, answer)
+            self.seen.remove(excess.source, excess.measurement)
+        return Answer(AnswerStatus.PENDING, 'pending', 'waits for odometry to reach its stamp')
+
+    def attach_due(self) -> None:
+        """Attach the measurements whose stamps odometry has reached."""
+        if len(self.waiting) > 0:
+            for waiting in self.waiting.pop_due(self._nodes.covered_ns):
+                self.count(waiting.source, self._attach(waiting.measurement, waiting.source))
+
+    def _attach(self, measurement: Measurement, source: str) -> Answer:
+        """Queue the constraint of a measurement whose stamp odometry has reached."""
+        attachment = attach(self._nodes, measurement.stamp_ns)
+        if isinstance(attachment, Answer):
+            return attachment
+        if not isinstance(measurement, LoopClosure):
+            self._enqueue(measurement, source, attachment)
+            return ACCEPTED
+        reference = attach_reference(self._nodes, measurement)
+        if isinstance(reference, Answer):
+            return reference
+        if reference.node == attachment.node:
+            return rejected(
+                'same_node', f'both ends are attached to hidden node {attachment.node}')
+        self.queue.edges.append(
+            (source, loop_closure_constraint(measurement, reference, attachment)))
+        return ACCEPTED
+
+    def attach_to_node(self, measurement: Absolute, source: str, node: int) -> None:
+        """
+        Attach a measurement to a hidden node, with no motion in between.
+
+        Parameters
+        ----------
+        measurement : GlobalPose, Position or HeadingOnly
+        source : str
+        node : int
+            Row of the node in the graph.
+
+        """
+        self._enqueue(measurement, source, Attachment(node, np.zeros(3), np.zeros((3, 3))))
+
+    def _enqueue(self, measurement: Absolute, source: str, attachment: Attachment) -> None:
+        self.queue.observed.append(AttachedMeasurement(
+            source, absolute_constraint(measurement, attachment), measurement, attachment))
+
+    def take_ready(self, *, aligned: bool) -> Queue:
+        """
+        Take the constraints out of the queue that can be added to the graph.
+
+        If the graph is not aligned with the map, observed nodes stay in the queue; the oldest ones
+        beyond `MOST_UNALIGNED` are dropped and counted.
+        """
+        ready = Queue(edges=self.queue.edges)
+        self.queue.edges = []
+        if aligned:
+            ready.observed, self.queue.observed = self.queue.observed, []
+        else:
+            # bounds the memory of a robot that is not aligned for days
+            excess = self.queue.observed[:-MOST_UNALIGNED]
+            del self.queue.observed[:len(excess)]
+            self.counts.update((dropped.source, 'dropped_unaligned') for dropped in excess)
+        return ready
+
+    def count(self, source: str, answer: Answer) -> Answer:
+        """
+        Count an answer and return it.
+
+        Parameters
+        ----------
+        source : str
+        answer : Answer
+            One that is pending is not counted.
+
+        Returns
+        -------
+        Answer
+            The same one.
+
+        """
+        if answer.status is AnswerStatus.ACCEPTED:
+            self.counts[source, 'accepted'] += 1
+        elif answer.status is AnswerStatus.REJECTED:
+            self.counts[source, answer.reason] += 1
+        return answer

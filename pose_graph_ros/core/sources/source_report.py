@@ -1,0 +1,90 @@
+# Copyright 2026 The pose_graph_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""How well the measurements of a source fit the estimate, and whether their errors are white."""
+
+from typing import NamedTuple
+
+import numpy as np
+
+from pose_graph_ros.core.geometry import se2
+from pose_graph_ros.core.geometry.se2 import FloatArray, IntArray
+from pose_graph_ros.core.graph import error_functions
+from pose_graph_ros.core.graph.constraints import Edges, ObservedNodes
+from pose_graph_ros.core.graph.graph import Graph
+from pose_graph_ros.core.sources import autocorrelation
+
+# Number of the newest residuals of a source that are evaluated.
+MOST_RESIDUALS = 5000
+# The whiteness test is skipped below this mean squared residual [sigma^2].
+LEAST_ENERGY = 0.1
+
+
+class SourceReport(NamedTuple):
+    """How well the measurements of a source fit."""
+
+    n: int
+    """Number of its measurements in the graph."""
+    energy: float
+    """Mean squared residual of a coordinate, in units of its sigma."""
+    errors: autocorrelation.Autocorrelation
+    """Autocorrelation of the newest residuals [m]."""
+    white: bool
+    """Whether the graph treats its errors as white."""
+
+    @property
+    def wrongly_white(self) -> bool:
+        """Whether its errors are treated as white but look correlated: its sigmas are too low."""
+        return self.white and self.errors.significant and self.energy > LEAST_ENERGY
+
+
+def report(graph: Graph, rows: IntArray, *, biased: bool, white: bool) -> SourceReport:
+    """
+    Return how well the newest measurements of a source fit the estimate.
+
+    Parameters
+    ----------
+    graph : Graph
+    rows : ndarray of int64, shape (K, 2)
+        Stamp [ns] and row of each constraint of the source, in the order of their addition.
+    biased : bool
+        Whether the constraints are edges to a bias; else they are observed nodes.
+    white : bool
+        Whether the errors are treated as white.
+
+    """
+    newest = rows[-MOST_RESIDUALS:]
+    newest = newest[np.argsort(newest[:, 0], kind='stable')]
+    newest = newest[np.append(True, np.diff(newest[:, 0]) > 0)]
+    stamps, numbers = newest[:, 0], newest[:, 1]
+    if biased:
+        residuals, information = _biased_residuals(graph, graph.edges_at(numbers))
+    else:
+        residuals, information = _residuals(graph, graph.observed_at(numbers))
+    energy = np.einsum('ki,kij,kj->k', residuals, information, residuals)
+    return SourceReport(len(rows), float(np.mean(energy)) / 2.0,
+                        autocorrelation.estimate(stamps, residuals), white)
+
+
+def _residuals(graph: Graph, observed: ObservedNodes) -> tuple[FloatArray, FloatArray]:
+    """Return residuals of positions in map axes, shape (K, 2), and their information."""
+    errors = error_functions.observed_errors(graph.poses, observed)
+    turn = se2.rotation(observed.mean[:, 2])
+    residuals = np.einsum('kij,kj->ki', turn, errors[:, :2])
+    information = turn @ observed.information[:, :2, :2] @ np.swapaxes(turn, 1, 2)
+    return residuals, information
+
+
+def _biased_residuals(graph: Graph, edges: Edges) -> tuple[FloatArray, FloatArray]:
+    """
+    Return residuals and information as `_residuals` does, for edges to a bias.
+
+    The residual is the whole error of the measurement: the part that the bias explains and the
+    white rest.
+    """
+    poses = graph.poses
+    errors = error_functions.edge_errors(poses, edges)[:, :2]
+    factor = edges.bias[:, 2]
+    total = errors - factor[:, None] * poses[edges.j, :2]
+    variance = factor**2 + 1.0 / (0.5 * np.trace(
+        edges.information[:, :2, :2], axis1=1, axis2=2) + 1e-12)
+    return total, np.eye(2) / variance[:, None, None]

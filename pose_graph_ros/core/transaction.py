@@ -1,0 +1,88 @@
+# Copyright 2026 The pose_graph_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""One update of the back end, which is applied completely or rolled back."""
+
+from types import TracebackType
+from typing import Self
+
+from pose_graph_ros.core.alignment.monitor import AlignmentMonitor
+from pose_graph_ros.core.batch.optimizer import Status
+from pose_graph_ros.core.exceptions import LinearSolveError
+from pose_graph_ros.core.geometry import se2
+from pose_graph_ros.core.geometry.se2 import FloatArray
+from pose_graph_ros.core.graph.graph import Graph
+from pose_graph_ros.core.smoother.incremental import UpdateResult
+from pose_graph_ros.core.sources.factor_builder import FactorBuilder, Queue
+
+
+class Transaction:
+    """
+    Context manager in which an update is built and solved.
+
+    If the solver fails or the context raises an `Exception`, it restores the poses of the graph,
+    the state of the alignment and the records of the factor builder, and moves the new constraints
+    to the quarantine. It suppresses the exception and stores its message in `failure`. The
+    smoother rolls back its own changes, bit for bit.
+
+    Parameters
+    ----------
+    graph : Graph
+    alignment : AlignmentMonitor
+    factors : FactorBuilder
+    quarantine : Queue
+        Receives the constraints of a failed update.
+
+    """
+
+    def __init__(
+        self, graph: Graph, alignment: AlignmentMonitor, factors: FactorBuilder, quarantine: Queue,
+    ) -> None:
+        self._graph, self._alignment, self._factors = graph, alignment, factors
+        self._quarantine = quarantine
+        self._before = alignment.copy()
+        self._poses: FloatArray | None = None
+        self._queue = Queue()
+        self.result = UpdateResult(Status.CONVERGED, '', 0, 0, 0, 0)
+        """Result of the solver."""
+        self.failure = ''
+        """Why the update was rolled back; empty if it succeeded."""
+
+    def add(self, queue: Queue) -> Queue:
+        """Return the given constraints; a failure moves them to the quarantine."""
+        self._queue = queue
+        return queue
+
+    def move_graph(self, T_map_graph: FloatArray) -> None:
+        """Move all nodes by a rigid motion, shape (3,) [m, m, rad]."""
+        self._poses = self._graph.poses.copy()
+        self._graph.set_poses(se2.compose(T_map_graph, self._poses))
+
+    @property
+    def moved_back(self) -> bool:
+        """Whether the nodes were moved and restored, so that all must be eliminated again."""
+        return self.failure != '' and self._poses is not None
+
+    def solved(self, result: UpdateResult) -> None:
+        """Store the result of the solver; raise LinearSolveError if it failed."""
+        if result.status is Status.FAILED:
+            raise LinearSolveError(result.reason)
+        self.result = result
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None,
+        traceback: TracebackType | None,
+    ) -> bool:
+        if error is None:
+            return False
+        self._factors.rollback()
+        if self._poses is not None:
+            self._graph.set_poses(self._poses)
+        self._alignment.restore(self._before)
+        self._quarantine.extend(self._queue)
+        self.failure = str(error)
+        if not isinstance(error, LinearSolveError):
+            self.failure = f'{type(error).__name__}: {error}'
+        return isinstance(error, Exception)

@@ -1,0 +1,175 @@
+# Copyright 2026 The pose_graph_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""
+From messages to measurements, with a count for everything; imports no rclpy.
+
+Each message is counted, held back while it is in doubt whether time has jumped back, and read. A
+message that cannot be used is counted by source and reason; the first of each is logged.
+"""
+
+from collections import Counter
+from collections.abc import Callable, Mapping
+import time
+from typing import Any
+
+from pose_graph_ros.adapters.conversions import Message, stamp_ns
+from pose_graph_ros.adapters.message_reader import MessageReader
+from pose_graph_ros.adapters.sources import Kind, NANOSECONDS, Source
+from pose_graph_ros.core.measurements import Answer, Measurement, OdometrySample, rejected
+from pose_graph_ros.ros.liveness import Liveness
+from pose_graph_ros.ros.time_jump import Decision, ReceivedMessage, TimeJumpDetector
+
+PAUSED = rejected('paused', 'call ~/pause with false to resume')
+# Messages that are held back are released if no other one comes within this time [s].
+LONGEST_DOUBT = 1.0
+
+
+class Input:
+    """
+    Receives the messages of all sources.
+
+    Parameters
+    ----------
+    values : mapping
+        All checked parameters.
+    warn : callable
+        Logs a sentence.
+
+    Raises
+    ------
+    ConfigError
+        If the parameters do not go together.
+
+    """
+
+    def __init__(self, values: Mapping[str, Any], warn: Callable[[str], None]) -> None:
+        self.reader = MessageReader(values)
+        self.time_jumps = TimeJumpDetector(_threshold_ns(values))
+        self._warn = warn
+        self._warned: set[tuple[str, str]] = set()
+        self._received_at = 0.0
+        self.paused = False
+        """Whether all measurements are rejected."""
+        self._clear()
+
+    def _clear(self) -> None:
+        self.received: Counter[str] = Counter()
+        """Number of messages by source."""
+        self.rejected: Counter[tuple[str, str]] = Counter()
+        """Number of messages that did not reach the engine, by source and reason."""
+        self.posted = 0
+        """Number of measurements that were handed to the engine."""
+        self.liveness = Liveness([source.name for source in self.reader.sources.values()
+                                  if source.kind is Kind.LOOP_CLOSURE])
+        self.posted_at = time.monotonic()
+        """Time of the last measurement that was handed to the engine, by a monotonic clock [s]."""
+        self.is_streaming = False
+        """Whether measurements were posted since the final optimisation after a silence."""
+
+    def configure(self, values: Mapping[str, Any]) -> None:
+        """Set the parameters that can change while the node runs."""
+        self.reader.configure(values)
+        self.time_jumps.guard.limit_ns = _threshold_ns(values)
+
+    def start_new_graph(self, values: Mapping[str, Any]) -> None:
+        """Forget all messages but those of /tf_static; those that are held back stay so."""
+        self.reader = self.reader.renewed(values)
+        self._clear()
+
+    def receive(self, source: Source, message: Message, primary: str) -> Decision:
+        """
+        Return which messages can be read now, after counting a new one.
+
+        Parameters
+        ----------
+        source : Source
+        message : Message
+        primary : str
+            Name of the primary odometry, by whose stamps time is judged; empty for any odometry.
+
+        """
+        name = source.name
+        self.received[name] += 1
+        self.liveness.receive(name, time.monotonic())
+        # the stamp is without `time_offset`: a change of that must not look like a jump of time
+        decision = self.time_jumps.receive(ReceivedMessage(
+            name, message, stamp_ns(message),
+            source.kind is Kind.ODOMETRY and primary in ('', name)))
+        self._received_at = time.monotonic()
+        if decision.is_old:
+            self.reject(name, rejected(
+                'before_clock_jump', 'a message from before the clock was set back'))
+        return decision
+
+    def release_overdue(self) -> list[ReceivedMessage]:
+        """Remove and return the messages that were held back if no other has come for long."""
+        overdue = time.monotonic() - self._received_at > LONGEST_DOUBT
+        return self.time_jumps.release() if overdue else []
+
+    def read(self, received: ReceivedMessage) -> OdometrySample | Measurement | None:
+        """Return the measurement of a message; None if it cannot be used."""
+        try:
+            measurement = self.reader.read(received.source, received.message)
+        except Exception as error:
+            measurement = rejected('malformed', f'{type(error).__name__}: {error}')
+        if isinstance(measurement, Answer):
+            self.reject(received.source, measurement)
+            return None
+        return measurement
+
+    def post(
+        self, source: str, measurement: OdometrySample | Measurement,
+        post: Callable[[str, OdometrySample | Measurement], bool],
+    ) -> None:
+        """
+        Hand a measurement to the engine, unless the input is paused.
+
+        Parameters
+        ----------
+        source : str
+        measurement : OdometrySample or Measurement
+        post : callable
+            Called with both; returns False if the engine's inbox is full.
+
+        """
+        if self.paused:
+            self.reject(source, PAUSED)
+        elif not post(source, measurement):
+            self.reject(source, rejected('inbox_full', 'the solver does not keep up'))
+        else:
+            self.posted += 1
+            self.posted_at, self.is_streaming = time.monotonic(), True
+
+    def reject(self, source: str, answer: Answer) -> None:
+        """
+        Count a message that cannot be used; log the first for each source and reason.
+
+        Parameters
+        ----------
+        source : str
+        answer : Answer
+            Why it cannot be used.
+
+        """
+        self.rejected[source, answer.reason] += 1
+        self.warn_once(source, answer.reason, f'{source}: {answer.reason}: {answer.detail} '
+                                              '(logged once, counted in diagnostics)')
+
+    def warn_once(self, about: str, what: str, sentence: str) -> None:
+        """
+        Log a sentence, once for each pair of the first two arguments.
+
+        Parameters
+        ----------
+        about, what : str
+            A source and a reason, or a parameter and a value.
+        sentence : str
+
+        """
+        if (about, what) not in self._warned:
+            self._warned.add((about, what))
+            self._warn(sentence)
+
+
+def _threshold_ns(values: Mapping[str, Any]) -> int:
+    return round(values['clock_jump_threshold'] * NANOSECONDS)

@@ -1,0 +1,325 @@
+# Copyright 2026 The pose_graph_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""Bags: what is written is read back, and whatever is wrong is said in one line with the path."""
+
+import logging
+from pathlib import Path
+import shutil
+from typing import Any
+
+import numpy as np
+import pytest
+from rosbags.interfaces import ConnectionExtRosbag2, QosDurability
+from rosbags.rosbag1 import Writer as Rosbag1Writer
+from rosbags.rosbag2 import CompressionFormat, CompressionMode, Reader, StoragePlugin, Writer
+from rosbags.typesys import get_types_from_msg, get_typestore, Stores
+from ruamel.yaml import YAML
+
+from pose_graph_ros.adapters.bag_writer import BagWriter, message_types
+from pose_graph_ros.adapters.bags import BagError, choose_topic, MessageError, open_bag
+
+POINT = 'geometry_msgs/msg/Point'
+STRING = 'std_msgs/msg/String'
+TYPES = message_types()
+
+
+def point(x: float) -> Any:
+    return TYPES[POINT](x, 2.0, 3.0)
+
+
+def write_points(folder: Path, storage: str = 'mcap', count: int = 5) -> Path:
+    with BagWriter(folder, storage) as bag:
+        for k in range(count):
+            bag.write('/a', POINT, 100 + k, point(k))
+        bag.write('/b', STRING, 102, TYPES[STRING]('hello'))
+    return folder
+
+
+def files_below(folder: Path) -> list[Path]:
+    return sorted(folder.rglob('*'))
+
+
+@pytest.mark.parametrize('storage', ['mcap', 'sqlite3'])
+def test_what_is_written_is_read_back(tmp_path: Path, storage: str) -> None:
+    folder = write_points(tmp_path / 'deep' / 'bag', storage)
+    with open_bag(folder) as bag:
+        assert {name: (t.type, t.count) for name, t in bag.topics.items()} == {
+            '/a': (POINT, 5), '/b': (STRING, 1)}
+        messages = list(bag.messages(['/a', '/b']))
+    assert [m.recorded_ns for m in messages] == [100, 101, 102, 102, 103, 104]
+    assert [m.decode().x for m in messages if m.topic == '/a'] == [0.0, 1.0, 2.0, 3.0, 4.0]
+    assert all(type(m.raw) is bytes for m in messages)
+    assert files_below(tmp_path / 'deep') == [folder, *files_below(folder)]  # no scratch left
+
+
+def test_order_is_that_of_recording_not_of_writing(tmp_path: Path) -> None:
+    with BagWriter(tmp_path / 'bag') as bag:
+        for stamp in (30, 10, 20):
+            bag.write('/a', POINT, stamp, point(stamp))
+    with open_bag(tmp_path / 'bag') as reader:
+        assert [m.recorded_ns for m in reader.messages(['/a'])] == [10, 20, 30]
+
+
+def test_raw_messages_pass_through_unchanged(tmp_path: Path) -> None:
+    write_points(tmp_path / 'one')
+    with open_bag(tmp_path / 'one') as source, BagWriter(tmp_path / 'two') as copy:
+        raws = []
+        for message in source.messages(['/a']):
+            copy.write(message.topic, message.type, message.recorded_ns, message.raw)
+            raws.append(message.raw)
+    with open_bag(tmp_path / 'two') as reader:
+        assert [m.raw for m in reader.messages(['/a'])] == raws
+
+
+@pytest.mark.parametrize(('storage', 'suffix'), [('mcap', '.mcap'), ('sqlite3', '.db3')])
+def test_a_lone_file_is_a_bag_with_and_without_its_folder(
+    tmp_path: Path, storage: str, suffix: str,
+) -> None:
+    inside = write_points(tmp_path / 'bag', storage) / f'bag{suffix}'
+    alone = Path(shutil.copy(inside, tmp_path / f'alone{suffix}'))
+    for path in (inside, alone):
+        with open_bag(str(path)) as bag:
+            assert [m.decode().x for m in bag.messages({'/a'})] == [0.0, 1.0, 2.0, 3.0, 4.0]
+
+
+@pytest.mark.parametrize(('plugin', 'mode'), [
+    (StoragePlugin.SQLITE3, CompressionMode.FILE),
+    (StoragePlugin.SQLITE3, CompressionMode.MESSAGE),
+    (StoragePlugin.MCAP, CompressionMode.FILE),
+    (StoragePlugin.MCAP, CompressionMode.MESSAGE),
+    (StoragePlugin.MCAP, CompressionMode.STORAGE),
+])
+def test_compressed_bags_are_read(
+    tmp_path: Path, plugin: StoragePlugin, mode: CompressionMode,
+) -> None:
+    types = get_typestore(Stores.ROS2_JAZZY)
+    writer = Writer(tmp_path / 'bag', version=9, storage_plugin=plugin)
+    writer.set_compression(mode, CompressionFormat.ZSTD)
+    with writer:
+        connection = writer.add_connection('/a', POINT, typestore=types)
+        writer.write(connection, 7, types.serialize_cdr(point(1.5), POINT))
+    with open_bag(tmp_path / 'bag') as bag:
+        assert [m.decode().x for m in bag.messages(['/a'])] == [1.5]
+
+
+def test_a_ros_1_bag_is_read(tmp_path: Path) -> None:
+    types = get_typestore(Stores.ROS1_NOETIC)
+    with Rosbag1Writer(tmp_path / 'old.bag') as writer:
+        connection = writer.add_connection('/a', POINT, typestore=types)
+        message = types.types[POINT](1.5, 2.0, 3.0)
+        writer.write(connection, 7, types.serialize_ros1(message, POINT))
+    with open_bag(tmp_path / 'old.bag') as bag:
+        assert bag.topics['/a'].type == POINT
+        assert [m.decode().x for m in bag.messages(['/a'])] == [1.5]
+
+
+def test_metadata_is_what_jazzy_expects(tmp_path: Path) -> None:
+    with BagWriter(tmp_path / 'bag', latched=['/path']) as bag:
+        bag.write('/a', POINT, 1, point(1))
+        bag.write('/path', POINT, 2, point(2))
+        bag.write('/tf_static', POINT, 3, point(3))
+    text = (tmp_path / 'bag' / 'metadata.yaml').read_text()
+    information = YAML(typ='safe').load(text)['rosbag2_bagfile_information']
+    assert information['version'] == 9
+    assert information['storage_identifier'] == 'mcap'
+    topics = [t['topic_metadata'] for t in information['topics_with_message_count']]
+    assert all(t['type_description_hash'].startswith('RIHS01_') for t in topics)
+    with Reader(tmp_path / 'bag') as reader:
+        durability = {}
+        for connection in reader.connections:
+            assert isinstance(connection.ext, ConnectionExtRosbag2)
+            durability[connection.topic] = connection.ext.offered_qos_profiles[0].durability
+    assert durability == {
+        '/a': QosDurability.VOLATILE,
+        '/path': QosDurability.TRANSIENT_LOCAL,
+        '/tf_static': QosDurability.TRANSIENT_LOCAL,
+    }
+
+
+def test_an_empty_bag_and_an_empty_choice_have_no_messages(tmp_path: Path) -> None:
+    with BagWriter(tmp_path / 'empty'):
+        pass
+    with open_bag(tmp_path / 'empty') as bag:
+        assert bag.topics == {}
+        assert list(bag.messages([])) == []
+        assert bag.describe() == 'no topics'
+    with open_bag(write_points(tmp_path / 'bag')) as bag:
+        assert list(bag.messages([])) == []
+
+
+def test_a_bad_message_does_not_end_the_iteration(tmp_path: Path) -> None:
+    good = get_typestore(Stores.ROS2_JAZZY).serialize_cdr(point(1), POINT).tobytes()
+    with BagWriter(tmp_path / 'bag') as bag:
+        for k, raw in enumerate([good, good[:-5], b'', b'\xff' * 40, good]):
+            bag.write('/a', POINT, k, raw)
+    outcome = []
+    with open_bag(tmp_path / 'bag') as reader:
+        for message in reader.messages(['/a']):
+            try:
+                outcome.append(message.decode().x)
+            except MessageError:
+                outcome.append(None)
+                with pytest.raises(MessageError, match=f'^/a: .* is no {POINT}'):
+                    message.decode()
+    assert outcome == [1.0, None, None, None, 1.0]
+
+
+def test_the_bags_own_definitions_win(tmp_path: Path) -> None:
+    types = get_typestore(Stores.EMPTY)
+    types.register(get_types_from_msg('float32 q\nstring name', POINT))
+    with Writer(tmp_path / 'bag', version=9) as writer:
+        connection = writer.add_connection('/a', POINT, typestore=types)
+        writer.write(connection, 7, types.serialize_cdr(types.types[POINT](0.5, 'own'), POINT))
+    with open_bag(tmp_path / 'bag') as bag:
+        assert next(bag.messages(['/a'])).decode().name == 'own'
+
+
+@pytest.mark.parametrize(('definition', 'warnings'), [
+    ('', 0), ('no definition at all ?!', 1), ('unknown_msgs/Thing x', 1)])
+def test_without_a_usable_definition_that_of_jazzy_serves(
+    tmp_path: Path, definition: str, warnings: int, caplog: pytest.LogCaptureFixture,
+) -> None:
+    types = get_typestore(Stores.ROS2_JAZZY)
+    with Writer(tmp_path / 'bag', version=9, storage_plugin=StoragePlugin.MCAP) as writer:
+        connection = writer.add_connection('/a', POINT, msgdef=definition, rihs01='RIHS01_0')
+        for stamp in (7, 8):
+            writer.write(connection, stamp, types.serialize_cdr(point(1.5), POINT))
+    with open_bag(tmp_path / 'bag') as bag, caplog.at_level(logging.WARNING):
+        assert [m.decode().x for m in bag.messages(['/a'])] == [1.5, 1.5]
+    assert len(caplog.records) == warnings
+
+
+def test_a_type_that_nobody_knows_fails_when_decoded(tmp_path: Path) -> None:
+    with Writer(tmp_path / 'bag', version=9) as writer:
+        connection = writer.add_connection(
+            '/a', 'my_msgs/msg/Thing', msgdef='other_msgs/Part x', rihs01='RIHS01_0')
+        writer.write(connection, 7, b'\0\1\0\0')
+    with open_bag(tmp_path / 'bag') as bag:
+        message = next(bag.messages(['/a']))
+        with pytest.raises(MessageError, match='my_msgs/msg/Thing'):
+            message.decode()
+
+
+def test_unknown_topics_are_refused_at_once_with_those_that_exist(tmp_path: Path) -> None:
+    with open_bag(write_points(tmp_path / 'bag')) as bag, pytest.raises(
+        BagError, match=r'no topic /c; the bag has /a \(geometry_msgs/msg/Point\), /b',
+    ):
+        bag.messages(['/a', '/c'])
+
+
+def test_choose_topic(tmp_path: Path) -> None:
+    with BagWriter(tmp_path / 'bag') as writer:
+        for topic in ('/a', '/b'):
+            writer.write(topic, POINT, 1, point(1))
+        writer.write('/c', STRING, 2, TYPES[STRING]('hello'))
+    with open_bag(tmp_path / 'bag') as bag:
+        assert choose_topic(bag, '/b', POINT, '--point') == '/b'
+        assert choose_topic(bag, None, STRING, '--text') == '/c'
+        assert choose_topic(bag, None, 'nav_msgs/msg/Odometry', '--odom') is None
+        with pytest.raises(BagError, match='choose --point /a or --point /b'):
+            choose_topic(bag, None, POINT, '--point')
+        with pytest.raises(BagError, match=f'--point /c is of type {STRING}, expected {POINT}'):
+            choose_topic(bag, '/c', POINT, '--point')
+        with pytest.raises(BagError, match='no topic /d'):
+            choose_topic(bag, '/d', POINT, '--point')
+
+
+def assert_clear(path: Path, words: str) -> None:
+    with pytest.raises(BagError, match=words) as caught:
+        open_bag(path)
+    assert str(caught.value).startswith(str(path))
+    assert '\n' not in str(caught.value)
+
+
+def test_what_is_no_bag_is_said_so(tmp_path: Path) -> None:
+    assert_clear(tmp_path / 'nothing', 'does not exist')
+    assert_clear(tmp_path, 'no metadata.yaml$')
+    (tmp_path / 'notes.txt').write_text('no bag')
+    assert_clear(tmp_path / 'notes.txt', 'no bag, expected')
+    for name in ('a.mcap', 'a.db3', 'a.bag'):
+        for content in (b'', b'something else ' * 20):
+            (tmp_path / name).write_bytes(content)
+            assert_clear(tmp_path / name, 'damaged, cut short or not supported')
+    assert_clear(tmp_path, 'name a file in it: a.bag, a.db3, a.mcap')
+    for text in ('', '[1, 2]', '{ no yaml', 'rosbag2_bagfile_information: {version: 99}'):
+        (tmp_path / 'metadata.yaml').write_text(text)
+        assert_clear(tmp_path, 'damaged, cut short or not supported')
+
+
+@pytest.mark.parametrize(('storage', 'suffix'), [('mcap', '.mcap'), ('sqlite3', '.db3')])
+def test_a_damaged_bag_is_a_bag_error_wherever_it_is_cut(
+    tmp_path: Path, storage: str, suffix: str,
+) -> None:
+    whole = (write_points(tmp_path / 'bag', storage, 2000) / f'bag{suffix}').read_bytes()
+    cut = tmp_path / f'cut{suffix}'
+    generator = np.random.default_rng(0)
+    failures = 0
+    for k in range(40):
+        data = bytearray(whole)
+        if k % 2 == 0:
+            del data[generator.integers(len(data)):]
+        else:
+            at = int(generator.integers(len(data) - 64))
+            data[at:at + 64] = generator.bytes(64)
+        cut.write_bytes(data)
+        try:
+            with open_bag(cut) as bag:
+                for message in bag.messages(list(bag.topics)):
+                    message.decode()
+        except BagError:
+            failures += 1
+    assert failures > 10
+
+
+def test_missing_messages_are_logged(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture,
+) -> None:
+    metadata = write_points(tmp_path / 'bag') / 'metadata.yaml'
+    metadata.write_text(metadata.read_text().replace('message_count: 5', 'message_count: 9'))
+    with open_bag(tmp_path / 'bag') as bag, caplog.at_level(logging.WARNING):
+        assert len(list(bag.messages(['/a']))) == 5
+    assert '/a should have 9 messages, 5 were found' in caplog.text
+
+
+def test_nothing_is_overwritten_unless_asked_and_a_bag(tmp_path: Path) -> None:
+    folder = write_points(tmp_path / 'bag')
+    with pytest.raises(BagError, match='exists already'):
+        BagWriter(folder)
+    write_points(tmp_path / 'bag2')
+    with BagWriter(folder, overwrite=True) as bag:
+        bag.write('/new', POINT, 1, point(1))
+    with open_bag(folder) as reader:
+        assert list(reader.topics) == ['/new']
+
+    for name in ('folder', 'bag2'):
+        (tmp_path / name).mkdir(exist_ok=True)
+        (tmp_path / name / 'precious.txt').write_text('mine')
+        with pytest.raises(BagError, match='holds other files'):
+            BagWriter(tmp_path / name, overwrite=True)
+    (tmp_path / 'file').write_text('mine')
+    with pytest.raises(BagError, match='not overwritten'):
+        BagWriter(tmp_path / 'file', overwrite=True)
+    assert [p.name for p in sorted(tmp_path.iterdir())] == ['bag', 'bag2', 'file', 'folder']
+
+
+def test_a_failure_leaves_the_old_bag_and_nothing_else(tmp_path: Path) -> None:
+    folder = write_points(tmp_path / 'bag')
+    before = files_below(tmp_path)
+    with pytest.raises(RuntimeError), BagWriter(folder, overwrite=True):
+        raise RuntimeError
+    with pytest.raises(RuntimeError), BagWriter(tmp_path / 'new'):
+        raise RuntimeError
+    assert files_below(tmp_path) == before
+
+
+def test_the_writer_refuses_what_it_cannot_write(tmp_path: Path) -> None:
+    with pytest.raises(BagError, match='expected mcap or sqlite3'):
+        BagWriter(tmp_path / 'bag', 'csv')
+    (tmp_path / 'file').write_text('')
+    with pytest.raises(BagError, match='cannot be written'):
+        BagWriter(tmp_path / 'file' / 'bag')
+    with BagWriter(tmp_path / 'bag') as bag:
+        with pytest.raises(BagError, match='unknown to ROS 2 Jazzy'):
+            bag.write('/a', 'my_msgs/msg/Thing', 1, b'')
+        with pytest.raises(BagError, match=f'/a: no valid {POINT}'):
+            bag.write('/a', POINT, 1, TYPES[STRING]('hello'))

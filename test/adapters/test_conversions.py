@@ -1,0 +1,210 @@
+# Copyright 2026 The pose_graph_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""Messages in: what is read, and how what cannot be used is answered."""
+
+import math
+
+from harness import fix, imu, odometry, pose
+import numpy as np
+import pytest
+
+from pose_graph_ros.adapters import conversions
+from pose_graph_ros.adapters.bag_writer import message_types
+from pose_graph_ros.adapters.message_reader import MessageReader
+from pose_graph_ros.adapters.parameters import checked
+from pose_graph_ros.core.measurements import (
+    Answer,
+    AnswerStatus,
+    GlobalPose,
+    HeadingOnly,
+    LoopClosure,
+    OdometrySample,
+)
+
+
+def test_odometry_is_read_whatever_the_length_of_its_quaternion() -> None:
+    message = odometry(12.5, 1.0, -2.0, 2.5)
+    message.pose.pose.orientation.z *= 3.0
+    message.pose.pose.orientation.w *= 3.0
+    sample = conversions.odometry_sample(message)
+    assert sample.stamp_ns == 12_500_000_000
+    assert sample.pose == pytest.approx([1.0, -2.0, 2.5])
+
+
+def test_the_message_of_a_bag_reader_is_read_like_that_of_rclpy() -> None:
+    types = message_types()
+    time = types['builtin_interfaces/msg/Time'](sec=12, nanosec=500_000_000)
+    header = types['std_msgs/msg/Header'](stamp=time, frame_id='map')
+    point = types['geometry_msgs/msg/Point'](x=1.0, y=-2.0, z=0.0)
+    quaternion = types['geometry_msgs/msg/Quaternion'](
+        x=0.0, y=0.0, z=math.sin(1.25), w=math.cos(1.25))
+    inner = types['geometry_msgs/msg/Pose'](position=point, orientation=quaternion)
+    covariance = np.zeros(36)
+    covariance[[0, 7, 35]] = (0.01, 0.01, 0.001)
+    foreign = types['geometry_msgs/msg/PoseWithCovarianceStamped'](
+        header=header,
+        pose=types['geometry_msgs/msg/PoseWithCovariance'](pose=inner, covariance=covariance))
+    theirs = conversions.global_pose(foreign, 'map')
+    ours = conversions.global_pose(pose(12.5, 1.0, -2.0, 2.5), 'map')
+    assert isinstance(theirs, GlobalPose)
+    assert isinstance(ours, GlobalPose)
+    assert theirs.stamp_ns == ours.stamp_ns
+    assert np.array_equal(theirs.pose, ours.pose)
+    assert np.array_equal(theirs.covariance, ours.covariance)
+
+
+@pytest.mark.parametrize('frame', ['map', '/map', ''])
+def test_a_global_pose_in_the_map_is_taken(frame: str) -> None:
+    assert isinstance(conversions.global_pose(pose(1.0, 0.0, 0.0, 0.0, frame), 'map'), GlobalPose)
+
+
+def test_a_global_pose_elsewhere_is_refused_with_both_frames() -> None:
+    answer = conversions.global_pose(pose(1.0, 0.0, 0.0, 0.0, 'utm'), 'map')
+    assert isinstance(answer, Answer)
+    assert (answer.status, answer.reason) == (AnswerStatus.REJECTED, 'wrong_frame')
+    assert 'map' in answer.detail
+    assert 'utm' in answer.detail
+
+
+@pytest.mark.parametrize(('frame', 'node', 'time'), [
+    ('x42', 42, None), ('@1695.250000000', None, 1_695_250_000_000),
+    ('@1695', None, 1_695_000_000_000), ('@1695.25', None, 1_695_250_000_000),
+    ('@1700000000.123456789', None, 1_700_000_000_123_456_789)])
+def test_the_reference_of_a_loop_closure(frame: str, node: int | None, time: int | None) -> None:
+    closure = conversions.loop_closure(pose(2000.0, 1.0, 0.0, 0.0, frame))
+    assert isinstance(closure, LoopClosure)
+    assert (closure.reference_node, closure.reference_ns) == (node, time)
+
+
+@pytest.mark.parametrize('frame', [
+    '', 'x', '@', 'x-1', '@-1.0', '@1.0e3', 'base_link', 'x1x', ' x1', '@1.1234567890', 'x1\n'])
+def test_any_other_frame_of_a_loop_closure_is_refused(frame: str) -> None:
+    answer = conversions.loop_closure(pose(2000.0, 1.0, 0.0, 0.0, frame))
+    assert isinstance(answer, Answer)
+    assert answer.reason == 'wrong_frame'
+
+
+@pytest.mark.parametrize('x', [1e200, -1e12])
+def test_odometry_beyond_any_map_is_refused_at_the_door(x: float) -> None:
+    answer = conversions.odometry_sample(odometry(1.0, x, 0.0, 0.0))
+    assert isinstance(answer, Answer)
+    assert answer.reason == 'too_large'
+
+
+def test_the_twist_of_odometry_tells_speed_and_noise() -> None:
+    message = odometry(1.0, 0.0, 0.0, 0.0, speed=-3.0)
+    message.twist.twist.linear.y = 4.0
+    assert conversions.odometry_sample(message).speed == pytest.approx(5.0)
+    assert conversions.odometry_sample(message).twist_variance is None
+    message.twist.covariance[0], message.twist.covariance[35] = 0.01, 0.02
+    assert conversions.odometry_sample(message).twist_variance.tolist() == [0.01, 0.0, 0.02]
+
+
+@pytest.mark.parametrize('number', [math.nan, math.inf, -1.0, 1.7e308])
+def test_a_twist_that_says_nothing_is_left_out(number: float) -> None:
+    message = odometry(1.0, 0.0, 0.0, 0.0, speed=number)
+    message.twist.covariance[0], message.twist.covariance[7] = 1.0, number
+    sample = conversions.odometry_sample(message)
+    assert isinstance(sample, OdometrySample)
+    assert math.isfinite(sample.speed)
+    assert sample.twist_variance is None
+
+
+@pytest.mark.parametrize('number', [math.nan, math.inf, -1.0, 0.0, 1.7e308])
+def test_covariances_are_handed_on_as_they_are(number: float) -> None:
+    message = pose(1.0, 0.0, 0.0, 0.0, variances=(number, 1.0, number))
+    message.pose.covariance[5] = number
+    expected = [[number, 0.0, number], [0.0, 1.0, 0.0], [0.0, 0.0, number]]
+    for measurement in (conversions.global_pose(message, 'map'),
+                        conversions.loop_closure(pose_in(message, 'x1'))):
+        np.testing.assert_array_equal(measurement.covariance, expected)
+
+
+def pose_in(message: object, frame: str) -> object:
+    message.header.frame_id = frame
+    return message
+
+
+def test_an_imu_tells_the_heading_from_east() -> None:
+    measurement = conversions.heading(imu(2.5, 1.0, variance=0.04), 0.25, yaw_offset=3.0,
+                                      offset_ns=-500_000_000)
+    assert isinstance(measurement, HeadingOnly)
+    assert measurement.stamp_ns == 2_000_000_000
+    assert measurement.heading == pytest.approx(3.75 - 2.0 * math.pi)
+    assert measurement.variance == 0.04
+
+
+def test_an_imu_without_an_orientation_is_refused() -> None:
+    message = imu(1.0, 0.0)
+    message.orientation_covariance[0] = -1.0
+    assert conversions.heading(message).reason == 'no_orientation'
+    message = imu(1.0, 0.0)
+    message.orientation.w = message.orientation.z = 0.0
+    assert conversions.heading(message).reason == 'not_finite'
+
+
+def reader(**values: object) -> MessageReader:
+    return MessageReader(checked({
+        name.replace('__', '.'): value for name, value in values.items()}))
+
+
+def test_the_stamps_of_a_source_are_shifted_but_not_those_that_are_not_set() -> None:
+    shifted = reader(sources=['odom', 'global_pose', 'fix', 'imu'], odom__time_offset=0.25,
+                     global_pose__time_offset=-0.5, fix__time_offset=1.5, imu__time_offset=0.125,
+                     loop_closure__time_offset=-1.0)
+    for name, message, stamp_ns in (
+            ('odom', odometry(10.0, 0.0, 0.0, 0.0), 10_250_000_000),
+            ('global_pose', pose(10.0, 0.0, 0.0, 0.0), 9_500_000_000),
+            ('fix', fix(10.0, 48.0, 11.0), 11_500_000_000),
+            ('imu', imu(10.0, 0.0), 10_125_000_000),
+            ('loop_closure', pose(10.0, 0.0, 0.0, 0.0, '@5.0'), 9_000_000_000)):
+        measurement = shifted.read(name, message)
+        assert measurement.stamp_ns == stamp_ns, name
+        if name == 'loop_closure':
+            assert measurement.reference_ns == 4_000_000_000
+    assert shifted.read('odom', odometry(0.0, 0.0, 0.0, 0.0)).stamp_ns == 0
+    assert shifted.read('fix', fix(0.0, 48.0, 11.0)).reason == 'zero_stamp'
+
+
+def test_a_source_that_is_not_listed_is_not_read() -> None:
+    with pytest.raises(KeyError):
+        reader().read('imu', None)
+
+
+def test_odometry_with_the_stamp_of_another_time_is_refused_unless_it_goes_on() -> None:
+    one = reader()
+
+    def answers(*seconds: float) -> list[str]:
+        return [getattr(one.read('odom', odometry(at, 0.0, 0.0, 0.0)), 'reason', 'read')
+                for at in seconds]
+
+    assert answers(1e9, 1e9 + 59.0, 1e9 + 58.0) == 3 * ['read']
+    assert answers(2e9, 1e9 + 60.0, 5.0, 5.1, 2e9, 2e9, 2e9) == [
+        'stamp_leap', 'read', *(5 * ['stamp_leap'])]
+    assert answers(1e9 + 61.0) == ['read']
+    # it had been away, and is again
+    assert answers(*(1.1e9 + 0.1 * step for step in range(8))) == (
+        5 * ['stamp_leap'] + 3 * ['read'])
+    assert answers(*(1e9 + 0.1 * step for step in range(8))) == (
+        5 * ['stamp_leap'] + 3 * ['read'])
+
+
+@pytest.mark.parametrize('offset', [-3600.0, -90.0, 0.5, 90.0, 3600.0])
+def test_another_time_offset_is_no_leap_of_the_stamps(offset: float) -> None:
+    values = checked({'sources': ['odom', 'imu']})
+    one = MessageReader(values)
+    one.configure({**values, 'odom.time_offset': 0.0})
+    assert one.read('odom', odometry(1e9, 0.0, 0.0, 0.0)).stamp_ns == 10**18
+    one.configure({**values, 'odom.time_offset': offset, 'imu.yaw_offset': 0.25})
+    for at in (1e9 + 0.1, 1e9 + 0.2):
+        sample = one.read('odom', odometry(at, 0.0, 0.0, 0.0))
+        assert sample.stamp_ns == pytest.approx(1e9 * (at + offset), abs=1e3)
+    assert one.read('odom', odometry(1e9 + 70.0, 0.0, 0.0, 0.0)).reason == 'stamp_leap'
+    assert one.read('imu', imu(1e9, 0.5)).heading == pytest.approx(0.75)
+
+
+def test_stamps_that_no_message_can_hold_are_refused() -> None:
+    one = reader(odom__time_offset=10.0, fix__time_offset=-10.0)
+    assert one.read('odom', odometry(2**31 - 1.0, 0.0, 0.0, 0.0)).reason == 'stamp_out_of_range'
+    assert one.read('fix', fix(2**31 - 1.0, 48.0, 11.0)).reason == 'stamp_out_of_range'
+    assert one.read('fix', fix(5.0, 48.0, 11.0)).reason == 'zero_stamp'

@@ -1,0 +1,239 @@
+# Copyright 2026 The pose_graph_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""Fixes in: the datum, the antennas, and what is refused."""
+
+import math
+
+from harness import fix, TFMessage, transform
+import numpy as np
+import pyproj
+import pytest
+
+from pose_graph_ros.adapters.fixes import Datum, FixReader
+from pose_graph_ros.adapters.message_reader import MessageReader
+from pose_graph_ros.adapters.parameters import checked
+from pose_graph_ros.adapters.sources import Kind, Source
+from pose_graph_ros.adapters.static_frames import StaticFrames
+from pose_graph_ros.core.exceptions import ConfigError
+from pose_graph_ros.core.measurements import Answer, Position
+
+
+def fixes(**values: object) -> FixReader:
+    return MessageReader(checked({
+        name.replace('__', '.'): value for name, value in values.items()})).fixes['fix']
+
+
+def test_the_first_good_fix_is_the_datum() -> None:
+    reader = fixes()
+    bad = fix(1.0, 48.0, 11.0)
+    bad.status.status = -1
+    assert isinstance(reader.position(bad), Answer)
+    assert reader.position(fix(0.0, 48.0, 11.0)).reason == 'zero_stamp'
+    first = reader.position(fix(2.0, 48.1, 11.6))
+    assert isinstance(first, Position)
+    assert first.position == pytest.approx([0.0, 0.0], abs=1e-9)
+    second = reader.position(fix(3.0, 48.101, 11.6))
+    # a thousandth of a degree of latitude is 111 m
+    assert second.position == pytest.approx([0.0, 111.2], abs=0.1)
+
+
+def test_a_datum_with_a_yaw_turns_positions_and_covariances() -> None:
+    reader = fixes(datum=[48.1, 11.6, math.pi / 2.0])
+    message = fix(1.0, 48.101, 11.6)
+    message.position_covariance = [1.0, 0.0, 0.0, 0.0, 4.0, 0.0, 0.0, 0.0, 9.0]
+    measurement = reader.position(message)
+    assert measurement.position == pytest.approx([111.2, 0.0], abs=0.1)
+    assert np.diagonal(measurement.covariance) == pytest.approx([4.0, 1.0])
+
+
+def test_an_altitude_that_is_not_known_is_that_of_the_datum() -> None:
+    reader = fixes()
+    reader.position(fix(1.0, 48.1, 11.6))
+    message = fix(2.0, 48.101, 11.6)
+    known = reader.position(message).position
+    message.altitude = math.nan
+    assert reader.position(message).position == pytest.approx(known, abs=1e-6)
+
+
+def test_with_a_datum_the_altitudes_of_the_first_fixes_do_not_matter() -> None:
+    there = [fix(2.0, 48.101, 11.61), fix(3.0, 48.09, 11.6)]
+    there[1].altitude = 900.0
+    forth, back = fixes(datum=[48.1, 11.6]), fixes(datum=[48.1, 11.6])
+    positions = [forth.position(message).position for message in there]
+    turned = [back.position(message).position for message in reversed(there)]
+    np.testing.assert_allclose(positions, turned[::-1], atol=1e-8)
+
+
+@pytest.mark.parametrize('covariance', [
+    [0.0] * 9, [math.nan] * 9, [-1.0] * 9, [math.inf] + [0.0] * 8, [1.7e308] * 9])
+@pytest.mark.parametrize('datum', [[], [48.1, 11.6, 0.3]])
+def test_covariances_are_handed_on_by_their_type(
+    covariance: list[float], datum: list[float],
+) -> None:
+    reader = fixes(datum=datum)
+    message = fix(1.0, 48.1, 11.6, sigma=2.0)
+    assert reader.position(message).covariance == pytest.approx(4.0 * np.eye(2))
+    message.position_covariance = covariance
+    read = reader.position(message)
+    assert isinstance(read, Position)
+    assert np.all(np.isfinite(read.position))
+    if covariance[0] in (0.0, -1.0):
+        # a singular one turned by the datum's yaw is the same, but for rounding
+        assert np.trace(read.covariance) == pytest.approx(2.0 * covariance[0])
+    message.position_covariance_type = 0
+    assert not np.any(reader.position(message).covariance)
+
+
+@pytest.mark.parametrize(('latitude', 'longitude', 'altitude', 'reason'), [
+    (math.nan, 11.6, 1.0, 'not_finite'), (48.1, math.inf, 1.0, 'not_finite'),
+    (90.1, 11.6, 1.0, 'out_of_range'), (48.1, -360.5, 1.0, 'out_of_range'),
+    (48.1, 11.6, math.inf, 'out_of_range'), (48.1, 11.6, 1e300, 'out_of_range')])
+def test_what_is_no_place_is_refused_and_no_datum(
+    latitude: float, longitude: float, altitude: float, reason: str,
+) -> None:
+    reader = fixes()
+    message = fix(1.0, latitude, longitude)
+    message.altitude = altitude
+    assert reader.position(message).reason == reason
+    assert reader.position(fix(2.0, 10.0, 20.0)).position == pytest.approx([0.0, 0.0], abs=1e-9)
+
+
+def test_fixes_wait_for_a_datum_if_they_are_told_to() -> None:
+    datum = Datum(wait=True)
+    reader = FixReader(Source('fix', Kind.FIX, 'fix'), datum, StaticFrames(), 'base_link')
+    assert reader.position(fix(1.0, 48.0, 11.0)).reason == 'no_datum'
+    datum.renew()
+    assert isinstance(reader.position(fix(2.0, 48.1, 11.6)), Position)
+    assert (datum.plane.latitude, datum.plane.longitude) == (48.1, 11.6)
+    # one that is given need not be waited for
+    assert isinstance(fixes(datum=[48.1, 11.6], wait_for_datum=True).position(
+        fix(1.0, 48.0, 11.0)), Position)
+
+
+def test_all_sources_of_fixes_share_the_datum() -> None:
+    reader = MessageReader(checked({'sources': ['odom', 'fix', 'rear'], 'rear.type': 'fix'}))
+    reader.read('rear', fix(1.0, 48.1, 11.6))
+    assert reader.read('fix', fix(1.0, 48.101, 11.6)).position == pytest.approx(
+        [0.0, 111.2], abs=0.1)
+
+
+@pytest.mark.parametrize('datum', [[91.0, 0.0], [0.0, 361.0]])
+def test_a_datum_that_is_no_place_is_refused(datum: list[float]) -> None:
+    with pytest.raises(ConfigError, match='datum: expected latitude'):
+        fixes(datum=datum)
+
+
+GEOD = pyproj.Geod(ellps='WGS84')
+
+
+@pytest.mark.parametrize('place', [
+    (89.9, 30.0), (-89.9, -100.0), (10.0, 179.9999), (-16.5, -179.9999), (48.0, 11.9999),
+    (64.0, 5.9999), (0.0, 0.0), (48.0, 12.0)])
+@pytest.mark.parametrize('azimuth', [0.0, 37.0, 90.0, 145.0, 270.0])
+def test_two_fixes_are_as_far_apart_as_on_the_earth(
+    place: tuple[float, float], azimuth: float,
+) -> None:
+    """Near the poles, across the meridian of 180 degrees and borders of UTM zones."""
+    longitude, latitude, _ = GEOD.fwd(place[1], place[0], azimuth, 100.0)
+    here, there = fix(1.0, *place), fix(2.0, latitude, longitude)
+    for message in (here, there):
+        message.altitude = 0.0
+    expected = 100.0 * np.array([math.sin(math.radians(azimuth)), math.cos(math.radians(azimuth))])
+    for reader in (fixes(), fixes(datum=list(place))):
+        start = reader.position(here).position
+        np.testing.assert_allclose(reader.position(there).position - start, expected, atol=1e-3)
+    # from a datum elsewhere the distance is the same
+    reader = fixes(datum=[place[0], place[1] + 1e-4])
+    step = reader.position(there).position - reader.position(here).position
+    assert math.hypot(*step) == pytest.approx(100.0, abs=1e-3)
+
+
+# --- antennas
+
+class Transforms:
+    def __init__(self, *transforms: object) -> None:
+        self.transforms = transforms
+
+
+HALF = math.sqrt(0.5)
+
+
+def test_frames_are_composed_along_any_chain() -> None:
+    frames = StaticFrames()
+    frames.receive(Transforms(
+        # the mast leans back by 90 degrees about y: its z points to the robot's x
+        transform('base_link', '/mast', (1.0, 0.0, 0.5), (0.0, HALF, 0.0, HALF)),
+        transform('mast', 'gps', (0.0, 0.25, 2.0))))
+    np.testing.assert_allclose(frames.position('gps', 'base_link'), [3.0, 0.25, 0.5], atol=1e-12)
+    # a root above the base, turned to the left
+    frames.receive(Transforms(
+        transform('base_footprint', 'base_link', (0.0, 0.0, 0.3)),
+        transform('base_footprint', 'roof', (0.0, 1.0, 2.0), (0.0, 0.0, HALF, HALF)),
+        transform('roof', 'other', (0.5, 0.0, 0.0))))
+    np.testing.assert_allclose(frames.position('other', 'base_link'), [0.0, 1.5, 1.7], atol=1e-12)
+    np.testing.assert_allclose(frames.position('base_link', 'base_link'), 0.0, atol=1e-12)
+    np.testing.assert_allclose(
+        frames.position('gps', 'base_footprint'), [3.0, 0.25, 0.8], atol=1e-12)
+    assert frames.position('nowhere', 'base_link') is None
+    assert frames.position('', 'base_link') is None
+
+
+def test_frames_that_are_none_and_circles_do_no_harm() -> None:
+    frames = StaticFrames()
+    here = (1.0, 0.0, 0.0)
+    frames.receive(Transforms(
+        transform('a', 'a', here), transform('', 'b', here), transform('a', '', here),
+        transform('a', 'b', (math.nan, 0.0, 0.0)), transform('a', 'b', (math.inf, 0.0, 0.0)),
+        transform('a', 'b', (1e300, 0.0, 0.0)), transform('a', 'b', here, (0, 0, 0, 0)),
+        transform('a', 'b', here, (math.nan, 0, 0, 1))))
+    assert frames.position('b', 'a') is None
+    frames.receive(Transforms(
+        transform('a', 'b', here), transform('b', 'c', here), transform('c', 'a', here)))
+    assert np.all(np.isfinite(frames.position('c', 'a')))
+    assert frames.position('c', 'elsewhere') is None
+
+
+def test_the_antenna_is_where_the_parameter_says_else_where_tf_static_does() -> None:
+    reader = MessageReader(checked({
+        'sources': ['odom', 'fix', 'rear'], 'rear.type': 'fix', 'rear.lever_arm': [-1.0, 0.5]}))
+    assert reader.read('fix', fix(1.0, 48.1, 11.6)).lever_arm.tolist() == [0.0, 0.0]
+    assert reader.fixes['fix'].antenna.origin == 'none'
+    assert reader.fixes['fix'].without_lever_arm == 1
+    reader.frames.receive(Transforms(transform('base_link', 'gps', (0.75, -0.25, 1.0))))
+    assert reader.read('fix', fix(2.0, 48.1, 11.6)).lever_arm.tolist() == [0.75, -0.25]
+    assert reader.fixes['fix'].antenna.origin == 'tf_static'
+    assert reader.fixes['fix'].without_lever_arm == 1
+    assert reader.read('rear', fix(2.0, 48.1, 11.6)).lever_arm.tolist() == [-1.0, 0.5]
+    assert reader.fixes['rear'].antenna.origin == 'parameter'
+
+
+def test_another_lever_arm_is_taken_for_fixes_from_then_on_and_all_else_stays() -> None:
+    values = checked({'fix.lever_arm': [0.5, 0.0]})
+    reader = MessageReader(values)
+    first = reader.read('fix', fix(1.0, 48.1, 11.6))
+    plane, one = reader.datum.plane, reader.fixes['fix']
+    reader.frames.receive(Transforms(transform('base_link', 'gps', (0.75, -0.25, 1.0))))
+    reader.configure({**values, 'fix.lever_arm': [1.5, 0.25], 'fix.time_offset': -0.5})
+    second = reader.read('fix', fix(2.0, 48.1, 11.6))
+    assert (first.lever_arm.tolist(), second.lever_arm.tolist()) == ([0.5, 0.0], [1.5, 0.25])
+    assert second.stamp_ns == 1_500_000_000
+    assert second.position == pytest.approx(first.position, abs=1e-9)
+    assert reader.datum.plane is plane
+    assert reader.fixes['fix'] is one
+    # zero: from the transforms that came before
+    reader.configure({**values, 'fix.lever_arm': [0.0, 0.0]})
+    assert reader.read('fix', fix(3.0, 48.1, 11.6)).lever_arm.tolist() == [0.75, -0.25]
+    assert reader.sources['fix'].time_offset_ns == 0
+    # and those are all that stays where the graph begins anew
+    renewed = reader.renewed(values | {'fix.lever_arm': [0.0, 0.0]})
+    assert renewed.datum.plane is None
+    assert renewed.fixes['fix'].antenna is None
+    assert renewed.read('fix', fix(4.0, 50.0, 9.0)).lever_arm.tolist() == [0.75, -0.25]
+
+
+def test_a_real_message_of_tf_static_is_read() -> None:
+    if TFMessage is None:
+        pytest.skip('tf2_msgs is not built')
+    frames = StaticFrames()
+    frames.receive(TFMessage(transforms=[transform('base_link', 'gps', (1.0, 2.0, 3.0))]))
+    np.testing.assert_allclose(frames.position('gps', 'base_link'), [1.0, 2.0, 3.0])

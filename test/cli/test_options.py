@@ -1,0 +1,101 @@
+# Copyright 2026 The pose_graph_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""Command line options that several tools share: topics, and the parameters of the node."""
+
+import argparse
+from pathlib import Path
+
+import pytest
+
+from pose_graph_ros.adapters.parameters import checked
+from pose_graph_ros.cli import options as shared
+from pose_graph_ros.core.exceptions import ConfigError
+
+FILE = """
+/**:
+  ros__parameters:
+    use_sim_time: true
+    frequency: 5.0
+    sources: [odom, fix, rear]
+    rear: {type: fix, lever_arm: [-0.5, 0.25]}
+    alignment: {minimum_baseline: 2.0}
+    qos_overrides: {/path: {publisher: {depth: 1}}}
+/robot/pose_graph:
+  ros__parameters: {path_period: 3.0}
+/robot/other:
+  ros__parameters: {no_such_parameter: 1.0}
+other:
+  nothing: true
+"""
+
+
+def parsed(*words: str) -> argparse.Namespace:
+    parser = argparse.ArgumentParser()
+    shared.add_inputs(parser)
+    shared.add_parameters(parser)
+    return parser.parse_args(words)
+
+
+def test_topics_are_those_of_the_options() -> None:
+    nothing = {'odom': None, 'fix': None, 'global_pose': None, 'loop_closure': None, 'imu': None}
+    assert shared.wanted_topics(parsed()) == nothing
+    given = parsed('--odom', '/a', '--global-pose', '/b', '--loop-closure', '/c', '--imu', '/d')
+    assert shared.wanted_topics(given) == {
+        'odom': '/a', 'fix': None, 'global_pose': '/b', 'loop_closure': '/c', 'imu': '/d'}
+    assert (parsed().truth, parsed().hold_out) == (None, 0)
+
+
+def test_without_options_all_parameters_have_their_defaults() -> None:
+    assert shared.parameter_values(parsed()) == checked({})
+    assert shared.ros_arguments(parsed()) == ['--ros-args']
+
+
+def test_parameters_come_from_the_file_and_from_the_command_line(tmp_path: Path) -> None:
+    path = tmp_path / 'params.yaml'
+    path.write_text(FILE, encoding='utf-8')
+    in_file = {
+        'frequency': 5.0, 'sources': ['odom', 'fix', 'rear'], 'rear.type': 'fix',
+        'rear.lever_arm': [-0.5, 0.25], 'alignment.minimum_baseline': 2.0, 'path_period': 3.0}
+    assert shared.parameter_values(parsed('--params-file', str(path))) == checked(in_file)
+    # the command line wins, and its values are read as yaml
+    given = parsed('--params-file', str(path), '-p', 'frequency:=20', '--param',
+                   'rear.lever_arm:=[1, 2]', '-p', 'publish_tf:=false')
+    assert shared.parameter_values(given) == checked({
+        **in_file, 'frequency': 20.0, 'rear.lever_arm': [1.0, 2.0], 'publish_tf': False})
+    assert shared.ros_arguments(given) == [
+        '--ros-args', '--params-file', str(path), '-p', 'frequency:=20', '-p',
+        'rear.lever_arm:=[1, 2]', '-p', 'publish_tf:=false']
+
+
+def test_a_file_without_a_section_for_the_node_sets_nothing(tmp_path: Path) -> None:
+    path = tmp_path / 'params.yaml'
+    for text in ('', '- a list', 'other: {ros__parameters: {frequency: 1.0}}'):
+        path.write_text(text, encoding='utf-8')
+        assert shared.parameter_values(parsed('--params-file', str(path))) == checked({})
+
+
+@pytest.mark.parametrize(('text', 'said'), [
+    ('/**: {ros__parameters: {frequency: 0.0}}', r'frequency: expected a number in'),
+    ('/**: {ros__parameters: {no_such: 0.0}}', r"'no_such' is not known"),
+    ('/**: {frequency: 1.0}', r'params\.yaml: /\*\*: expected ros__parameters'),
+    ('pose_graph: 5', r'params\.yaml: pose_graph: expected ros__parameters'),
+    ('/**: [', r'params\.yaml: cannot be read as yaml'),
+    (b'\xff\xfe\xfa', r'params\.yaml: cannot be read as yaml'),
+    (None, r'params\.yaml: cannot be read as yaml')])
+def test_a_wrong_file_is_refused(text: str | bytes | None, said: str, tmp_path: Path) -> None:
+    path = tmp_path / 'params.yaml'
+    if text is not None:
+        path.write_bytes(text if isinstance(text, bytes) else text.encode())
+    with pytest.raises(ConfigError, match=said) as caught:
+        shared.parameter_values(parsed('--params-file', str(path)))
+    assert '\n' not in str(caught.value)
+
+
+def test_a_parameter_without_a_value_is_refused() -> None:
+    with pytest.raises(ConfigError, match=r"expected NAME:=VALUE, got 'frequency=1\.0'"):
+        shared.parameter_values(parsed('-p', 'frequency=1.0'))
+
+
+def test_a_value_that_cannot_be_read_is_refused_with_the_name_of_its_parameter() -> None:
+    with pytest.raises(ConfigError, match=r"--param frequency: '\[1' is not YAML"):
+        shared.parameter_values(parsed('-p', 'frequency:=[1'))

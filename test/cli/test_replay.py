@@ -1,0 +1,311 @@
+# Copyright 2026 The pose_graph_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""The tool `pose-graph replay` without ROS: its files, counts, comparisons and exit codes."""
+
+import argparse
+import json
+import os
+from pathlib import Path
+import sys
+from typing import Any
+
+import numpy as np
+import pytest
+from tum_files import read_tum
+
+from pose_graph_ros.adapters.bag_inputs import choose_inputs
+from pose_graph_ros.adapters.bag_writer import message_types
+from pose_graph_ros.adapters.bags import BagError, open_bag
+from pose_graph_ros.adapters.parameters import checked
+from pose_graph_ros.adapters.sources import source_list
+from pose_graph_ros.cli import replay
+from pose_graph_ros.cli.bag_messages import (
+    fix_messages,
+    loop_closure_messages,
+    Message,
+    odometry_messages,
+    write_bag,
+)
+from pose_graph_ros.cli.main import main
+from pose_graph_ros.cli.results import collect_drive, read_truth
+from pose_graph_ros.core.batch.optimizer import Status
+from pose_graph_ros.core.exceptions import PoseGraphError
+from pose_graph_ros.core.geometry import se2
+from pose_graph_ros.core.geometry.geodesy import TangentPlane
+from pose_graph_ros.core.geometry.trajectory import Trajectory
+from pose_graph_ros.core.io.g2o import read_g2o
+
+TYPES = message_types()
+POSE = 'geometry_msgs/msg/PoseWithCovarianceStamped'
+SECOND = 10**9
+VARIANCES = (1e-3, 1e-3, 1e6, 1e6, 1e6, 1e-3)
+ANTENNA = np.array([1.5, -0.5])
+
+
+def circle(seconds: int = 40) -> Trajectory:
+    """Drive along a circle with a radius of 10 m at 2 m/s, a little more than once."""
+    stamps = 1_700_000_000 * SECOND + np.arange(0, seconds * SECOND, SECOND // 10)
+    angle = np.arange(len(stamps)) * 0.02
+    return Trajectory(stamps, np.column_stack(
+        (10.0 * np.sin(angle), 10.0 * (1.0 - np.cos(angle)), se2.wrap(angle))))
+
+
+def odometry() -> list[Message]:
+    """The circle in a frame of its own, 1 % too long and turning a little too far."""
+    path = circle()
+    steps = se2.between(path.poses[:-1], path.poses[1:]) * (1.01, 1.01, 1.002)
+    poses = [np.array([3.0, -4.0, 2.0])]
+    for step in steps:
+        poses.append(se2.compose(poses[-1], step))
+    return list(odometry_messages(
+        '/odom', 'odom', Trajectory(path.stamps_ns, np.array(poses)), VARIANCES))
+
+
+def pose_messages(topic: str, type_name: str, frame: str = 'map') -> list[Message]:
+    """The circle once a second, in messages of a type with a stamped pose."""
+    path = circle()
+    made = []
+    for (_, _, stamp, message), in zip(odometry_messages(
+            topic, frame, path, (0.01, 0.01, 0.0, 0.0, 0.0, 1e-4)), strict=True):
+        pose = message.pose.pose if type_name.endswith('PoseStamped') else message.pose
+        made.append((topic, type_name, stamp, TYPES[type_name](message.header, pose)))
+    return made[::10]
+
+
+def fixes(arm: np.ndarray) -> list[Message]:
+    """Exact positions of an antenna with a lever arm, twice a second."""
+    path = circle()
+    places = se2.transform(path.poses[::5], arm)
+    geodetic = TangentPlane(50.7, 7.1, 60.0).to_geodetic(places, 60.0)
+    return list(fix_messages('/gps/fix', path.stamps_ns[::5], geodetic, 0.1))
+
+
+def run(*words: object) -> int:
+    return main(['replay', *map(str, words)])
+
+
+def summary_of(folder: Path) -> dict[str, Any]:
+    return json.loads((folder / 'summary.json').read_text(encoding='utf-8'))
+
+
+def rms(content: dict[str, Any]) -> dict[str, float]:
+    return {row['name']: row['rms'] for row in content['errors']}
+
+
+def test_global_poses_correct_the_path_and_all_files_are_written(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str],
+) -> None:
+    path = circle()
+    closed = path.stamps_ns[[0, 314]]
+    relative = se2.between(path.poses[[0]], path.poses[[314]])
+    write_bag(tmp_path / 'bag', (
+        *odometry(), *pose_messages('/pose', POSE),
+        *loop_closure_messages('/loop_closure', closed[None], relative, 0.01 * np.eye(3)),
+        *odometry_messages('/truth', 'map', path, (0.0,) * 6)))
+    out = tmp_path / 'deep' / 'out'
+    assert run(tmp_path / 'bag', '--odom', '/odom', '--truth', '/truth', '-o', out) == 0
+    printed = capsys.readouterr().out
+    assert 'odom: /odom\nglobal_pose: /pose\nloop_closure: /loop_closure\n' in printed
+    assert sorted(each.name for each in out.iterdir()) == [
+        'drive.png', 'graph.g2o', 'path.tum', 'summary.json']
+    content = summary_of(out)
+    assert content['counts'] == {
+        'odom.accepted': 400, 'global_pose.accepted': 40, 'loop_closure.accepted': 1}
+    assert (content['status'], content['alignment']) == ('converged', 'aligned')
+    assert (content['loop_closures'], content['fixes_used'], content['odometry']) == (1, 40, 400)
+    assert content['truth'] is True
+    assert content['hidden_nodes'] == read_g2o(out / 'graph.g2o').graph.n_nodes
+    # the path is as long as the drive, at its place, and better than odometry at its best
+    corrected = read_tum(out / 'path.tum')
+    expected = path.at(corrected.stamps_ns)
+    assert np.max(np.hypot(*(corrected.poses - expected)[:, :2].T)) < 0.1
+    errors = rms(content)
+    assert errors['corrected path to truth'] < 0.03 < errors['odometry alone to truth']
+    assert 'corrected path to truth' in printed
+    assert 'counts: global_pose.accepted 40, loop_closure.accepted 1, odom.accepted 400' in printed
+
+
+def test_distances_from_fixes_are_those_of_the_robot_not_of_the_antenna(tmp_path: Path) -> None:
+    write_bag(tmp_path / 'bag', (*odometry(), *fixes(ANTENNA)))
+    assert run(tmp_path / 'bag', '--hold-out', 4, '-o', tmp_path, '-p',
+               f'fix.lever_arm:={ANTENNA.tolist()}') == 0
+    content = summary_of(tmp_path)
+    assert (content['fixes_used'], content['fixes_held_out']) == (60, 20)
+    assert content['counts']['fix.accepted'] == 60
+    errors = rms(content)
+    for kind in ('used', 'held out'):
+        assert errors[f'corrected path to fixes {kind}'] < 0.1
+
+
+def test_the_antenna_may_come_from_tf_static_whenever_it_was_recorded(tmp_path: Path) -> None:
+    header, time = TYPES['std_msgs/msg/Header'], TYPES['builtin_interfaces/msg/Time']
+    transform = TYPES['geometry_msgs/msg/TransformStamped'](
+        header(time(0, 0), 'base_link'), 'gps', TYPES['geometry_msgs/msg/Transform'](
+            TYPES['geometry_msgs/msg/Vector3'](*ANTENNA.tolist(), 1.0),
+            TYPES['geometry_msgs/msg/Quaternion'](0.0, 0.0, 0.0, 1.0)))
+    last = int(circle().stamps_ns[-1])
+    write_bag(tmp_path / 'bag', (
+        *odometry(), *fixes(ANTENNA),
+        ('/tf_static', 'tf2_msgs/msg/TFMessage', last - 1, b'\0\1\0\0junk'),
+        ('/tf_static', 'tf2_msgs/msg/TFMessage', last, TYPES['tf2_msgs/msg/TFMessage'](
+            [transform]))))
+    assert run(tmp_path / 'bag', '-o', tmp_path) == 0
+    assert rms(summary_of(tmp_path))['corrected path to fixes used'] < 0.1
+
+
+def test_messages_without_a_measurement_are_counted_and_not_compared_with(tmp_path: Path) -> None:
+    bad = fixes(np.zeros(2))[:3]
+    for _, _, _, message in bad:
+        message.status.status = -1
+    first = int(circle().stamps_ns[0])
+    elsewhere = pose_messages('/pose', POSE, 'elsewhere')[:2]
+    junk = [('/gps/fix', 'sensor_msgs/msg/NavSatFix', first + k, b'\0\1\0\0x') for k in range(4)]
+    write_bag(tmp_path / 'bag', (*odometry(), *fixes(np.zeros(2))[3:], *bad, *junk, *elsewhere))
+    assert run(tmp_path / 'bag', '--fix', '/gps/fix', '--global-pose', '/pose',
+               '-o', tmp_path) == 0
+    content = summary_of(tmp_path)
+    assert content['counts'] == {
+        'fix.accepted': 77, 'fix.malformed': 4, 'fix.no_fix': 3, 'global_pose.wrong_frame': 2,
+        'odom.accepted': 400}
+    assert content['fixes_used'] == 77
+
+
+def test_a_loop_closure_to_a_node_is_used_but_has_no_stamp_to_be_drawn_at(tmp_path: Path) -> None:
+    path = circle()
+    closures = list(loop_closure_messages(
+        '/loop_closure', path.stamps_ns[[[0, 314]]], se2.between(
+            path.poses[[0]], path.poses[[314]]), 0.01 * np.eye(3)))
+    closures[0][3].header.frame_id = 'x0'
+    write_bag(tmp_path / 'bag', (*odometry(), *closures))
+    assert run(tmp_path / 'bag', '-o', tmp_path) == 0
+    content = summary_of(tmp_path)
+    assert content['counts']['loop_closure.accepted'] == 1
+    assert content['loop_closures'] == 0
+
+
+@pytest.mark.parametrize(('datum', 'axes'), [
+    ([], ('east', 'north')), ([50.7, 7.1], ('east', 'north')), ([50.7, 7.1, 0.5], ('x', 'y'))])
+def test_the_axes_of_the_map_are_east_and_north_unless_it_is_turned(
+    datum: list[float], axes: tuple[str, str], tmp_path: Path,
+) -> None:
+    write_bag(tmp_path / 'bag', (*odometry(), *fixes(np.zeros(2))))
+    values = checked({'datum': datum})
+    with open_bag(tmp_path / 'bag') as bag:
+        inputs = choose_inputs(bag, source_list(values), {})
+        drive = collect_drive(bag, inputs, values, circle(), None)
+    assert drive.map_axes == axes
+    assert drive.truth is None
+    np.testing.assert_array_equal(drive.odometry.stamps_ns, circle().stamps_ns)
+
+
+@pytest.mark.parametrize('type_name', [
+    'nav_msgs/msg/Odometry', 'geometry_msgs/msg/PoseStamped', POSE])
+def test_truth_is_read_from_each_type_with_a_pose(type_name: str, tmp_path: Path) -> None:
+    path = circle()
+    messages = list(odometry_messages('/truth', 'map', path, (0.0,) * 6))[::10]
+    if type_name != 'nav_msgs/msg/Odometry':
+        messages = pose_messages('/truth', type_name)
+    broken = [('/truth', type_name, int(path.stamps_ns[5]), b'\0\1\0\0junk')]
+    write_bag(tmp_path / 'bag', (*odometry(), *messages, *broken))
+    with open_bag(tmp_path / 'bag') as bag:
+        truth = read_truth(bag, '/truth')
+        np.testing.assert_array_equal(truth.stamps_ns, path.stamps_ns[::10])
+        np.testing.assert_allclose(truth.poses, path.poses[::10], atol=1e-12)
+        with pytest.raises(BagError, match=r'no topic /nothing \(--truth\)'):
+            read_truth(bag, '/nothing')
+
+
+def test_a_topic_without_poses_is_no_truth(tmp_path: Path) -> None:
+    write_bag(tmp_path / 'bag', (*odometry(), *fixes(np.zeros(2))))
+    with open_bag(tmp_path / 'bag') as bag, pytest.raises(
+            BagError, match=r'type sensor_msgs/msg/NavSatFix of /gps/fix \(--truth\); expected'):
+        read_truth(bag, '/gps/fix')
+
+
+def test_a_bag_without_usable_odometry_is_one_line_of_error(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str],
+) -> None:
+    messages = odometry()[:5]
+    for _, _, _, message in messages:
+        message.pose.pose.position.x = np.nan
+    write_bag(tmp_path / 'bag', messages)
+    assert run(tmp_path / 'bag', '-o', tmp_path / 'out') == 2
+    assert capsys.readouterr().err == f'error: {tmp_path}/bag: no usable odometry on /odom\n'
+    assert not (tmp_path / 'out').exists()
+
+
+def test_correlated_errors_are_reported(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str],
+) -> None:
+    # positions that wander by 2 m in half a minute, with sigmas of 0.3 m
+    path = circle(600)
+    wave = 2.0 * np.sin(path.stamps_ns * 1e-9 * 2.0 * np.pi / 120.0)
+    places = path.poses[:, :2] + np.column_stack((wave, np.roll(wave, 300)))
+    geodetic = TangentPlane(50.7, 7.1, 60.0).to_geodetic(places[::10], 60.0)
+    write_bag(tmp_path / 'bag', (
+        *odometry_messages('/odom', 'odom', path, VARIANCES),
+        *fix_messages('/gps/fix', path.stamps_ns[::10], geodetic, 0.3)))
+    assert run(tmp_path / 'bag', '-o', tmp_path) == 0
+    line = next(line for line in capsys.readouterr().out.splitlines()
+                if line.startswith('fix: squared residual'))
+    assert 'with a time constant of' in line
+    assert line.endswith('but are treated as white: see fix.correlation_time')
+
+
+def test_replay_is_a_program_of_its_own(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str],
+) -> None:
+    write_bag(tmp_path / 'bag', odometry())
+    assert replay.main([str(tmp_path / 'bag'), '-o', str(tmp_path)]) == 0
+    assert len(read_tum(tmp_path / 'path.tum')) > 20
+    assert 'nothing to compare' in capsys.readouterr().out
+
+
+def test_the_exit_code_says_whether_the_optimisation_converged(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    write_bag(tmp_path / 'bag', odometry())
+    with open_bag(tmp_path / 'bag') as bag:
+        values = checked({})
+        done = replay.run(bag, choose_inputs(bag, source_list(values), {}), values)
+    assert done.report.status is Status.CONVERGED
+    for status, code in ((Status.CONVERGED, 0), (Status.MAX_ITERATIONS, 1), (Status.FAILED, 1)):
+        report = type('Report', (), {'status': status, 'chi2': 0.0})()
+        monkeypatch.setattr(
+            replay, 'run', lambda *_, report=report: replay.Replayed(
+                done.backend, report, done.refused))
+        assert run(tmp_path / 'bag', '-o', tmp_path / 'out') == code
+
+
+@pytest.mark.parametrize(('error', 'code', 'said'), [
+    (PoseGraphError('what is wrong'), 2, 'error: what is wrong\n'),
+    (PermissionError('no entry'), 2, 'error: no entry\n'), (KeyboardInterrupt(), 130, '')])
+def test_errors_of_the_user_are_one_line_and_an_exit_code(
+    error: BaseException, code: int, said: str, capsys: pytest.CaptureFixture[str],
+) -> None:
+    def execute(_: argparse.Namespace) -> int:
+        raise error
+
+    assert replay.guarded(execute, argparse.Namespace()) == code
+    assert capsys.readouterr() == ('', said)
+
+
+def test_an_error_of_the_program_is_not_hidden() -> None:
+    def execute(_: argparse.Namespace) -> int:
+        raise ZeroDivisionError
+
+    with pytest.raises(ZeroDivisionError):
+        replay.guarded(execute, argparse.Namespace())
+
+
+def test_a_pipe_whose_reader_has_ended_is_no_traceback(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    def execute(_: argparse.Namespace) -> int:
+        raise BrokenPipeError
+
+    with (tmp_path / 'out').open('w', encoding='utf-8') as stream:
+        monkeypatch.setattr(sys, 'stdout', stream)
+        assert replay.guarded(execute, argparse.Namespace()) == 1
+        # what is still in the buffer goes nowhere
+        assert os.path.samestat(os.fstat(stream.fileno()), os.stat(os.devnull))

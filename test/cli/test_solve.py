@@ -1,0 +1,209 @@
+# Copyright 2026 The pose_graph_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""The tool `pose-graph solve`: optima, files that it writes, and what it prints."""
+
+from collections.abc import Sequence
+import json
+from pathlib import Path
+import re
+
+import numpy as np
+import pytest
+
+from pose_graph_ros.cli.main import main
+from pose_graph_ros.core.io.g2o import read_g2o
+
+DATA = Path(__file__).resolve().parents[1] / 'data'
+GOLDEN = json.loads((DATA / 'golden.json').read_text(encoding='utf-8'))
+NAMES = [name for name in GOLDEN if name.endswith('.g2o')]
+# Relative difference of chi2 from that of the other solver.
+SAME_CHI2 = 1e-8
+IDENTITY = '1 0 0 1 0 1'
+
+# A square with a wrong loop closure between 20 and 22, and a wrong position on 23.
+CONFLICT = f"""
+VERTEX_SE2 20 0 0 0
+EDGE_SE2 20 21 1 0 1.5707963267948966 {IDENTITY}
+EDGE_SE2 21 22 1 0 1.5707963267948966 {IDENTITY}
+EDGE_SE2 22 23 1 0 1.5707963267948966 {IDENTITY}
+EDGE_SE2 23 20 1 0 1.5707963267948966 {IDENTITY}
+EDGE_SE2 20 22 2 1 3.141592653589793 {IDENTITY}
+EDGE_PRIOR_SE2 20 0 0 0 100 0 0 100 0 100
+EDGE_PRIOR_SE2_XY 23 0.6 1 0.3 0 0.3
+"""
+
+
+def write(path: Path, text: str) -> Path:
+    path.write_text(text, encoding='utf-8')
+    return path
+
+
+def chi2_of(path: Path) -> float:
+    return float(read_g2o(path).graph.energies().chi2)
+
+
+def printed_chi2(lines: Sequence[str]) -> float:
+    """Return chi2 after the optimisation."""
+    return next(float(line.split()[1].rstrip(',')) for line in lines if line.startswith('chi2'))
+
+
+@pytest.mark.parametrize('start', ['chordal', 'file'])
+@pytest.mark.parametrize('name', NAMES)
+def test_a_graph_is_solved_to_its_optimum(
+    name: str, start: str, tmp_path: Path, capsys: pytest.CaptureFixture[str],
+) -> None:
+    out = tmp_path / 'optimised.g2o'
+    assert main(['solve', str(DATA / name), '-o', str(out), '--start', start]) == 0
+    lines = capsys.readouterr().out.splitlines()
+    assert printed_chi2(lines) == pytest.approx(GOLDEN[name]['chi2'], rel=SAME_CHI2)
+    assert any('converged after' in line for line in lines)
+    assert chi2_of(out) == pytest.approx(GOLDEN[name]['chi2'], rel=SAME_CHI2)
+    before, after = read_g2o(DATA / name), read_g2o(out)
+    assert after.has_start
+    np.testing.assert_array_equal(after.ids, before.ids)
+    np.testing.assert_array_equal(after.graph.fixed, before.graph.fixed)
+    # constraints of the same tag keep their order, and no number of them is changed
+    assert after.graph.edges.mean.tobytes() == before.graph.edges.mean.tobytes()
+    assert after.graph.edges.information.tobytes() == before.graph.edges.information.tobytes()
+    assert len(after.graph.observed) == len(before.graph.observed)
+
+
+def test_nothing_is_written_without_out(tmp_path: Path) -> None:
+    path = write(tmp_path / 'graph.g2o', CONFLICT)
+    assert main(['solve', str(path)]) == 0
+    assert path.read_text(encoding='utf-8') == CONFLICT
+    assert list(tmp_path.iterdir()) == [path]
+
+
+def test_the_start_is_that_of_the_file_only_if_asked_for(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str],
+) -> None:
+    text = (DATA / 'ring.g2o').read_text(encoding='ascii')
+    rng = np.random.default_rng(2)
+
+    def scrambled(match: re.Match[str]) -> str:
+        x, y = rng.uniform(-20.0, 20.0, 2)
+        return f'VERTEX_SE2 {match[1]} {x} {y} {rng.uniform(-3.0, 3.0)}'
+
+    path = write(tmp_path / 'far.g2o', re.sub(
+        r'(?m)^VERTEX_SE2 ([1-9]\d*) .*$', scrambled, text))
+    assert main(['solve', str(path)]) == 0
+    best = printed_chi2(capsys.readouterr().out.splitlines())
+    assert best == pytest.approx(GOLDEN['ring.g2o']['chi2'], rel=SAME_CHI2)
+    main(['solve', str(path), '--start', 'file'])
+    assert printed_chi2(capsys.readouterr().out.splitlines()) > 2.0 * best
+
+    # the optimised file is the best start
+    out = tmp_path / 'optimised.g2o'
+    assert main(['solve', str(path), '-o', str(out)]) == 0
+    assert main(['solve', str(out), '--start', 'file']) == 0
+    lines = capsys.readouterr().out.splitlines()
+    assert re.search(r'converged after [12] iterations', lines[-6])
+    assert printed_chi2(lines[-6:]) == pytest.approx(best, rel=SAME_CHI2)
+
+
+def test_edge2_is_read_as_said(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    root = np.array([[3.0, 1.0, -0.5], [0.0, 2.0, 0.25], [0.0, 0.0, 4.0]])
+    full = root.T @ root
+    numbers = {
+        'g2o': full[np.triu_indices(3)], 'isam': root[np.triu_indices(3)],
+        'toro': np.array([full[0, 0], full[0, 1], full[1, 1], full[2, 2], full[0, 2],
+                          full[1, 2]])}
+    means = ('0 1 1 0 0.5', '1 2 1 0 0.5', '0 2 1.5 1 1.5')
+    chi2 = {}
+    for order, six in numbers.items():
+        tag = 'EDGE_SE2' if order == 'g2o' else 'EDGE2'
+        path = write(tmp_path / f'{order}.g2o', ''.join(
+            f'{tag} {mean} {" ".join(map(repr, six.tolist()))}\n' for mean in means))
+        option = [] if order == 'g2o' else ['--edge2', order]
+        assert main(['solve', str(path), *option]) == 0
+        chi2[order] = printed_chi2(capsys.readouterr().out.splitlines())
+    assert chi2['g2o'] > 0.01
+    assert chi2['toro'] == pytest.approx(chi2['g2o'], rel=SAME_CHI2)
+    assert chi2['isam'] == pytest.approx(chi2['g2o'], rel=SAME_CHI2)
+    # the meaning of the tag is not guessed
+    assert main(['solve', str(tmp_path / 'toro.g2o')]) == 2
+    assert 'toro or isam' in capsys.readouterr().err
+
+
+def test_a_failed_solve_is_exit_code_1(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str],
+) -> None:
+    path = write(tmp_path / 'loose.g2o', f"""
+        VERTEX_SE2 0 0 0 0
+        VERTEX_SE2 1 5 0 0
+        VERTEX_SE2 2 0 9 0
+        VERTEX_SE2 3 0 5 0
+        EDGE_SE2 0 1 1 0 0 {IDENTITY}
+        EDGE_SE2 2 3 1 0 0 {IDENTITY}
+    """)
+    out = tmp_path / 'out.g2o'
+    assert main(['solve', str(path), '-o', str(out)]) == 1
+    captured = capsys.readouterr()
+    assert captured.err == ''
+    assert re.search(r'failed after 0 iterations, .*: .*not determined', captured.out)
+    # the poses are those that were read
+    np.testing.assert_array_equal(read_g2o(out).graph.poses, read_g2o(path).graph.poses)
+
+
+def test_the_constraints_with_the_largest_energies_are_named(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str],
+) -> None:
+    path, out = write(tmp_path / 'conflict.g2o', CONFLICT), tmp_path / 'out.g2o'
+    assert main(['solve', str(path), '-o', str(out)]) == 0
+    lines = capsys.readouterr().out.splitlines()
+    assert lines[0].startswith('4 hidden nodes, 5 edges, 2 observed nodes; chi2 ')
+    assert lines[1].startswith('nodes without a pose in the file')
+    named = re.findall(r'(?m)^  edge (\d+) -> (\d+): energy (\S+)$', '\n'.join(lines))
+    assert len(named) == 5
+    assert named[0][:2] == ('20', '22')
+    graph = read_g2o(out).graph
+    energies = graph.energies()
+    assert [float(energy) for _, _, energy in named] == pytest.approx(
+        sorted(energies.edges.tolist(), reverse=True), rel=1e-3)
+    named = re.findall(r'(?m)^  observed node on (\d+): energy (\S+)$', '\n'.join(lines))
+    assert [name for name, _ in named] == ['23', '20']
+    assert [float(energy) for _, energy in named] == pytest.approx(
+        sorted(energies.observed.tolist(), reverse=True), rel=1e-3)
+
+
+def test_at_most_five_of_each_are_named(capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(['solve', str(DATA / 'chain.g2o')]) == 0
+    lines = capsys.readouterr().out.splitlines()
+    assert sum(line.startswith('  edge ') for line in lines) == 5
+    assert sum(line.startswith('  observed node ') for line in lines) == 5
+
+
+@pytest.mark.parametrize(('text', 'said'), [
+    (None, 'cannot be read as text'),
+    ('', 'holds no vertex and no edge'),
+    ('# nothing but a comment\n', 'holds no vertex and no edge'),
+    ('VERTEX_SE3:QUAT 0 0 0 0 0 0 0 1\n', r"graph\.g2o:1: tag 'VERTEX_SE3:QUAT' is not known"),
+    ('VERTEX_SE2 0 0 0 0\nVERTEX_SE2 1 0 0\n', r'graph\.g2o:2: VERTEX_SE2 is followed by 4'),
+    (f'EDGE_SE2 0 1 1 x 0 {IDENTITY}\n', r'graph\.g2o:1: EDGE_SE2: could not convert'),
+    (f'EDGE_SE2 0 1 1 nan 0 {IDENTITY}\n', r'graph\.g2o:1: EDGE_SE2 holds a number that is not'),
+    ('EDGE_SE2 0 1 1 0 0 -1 0 0 1 0 1\n', r'graph\.g2o:1: '),
+    (f'FIX 5\nEDGE_SE2 0 1 1 0 0 {IDENTITY}\n', r'graph\.g2o:1: FIX 5')])
+def test_a_broken_file_is_one_line_of_error(
+    text: str | None, said: str, tmp_path: Path, capsys: pytest.CaptureFixture[str],
+) -> None:
+    path = tmp_path / 'graph.g2o'
+    if text is not None:
+        write(path, text)
+    assert main(['solve', str(path), '-o', str(tmp_path / 'out.g2o')]) == 2
+    captured = capsys.readouterr()
+    assert captured.out == ''
+    assert len(captured.err.splitlines()) == 1
+    assert captured.err.startswith(f'error: {path}')
+    assert re.search(said, captured.err)
+    assert not (tmp_path / 'out.g2o').exists()
+
+
+def test_a_file_that_cannot_be_written_is_one_line_of_error(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str],
+) -> None:
+    path = write(tmp_path / 'graph.g2o', CONFLICT)
+    assert main(['solve', str(path), '-o', str(tmp_path / 'missing' / 'out.g2o')]) == 2
+    err = capsys.readouterr().err
+    assert len(err.splitlines()) == 1
+    assert 'out.g2o' in err

@@ -1,0 +1,211 @@
+# Copyright 2026 The pose_graph_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""The states of the alignment: found once, checked when the evidence has doubled, saved."""
+
+import numpy as np
+import pytest
+from saved_graphs import assert_same_value
+
+from pose_graph_ros.core.alignment import monitor
+from pose_graph_ros.core.alignment.monitor import AlignmentMonitor, AlignmentState
+from pose_graph_ros.core.config import BackendConfig
+from pose_graph_ros.core.geometry import se2
+from pose_graph_ros.core.geometry.se2 import FloatArray
+from pose_graph_ros.core.measurements import (
+    Absolute,
+    GlobalPose,
+    HeadingOnly,
+    OdometrySample,
+    Position,
+)
+from pose_graph_ros.core.odometry.hidden_nodes import HiddenNodes
+from pose_graph_ros.core.odometry.motion import Attachment
+from pose_graph_ros.core.sources.factor_builder import AttachedMeasurement
+from pose_graph_ros.core.sources.measurement_constraints import absolute_constraint
+
+SECOND = 1_000_000_000
+CONFIG = BackendConfig()
+T_MAP_ODOM = np.array([30.0, -7.0, 2.5])
+
+
+def driven(n: int) -> HiddenNodes:
+    """Return the nodes of exact odometry along a curve, a node per metre and second."""
+    rows = iter(range(n))
+    nodes = HiddenNodes(CONFIG, lambda *_: next(rows))
+    pose = np.zeros(3)
+    for k in range(n + 1):      # the last one settles the one before
+        nodes.add_sample(OdometrySample((k + 1) * SECOND, pose, 1.0), 'odom')
+        pose = se2.compose(pose, np.array([1.01, 0.0, 0.05]))
+    return nodes
+
+
+NODES = driven(70)
+
+
+def attached(
+    measurement: Absolute, node: int, source: str = 'fix',
+) -> AttachedMeasurement:
+    attachment = Attachment(node, np.zeros(3), np.zeros((3, 3)))
+    return AttachedMeasurement(
+        source, absolute_constraint(measurement, attachment), measurement, attachment)
+
+
+def fixes(
+    nodes: range, T_map_odom: FloatArray = T_MAP_ODOM, source: str = 'fix',
+) -> list[AttachedMeasurement]:
+    where = se2.compose(T_map_odom, NODES.odometry)[:, :2]
+    return [attached(Position((k + 1) * SECOND, where[k], 0.04 * np.eye(2), np.zeros(2)), k,
+                     source) for k in nodes]
+
+
+def aligned_with(first: list[AttachedMeasurement]) -> AlignmentMonitor:
+    monitor_ = AlignmentMonitor(CONFIG)
+    assert monitor_.find(NODES.odometry, first, 'odom') is not None
+    monitor_.add(first)
+    return monitor_
+
+
+def test_positions_lead_from_local_over_unaligned_to_aligned() -> None:
+    some = AlignmentMonitor(CONFIG)
+    assert (some.state, some.sigma) == (AlignmentState.LOCAL, np.inf)
+    assert some.find(NODES.odometry, [], 'odom') is None
+    assert some.state is AlignmentState.LOCAL
+    assert some.find(NODES.odometry, fixes(range(1)), 'odom') is None
+    assert some.state is AlignmentState.UNALIGNED
+    assert not some.is_aligned
+    T_map_graph = some.find(NODES.odometry, fixes(range(12)), 'odom')
+    assert T_map_graph is not None
+    assert some.is_aligned
+    assert 0.0 < some.sigma < CONFIG.alignment.sigma_heading
+    np.testing.assert_allclose(T_map_graph, T_MAP_ODOM, atol=1e-9)
+    # found once
+    assert some.find(NODES.odometry, fixes(range(12)), 'odom') is None
+
+
+def test_headings_alone_leave_the_map_local() -> None:
+    some = AlignmentMonitor(CONFIG)
+    compass = [attached(HeadingOnly(SECOND, T_MAP_ODOM[2], 1e-4), 0)]
+    assert some.find(NODES.odometry, compass, 'odom') is None
+    assert some.state is AlignmentState.LOCAL
+
+
+@pytest.mark.parametrize('node', [0, 3])
+def test_a_certain_heading_and_one_position_are_enough(node: int) -> None:
+    some = AlignmentMonitor(CONFIG)
+    heading = float(se2.wrap(T_MAP_ODOM[2] + NODES.odometry[node, 2]))
+    compass = [attached(HeadingOnly(SECOND, heading, variance), node, 'compass')
+               for variance in (1e-4, 4e-4)]
+    T_map_graph = some.find(NODES.odometry, [*compass, *fixes(range(1))], 'odom')
+    assert T_map_graph is not None
+    np.testing.assert_allclose(T_map_graph, T_MAP_ODOM, atol=1e-9)
+    assert some.sigma == pytest.approx(0.01)    # of the better one
+
+
+def test_an_uncertain_heading_does_not_align() -> None:
+    some = AlignmentMonitor(CONFIG)
+    compass = attached(HeadingOnly(SECOND, T_MAP_ODOM[2], 4.0), 0, 'compass')
+    assert some.find(NODES.odometry, [compass, *fixes(range(1))], 'odom') is None
+    assert some.state is AlignmentState.UNALIGNED
+
+
+def test_a_global_pose_aligns_alone() -> None:
+    some = AlignmentMonitor(CONFIG)
+    pose = GlobalPose(SECOND, T_MAP_ODOM, np.diag([0.01, 0.01, 1e-4]))
+    T_map_graph = some.find(NODES.odometry, [attached(pose, 0)], 'odom')
+    assert T_map_graph is not None
+    np.testing.assert_allclose(T_map_graph, T_MAP_ODOM, atol=1e-9)
+
+
+def test_the_angle_is_checked_at_eight_measurements_and_whenever_they_have_doubled() -> None:
+    some = aligned_with(fixes(range(5)))
+    turned = se2.compose(T_MAP_ODOM + np.array([0.0, 0.0, 1.0]), NODES.odometry)
+    checked = []
+    for k in range(5, 70):
+        before = some.saved().next_verdict
+        # the solution is right: whatever is found, it is no reason to turn
+        assert some.recheck(se2.compose(T_MAP_ODOM, NODES.odometry), NODES) is None
+        if some.saved().next_verdict != before:
+            checked.append(k)
+        some.add(fixes(range(k, k + 1)))
+    assert checked == [8, 16, 32, 64]
+    # after a check a wrong angle stays unnoticed until the evidence has doubled again
+    assert some.recheck(turned, NODES) is None
+
+
+def test_a_wrong_first_angle_is_corrected_and_its_sigma_too() -> None:
+    wrong = se2.compose(T_MAP_ODOM, np.array([0.0, 0.0, 1.5]))
+    some = aligned_with(fixes(range(5), wrong))
+    some.add(fixes(range(5, 35)))
+    found = some.recheck(se2.compose(wrong, NODES.odometry), NODES)
+    assert found is not None
+    assert abs(float(se2.wrap(found[2] - T_MAP_ODOM[2]))) < 0.2
+    assert 0.0 < some.sigma < np.inf
+    assert some.is_aligned
+
+
+def test_headings_are_no_evidence_for_the_angle() -> None:
+    some = aligned_with(fixes(range(5)))
+    some.add([attached(HeadingOnly(SECOND, 0.0, 1e-4), 0)] * 20)
+    assert len(some.saved().node) == 5
+
+
+def test_checks_end_when_the_path_is_not_that_of_odometry_any_more() -> None:
+    wrong = se2.compose(T_MAP_ODOM, np.array([0.0, 0.0, 1.5]))
+    some = aligned_with(fixes(range(5), wrong))
+    some.stop_rechecking()
+    some.add(fixes(range(5, 65)))
+    assert len(some.saved().node) == 0
+    assert some.recheck(se2.compose(wrong, NODES.odometry), NODES) is None
+
+
+def test_after_the_last_check_no_evidence_is_kept(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(monitor, 'LAST_RECHECK', 20)
+    some = aligned_with(fixes(range(5)))
+    solved = se2.compose(T_MAP_ODOM, NODES.odometry)
+    for k in range(5, 60):
+        some.add(fixes(range(k, k + 1)))
+        some.recheck(solved, NODES)
+    assert len(some.saved().node) == 0
+
+
+def test_before_the_alignment_nothing_is_checked() -> None:
+    some = AlignmentMonitor(CONFIG)
+    some.find(NODES.odometry, fixes(range(1)), 'odom')
+    some.add(fixes(range(60)))
+    assert some.recheck(NODES.odometry, NODES) is None
+    assert some.saved().next_verdict == monitor.FIRST_RECHECK
+
+
+def test_what_find_has_done_is_undone_by_the_copy_from_before() -> None:
+    some = AlignmentMonitor(CONFIG)
+    some.find(NODES.odometry, fixes(range(1)), 'odom')
+    before = some.copy()
+    first = some.find(NODES.odometry, fixes(range(12)), 'odom')
+    assert some.is_aligned
+    some.restore(before)
+    assert some.copy() == before
+    assert some.state is AlignmentState.UNALIGNED
+    # the next attempt finds the same
+    np.testing.assert_array_equal(some.find(NODES.odometry, fixes(range(12)), 'odom'), first)
+
+
+@pytest.mark.parametrize('n', [0, 1, 20])
+def test_a_saved_monitor_decides_as_the_first_one_would_have(n: int) -> None:
+    wrong = se2.compose(T_MAP_ODOM, np.array([0.0, 0.0, 1.5]))
+    one = AlignmentMonitor(CONFIG)
+    if n > 0:
+        first = [*fixes(range(min(n, 5)), wrong, 'gps'), *fixes(range(5, n), source='beacon')]
+        one.find(NODES.odometry, first[:5], 'odom')
+        one.add(first)
+    other = AlignmentMonitor(CONFIG)
+    other.load(one.saved())
+    assert other.copy() == one.copy()
+    assert_same_value(other.saved(), one.saved())
+    assert one.saved().sources == (('gps', 'beacon')[:min(n, 2)] if n != 1 else ('gps',))
+    for each in (one, other):
+        each.add(fixes(range(n, 50)))
+    results = [each.recheck(se2.compose(wrong, NODES.odometry), NODES) for each in (one, other)]
+    assert (results[0] is None) is (results[1] is None) is (n < 20)
+    if n == 20:
+        np.testing.assert_array_equal(results[0], results[1])
+    assert_same_value(other.saved(), one.saved())

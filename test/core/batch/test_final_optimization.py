@@ -1,0 +1,327 @@
+# Copyright 2026 The pose_graph_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""Robust losses: the minimum of the robust cost, the influence of outliers, failures."""
+
+from collections.abc import Sequence
+
+import numpy as np
+import pytest
+from random_graphs import snapshot
+from scipy.optimize import minimize
+
+from pose_graph_ros.core.backend import PoseGraphBackend
+from pose_graph_ros.core.batch import final_optimization, optimizer
+from pose_graph_ros.core.batch.optimizer import BatchResult, Status
+from pose_graph_ros.core.config import (
+    BackendConfig,
+    Loss,
+    MeasurementSource,
+    OdometrySource,
+    SolverConfig,
+)
+from pose_graph_ros.core.geometry import se2
+from pose_graph_ros.core.geometry.se2 import FloatArray
+from pose_graph_ros.core.graph import error_functions, losses
+from pose_graph_ros.core.graph.graph import Graph
+from pose_graph_ros.core.measurements import (
+    GlobalPose,
+    LoopClosure,
+    Measurement,
+    OdometrySample,
+    Position,
+)
+
+SECOND = 1_000_000_000
+ROBUST = (Loss.HUBER, Loss.CAUCHY)
+
+
+# --- A drive with fixes ----------------------------------------------------------------------
+
+N = 60
+
+
+def drive(
+    seed: int, outliers: Sequence[int] = (), off: float = 20.0, n: int = N,
+) -> tuple[list[OdometrySample], list[Measurement], FloatArray]:
+    """Return odometry of a circle at 1 m/s, measurements with a fix per second, and the truth."""
+    rng = np.random.default_rng(seed)
+    step = np.array([1.0, 0.0, 0.1])
+    pose, odometry, truth, fixes = np.zeros(3), [], [np.array([5.0, -3.0, 1.0])], []
+    for k in range(n):
+        stamp = (k + 1) * SECOND
+        odometry.append(OdometrySample(stamp, pose))
+        pose = se2.compose(pose, step + rng.normal(0.0, [0.02, 0.01, 0.004]))
+        where = truth[-1][:2] + rng.normal(0.0, 0.3, 2)
+        if k in outliers:
+            angle = rng.uniform(-np.pi, np.pi)
+            where = where + off * np.array([np.cos(angle), np.sin(angle)])
+        fixes.append(Position(stamp, where, 0.09 * np.eye(2), np.zeros(2)))
+        truth.append(se2.compose(truth[-1], step))
+    first = GlobalPose(SECOND, truth[0], np.diag([0.01, 0.01, 1e-4]))
+    return odometry, [first, *fixes], np.array(truth[:-1])
+
+
+def config(loss: Loss, threshold: float = 3.0) -> BackendConfig:
+    return BackendConfig(
+        odometry={'odom': OdometrySource(reorder_window=0.0)},
+        measurements={'fix': MeasurementSource(loss=loss, rejection_threshold=threshold),
+                      'scan': MeasurementSource(loss=loss, rejection_threshold=threshold)})
+
+
+def fed(
+    backend: PoseGraphBackend, odometry: Sequence[OdometrySample],
+    measurements: Sequence[Measurement], *, updates: bool = True,
+) -> PoseGraphBackend:
+    events = sorted([*odometry, *measurements], key=lambda event: event.stamp_ns)
+    for event in events:
+        if isinstance(event, OdometrySample):
+            backend.add_odometry(event)
+        else:
+            source = {GlobalPose: 'pose', Position: 'fix', LoopClosure: 'scan'}[type(event)]
+            backend.add_measurement(event, source)
+        if updates:
+            assert backend.update().status is not Status.FAILED
+    return backend
+
+
+def rms(backend: PoseGraphBackend, truth: FloatArray) -> float:
+    off = backend.graph.poses[:, :2] - truth[:backend.graph.n_nodes, :2]
+    return float(np.sqrt(np.mean(np.sum(off**2, axis=1))))
+
+
+def robust_cost(backend: PoseGraphBackend, loss: Loss, threshold: float,
+                poses: FloatArray) -> float:
+    """Sum up rho over the fixes and plain energies over the rest."""
+    edges, observed = backend.graph.edges, backend.graph.observed
+    fixes = error_functions.energies(
+        error_functions.observed_errors(poses, observed), observed.information)
+    rest = error_functions.energies(error_functions.edge_errors(poses, edges), edges.information)
+    has_loss = observed.kind == 1
+    return float(np.sum(rest) + np.sum(fixes[~has_loss])
+                 + np.sum(losses.costs(loss, fixes[has_loss], threshold)))
+
+
+@pytest.mark.parametrize('loss', ROBUST)
+@pytest.mark.parametrize('seed', range(3))
+def test_the_minimum_is_that_of_the_robust_cost(loss: Loss, seed: int) -> None:
+    threshold = 1.5
+    odometry, measurements, _ = drive(seed, outliers=(3, 7), off=3.0, n=11)
+    backend = fed(PoseGraphBackend(config(loss, threshold)), odometry, measurements)
+    report = backend.optimize()
+    assert report.status is Status.CONVERGED
+    poses = backend.graph.poses.copy()
+
+    def cost(flat: FloatArray) -> float:
+        return robust_cost(backend, loss, threshold, flat.reshape(-1, 3))
+
+    assert report.chi2 == pytest.approx(cost(poses.ravel()), rel=1e-9)
+    assert backend.estimate().chi2 == report.chi2
+    found = minimize(cost, poses.ravel() + np.random.default_rng(seed).normal(
+        0.0, 0.02, poses.size), method='BFGS', options={'gtol': 1e-6, 'maxiter': 2000})
+    assert report.chi2 <= found.fun * (1.0 + 1e-9)
+    np.testing.assert_allclose(poses[:, :2], found.x.reshape(-1, 3)[:, :2], atol=1e-4)
+    weights = backend.graph.observed.weight
+    assert weights[4] < 0.5     # row 0 is the global pose, so row 4 is fix 3
+    assert weights[0] == 1.0
+
+
+@pytest.mark.parametrize('seed', range(4))
+@pytest.mark.parametrize('off', [5.0, 20.0, 1000.0])
+def test_a_fifth_of_outliers_hardly_shows_with_cauchy(seed: int, off: float) -> None:
+    rng = np.random.default_rng(100 + seed)
+    outliers = rng.choice(np.arange(2, N), N // 5, replace=False).tolist()
+    odometry, clean, truth = drive(seed)
+    _, dirty, _ = drive(seed, outliers, off)
+    without = fed(PoseGraphBackend(config(Loss.CAUCHY)), odometry, clean)
+    without.optimize()
+    with_ = fed(PoseGraphBackend(config(Loss.CAUCHY)), odometry, dirty)
+    assert rms(with_, truth) < rms(without, truth) + 0.1     # before the final optimisation
+    with_.optimize()
+    assert rms(with_, truth) < rms(without, truth) + 0.1
+    plain = fed(PoseGraphBackend(config(Loss.NONE)), odometry, dirty)
+    plain.optimize()
+    assert rms(plain, truth) > rms(with_, truth)
+    huber = fed(PoseGraphBackend(config(Loss.HUBER)), odometry, dirty)
+    huber.optimize()
+    assert rms(with_, truth) - 0.05 < rms(huber, truth) < 1.0
+
+
+def test_fixes_with_small_weights_regain_them_when_more_fixes_agree() -> None:
+    # an accurate but wrong pose at the start: the fixes look like outliers until they are many
+    cauchy = MeasurementSource(loss=Loss.CAUCHY)
+    backend = PoseGraphBackend(BackendConfig(
+        odometry={'odom': OdometrySource(reorder_window=0.0)},
+        measurements={'pose': cauchy, 'fix': cauchy}))
+    first, weights = GlobalPose(SECOND, np.zeros(3), np.diag([0.01, 0.01, 1e-4])), []
+    for k in range(40):
+        stamp, moved = (k + 1) * SECOND, np.array([1.0 * k, 0.0, 0.0])
+        backend.add_odometry(OdometrySample(stamp, moved))
+        if k == 0:
+            backend.add_measurement(first, 'pose')
+        backend.add_measurement(
+            Position(stamp, np.add(moved[:2], [0.0, 6.0]), 0.09 * np.eye(2), np.zeros(2)), 'fix')
+        backend.update()
+        weights.append(backend.graph.observed.weight[:3])
+    assert weights[2][0] > 0.9      # the pose
+    assert weights[2][1] < 0.1      # the first fix
+    assert weights[-1][0] < 0.1
+    assert weights[-1][1] > 0.9
+    assert backend.estimate().T_map_base[1] == pytest.approx(6.0, abs=0.1)
+    backend.optimize()
+    assert backend.estimate().T_map_base[1] == pytest.approx(6.0, abs=0.1)
+
+
+@pytest.mark.parametrize('loss', ROBUST)
+def test_updates_alone_lead_near_the_minimum_and_settle(loss: Loss) -> None:
+    odometry, measurements, truth = drive(7, outliers=range(5, N, 6))
+    backend = fed(PoseGraphBackend(config(loss)), odometry, measurements)
+    reports = [backend.update() for _ in range(20)]
+    assert reports[-1].iterations == 0
+    online = backend.graph.poses.copy()
+    backend.optimize()
+    off = np.hypot(*(online - backend.graph.poses)[:, :2].T)
+    assert np.max(off) < 3e-3
+    # a second optimisation changes nothing
+    before = backend.graph.poses.copy()
+    backend.optimize()
+    np.testing.assert_allclose(backend.graph.poses, before, atol=1e-9)
+    assert rms(backend, truth) < 0.8
+
+
+@pytest.mark.parametrize('loss', ROBUST)
+def test_a_wrong_loop_closure_gets_a_small_weight(loss: Loss) -> None:
+    odometry, measurements, truth = drive(8, n=130)
+    scans = [LoopClosure(
+        (k + 64) * SECOND, se2.between(truth[k], truth[k + 63]), np.diag([0.01, 0.01, 1e-4]),
+        reference_ns=(k + 1) * SECOND) for k in range(2, 60, 6)]
+    wrong = LoopClosure(
+        90 * SECOND, np.array([8.0, 5.0, 2.0]), np.diag([0.01, 0.01, 1e-4]),
+        reference_ns=20 * SECOND)
+    backend = fed(PoseGraphBackend(config(loss)), odometry, [*measurements, *scans, wrong])
+    backend.optimize()
+    edges = backend.graph.edges
+    closures = np.flatnonzero(edges.kind == 1)
+    lost = closures[np.argmin(edges.weight[closures])]
+    assert (edges.i[lost], edges.j[lost]) == (19, 89)
+    assert edges.weight[lost] < 0.05
+    assert np.min(edges.weight[closures[closures != lost]]) > 0.5
+    if loss is Loss.CAUCHY:
+        assert rms(backend, truth) < 0.3
+
+
+# --- Failures --------------------------------------------------------------------------------
+
+class Failing:
+    """A solver that changes the poses and fails at its n-th call."""
+
+    def __init__(self, last: int, *, raises: bool) -> None:
+        self.left, self.raises = last, raises
+
+    def __call__(self, graph: Graph, settings: SolverConfig) -> BatchResult:
+        self.left -= 1
+        if self.left > 0:
+            return optimizer.optimize(graph, settings)
+        graph.set_poses(graph.poses + 17.0)
+        if self.raises:
+            raise ValueError('broken on purpose')
+        return BatchResult(Status.FAILED, 'broken on purpose', 0, 1.0, 1.0)
+
+
+@pytest.mark.parametrize('raises', [False, True])
+@pytest.mark.parametrize('last', [1, 3])
+def test_a_failed_optimisation_leaves_weights_and_poses_to_the_bit(
+    last: int, *, raises: bool,
+) -> None:
+    odometry, measurements, _ = drive(9, outliers=(5, 20, 40))
+    solve = Failing(last, raises=raises)
+    backend = fed(PoseGraphBackend(config(Loss.CAUCHY), solve=solve), odometry, measurements)
+    before, weights = snapshot(backend.graph), backend.graph.observed.weight
+    poses, estimate = backend.graph.poses.copy(), backend.estimate()
+    assert np.min(weights) < 0.1
+    report = backend.optimize()
+    assert report.status is Status.FAILED
+    assert snapshot(backend.graph) == before
+    np.testing.assert_array_equal(backend.graph.observed.weight, weights)
+    np.testing.assert_array_equal(backend.graph.poses, poses)
+    np.testing.assert_array_equal(backend.estimate().path.poses, estimate.path.poses)
+    solve.left = 10**9
+    assert backend.optimize().status is Status.CONVERGED
+
+
+def test_one_start_that_fails_does_not_affect_the_other() -> None:
+    odometry, measurements, truth = drive(9, outliers=(5, 20, 40))
+
+    class Flaky(Failing):
+        def __call__(self, graph: Graph, settings: SolverConfig) -> BatchResult:
+            result = super().__call__(graph, settings)
+            if result.status is Status.FAILED:
+                self.left = 10**9     # once
+            return result
+
+    backend = fed(PoseGraphBackend(config(Loss.CAUCHY), solve=Flaky(2, raises=False)),
+                  odometry, measurements)
+    assert backend.optimize().status is Status.CONVERGED
+    other = fed(PoseGraphBackend(config(Loss.CAUCHY)), odometry, measurements)
+    other.optimize()
+    np.testing.assert_allclose(backend.graph.poses, other.graph.poses, atol=1e-9)
+    assert rms(backend, truth) < 0.4
+
+
+# --- Structure priors ------------------------------------------------------------------------
+
+def test_perpendicular_walls_turn_headings_as_weighted_least_squares_says() -> None:
+    """One turn of 80 degrees by odometry, 90 by the walls: the mean by their information."""
+    settings = BackendConfig(odometry={'odom': OdometrySource(reorder_window=0.0)})
+    backend = PoseGraphBackend(settings)
+    poses = [np.zeros(3), np.array([2.0, 0.0, np.deg2rad(80.0)])]
+    for k, pose in enumerate(poses):
+        backend.add_odometry(OdometrySample((k + 1) * SECOND, pose))
+    assert backend.graph.n_nodes == 2
+    cov = np.linalg.inv(backend.graph.edges.information[0])
+    sigma = 0.05
+    answer = backend.add_measurement(LoopClosure(
+        2 * SECOND, np.array([123.0, -7.0, np.pi / 2.0]), np.diag([np.inf, np.inf, sigma**2]),
+        reference_ns=SECOND), 'walls')
+    assert answer.reason == ''
+    assert backend.update().new_constraints == 1
+    backend.optimize()
+    # the heading alone is measured: a scalar update of odometry's (x, y, theta)
+    gain = cov[:, 2] / (cov[2, 2] + sigma**2)
+    innovation = np.deg2rad(10.0)
+    # in the frame of the measured pose, where the edge's information lives
+    expected = se2.compose(poses[1], np.zeros(3)) + np.concatenate((
+        se2.rotation(poses[1][2]) @ (gain[:2] * innovation), [gain[2] * innovation]))
+    np.testing.assert_allclose(backend.graph.poses[1], expected, atol=1e-9)
+    np.testing.assert_array_equal(backend.graph.poses[0], 0.0)
+
+
+def test_a_structure_prior_leaves_positions_that_are_known_alone() -> None:
+    odometry, measurements, truth = drive(10, n=40)
+    plain = fed(PoseGraphBackend(config(Loss.NONE)), odometry, measurements)
+    plain.optimize()
+    turn = float(truth[30, 2] - truth[10, 2]) + 0.05
+    prior = LoopClosure(31 * SECOND, np.array([0.0, 0.0, turn]),
+                        np.diag([np.inf, np.inf, 1e-4]), reference_ns=11 * SECOND)
+    backend = fed(PoseGraphBackend(config(Loss.NONE)), odometry, [*measurements, prior])
+    backend.optimize()
+    turned = se2.wrap(np.diff(backend.graph.poses[[10, 30], 2])[0])
+    before = se2.wrap(np.diff(plain.graph.poses[[10, 30], 2])[0])
+    # the turn changes by the gain of a scalar Kalman update
+    joint = plain._smoother.joint_covariance(10, 30)
+    variance = joint[2, 2] + joint[5, 5] - 2.0 * joint[2, 5]
+    expected = se2.wrap(turn - before) * variance / (variance + 1e-4)
+    assert se2.wrap(turned - before) == pytest.approx(float(expected), rel=0.02)
+    # the positions move as far as the fixes let them
+    off = backend.graph.poses[:, :2] - plain.graph.poses[:, :2]
+    assert np.max(np.hypot(*off.T)) < 0.3
+
+
+def test_weights_that_have_not_settled_are_not_called_converged(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    odometry, measurements, _ = drive(9, outliers=(5, 20, 40))
+    backend = fed(PoseGraphBackend(config(Loss.CAUCHY)), odometry, measurements, updates=False)
+    with monkeypatch.context() as patch:
+        patch.setattr(final_optimization, 'REWEIGHTINGS', 1)
+        assert backend.optimize().status is Status.MAX_ITERATIONS
+    assert backend.optimize().status is Status.CONVERGED

@@ -1,0 +1,127 @@
+# Copyright 2026 The pose_graph_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""The parts of a batch iteration against dense and sparse matrices: steps, chi2."""
+
+from hypothesis import given, settings, strategies as st
+import numpy as np
+import pytest
+from random_graphs import random_graph
+from sparse_system import Factorization, LinearSystem
+
+from pose_graph_ros.core.batch import gauss_newton
+from pose_graph_ros.core.elimination import symbolic
+from pose_graph_ros.core.geometry.se2 import FloatArray
+from pose_graph_ros.core.graph import tables as tb
+from pose_graph_ros.core.graph.graph import Graph, GraphUpdate
+
+# Relative error of a step, for a condition number of H of some 1e4.
+ROUNDING = 1e-9
+
+seeds = st.integers(0, 2**32 - 1)
+
+
+def weighted_graph(seed: int, n_nodes: int = 12) -> Graph:
+    """Return a graph with various weights, also zero, all parts of which are determined."""
+    rng = np.random.default_rng(seed)
+    n_biases = int(rng.integers(0, 4))
+    graph = random_graph(
+        seed, n_nodes, 2 * n_nodes, 6, fix=(int(rng.integers(n_nodes)),), n_biases=n_biases)
+    loose = range(n_nodes - 1, graph.n_edges - 4 * n_biases)
+    weights = {int(e): float(rng.choice([0.0, 0.3, 2.5])) for e in loose}
+    weights |= {e: float(rng.choice([0.3, 2.5])) for e in range(loose.stop, graph.n_edges)}
+    graph.apply(GraphUpdate(weigh_edges=weights, weigh_observed={0: 0.0, 1: 0.5}))
+    return graph
+
+
+def planted(graph: Graph) -> symbolic.Cliques:
+    """Store the cliques of the whole graph in its tables."""
+    memory = graph.memory
+    cliques, need_f, need_i, largest = symbolic.analyse(memory.head)
+    memory.ensure('pool_f', need_f)
+    memory.ensure('pool_i', need_i)
+    memory.ensure('work_f', largest)
+    symbolic.plant(memory.head, cliques)
+    return cliques
+
+
+def full_step(graph: Graph, damping: float = 0.0) -> FloatArray:
+    """Make a step; return the solution of the free nodes, in the order of H."""
+    head = graph.memory.head
+    gauss_newton.linearize(head)
+    assert gauss_newton.eliminate(head, damping)
+    length = gauss_newton.gauss_newton_step(head)
+    step = graph.memory['node_f'][:graph.n_nodes, tb.DELTA:tb.DELTA + 3]
+    assert length == np.max(np.abs(step))
+    np.testing.assert_array_equal(step[graph.fixed], 0.0)
+    return step[~graph.fixed].ravel()
+
+
+@given(seeds)
+@settings(max_examples=50)
+def test_a_step_is_that_of_sparse_matrices(seed: int) -> None:
+    graph = weighted_graph(seed)
+    H, b = LinearSystem(graph).assemble(graph.poses)
+    expected = -Factorization(H).solve(b)
+    planted(graph)
+    for _ in range(2):  # again over the same cliques
+        poses = graph.poses.copy()
+        np.testing.assert_allclose(
+            full_step(graph), expected, rtol=ROUNDING, atol=ROUNDING * np.max(np.abs(expected)))
+        gauss_newton.put_poses(graph.memory.head, poses)
+
+
+@given(seeds, st.floats(1e-4, 1e4))
+@settings(max_examples=50)
+def test_a_damped_step_is_that_of_sparse_matrices(seed: int, damping: float) -> None:
+    graph = weighted_graph(seed)
+    H, b = LinearSystem(graph).assemble(graph.poses)
+    rows = graph.memory['node_f'][:graph.n_nodes][~graph.fixed]
+    scale = rows[:, [tb.SCALE_T, tb.SCALE_T, tb.SCALE_R]].ravel()**2
+    expected = -np.linalg.solve(H.toarray() + damping * np.diag(scale), b)
+    planted(graph)
+    np.testing.assert_allclose(
+        full_step(graph, damping), expected, rtol=ROUNDING,
+        atol=ROUNDING * np.max(np.abs(expected)))
+
+
+@given(seeds)
+@settings(max_examples=50)
+def test_a_chord_step_has_the_old_matrix_and_the_new_gradient(seed: int) -> None:
+    graph = weighted_graph(seed)
+    system = LinearSystem(graph)
+    factorization = Factorization(system.assemble(graph.poses)[0])
+    planted(graph)
+    full_step(graph)
+    head, right = graph.memory.head, np.empty((graph.n_nodes, 3))
+    for _ in range(2):
+        before = graph.poses.copy()
+        gauss_newton.evaluate(head, right)
+        expected = -factorization.solve(system.assemble(before)[1])
+        length = gauss_newton.chord_step(head, right)
+        size = np.max(np.abs(expected))
+        assert length == pytest.approx(size, rel=ROUNDING)
+        step = (graph.poses - before)[~graph.fixed]
+        turns = np.round((step - expected.reshape(-1, 3))[:, 2] / (2.0 * np.pi))
+        step[:, 2] -= 2.0 * np.pi * turns
+        np.testing.assert_allclose(step.ravel(), expected, rtol=ROUNDING, atol=ROUNDING * size)
+        np.testing.assert_array_equal(graph.poses[graph.fixed], before[graph.fixed])
+
+
+@given(seeds)
+def test_chi2_and_its_gradient_are_those_of_the_constraints(seed: int) -> None:
+    graph = weighted_graph(seed)
+    right = np.empty((graph.n_nodes, 3))
+    chi2, rounding = gauss_newton.evaluate(graph.memory.head, right)
+    assert chi2 == pytest.approx(graph.energies().chi2, rel=1e-12)
+    assert 0.0 < rounding < 1e-10 * chi2
+    b = LinearSystem(graph).assemble(graph.poses)[1]
+    np.testing.assert_allclose(
+        right[~graph.fixed].ravel(), -b, rtol=ROUNDING, atol=ROUNDING * np.max(np.abs(b)))
+
+
+def test_the_rounding_error_of_chi2_grows_with_the_distance_from_the_origin() -> None:
+    graph = random_graph(seed=2, fix=(0,))
+    right = np.empty((graph.n_nodes, 3))
+    near = gauss_newton.evaluate(graph.memory.head, right)[1]
+    graph.set_poses(graph.poses + np.array([5e6, 0.0, 0.0]))
+    assert gauss_newton.evaluate(graph.memory.head, right)[1] > 1e3 * near

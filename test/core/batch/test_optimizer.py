@@ -1,0 +1,467 @@
+# Copyright 2026 The pose_graph_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""The batch optimisation against other solvers, stored optima and the meaning of its result."""
+
+import hashlib
+import json
+import os
+from pathlib import Path
+
+import numpy as np
+import pytest
+from random_graphs import (
+    consistent_graph,
+    dense_system,
+    free_part,
+    random_edges,
+    random_graph,
+    random_observed,
+    random_poses,
+    slow_edge,
+    slow_observed,
+    snapshot,
+)
+from scipy.optimize import least_squares
+from slow_smoother import EXACT
+
+from pose_graph_ros.core.batch import chordal_start, optimizer
+from pose_graph_ros.core.batch.optimizer import Status
+from pose_graph_ros.core.config import SolverConfig
+from pose_graph_ros.core.geometry import se2
+from pose_graph_ros.core.geometry.se2 import FloatArray
+from pose_graph_ros.core.graph.constraints import EdgeKind, Edges, ObservedKind, ObservedNodes
+from pose_graph_ros.core.graph.graph import Graph, GraphUpdate
+from pose_graph_ros.core.io.g2o import read_g2o
+from pose_graph_ros.core.smoother.incremental import IncrementalSmoother
+
+# chi2 is flat at its minimum: steps of 1e-8 leave a relative error of some 1e-15.
+SAME_CHI2 = 1e-9
+# A numeric Jacobian stops the other solver some 1e-8 before the minimum.
+SAME_POSES = 1e-6
+# Relative rounding error of chi2.
+ROUNDING = 1e-12
+# Largest gradient at convergence, from some 1e4 at the start.
+STATIONARY = 1e-6
+
+DATA = Path(__file__).parents[2] / 'data'
+GOLDEN = {name: entry for name, entry in
+          json.loads((DATA / 'golden.json').read_text(encoding='ascii')).items()
+          if name != 'about'}
+
+PUBLIC = Path(os.environ.get(
+    'POSE_GRAPH_DATA', Path(__file__).parents[4] / 'shared' / 'data' / 'graphs'))
+# chi2 at the optima of public graphs, by the literature and other solvers; relative error 1e-5.
+PUBLIC_OPTIMA = {
+    'ring.g2o': (11.163, None),
+    'input_M3500_g2o.g2o': (137.912951, None),
+    'intel_vertigo.g2o': (546.461112, None),
+    'CSAIL_P_toro.graph': (38.956286, 'toro'),
+    'M3500a.g2o': (912.115, 'toro'),
+    'city10000.g2o': (511.985164, None),
+}
+NEEDS_CHORDAL_START = {'M3500a.g2o'}
+
+THOROUGH = SolverConfig(max_iterations=200, step_tolerance=1e-10)
+
+
+def gradient(graph: Graph) -> FloatArray:
+    return free_part(graph, *dense_system(graph))[1]
+
+
+def other_solver(graph: Graph) -> tuple[float, FloatArray]:
+    """Return chi2 and the poses of scipy's optimum, from the graph's own start."""
+    edges, observed, free = graph.edges, graph.observed, ~graph.fixed
+    roots = [np.linalg.cholesky(w).T for w in edges.information]
+    values, vectors = np.linalg.eigh(observed.information)
+    unary_roots = np.sqrt(np.maximum(values, 0.0))[:, :, None] * np.swapaxes(vectors, 1, 2)
+
+    def moved(x: FloatArray) -> FloatArray:
+        poses = graph.poses.copy()
+        poses[free] = x.reshape(-1, 3)
+        return poses
+
+    def errors(x: FloatArray) -> FloatArray:
+        poses = moved(x)
+        whitened = [
+            root @ slow_edge(poses[i], poses[j], z)[0]
+            for root, i, j, z in zip(roots, edges.i, edges.j, edges.mean, strict=True)]
+        whitened += [
+            root @ slow_observed(poses[i], offset, z)[0]
+            for root, i, offset, z in zip(
+                unary_roots, observed.node, observed.offset, observed.mean, strict=True)]
+        return np.concatenate(whitened)
+
+    result = least_squares(errors, graph.poses[free].ravel(), xtol=1e-15, ftol=1e-15, gtol=1e-15)
+    return float(2.0 * result.cost), se2.wrapped(moved(result.x))
+
+
+@pytest.mark.parametrize('seed', range(6))
+def test_the_optimum_is_that_of_scipy(seed: int) -> None:
+    graph = consistent_graph(seed, noise=0.05)
+    rng = np.random.default_rng(seed)
+    at = [1, 4, 6]
+    observed = random_observed(rng, at)
+    mean = se2.compose(graph.poses[at], observed.offset) + 0.1 * rng.standard_normal((3, 3))
+    mean[0, 2] = 0.0     # a position
+    graph.apply(GraphUpdate(observed=ObservedNodes(
+        observed.node, observed.offset, mean, observed.information, observed.kind)))
+    chi2, poses = other_solver(graph)
+    result = optimizer.optimize(graph, SolverConfig())
+    assert result.status is Status.CONVERGED
+    assert result.chi2 == pytest.approx(chi2, rel=SAME_CHI2)
+    difference = graph.poses - poses
+    np.testing.assert_allclose(difference[:, :2], 0.0, atol=SAME_POSES)
+    np.testing.assert_allclose(se2.wrap(difference[:, 2]), 0.0, atol=SAME_POSES)
+
+
+@pytest.mark.parametrize('seed', range(20))
+def test_a_converged_result_is_stationary_and_reports_what_was_done(seed: int) -> None:
+    graph = consistent_graph(seed, noise=0.2)
+    chi2_before = graph.energies().chi2
+    result = optimizer.optimize(graph, THOROUGH)
+    assert result.status is Status.CONVERGED
+    assert result.reason == ''
+    assert result.iterations > 1
+    assert result.chi2_before == pytest.approx(chi2_before, rel=SAME_CHI2)
+    assert result.chi2 == pytest.approx(graph.energies().chi2, rel=SAME_CHI2)
+    np.testing.assert_allclose(gradient(graph), 0.0, atol=STATIONARY)
+
+
+@pytest.mark.parametrize('seed', range(10))
+def test_no_step_raises_chi2(seed: int) -> None:
+    graph = random_graph(seed, fix=(0,))
+    one_step = SolverConfig(max_iterations=1, step_tolerance=1e-10)
+    chi2 = graph.energies().chi2
+    for _ in range(30):
+        result = optimizer.optimize(graph, one_step)
+        assert result.status is not Status.FAILED
+        assert result.iterations <= 1
+        assert graph.energies().chi2 <= chi2 * (1.0 + ROUNDING) + ROUNDING
+        chi2 = graph.energies().chi2
+
+
+def test_it_converges_where_plain_gauss_newton_does_not() -> None:
+    graph = consistent_graph(seed=111, noise=0.8, n_nodes=12)
+    start = graph.poses.copy()
+    chi2_of_steps = []
+    for _ in range(50):     # plain Gauss-Newton with dense matrices
+        H, b = free_part(graph, *dense_system(graph))
+        step = -np.linalg.solve(H, b)
+        graph.set_poses(np.vstack((graph.poses[:1], graph.poses[1:] + step.reshape(-1, 3))))
+        chi2_of_steps.append(graph.energies().chi2)
+    assert np.max(np.abs(step)) > 1.0
+    graph.set_poses(start)
+    result = optimizer.optimize(graph, THOROUGH)
+    assert result.status is Status.CONVERGED
+    assert result.chi2 < min(chi2_of_steps[-10:])
+    np.testing.assert_allclose(gradient(graph), 0.0, atol=STATIONARY)
+
+
+def test_it_converges_fast_at_zero_error() -> None:
+    graph = consistent_graph(seed=3)
+    truth = graph.poses.copy()
+    disturbed = truth + 0.05 * np.random.default_rng(3).standard_normal(truth.shape)
+    disturbed[0] = truth[0]
+    graph.set_poses(disturbed)
+    result = optimizer.optimize(graph, SolverConfig(step_tolerance=1e-13))
+    assert result.status is Status.CONVERGED
+    assert result.iterations <= 8
+    assert result.chi2 < 1e-20
+    np.testing.assert_allclose(graph.poses, truth, atol=1e-12)
+
+
+def chain_with_positions(rng: np.random.Generator) -> Graph:
+    truth = np.zeros((15, 3))
+    steps = np.column_stack((np.ones(14), np.zeros(14), rng.uniform(-0.3, 0.3, 14)))
+    for k, step in enumerate(steps):
+        truth[k + 1] = se2.compose(truth[k], step)
+    noisy = steps + 0.02 * rng.standard_normal(steps.shape)
+    at = np.arange(0, 15, 2)
+    mean = truth[at] + 0.1 * rng.standard_normal((len(at), 3))
+    mean[:, 2] = 0.0
+    graph = Graph()
+    graph.apply(GraphUpdate(
+        hidden=truth, edges=Edges(np.arange(14), np.arange(1, 15), noisy,
+                                  np.tile(np.diag([400.0, 900.0, 2500.0]), (14, 1, 1)),
+                                  [EdgeKind.ODOMETRY] * 14),
+        observed=ObservedNodes(at, None, mean, np.tile(np.diag([100.0, 80.0, 0.0]),
+                                                       (len(at), 1, 1)),
+                               [ObservedKind.POSITION] * len(at))))
+    return graph
+
+
+def test_the_result_does_not_depend_on_the_start() -> None:
+    rng = np.random.default_rng(5)
+    graph = chain_with_positions(rng)
+    truth, results = graph.poses.copy(), []
+    for _ in range(10):
+        graph.set_poses(truth + rng.uniform(-0.4, 0.4, truth.shape))
+        assert optimizer.optimize(graph, THOROUGH).status is Status.CONVERGED
+        results.append(graph.poses.copy())
+    for poses in results[1:]:
+        np.testing.assert_allclose(poses, results[0], atol=1e-9)
+
+
+def test_a_map_far_from_its_origin_converges_to_the_same_shape() -> None:
+    near = chain_with_positions(np.random.default_rng(6))
+    shift = np.array([691_000.0, 5_334_000.0, 0.0])     # as UTM has it
+    unary = near.observed
+    far = Graph()
+    far.apply(GraphUpdate(hidden=near.poses + shift, edges=near.edges, observed=ObservedNodes(
+        unary.node, unary.offset, unary.mean + shift, unary.information, unary.kind)))
+    for graph in (near, far):
+        assert optimizer.optimize(graph, SolverConfig()).status is Status.CONVERGED
+    # a double has steps of 1e-9 m there
+    np.testing.assert_allclose(far.poses - shift, near.poses, atol=1e-7)
+
+
+def test_fixed_nodes_keep_their_poses_bit_for_bit() -> None:
+    graph = random_graph(seed=7, fix=(0, 3))
+    start = graph.poses.copy()
+    before = start[[0, 3]]
+    optimizer.optimize(graph, SolverConfig())
+    np.testing.assert_array_equal(graph.poses[[0, 3]], before)
+    assert np.all(graph.poses[[1, 2, 4, 5, 6]] != start[[1, 2, 4, 5, 6]])
+
+
+def test_headings_leave_wrapped() -> None:
+    for seed in range(5):
+        graph = random_graph(seed, fix=(0,))
+        optimizer.optimize(graph, SolverConfig())
+        assert np.all((graph.poses[:, 2] >= -np.pi) & (graph.poses[:, 2] < np.pi))
+
+
+@pytest.mark.parametrize('n_nodes', [0, 1])
+def test_a_graph_without_unknowns_has_converged(n_nodes: int) -> None:
+    graph = Graph()
+    graph.apply(GraphUpdate(hidden=np.zeros((n_nodes, 3)), fix=range(n_nodes)))
+    result = optimizer.optimize(graph, SolverConfig())
+    assert result.status is Status.CONVERGED
+    assert result.iterations == 0
+
+
+def floating(rng: np.random.Generator) -> Graph:
+    return random_graph(int(rng.integers(100)), n_observed=0)
+
+
+def with_a_loose_part(rng: np.random.Generator) -> Graph:
+    graph = random_graph(1, fix=(0,))
+    graph.apply(GraphUpdate(hidden=random_poses(rng, 2), edges=random_edges(rng, [7], [8])))
+    return graph
+
+
+def without_any_heading(_: np.random.Generator) -> Graph:
+    graph = Graph()
+    graph.apply(GraphUpdate(hidden=np.zeros((1, 3)), observed=ObservedNodes(
+        [0], None, [[1.0, 2.0, 0.0]], [np.diag([1.0, 1.0, 0.0])], [ObservedKind.POSITION])))
+    return graph
+
+
+def beyond_all_numbers(_: np.random.Generator) -> Graph:
+    graph = random_graph(2, fix=(0,))
+    graph.apply(GraphUpdate(observed=ObservedNodes(
+        [3], None, [[1e200, 0.0, 0.0]], [np.eye(3)], [ObservedKind.GLOBAL_POSE])))
+    return graph
+
+
+@pytest.mark.parametrize(
+    'make', [floating, with_a_loose_part, without_any_heading, beyond_all_numbers])
+def test_a_failure_is_a_result_and_leaves_everything_as_it_was(make) -> None:
+    graph = make(np.random.default_rng(8))
+    before = snapshot(graph)
+    with np.errstate(over='ignore', invalid='ignore'):
+        result = optimizer.optimize(graph, SolverConfig())
+    assert result.status is Status.FAILED
+    assert result.reason != ''
+    assert result.iterations == 0
+    assert snapshot(graph) == before
+
+
+def test_being_stuck_where_an_angle_jumps_does_not_count_as_converged() -> None:
+    graph = consistent_graph(seed=263, noise=0.8, n_nodes=12)
+    result = optimizer.optimize(graph, THOROUGH)
+    assert np.max(np.abs(gradient(graph))) > 50.0     # one error is at pi
+    assert result.status is Status.STALLED
+
+
+@pytest.mark.parametrize('seed', [85, 143])
+def test_it_goes_uphill_where_that_is_the_way_to_the_minimum(seed: int) -> None:
+    n_nodes, noise = (30, 0.5) if seed == 85 else (12, 0.8)
+    graph = consistent_graph(seed, noise, n_nodes)
+    start, chi2_of_steps = graph.poses.copy(), [graph.energies().chi2]
+    for _ in range(60):     # plain Gauss-Newton with dense matrices
+        H, b = free_part(graph, *dense_system(graph))
+        graph.set_poses(np.vstack((
+            graph.poses[:1], graph.poses[1:] - np.linalg.solve(H, b).reshape(-1, 3))))
+        chi2_of_steps.append(graph.energies().chi2)
+    assert np.any(np.diff(chi2_of_steps) > 0.1 * chi2_of_steps[-1])
+    graph.set_poses(start)
+    result = optimizer.optimize(graph, THOROUGH)
+    assert result.status is Status.CONVERGED
+    assert result.chi2 == pytest.approx(chi2_of_steps[-1], rel=SAME_CHI2)
+
+
+# --- Parts and weights -----------------------------------------------------------------------
+
+def test_parts_of_a_graph_are_optimised_each_for_itself() -> None:
+    parts = [consistent_graph(seed, noise=0.05) for seed in (1, 2, 3)]
+    whole = Graph()
+    for part in parts:
+        n, edges = whole.n_nodes, part.edges
+        whole.apply(GraphUpdate(
+            hidden=part.poses, fix=[n],
+            edges=Edges(edges.i + n, edges.j + n, edges.mean, edges.information, edges.kind)))
+    for graph in (*parts, whole):
+        assert optimizer.optimize(graph, THOROUGH).status is Status.CONVERGED
+    np.testing.assert_allclose(
+        whole.poses, np.vstack([part.poses for part in parts]), atol=1e-9)
+
+
+def test_a_removed_constraint_does_not_count() -> None:
+    graph, same = (consistent_graph(seed=4, noise=0.05) for _ in range(2))
+    rng = np.random.default_rng(4)
+    graph.apply(GraphUpdate(edges=random_edges(rng, [0, 3], [5, 7]),
+                            observed=random_observed(rng, [2])))
+    n_edges = graph.n_edges
+    graph.apply(GraphUpdate(remove_edges=[n_edges - 2, n_edges - 1], remove_observed=[0]))
+    for each in (graph, same):
+        assert optimizer.optimize(each, THOROUGH).status is Status.CONVERGED
+    np.testing.assert_allclose(graph.poses, same.poses, atol=1e-9)
+
+
+def test_a_part_that_removals_disconnect_is_named() -> None:
+    graph = random_graph(seed=5, n_nodes=4, n_observed=0, fix=(0,))
+    edges = graph.edges
+    graph.apply(GraphUpdate(
+        remove_edges=np.flatnonzero((edges.i == 0) | (edges.j == 0)).tolist()))
+    before = snapshot(graph)
+    result = optimizer.optimize(graph, SolverConfig())
+    assert result.status is Status.FAILED
+    assert 'hidden node 1 and 2 others' in result.reason
+    assert snapshot(graph) == before
+
+
+def test_an_undetermined_heading_is_named() -> None:
+    result = optimizer.optimize(without_any_heading(np.random.default_rng(0)), SolverConfig())
+    assert result.reason == 'hidden node 0 is not determined'
+
+
+# --- From nothing ----------------------------------------------------------------------------
+
+@pytest.mark.parametrize('seed', range(10))
+def test_from_nothing_it_finds_the_minimum_from_anywhere(seed: int) -> None:
+    graph = consistent_graph(seed, noise=0.03)
+    optimizer.optimize(graph, THOROUGH)
+    optimum, rng = graph.poses.copy(), np.random.default_rng(seed)
+    poses = random_poses(rng, graph.n_nodes, 100.0)
+    poses[0] = optimum[0]
+    graph.set_poses(poses)
+    result = optimizer.optimize_from_linear_start(graph, THOROUGH)
+    assert result.status is Status.CONVERGED
+    assert result.chi2_before > 1e3 * result.chi2
+    np.testing.assert_allclose(graph.poses, optimum, atol=1e-9)
+
+
+def test_from_nothing_positions_alone_are_enough() -> None:
+    rng = np.random.default_rng(9)
+    graph = chain_with_positions(rng)
+    optimizer.optimize(graph, THOROUGH)
+    optimum = graph.poses.copy()
+    graph.set_poses(random_poses(rng, graph.n_nodes, 100.0))
+    assert optimizer.optimize_from_linear_start(graph, THOROUGH).status is Status.CONVERGED
+    np.testing.assert_allclose(graph.poses, optimum, atol=1e-9)
+
+
+@pytest.mark.parametrize('seed', range(10))
+def test_from_nothing_is_never_worse_than_the_present_poses(seed: int) -> None:
+    graph = consistent_graph(seed, noise=1.0, n_nodes=12)
+    optimizer.optimize(graph, THOROUGH)
+    chi2 = graph.energies().chi2
+    result = optimizer.optimize_from_linear_start(graph, SolverConfig())
+    assert result.chi2 <= chi2 * (1.0 + ROUNDING)
+    assert result.chi2 == pytest.approx(graph.energies().chi2, rel=SAME_CHI2)
+
+
+@pytest.mark.parametrize(
+    'make', [floating, with_a_loose_part, without_any_heading, beyond_all_numbers])
+def test_from_nothing_a_failure_leaves_everything_as_it_was(make) -> None:
+    graph = make(np.random.default_rng(8))
+    before = snapshot(graph)
+    result = optimizer.optimize_from_linear_start(graph, SolverConfig())
+    assert result.status is Status.FAILED
+    assert result.reason != ''
+    assert snapshot(graph) == before
+
+
+# --- The smoother continues ------------------------------------------------------------------
+
+@pytest.mark.parametrize('from_nothing', [False, True])
+@pytest.mark.parametrize('seed', range(5))
+def test_the_smoother_continues_from_the_result(seed: int, *, from_nothing: bool) -> None:
+    smoother, rng = IncrementalSmoother(EXACT), np.random.default_rng(seed)
+    first = consistent_graph(seed, noise=0.05)
+    smoother.update(GraphUpdate(hidden=first.poses, edges=first.edges, fix=[0]))
+    graph = smoother.graph
+    graph.apply(GraphUpdate(observed=random_observed(rng, [3]), weigh_observed={0: 0.01}))
+    optimize = optimizer.optimize_from_linear_start if from_nothing else optimizer.optimize
+    assert optimize(graph, THOROUGH).status is Status.CONVERGED
+    poses = graph.poses.copy()
+    for k in range(3):
+        n = graph.n_nodes
+        edges = Edges(
+            [n - 1, k], [n, n], [[1.0, 0.1, 0.2], se2.between(poses[k], poses[-1])],
+            np.tile(np.diag([50.0, 50.0, 100.0]), (2, 1, 1)), [0, 1])
+        hidden = se2.compose(graph.poses[-1], np.array([1.0, 0.1, 0.2]))[None]
+        assert smoother.update(GraphUpdate(hidden=hidden, edges=edges)).status is Status.CONVERGED
+        found = graph.poses.copy()
+        other = Graph()
+        other.apply(GraphUpdate(hidden=found, edges=graph.edges, observed=graph.observed, fix=[0]))
+        assert optimizer.optimize(other, THOROUGH).status is Status.CONVERGED
+        np.testing.assert_allclose(found, other.poses, atol=SAME_POSES)
+
+
+def test_without_new_data_the_smoother_has_nothing_to_do_after_it() -> None:
+    smoother = IncrementalSmoother()
+    first = consistent_graph(6, noise=0.05)
+    smoother.update(GraphUpdate(hidden=first.poses, edges=first.edges, fix=[0]))
+    optimizer.optimize(smoother.graph, THOROUGH)
+    poses = smoother.poses.copy()
+    assert smoother.update(GraphUpdate()).eliminated == 0
+    np.testing.assert_array_equal(smoother.poses, poses)
+    H, _ = free_part(smoother.graph, *dense_system(smoother.graph))
+    np.testing.assert_allclose(
+        smoother.covariance(3), np.linalg.inv(H)[6:9, 6:9], rtol=1e-6)
+
+
+# --- Stored optima ---------------------------------------------------------------------------
+
+@pytest.mark.parametrize('name', GOLDEN)
+@pytest.mark.parametrize('chordal', [False, True])
+def test_small_graphs_reach_their_stored_optima(name: str, *, chordal: bool) -> None:
+    path = DATA / name
+    assert hashlib.sha256(path.read_bytes()).hexdigest() == GOLDEN[name]['sha256']
+    graph = read_g2o(path).graph
+    if chordal:
+        graph.set_poses(chordal_start.chordal(graph))
+    result = optimizer.optimize(graph, SolverConfig())
+    assert result.status is Status.CONVERGED
+    assert result.chi2 == pytest.approx(GOLDEN[name]['chi2'], rel=SAME_CHI2)
+    np.testing.assert_allclose(gradient(graph), 0.0, atol=STATIONARY)
+
+
+@pytest.mark.parametrize('from_nothing', [False, True])
+@pytest.mark.parametrize('name', PUBLIC_OPTIMA)
+def test_public_graphs_reach_their_known_optima(name: str, *, from_nothing: bool) -> None:
+    path = PUBLIC / name
+    if not path.is_file():
+        pytest.skip(f'{path} is not there; POSE_GRAPH_DATA may name the folder of {name}')
+    chi2, edge2_order = PUBLIC_OPTIMA[name]
+    graph = read_g2o(path, edge2_order).graph
+    if from_nothing:
+        result = optimizer.optimize_from_linear_start(graph, SolverConfig())
+    else:
+        if name in NEEDS_CHORDAL_START:
+            graph.set_poses(chordal_start.chordal(graph))
+        result = optimizer.optimize(graph, SolverConfig())
+    assert result.status is Status.CONVERGED
+    assert result.chi2 == pytest.approx(chi2, rel=1e-5)

@@ -1,0 +1,403 @@
+# Copyright 2026 The pose_graph_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""Kernels: kept between starts, in a folder that is there, and never the wrong ones."""
+
+from collections.abc import Callable
+import importlib
+import os
+from pathlib import Path
+import shutil
+import subprocess
+import sys
+import tempfile
+from types import ModuleType
+
+import numba
+from numba.core.caching import FunctionCache, NullCache
+from numba.core.dispatcher import Dispatcher
+from numba.core.runtime import _nrt_python, rtsys
+import numpy as np
+import pytest
+
+from pose_graph_ros.core.compiled import jit, kernel_cache
+from pose_graph_ros.core.warm_up import warm_up
+
+TREE = Path(__file__).resolve().parents[3]
+PACKAGE = 'kernels_of_a_test'
+INNER = """
+from pose_graph_ros.core.compiled.jit import kernel
+
+GAIN = 2.0
+
+@kernel(fastmath={'arcp', 'contract', 'nsz'})
+def scaled(x):
+    return GAIN * x
+"""
+OUTER = f"""
+from pose_graph_ros.core.compiled.jit import kernel
+from {PACKAGE}.inner import scaled
+
+@kernel
+def total(a):
+    result = 0.0
+    for i in range(a.size):
+        result += scaled(a[i])
+    return result
+"""
+OUTER_BY_MODULE = OUTER.replace('.inner import scaled', ' import inner').replace(
+    'scaled(', 'inner.scaled(')
+START = f"""
+import logging
+logging.basicConfig()
+import numpy as np
+from {PACKAGE} import outer
+from pose_graph_ros.core.compiled.jit import is_cached
+kept = is_cached()
+print(outer.total(np.ones(3)), outer.total(np.ones(3, dtype=np.int32)), kept)
+if hasattr(outer.total, 'stats'):
+    print(sum(outer.total.stats.cache_hits.values()), outer.total.stats.cache_path)
+"""
+ONES = np.ones(3)
+
+
+@pytest.fixture(autouse=True)
+def own_registry(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(jit, '_registered', {})
+
+
+@pytest.fixture
+def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """Return a package with kernels, as this process could import it."""
+    monkeypatch.syspath_prepend(tmp_path)
+    monkeypatch.setattr(numba.config, 'CACHE_DIR', '')
+    monkeypatch.setattr(sys, 'dont_write_bytecode', True)   # stamps of bytecode are in seconds
+    package = tmp_path / PACKAGE
+    package.mkdir()
+    for name, text in (('__init__', ''), ('inner', INNER), ('outer', OUTER)):
+        (package / f'{name}.py').write_text(text)
+    kernel_cache.find_folder.cache_clear()
+    kernel_cache._warn_once.cache_clear()
+    return package
+
+
+def start() -> ModuleType:
+    """Import the package anew, as another process would."""
+    for name in [name for name in sys.modules if name.partition('.')[0] == PACKAGE]:
+        del sys.modules[name]
+    importlib.invalidate_caches()
+    return importlib.import_module(f'{PACKAGE}.outer')
+
+
+def loaded(kernel: Dispatcher) -> bool:
+    """Tell whether all signatures came from the cache."""
+    hits, misses = kernel.stats.cache_hits.total(), kernel.stats.cache_misses.total()
+    assert hits + misses > 0
+    return misses == 0
+
+
+def files(folder: Path, pattern: str) -> list[Path]:
+    return sorted((folder / '__pycache__').glob(pattern))
+
+
+# --- kernels ------------------------------------------------------------------------------------
+
+def test_registry_knows_every_kernel_and_its_signatures(folder: Path) -> None:
+    total = start().total
+    assert jit._registered.keys() == {f'{PACKAGE}.inner.scaled', f'{PACKAGE}.outer.total'}
+    assert jit._registered[f'{PACKAGE}.outer.total'] is total
+    assert total.signatures == []
+    total(ONES)
+    total(2.0 * ONES)
+    assert len(total.signatures) == 1
+    total(np.ones(3, dtype=np.float32))
+    assert len(total.signatures) == 2
+
+
+def test_kernel_divides_as_numpy_does_and_passes_options_on() -> None:
+    @jit.kernel(fastmath={'contract'})
+    def ratio(x, y):
+        return x / y
+
+    assert ratio(1.0, 0.0) == np.inf
+    assert ratio.targetoptions['nogil']
+    assert ratio.targetoptions['fastmath'] == {'contract'}
+
+
+def test_other_users_of_numba_keep_their_cache(folder: Path) -> None:
+    environment = dict(os.environ)
+    start()
+    # a function of a file, as Numba finds no place for others
+    own = numba.njit(cache=True)(kernel_cache._top)
+    assert type(own._cache) is FunctionCache
+    assert numba.config.CACHE_DIR == ''
+    assert dict(os.environ) == environment
+
+
+def test_warm_up_can_be_stopped(monkeypatch: pytest.MonkeyPatch) -> None:
+    done: list[int] = []
+    steps = tuple((lambda number=number: done.append(number)) for number in range(3))
+    monkeypatch.setattr('pose_graph_ros.core.warm_up.STEPS', steps)
+    assert warm_up(lambda: len(done) == 2) >= 0.0
+    assert done == [0, 1]
+    warm_up()
+    assert done == [0, 1, 0, 1, 2]
+
+
+# --- what is kept is used, and only if it is right ----------------------------------------------
+
+def test_kernels_free_every_array_that_they_make() -> None:
+    """Those that count no references must not be handed arrays to keep (`allocates`)."""
+    warm_up()
+    _nrt_python.memsys_enable_stats()
+    try:
+        before = rtsys.get_allocation_stats()
+        warm_up()
+        after = rtsys.get_allocation_stats()
+    finally:
+        _nrt_python.memsys_disable_stats()
+    assert after.alloc > before.alloc
+    assert after.alloc - before.alloc == after.free - before.free
+
+
+def test_second_start_takes_all_from_the_cache(folder: Path) -> None:
+    first = start()
+    assert not jit.is_cached()
+    assert first.total(ONES) == 6.0
+    assert not loaded(first.total)
+    again = start()
+    assert jit.is_cached()
+    assert again.total is not first.total
+    assert again.total(ONES) == 6.0
+    assert loaded(again.total)
+
+
+@pytest.mark.parametrize('outer', [OUTER, OUTER_BY_MODULE], ids=['name', 'module'])
+@pytest.mark.parametrize('change', [
+    ('GAIN = 2.0', 'GAIN = 5.0'), ('GAIN * x', '(3.0 + GAIN) * x')], ids=['number', 'code'])
+def test_change_in_what_a_kernel_calls_is_noticed(
+    folder: Path, outer: str, change: tuple[str, str],
+) -> None:
+    (folder / 'outer.py').write_text(outer)
+    assert start().total(ONES) == 6.0
+    (folder / 'inner.py').write_text(INNER.replace(*change))
+    changed = start()
+    assert not jit.is_cached()
+    assert changed.total(ONES) == 15.0
+    again = start()
+    assert again.total(ONES) == 15.0
+    assert loaded(again.total)
+
+
+def test_change_of_the_options_is_noticed(folder: Path) -> None:
+    assert start().total(ONES) == 6.0
+    (folder / 'inner.py').write_text(INNER.replace('nsz', 'nnan'))
+    changed = start()
+    changed.total(ONES)
+    assert not loaded(changed.total)
+
+
+def test_files_do_not_pile_up(folder: Path) -> None:
+    for line in range(3):
+        (folder / 'outer.py').write_text('\n' * line + OUTER)
+        start().total(ONES)
+        assert len(files(folder, '*.nb?')) == 4
+
+
+@pytest.mark.parametrize('pattern', ['*total*.nbi', '*total*.nbc'], ids=['index', 'code'])
+@pytest.mark.parametrize('damage', [
+    lambda content: b'', lambda content: content[:len(content) // 2],
+    lambda content: b'\0' * 100,
+    lambda content: content[:-1000] + bytes([content[-1000] ^ 1]) + content[-999:],
+], ids=['empty', 'half', 'zeros', 'bit'])
+def test_damaged_file_costs_time_alone(
+    folder: Path, pattern: str, damage: Callable[[bytes], bytes],
+) -> None:
+    start().total(ONES)
+    [path] = files(folder, pattern)
+    path.write_bytes(damage(path.read_bytes()))
+    repaired = start()
+    assert repaired.total(ONES) == 6.0
+    assert not loaded(repaired.total)
+    again = start()
+    assert again.total(ONES) == 6.0
+    assert loaded(again.total)
+
+
+def test_code_under_the_name_of_another_signature_is_not_used(folder: Path) -> None:
+    # what two processes at once, each with a signature, can leave behind
+    first = start()
+    first.total(ONES)
+    first.total(np.ones(3, dtype=np.int32))
+    one, other = files(folder, '*total*.nbc')
+    shutil.copyfile(one, other)
+    second = start()
+    assert second.total(np.ones(3, dtype=np.int32)) == 6.0
+    assert second.total(ONES) == 6.0
+
+
+def test_index_without_its_code_does_not_bring_old_code_back(folder: Path) -> None:
+    start().total(ONES)
+    [code] = files(folder, '*total*.nbc')
+    old = code.read_bytes()
+    (folder / 'outer.py').write_text(OUTER.replace('result = 0.0', 'result = 1.0'))
+    start().total(ONES)
+    code.write_bytes(old)       # the disk was full, or the power went, between the two files
+    assert start().total(ONES) == 7.0
+
+
+def test_folder_that_vanishes_costs_time_alone(
+    folder: Path, caplog: pytest.LogCaptureFixture,
+) -> None:
+    module = start()
+    shutil.rmtree(folder / '__pycache__')
+    (folder / '__pycache__').write_text('no folder')
+    assert module.total(ONES) == 6.0
+    assert 'could not be' in caplog.text
+
+
+# --- the folder ---------------------------------------------------------------------------------
+
+class Places:
+    """The places where compiled kernels can be kept, each of which can be blocked."""
+
+    def __init__(self, root: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+        self.source = root / 'source'
+        self.numba, self.xdg, self.home, self.temporary = (
+            root / name for name in ('numba', 'xdg', 'home', 'temporary'))
+        for folder in (self.source, self.home, self.temporary):
+            folder.mkdir()
+        self.private = self.temporary / f'pose_graph_ros-{os.getuid()}'
+        monkeypatch.setattr(numba.config, 'CACHE_DIR', str(self.numba))
+        monkeypatch.setenv('XDG_CACHE_HOME', str(self.xdg))
+        monkeypatch.setenv('HOME', str(self.home))
+        monkeypatch.setattr(tempfile, 'tempdir', str(self.temporary))
+
+    def find(self) -> Path | None:
+        found = kernel_cache.find_folder.__wrapped__(self.source)
+        assert found is None or found.is_dir()
+        return found
+
+
+def block(path: Path) -> None:
+    """Make a path that no folder can be made at, not even by root."""
+    shutil.rmtree(path, ignore_errors=True)
+    path.write_text('a file')
+
+
+@pytest.fixture
+def places(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Places:
+    return Places(tmp_path, monkeypatch)
+
+
+def test_first_folder_that_can_be_written_to_is_taken(
+    places: Places, caplog: pytest.LogCaptureFixture,
+) -> None:
+    assert places.find().parent == places.numba
+    block(places.numba)
+    assert places.find() == places.source / '__pycache__'
+    block(places.source / '__pycache__')
+    assert places.find().parent == places.xdg / 'pose_graph_ros'
+    block(places.xdg)
+    assert places.find().parent == places.home / '.cache' / 'pose_graph_ros'
+    block(places.home)
+    assert places.find().parent == places.private
+    assert places.private.stat().st_mode & 0o777 == 0o700
+    assert caplog.text == ''
+    block(places.private)
+    assert places.find() is None
+    assert 'NUMBA_CACHE_DIR' in caplog.text
+
+
+def test_two_installations_do_not_share_a_folder(places: Places, tmp_path: Path) -> None:
+    first = places.find()
+    (tmp_path / 'other').mkdir()
+    places.source = (tmp_path / 'other' / 'source')
+    assert places.find() != first
+    assert places.find().parent == first.parent
+
+
+def test_without_a_home_nothing_is_made_in_the_current_folder(
+    places: Places, tmp_path: Path, monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    block(places.numba)
+    block(places.source / '__pycache__')
+    monkeypatch.setenv('XDG_CACHE_HOME', 'relative')
+    monkeypatch.setattr(os.path, 'expanduser', lambda path: path)
+    (tmp_path / 'here').mkdir()
+    monkeypatch.chdir(tmp_path / 'here')
+    assert places.find().parent == places.private
+    assert list((tmp_path / 'here').iterdir()) == []
+
+
+@pytest.mark.parametrize('trap', ['open', 'link', 'of another'])
+def test_private_folder_that_others_can_write_to_is_refused(
+    places: Places, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, trap: str,
+) -> None:
+    for path in (places.numba, places.source / '__pycache__', places.xdg, places.home):
+        block(path)
+    if trap == 'open':
+        places.private.mkdir()
+        places.private.chmod(0o777)
+    elif trap == 'link':
+        (tmp_path / 'elsewhere').mkdir(mode=0o700)
+        places.private.symlink_to(tmp_path / 'elsewhere')
+    else:
+        places.private.mkdir(mode=0o700)
+        uid = os.getuid() + 1
+        places.private.rename(places.temporary / f'pose_graph_ros-{uid}')
+        monkeypatch.setattr(os, 'getuid', lambda: uid)
+    assert places.find() is None
+
+
+def test_kernel_without_a_folder_works(
+    folder: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture,
+) -> None:
+    monkeypatch.setattr(kernel_cache, '_candidates', lambda source: iter(()))
+    module = start()
+    assert module.total(ONES) == 6.0
+    assert isinstance(module.total._cache, NullCache)
+    assert not jit.is_cached()
+    assert 'compiles them again' in caplog.text
+
+
+# --- whole processes ----------------------------------------------------------------------------
+
+def launch(folder: Path, **environment: str) -> 'subprocess.Popen[str]':
+    inherited = os.environ.get('PYTHONPATH', '').split(os.pathsep)
+    path = os.pathsep.join([str(folder.parent), str(TREE), *inherited])
+    return subprocess.Popen(
+        [sys.executable, '-c', START], env={'PYTHONPATH': path, **environment}, text=True,
+        cwd=folder.parent, stdout=subprocess.PIPE, stderr=subprocess.PIPE)
+
+
+def output(process: 'subprocess.Popen[str]') -> tuple[list[str], str]:
+    out, errors = process.communicate(timeout=60)
+    assert process.returncode == 0, errors
+    return out.splitlines(), errors
+
+
+def test_processes_that_compile_at_the_same_time_do_no_harm(folder: Path) -> None:
+    processes = [launch(folder, PYTHONHASHSEED=seed) for seed in '12']
+    for process in processes:
+        assert output(process)[0][0].startswith('6.0 6.0 ')
+    # the order of a set, as in an option of a kernel, differs from process to process
+    lines, _ = output(launch(folder, PYTHONHASHSEED='3'))
+    assert lines == ['6.0 6.0 True', f'2 {folder / "__pycache__"}']
+
+
+def test_service_without_home_and_in_a_read_only_installation(
+    folder: Path, tmp_path: Path,
+) -> None:
+    block(folder / '__pycache__')
+    (tmp_path / 'tmp').mkdir()
+    environment = {'HOME': '/proc/nowhere', 'TMPDIR': str(tmp_path / 'tmp')}
+    first, errors = output(launch(folder, **environment))
+    assert first[0] == '6.0 6.0 False'
+    assert 'compiles them again' not in errors
+    second, _ = output(launch(folder, **environment))
+    assert second[0] == '6.0 6.0 True'
+    assert second[1].startswith(f'2 {tmp_path / "tmp"}')
+
+
+def test_nothing_is_compiled_where_numba_is_told_so(folder: Path) -> None:
+    assert output(launch(folder, NUMBA_DISABLE_JIT='1'))[0] == ['6.0 6.0 True']

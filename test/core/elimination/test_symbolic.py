@@ -1,0 +1,80 @@
+# Copyright 2026 The pose_graph_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""The cliques of a whole graph are in postorder and cover it; loose parts are found."""
+
+from hypothesis import given, strategies as st
+import numpy as np
+import pytest
+from random_graphs import random_edges, random_graph, random_observed, random_poses
+import scipy.sparse.csgraph
+
+from pose_graph_ros.core.elimination import symbolic
+from pose_graph_ros.core.graph.graph import Graph, GraphUpdate
+
+seeds = st.integers(0, 2**32 - 1)
+
+
+@given(seeds, st.integers(1, 40), st.integers(0, 40))
+def test_cliques_cover_the_graph_in_postorder(seed: int, n_nodes: int, extra: int) -> None:
+    rng = np.random.default_rng(seed)
+    graph = Graph()
+    graph.apply(GraphUpdate(hidden=random_poses(rng, n_nodes)))
+    if n_nodes > 1:
+        pairs = np.array([rng.choice(n_nodes, 2, replace=False) for _ in range(extra)])
+        graph.apply(GraphUpdate(edges=random_edges(rng, *pairs.reshape(-1, 2).T.tolist())))
+    cliques = symbolic.analyse(graph.memory.head).cliques
+    bounds = [slice(a, b) for a, b in zip(cliques.first, cliques.first[1:], strict=False)]
+    lists = [cliques.nodes[part].tolist() for part in bounds]
+    frontal = [nodes[:k] for nodes, k in zip(lists, cliques.n_frontal, strict=True)]
+    order = [node for nodes in frontal for node in nodes]
+    assert sorted(order) == list(range(n_nodes))
+    position = {node: k for k, node in enumerate(order)}
+    for k, nodes in enumerate(lists):
+        separator = nodes[len(frontal[k]):]
+        places = [position[node] for node in separator]
+        assert places == sorted(places)
+        parent = cliques.parent[k]
+        assert (parent < 0) == (separator == [])
+        if parent >= 0:
+            assert parent > k
+            assert set(separator) <= set(lists[parent])
+            # each subtree is contiguous: all cliques in between are below the same parent
+            below = k + 1
+            while below != parent:
+                below = cliques.parent[below]
+                assert 0 <= below <= parent
+    clique_of = {node: k for k, nodes in enumerate(frontal) for node in nodes}
+    for i, j in zip(graph.edges.i, graph.edges.j, strict=True):
+        first = min(clique_of[i], clique_of[j])
+        assert {i, j} <= set(lists[first])
+
+
+@pytest.mark.parametrize('n_biases', [0, 5])
+def test_the_newest_pose_is_alone_in_its_clique(n_biases: int) -> None:
+    graph = random_graph(seed=1, n_nodes=30, n_edges=60, n_biases=n_biases)
+    cliques = symbolic.analyse(graph.memory.head).cliques
+    assert cliques.nodes[-1] == graph.newest_pose == 29
+    assert cliques.n_frontal[-1] == 1
+
+
+@given(seeds)
+def test_loose_parts_are_those_of_scipy(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    n = 15
+    graph = Graph()
+    graph.apply(GraphUpdate(hidden=random_poses(rng, n)))
+    i = rng.integers(0, n, 14)
+    j = (i + rng.integers(1, n, 14)) % n
+    graph.apply(GraphUpdate(
+        edges=random_edges(rng, i.tolist(), j.tolist()),
+        observed=random_observed(rng, rng.integers(0, n, 3).tolist()),
+        fix=[int(rng.integers(n))]))
+    graph.apply(GraphUpdate(remove_edges=[0, 3], remove_observed=[1]))
+    edges, observed = graph.edges, graph.observed
+    matrix = scipy.sparse.coo_array((edges.weight, (edges.i, edges.j)), shape=(n, n)).tocsr()
+    matrix.eliminate_zeros()
+    _, part = scipy.sparse.csgraph.connected_components(matrix, directed=False)
+    held = set(part[graph.fixed]) | set(part[observed.node[observed.weight > 0.0]])
+    loose = [node for node in range(n) if part[node] not in held]
+    expected = (loose[0] if len(loose) > 0 else -1, len(loose))
+    assert symbolic.loose_part(graph.memory.head) == expected

@@ -1,0 +1,290 @@
+# Copyright 2026 The pose_graph_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""Covariances: what is one, how they turn, how the noise of odometry adds up."""
+
+from hypothesis import given, strategies as st
+from hypothesis.extra.numpy import arrays
+import numpy as np
+import pytest
+
+from pose_graph_ros.core.config import OdometryNoise
+from pose_graph_ros.core.geometry import covariance, se2
+from pose_graph_ros.core.geometry.se2 import FloatArray
+from pose_graph_ros.core.odometry.motion import Motion, odometry_covariance
+
+ROUNDING = 1e-12
+# Sample covariances of 2e5 draws: 1 / sqrt(1e5) = 0.3 % one sigma; 2 % for the worst of six.
+N_SAMPLES = 200_000
+SAMPLING = 0.02
+
+seeds = st.integers(0, 2**32 - 1)
+
+
+def random_covariance(seed: int, size: int = 3) -> FloatArray:
+    rng = np.random.default_rng(seed)
+    root = rng.uniform(-1.0, 1.0, (size, size)) + np.eye(size)
+    root *= 10.0 ** rng.uniform(-4.0, 3.0, (size, 1))
+    return root @ root.T + 1e-3 * np.diag(np.diagonal(root @ root.T))
+
+
+def assert_covariances_agree(sampled: FloatArray, expected: FloatArray) -> None:
+    scale = np.sqrt(np.outer(np.diagonal(expected), np.diagonal(expected)))
+    np.testing.assert_allclose(sampled / scale, expected / scale, atol=SAMPLING)
+
+
+# --- defects ---------------------------------------------------------------------------------
+
+HUGE = 1.7976e308
+DEFECTS = [
+    (np.eye(3), None),
+    (np.diag([1e-300, 1e-300]), None),
+    (np.diag([1e-12, 1e14, 1.0]), None),
+    (np.array([[1.0, 0.999], [0.999, 1.0]]), None),
+    (np.zeros((3, 3)), 'not_positive'),
+    (np.diag([-1.0, 1.0, 1.0]), 'not_positive'),
+    (np.diag([1.0, 1.0, 0.0]), 'not_positive'),
+    (np.full((3, 3), np.nan), 'not_finite'),
+    (np.diag([1.0, np.inf, 1.0]), 'not_finite'),
+    (np.array([[1.0, np.nan], [np.nan, 1.0]]), 'not_finite'),
+    (np.diag([HUGE, HUGE]), 'too_large'),
+    (np.diag([1.0, 1.0, 1e16]), 'too_large'),
+    (np.array([[1.0, 0.1], [0.0, 1.0]]), 'not_symmetric'),
+    (np.array([[1.0, HUGE], [-HUGE, 1.0]]), 'not_symmetric'),
+    (np.array([[1.0, HUGE], [HUGE, 1.0]]), 'not_positive_definite'),
+    (np.array([[1.0, 1.0], [1.0, 1.0]]), 'not_positive_definite'),
+    (np.array([[1.0, 2.0], [2.0, 1.0]]), 'not_positive_definite'),
+    (np.ones((3, 3)), 'not_positive_definite'),
+]
+
+
+@pytest.mark.parametrize(('matrix', 'word'), DEFECTS)
+def test_what_is_wrong_with_a_covariance_is_said_in_a_word(
+    matrix: FloatArray, word: str | None,
+) -> None:
+    with np.errstate(all='raise', under='ignore'):     # no overflow, no division by zero
+        assert covariance.defect(matrix) == word
+
+
+@given(arrays(np.float64, (3, 3), elements=st.floats(allow_nan=True, allow_infinity=True)))
+def test_no_matrix_brings_the_check_down(matrix: FloatArray) -> None:
+    if covariance.defect(matrix) is None:
+        np.linalg.cholesky(0.5 * (matrix + matrix.T))
+
+
+@given(arrays(np.float64, (3, 3), elements=st.floats(-2.0, 2.0, width=16)))
+def test_what_passes_is_positive_definite_and_what_is_clearly_so_passes(
+    matrix: FloatArray,
+) -> None:
+    for candidate in (matrix, matrix @ matrix.T, matrix @ matrix.T + np.eye(3)):
+        word = covariance.defect(candidate)
+        smallest = np.min(np.linalg.eigvalsh(0.5 * (candidate + candidate.T)))
+        if word is None:
+            assert smallest > 0.0
+        if smallest > 1e-3 and np.array_equal(candidate, candidate.T):
+            assert word is None
+
+
+@given(seeds)
+def test_a_covariance_has_no_defect_in_any_units(seed: int) -> None:
+    for size in (2, 3):
+        cov = random_covariance(seed, size)
+        assert covariance.defect(cov) is None
+        units = np.diag(10.0 ** np.arange(0, -3 * size, -3.0))
+        assert covariance.defect(units @ cov @ units) is None
+
+
+@given(seeds, st.floats(0.0, 1e3))
+def test_floors_raise_what_lies_below_and_nothing_else(seed: int, floor: float) -> None:
+    cov = random_covariance(seed)
+    floors = np.array([floor, 0.0, 1e-6])
+    result = covariance.floored(cov, floors)
+    np.testing.assert_allclose(
+        np.diagonal(result), np.maximum(np.diagonal(cov), floors), rtol=ROUNDING)
+    off_diagonal = ~np.eye(3, dtype=bool)
+    np.testing.assert_allclose(result[off_diagonal], cov[off_diagonal], rtol=ROUNDING)
+    np.testing.assert_array_equal(result, result.T)
+    assert np.min(np.linalg.eigvalsh(result)) > 0.0
+
+
+@given(seeds)
+def test_information_is_the_symmetric_inverse(seed: int) -> None:
+    cov = random_covariance(seed)
+    information = covariance.information(cov)
+    np.testing.assert_array_equal(information, information.T)
+    np.testing.assert_allclose(information @ cov, np.eye(3), atol=1e-6)
+
+
+# --- turning ---------------------------------------------------------------------------------
+
+@pytest.mark.parametrize('size', [2, 3])
+def test_turning_expresses_the_same_errors_in_other_axes(size: int) -> None:
+    rng = np.random.default_rng(3)
+    cov, theta = random_covariance(3, size), 0.7
+    errors = rng.standard_normal((1000, size))
+    # an error e in the parent's axes is R^T e in axes turned by theta
+    seen = errors.copy()
+    seen[:, :2] = errors[:, :2] @ se2.rotation(theta)
+    expected = np.einsum('ni,ij,nj->n', errors, np.linalg.inv(cov), errors)
+    turned = covariance.turned(cov, theta)
+    np.testing.assert_allclose(
+        np.einsum('ni,ij,nj->n', seen, np.linalg.inv(turned), seen), expected, rtol=1e-6)
+
+
+@given(seeds, st.floats(-7.0, 7.0), st.floats(-7.0, 7.0))
+def test_turns_add_up_and_leave_the_size(seed: int, first: float, second: float) -> None:
+    cov = random_covariance(seed)
+    scale = np.max(cov)
+    np.testing.assert_allclose(
+        covariance.turned(covariance.turned(cov, first), second),
+        covariance.turned(cov, first + second), atol=ROUNDING * scale)
+    turned = covariance.turned(cov, first)
+    assert np.trace(turned[:2, :2]) == pytest.approx(np.trace(cov[:2, :2]), rel=ROUNDING)
+    assert turned[2, 2] == cov[2, 2]
+
+
+def test_a_long_error_ahead_of_a_robot_that_faces_north_is_an_error_in_north() -> None:
+    ahead = np.diag([9.0, 1.0, 0.1])
+    in_map = covariance.turned(ahead, -0.5 * np.pi)
+    np.testing.assert_allclose(in_map, np.diag([1.0, 9.0, 0.1]), atol=ROUNDING)
+    np.testing.assert_allclose(
+        covariance.turned(in_map, 0.5 * np.pi), ahead, atol=ROUNDING)
+
+
+# --- odometry --------------------------------------------------------------------------------
+
+NOISE = OdometryNoise(sigma_distance=0.05, sigma_lateral=0.03, sigma_heading_distance=0.02,
+                      sigma_heading_turn=0.05, sigma_floor_position=0.01,
+                      sigma_floor_heading=0.001)
+
+
+def odometry(
+    increment: FloatArray, distance: float, turn: float, noise: OdometryNoise = NOISE,
+    **options: bool,
+) -> FloatArray:
+    return odometry_covariance(noise, Motion(increment, distance, turn), **options)
+
+
+def composed(first: FloatArray, second: FloatArray, increment: FloatArray) -> FloatArray:
+    """Return the covariance at the end of two increments, in the frame there."""
+    propagate = se2.adjoint(se2.inverse(increment))
+    return propagate @ first @ propagate.T + second
+
+
+@given(st.floats(0.0, 20.0), st.integers(1, 9))
+def test_the_parts_of_a_straight_increment_compose_to_the_whole(
+    distance: float, parts: int,
+) -> None:
+    step = distance / parts
+    part = odometry(np.array([step, 0.0, 0.0]), step, 0.0, floor=False)
+    total = np.zeros((3, 3))
+    for _ in range(parts):
+        total = composed(total, part, np.array([step, 0.0, 0.0]))
+    whole = odometry(np.array([distance, 0.0, 0.0]), distance, 0.0, floor=False)
+    np.testing.assert_allclose(total, whole, rtol=1e-9, atol=1e-15)
+
+
+@given(st.floats(0.0, 3.0), st.floats(0.0, 3.0))
+def test_the_parts_of_a_turn_in_place_compose_to_the_whole(first: float, second: float) -> None:
+    parts = [odometry(np.array([0.0, 0.0, turn]), 0.0, turn, floor=False)
+             for turn in (first, second)]
+    whole = odometry(np.array([0.0, 0.0, first + second]), 0.0, first + second, floor=False)
+    np.testing.assert_allclose(
+        composed(*parts, np.array([0.0, 0.0, second])), whole, atol=ROUNDING)
+
+
+def sampled_random_walk(distance: float) -> FloatArray:
+    """Drive straight ahead (or back, if negative) with a heading that walks; in the end frame."""
+    rng = np.random.default_rng(4)
+    n_drives, n_steps = 20_000, 100
+    sigma = NOISE.sigma_heading_distance * np.sqrt(abs(distance) / n_steps)
+    pose = np.zeros((n_drives, 3))
+    for _ in range(n_steps):
+        pose[:, 2] += 0.5 * sigma * rng.standard_normal(n_drives)
+        pose = se2.compose(pose, np.array([distance / n_steps, 0.0, 0.0]))
+        pose[:, 2] += np.sqrt(0.75) * sigma * rng.standard_normal(n_drives)
+    # the end as it was, seen from where it was thought to be: error in the frame at the end
+    return np.cov(se2.between(np.array([distance, 0.0, 0.0]), pose).T)
+
+
+def heading_part(distance: float) -> FloatArray:
+    noise = OdometryNoise(sigma_distance=0.0, sigma_lateral=0.0, sigma_heading_turn=0.0,
+                          sigma_heading_distance=NOISE.sigma_heading_distance)
+    return odometry(
+        np.array([distance, 0.0, 0.0]), abs(distance), 0.0, noise, floor=False)
+
+
+def test_a_walking_heading_shows_across_the_path_as_it_does_in_samples() -> None:
+    # 2e4 drives: 0.7 % one sigma, and 100 steps instead of a walk: 1 %
+    np.testing.assert_allclose(
+        sampled_random_walk(10.0)[1:, 1:], heading_part(10.0)[1:, 1:], rtol=0.05)
+
+
+def test_a_walking_heading_shows_across_the_path_when_reversing_too() -> None:
+    np.testing.assert_allclose(
+        sampled_random_walk(-10.0)[1:, 1:], heading_part(-10.0)[1:, 1:], rtol=0.05)
+
+
+@given(st.floats(0.0, 100.0), st.floats(0.0, 10.0))
+def test_odometry_that_has_a_floor_is_always_a_covariance(distance: float, turn: float) -> None:
+    increment = np.array([0.6 * distance, -0.8 * distance, turn])
+    cov = odometry(increment, distance, turn)
+    assert covariance.defect(cov) is None
+    bare = odometry(increment, distance, turn, floor=False)
+    np.testing.assert_allclose(cov - bare, np.diag([1e-4, 1e-4, 1e-6]), atol=1e-9)
+    assert np.min(np.linalg.eigvalsh(bare)) > -ROUNDING
+
+
+VARIANCE = np.array([0.04, 0.01, 0.0025])
+
+
+def test_the_variance_that_a_motion_brings_is_added_and_its_heading_sweeps_the_end() -> None:
+    increment = np.array([3.0, 1.0, 0.7])
+    silent = OdometryNoise(sigma_distance=0.0, sigma_lateral=0.0, sigma_heading_distance=0.0,
+                           sigma_heading_turn=0.0)
+    cov = odometry_covariance(
+        silent, Motion(increment, 4.0, 0.7, VARIANCE), floor=False)
+    # the same heading noise by the model
+    by_path = OdometryNoise(sigma_distance=0.0, sigma_lateral=0.0, sigma_heading_turn=0.0,
+                            sigma_heading_distance=float(np.sqrt(VARIANCE[2] / 4.0)))
+    expected = odometry(increment, 4.0, 0.7, by_path, floor=False)
+    expected[0, 0] += VARIANCE[0]
+    expected[1, 1] += VARIANCE[1]
+    np.testing.assert_allclose(cov, expected, atol=ROUNDING)
+
+
+def test_no_heading_is_less_certain_than_a_flat_guess() -> None:
+    cov = odometry(np.array([1e6, 0.0, 0.0]), 1e6, 0.0)
+    assert cov[2, 2] <= covariance.UNKNOWN_HEADING_VARIANCE + NOISE.sigma_floor_heading**2
+    assert covariance.defect(cov) is None
+
+
+# --- propagation -----------------------------------------------------------------------------
+
+@given(seeds)
+def test_propagation_follows_the_numeric_jacobians(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    pose, increment = rng.uniform(-3.0, 3.0, (2, 3))
+    cov, noise = (root @ root.T for root in rng.uniform(-1.0, 1.0, (2, 3, 3)))
+    step, end = 1e-6, se2.compose(pose, increment)
+    by_pose, by_noise = np.zeros((2, 3, 3))
+    for k, axis in enumerate(np.eye(3)):
+        moved = se2.compose(pose + step * axis, increment) - end
+        shaken = se2.compose(end, step * axis) - end
+        for column, difference in ((by_pose, moved), (by_noise, shaken)):
+            difference[2] = se2.wrap(difference[2])
+            column[:, k] = difference / step
+    expected = by_pose @ cov @ by_pose.T + by_noise @ noise @ by_noise.T
+    np.testing.assert_allclose(
+        covariance.propagated(pose, cov, increment, noise), expected, atol=1e-3)
+
+
+def test_propagation_agrees_with_samples() -> None:
+    rng = np.random.default_rng(5)
+    pose, increment = np.array([1.0, -2.0, 0.8]), np.array([2.0, 0.3, 0.4])
+    cov = 1e-4 * np.array([[4.0, 1.0, 0.5], [1.0, 3.0, -0.4], [0.5, -0.4, 1.0]])
+    noise = 1e-4 * np.array([[1.0, 0.2, 0.1], [0.2, 2.0, 0.6], [0.1, 0.6, 0.8]])
+    poses = pose + rng.multivariate_normal(np.zeros(3), cov, N_SAMPLES)
+    shakes = rng.multivariate_normal(np.zeros(3), noise, N_SAMPLES)
+    ends = se2.compose(poses, se2.compose(np.tile(increment, (N_SAMPLES, 1)), shakes))
+    assert_covariances_agree(
+        np.cov(ends.T), covariance.propagated(pose, cov, increment, noise))

@@ -1,0 +1,340 @@
+# Copyright 2026 The pose_graph_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""A `GraphUpdate` is applied whole or not at all; a rollback reverts it bit for bit."""
+
+from collections.abc import Callable
+from dataclasses import fields
+
+from hypothesis import given, strategies as st
+import numpy as np
+import pytest
+from random_graphs import (
+    dense_system,
+    random_edges,
+    random_edges_to_biases,
+    random_graph,
+    random_observed,
+    random_poses,
+    slow_edge,
+    slow_observed,
+    snapshot,
+)
+
+from pose_graph_ros.core.exceptions import GraphUpdateError
+from pose_graph_ros.core.graph import editing
+from pose_graph_ros.core.graph.constraints import EdgeKind, Edges, ObservedKind, ObservedNodes
+from pose_graph_ros.core.graph.graph import Graph, GraphUpdate
+
+# A graph of seven nodes, 0 to 6, is edited here.
+N_NODES = 7
+seeds = st.integers(0, 2**32 - 1)
+
+ASYMMETRIC = np.eye(3) + np.array([[0.0, 0.1, 0.0], [0.0] * 3, [0.0] * 3])
+NEGATIVE = np.diag([1.0, 1.0, -0.1])
+NOT_FINITE = np.diag([1.0, np.inf, 1.0])
+
+
+def edge(
+    i: object = (0,), j: object = (1,), mean: object = ((1.0, 0.0, 0.0),),
+    information: object = (np.eye(3),), kind: object = (EdgeKind.ODOMETRY,),
+) -> GraphUpdate:
+    return GraphUpdate(edges=Edges(i, j, mean, information, kind))
+
+
+def edge_to_bias(bias: object) -> GraphUpdate:
+    return GraphUpdate(biases=np.zeros((1, 3)), edges=Edges(
+        [0], [N_NODES], np.zeros((1, 3)), [np.eye(3)], [EdgeKind.BIAS], bias=bias))
+
+
+def observed(
+    node: object = (0,), offset: object = None, mean: object = ((1.0, 0.0, 0.0),),
+    information: object = (np.eye(3),), kind: object = (ObservedKind.GLOBAL_POSE,),
+) -> GraphUpdate:
+    return GraphUpdate(observed=ObservedNodes(node, offset, mean, information, kind))
+
+
+# Invalid updates, with a pattern of the message: what was expected, and the value.
+BAD_UPDATES = {
+    'hidden_shape': (lambda: GraphUpdate(hidden=np.zeros((2, 2))), r'\(N, 3\).*\(2, 2\)'),
+    'hidden_flat': (lambda: GraphUpdate(hidden=np.zeros(3)), r'\(N, 3\).*\(3,\)'),
+    'hidden_nan': (lambda: GraphUpdate(hidden=np.full((1, 3), np.nan)), 'finite'),
+    'fix_outside': (lambda: GraphUpdate(fix=(7,)), r'fix.*0\.\.6.*7'),
+    'fix_negative': (lambda: GraphUpdate(fix=(-1,)), r'fix.*0\.\.6.*-1'),
+    'fix_no_integer': (lambda: GraphUpdate(hidden=np.zeros((1, 3)), fix=(0.5,)), r'fix.*0\.5'),
+    'free_outside': (lambda: GraphUpdate(free=(9,)), r'free.*0\.\.6.*9'),
+    'weight_negative': (
+        lambda: GraphUpdate(weigh_edges={0: -0.1}), r'weigh_edges.*not negative, got -0\.1.*0'),
+    'weight_nan': (
+        lambda: GraphUpdate(weigh_observed={1: np.nan}), 'weigh_observed.*finite.*nan.*number 1'),
+    'edge_i_outside': (lambda: edge(i=[7]), r'Edges.*0\.\.6.*row 0: 7'),
+    'edge_j_outside': (lambda: edge(j=[-1]), r'Edges.*0\.\.6.*row 0: -1'),
+    'edge_to_itself': (lambda: edge(i=[3], j=[3]), 'itself.*row 0: 3'),
+    'edge_lengths': (lambda: edge(j=[1, 2]), r'Edges\.j.*\(1,\).*\(2,\)'),
+    'edge_mean_shape': (lambda: edge(mean=[[1.0, 2.0]]), r'Edges\.mean.*\(1, 3\).*\(1, 2\)'),
+    'edge_mean_nan': (lambda: edge(mean=[[np.nan, 0.0, 0.0]]), r'Edges\.mean.*finite.*nan'),
+    'edge_information_shape': (
+        lambda: edge(information=[np.eye(2)]), r'information.*\(1, 3, 3\).*\(1, 2, 2\)'),
+    'edge_information_inf': (
+        lambda: edge(information=[NOT_FINITE]), r'Edges\.information.*finite.*inf'),
+    'edge_information_asymmetric': (
+        lambda: edge(information=[ASYMMETRIC]), r'Edges\.information.*symmetric.*row 0'),
+    'edge_information_negative': (
+        lambda: edge(information=[NEGATIVE]), r'Edges\.information.*semidefinite.*row 0'),
+    'edge_information_negative_beside_large': (
+        lambda: edge(information=[np.diag([4e8, -100.0, 1.0])]),
+        r'Edges\.information.*semidefinite.*row 0'),
+    'edge_information_asymmetric_beside_large': (
+        lambda: edge(information=[1e12 * np.diag([1.0, 0.0, 0.0]) + ASYMMETRIC[::-1, ::-1]]),
+        r'Edges\.information.*symmetric.*row 0'),
+    'edge_information_huge_correlation': (
+        lambda: edge(information=[np.diag([1e-300] * 3) + 1e300 * (np.ones((3, 3)) - np.eye(3))]),
+        r'Edges\.information.*semidefinite.*row 0'),
+    'edge_information_zero': (
+        lambda: edge(information=[np.zeros((3, 3))]), r'Edges\.information.*row 0'),
+    'edge_kind_missing': (lambda: edge(kind=()), r'Edges\.kind.*\(1,\).*\(0,\)'),
+    'edge_to_a_pose_as_a_bias': (
+        lambda: edge(kind=[EdgeKind.BIAS]), r'kind BIAS to lead to a bias; row 0: 1'),
+    'edge_to_a_bias_of_another_kind': (
+        lambda: edge(j=[7])._replace(biases=np.zeros((1, 3))), r'other kind than BIAS.*\[0, 7\]'),
+    'edge_bias_shape': (
+        lambda: edge_to_bias([[1.0, 1.0]]), r'Edges\.bias.*\(1, 4\).*\(1, 2\)'),
+    'edge_bias_inf': (
+        lambda: edge_to_bias([[0.0, 0.0, np.inf, 1.0]]), r'Edges\.bias.*finite.*inf'),
+    'biases_shape': (lambda: GraphUpdate(biases=np.zeros((2, 2))), r'biases.*\(N, 3\).*\(2, 2\)'),
+    'biases_nan': (lambda: GraphUpdate(biases=np.full((1, 3), np.nan)), 'biases.*finite'),
+    'edge_second_row': (
+        lambda: edge([0, 2], [1, 9], np.zeros((2, 3)), [np.eye(3)] * 2, [0, 0]), 'row 1: 9'),
+    'observed_outside': (lambda: observed(node=[7]), r'ObservedNodes.*0\.\.6.*row 0: 7'),
+    'observed_offset_shape': (
+        lambda: observed(offset=[[0.0, 0.0]]), r'offset.*\(1, 3\).*\(1, 2\)'),
+    'observed_offset_inf': (
+        lambda: observed(offset=[[0.0, np.inf, 0.0]]), r'offset.*finite.*inf'),
+    'observed_mean_nan': (
+        lambda: observed(mean=[[0.0, np.nan, 0.0]]), r'ObservedNodes\.mean.*finite.*nan'),
+    'observed_information_asymmetric': (
+        lambda: observed(information=[ASYMMETRIC]), r'ObservedNodes\.information.*symmetric'),
+    'observed_information_negative': (
+        lambda: observed(information=[NEGATIVE]), r'ObservedNodes\.information.*semidefinite'),
+}
+
+
+@pytest.mark.parametrize('name', BAD_UPDATES)
+def test_a_bad_update_leaves_the_graph_bit_equal_and_says_why(name: str) -> None:
+    make, message = BAD_UPDATES[name]
+    graph = random_graph(seed=1, n_nodes=N_NODES, fix=(2,))
+    before = snapshot(graph)
+    with pytest.raises(GraphUpdateError, match=message):
+        graph.apply(make())
+    assert snapshot(graph) == before
+
+
+@pytest.mark.parametrize('name', BAD_UPDATES)
+def test_no_part_of_an_update_is_applied_where_another_is_bad(name: str) -> None:
+    bad, rng = BAD_UPDATES[name][0](), np.random.default_rng(2)
+    good = GraphUpdate(edges=random_edges(rng, [6], [0]), observed=random_observed(rng, [3]),
+                       fix=(1,), free=(2,))
+    mixed = good._replace(**{
+        part: rows for part, rows in bad._asdict().items() if len(rows) > 0})
+    graph = random_graph(seed=1, n_nodes=N_NODES, fix=(2,))
+    before = snapshot(graph)
+    with pytest.raises(GraphUpdateError):
+        graph.apply(mixed)
+    assert snapshot(graph) == before
+
+
+def test_the_rows_that_were_refused_are_gone_from_later_updates_too() -> None:
+    graph = random_graph(seed=3, n_nodes=N_NODES)
+    with pytest.raises(GraphUpdateError):
+        graph.apply(edge(j=[99]))
+    n_edges = len(graph.edges)
+    graph.apply(edge(j=[2]))
+    assert len(graph.edges) == n_edges + 1
+    assert graph.edges.j[-1] == 2
+
+
+def test_new_constraints_may_lead_to_the_new_hidden_nodes() -> None:
+    rng = np.random.default_rng(4)
+    graph = Graph()
+    graph.apply(GraphUpdate(
+        hidden=random_poses(rng, 3), edges=random_edges(rng, [0, 2], [1, 0]),
+        observed=random_observed(rng, [2]), fix=(1,)))
+    assert graph.n_nodes == 3
+    np.testing.assert_array_equal(graph.edges.i, [0, 2])
+    np.testing.assert_array_equal(graph.fixed, [False, True, False])
+    graph.apply(GraphUpdate(free=(1,), fix=(0,)))
+    np.testing.assert_array_equal(graph.fixed, [True, False, False])
+
+
+def test_headings_are_wrapped_when_they_come_in() -> None:
+    graph = Graph()
+    graph.apply(GraphUpdate(hidden=[[1.0, 2.0, np.pi], [1.0, 2.0, 7.0]]))
+    np.testing.assert_allclose(graph.poses[:, 2], [-np.pi, 7.0 - 2.0 * np.pi], atol=1e-15)
+
+
+def strided(array: np.ndarray) -> np.ndarray:
+    return np.repeat(array, 2, axis=0)[::2]
+
+
+def read_only(array: np.ndarray) -> np.ndarray:
+    array = array.copy()
+    array.flags.writeable = False
+    return array
+
+
+@pytest.mark.parametrize('odd', [
+    strided, read_only, np.asfortranarray, np.ndarray.tolist, lambda array: array.astype(
+        array.dtype.newbyteorder())], ids=['strided', 'read_only', 'fortran', 'lists', 'swapped'])
+def test_whatever_the_arrays_are_like_the_rows_are_the_same(
+    odd: Callable[[np.ndarray], object],
+) -> None:
+    rng = np.random.default_rng(10)
+    hidden, edges = random_poses(rng, 3), random_edges(rng, [0, 2, 1], [1, 0, 2])
+    observed = random_observed(rng, [2, 0])
+    usual, other = Graph(), Graph()
+    usual.apply(GraphUpdate(hidden=hidden, edges=edges, observed=observed))
+    signatures = len(editing.add_rows.signatures)
+    other.apply(GraphUpdate(
+        hidden=odd(hidden), edges=Edges(*map(odd, edges.columns)),
+        observed=ObservedNodes(*map(odd, observed.columns))))
+    assert snapshot(other) == snapshot(usual)
+    assert len(editing.add_rows.signatures) == signatures
+
+
+def test_tables_of_empty_lists_add_nothing() -> None:
+    graph = random_graph(seed=11)
+    before = snapshot(graph)
+    graph.apply(GraphUpdate(
+        edges=Edges([], [], [], [], []), observed=ObservedNodes([], None, [], [], [])))
+    assert snapshot(graph) == before
+    with pytest.raises(GraphUpdateError, match=r'\(N, 3\).*\(0,\)'):
+        graph.apply(GraphUpdate(hidden=[]))
+
+
+def test_rows_that_only_the_full_validation_accepts_are_added() -> None:
+    graph, far = random_graph(seed=12, n_nodes=N_NODES), [[1e301, 0.0, 0.0]]
+    information = [np.eye(3) + 5e-6 * np.eye(3)[::-1] * [0.0, 0.0, 1.0]]  # files print few digits
+    for _ in range(40):     # more than the first tables hold
+        graph.apply(edge(information=information))
+    graph.apply(GraphUpdate(hidden=far))
+    assert graph.n_nodes == N_NODES + 1
+    assert graph.poses[-1, 0] == far[0][0]
+
+
+@pytest.mark.parametrize('poses', [
+    np.zeros((6, 3)), np.zeros((7, 2)), np.full((7, 3), np.inf)], ids=['few', 'flat', 'inf'])
+def test_poses_that_do_not_fit_are_refused(poses: np.ndarray) -> None:
+    graph = random_graph(seed=5, n_nodes=N_NODES)
+    before = snapshot(graph)
+    with pytest.raises(GraphUpdateError, match=r'\(7, 3\)'):
+        graph.set_poses(poses)
+    assert snapshot(graph) == before
+
+
+def test_writing_to_what_leaves_the_graph_does_not_change_it() -> None:
+    graph = random_graph(seed=6)
+    before = snapshot(graph)
+    with pytest.raises(ValueError, match='read-only'):
+        graph.poses[0] = 0.0
+    # copies
+    for table in (graph.edges, graph.observed):
+        for item in fields(table):
+            getattr(table, item.name)[0] = 1
+    graph.fixed[0] = True
+    assert snapshot(graph) == before
+
+
+def grow(graph: Graph, rng: np.random.Generator, n: int) -> None:
+    first = graph.n_nodes
+    before = [graph.newest_pose, *range(first, first + n - 1)]
+    graph.apply(GraphUpdate(
+        hidden=random_poses(rng, n), edges=Edges.joined([
+            random_edges(rng, before, list(range(first, first + n))),
+            random_edges_to_biases(rng, [first, first], [first + n, first + n])]),
+        biases=random_poses(rng, 1),
+        observed=random_observed(rng, list(range(first, first + n))), fix=(first,), free=(0,)))
+
+
+@given(seeds, st.lists(st.integers(1, 20), min_size=1, max_size=4))
+def test_rollback_reverts_every_edit_bit_for_bit(
+    seed: int, sizes: list[int],
+) -> None:
+    rng = np.random.default_rng(seed)
+    graph = random_graph(seed, fix=(0,), n_biases=2)
+    before = snapshot(graph)
+    graph.begin()
+    for size in sizes:
+        grow(graph, rng, size)
+        graph.apply(GraphUpdate(
+            remove_edges=(0,), remove_observed=(1,), weigh_edges={2: 0.5},
+            weigh_observed={0: 3.0}))
+    assert snapshot(graph) != before
+    graph.rollback()
+    assert snapshot(graph) == before
+    # later updates have the same result as without the rollback
+    other = random_graph(seed, fix=(0,), n_biases=2)
+    grow(graph, np.random.default_rng(seed), 5)
+    grow(other, np.random.default_rng(seed), 5)
+    assert snapshot(graph) == snapshot(other)
+
+
+def test_rollback_returns_to_the_last_begin_and_no_further() -> None:
+    rng = np.random.default_rng(7)
+    graph = random_graph(seed=7)
+    graph.begin()
+    grow(graph, rng, 3)
+    before = snapshot(graph)
+    graph.begin()
+    grow(graph, rng, 4)
+    graph.rollback()
+    assert snapshot(graph) == before
+
+
+@given(seeds)
+def test_chi2_is_the_sum_of_all_energies(seed: int) -> None:
+    graph = random_graph(seed)
+    energies = graph.energies()
+    edges, unary = graph.edges, graph.observed
+    for k in range(len(edges)):
+        error, _, _ = slow_edge(graph.poses[edges.i[k]], graph.poses[edges.j[k]], edges.mean[k])
+        assert energies.edges[k] == pytest.approx(error @ edges.information[k] @ error, rel=1e-9)
+    for k in range(len(unary)):
+        error, _ = slow_observed(graph.poses[unary.node[k]], unary.offset[k], unary.mean[k])
+        assert energies.observed[k] == pytest.approx(
+            error @ unary.information[k] @ error, rel=1e-9, abs=1e-12)
+    assert energies.chi2 == pytest.approx(
+        np.sum(energies.edges) + np.sum(energies.observed), rel=1e-12)
+
+
+def test_the_gradient_of_chi2_is_twice_b() -> None:
+    graph = random_graph(seed=8)
+    _, b = dense_system(graph)
+    step = 1e-6
+
+    def chi2(shift: np.ndarray) -> float:
+        return graph.energies(graph.poses + shift.reshape(-1, 3)).chi2
+
+    numeric = [(chi2(step * axis) - chi2(-step * axis)) / (2.0 * step)
+               for axis in np.eye(3 * graph.n_nodes)]
+    np.testing.assert_allclose(numeric, 2.0 * b, rtol=1e-6, atol=1e-4)
+
+
+def test_adding_one_by_one_equals_adding_at_once() -> None:
+    at_once = random_graph(seed=9)
+    edges, unary = at_once.edges, at_once.observed
+    one_by_one = Graph()
+    append: Callable[[GraphUpdate], None] = one_by_one.apply
+    for pose in at_once.poses:
+        append(GraphUpdate(hidden=pose[None]))
+    for k in range(len(edges)):
+        append(GraphUpdate(edges=edges.rows(slice(k, k + 1))))
+    for k in range(len(unary)):
+        append(GraphUpdate(observed=unary.rows(slice(k, k + 1))))
+    assert snapshot(one_by_one) == snapshot(at_once)
+
+
+@pytest.mark.parametrize('make', [
+    lambda: edge(i=[0.5]), lambda: edge(j=['1']), lambda: observed(node=[True]),
+    lambda: edge(kind=[0.0])])
+def test_numbers_of_nodes_and_kinds_are_never_rounded(make: Callable[[], GraphUpdate]) -> None:
+    with pytest.raises(GraphUpdateError, match='expected integers, got'):
+        make()

@@ -1,0 +1,158 @@
+# Copyright 2026 The pose_graph_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""Reweighting: each constraint gets the weight of its loss, in time independent of the graph."""
+
+from hypothesis import given, settings, strategies as st
+import numpy as np
+import pytest
+from random_graphs import random_graph
+from saved_graphs import assert_same_value
+
+from pose_graph_ros.core.config import Loss
+from pose_graph_ros.core.graph import error_functions, losses, reweighting
+from pose_graph_ros.core.graph.graph import Graph, GraphUpdate
+from pose_graph_ros.core.graph.reweighting import Reweighting
+
+seeds = st.integers(0, 2**32 - 1)
+some_losses = st.lists(
+    st.tuples(st.sampled_from(Loss), st.floats(0.1, 10.0), st.floats(0.05, 1.0)),
+    min_size=9, max_size=9)
+
+
+def registered(chosen: list[tuple[Loss, float, float]], graph: Graph) -> Reweighting:
+    """Return the first edges and observed nodes of a graph with these losses."""
+    some = Reweighting()
+    for row, (loss, threshold, base) in enumerate(chosen):
+        some.add(row, loss, threshold, edge=True)
+        if row < graph.n_observed:
+            some.add(row, loss, threshold, edge=False)
+            some.set_base_weight(row, base)
+    return some
+
+
+def energies(graph: Graph) -> tuple[np.ndarray, np.ndarray]:
+    """Return the energies without weights of all edges and observed nodes."""
+    edges, observed = graph.edges, graph.observed
+    return (error_functions.energies(
+                error_functions.edge_errors(graph.poses, edges), edges.information),
+            error_functions.energies(
+                error_functions.observed_errors(graph.poses, observed), observed.information))
+
+
+@given(seeds, some_losses, st.sampled_from([1.0, 4.0]))
+@settings(max_examples=40)
+def test_every_weight_is_that_of_the_loss_times_the_base_weight(
+    seed: int, chosen: list[tuple[Loss, float, float]], widened: float,
+) -> None:
+    graph = random_graph(seed)
+    some = registered(chosen, graph)
+    found = some.all_changes(graph, widened)
+    for changed, energy, with_base in zip(found, energies(graph), (False, True), strict=True):
+        expected = {
+            row: (base if with_base else 1.0) * float(losses.weights(
+                loss, energy[row:row + 1], widened * threshold)[0])
+            for row, (loss, threshold, base) in enumerate(chosen[:len(energy)])
+            if loss is not Loss.NONE}
+        # all others have that weight already
+        assert changed == pytest.approx({k: v for k, v in expected.items() if v != 1.0})
+    graph.apply(GraphUpdate(weigh_edges=found[0], weigh_observed=found[1]))
+    assert some.all_changes(graph, widened) == ({}, {})
+
+
+@given(seeds, some_losses)
+@settings(max_examples=40)
+def test_with_the_cost_chi2_is_the_sum_of_the_robust_costs(
+    seed: int, chosen: list[tuple[Loss, float, float]],
+) -> None:
+    graph = random_graph(seed)
+    some = registered(chosen, graph)
+    edges, observed = some.all_changes(graph)
+    graph.apply(GraphUpdate(weigh_edges=edges, weigh_observed=observed))
+    expected = 0.0
+    for energy, with_base in zip(energies(graph), (False, True), strict=True):
+        for row, each in enumerate(energy):
+            loss, threshold, base = (
+                chosen[row] if row < len(chosen) else (Loss.NONE, 1.0, 1.0))
+            base = base if with_base and loss is not Loss.NONE else 1.0
+            expected += base * float(losses.costs(loss, np.array([each]), threshold)[0])
+    assert graph.energies().chi2 + some.cost(graph) == pytest.approx(expected)
+
+
+def test_constraints_without_a_loss_are_not_counted_and_cost_nothing() -> None:
+    graph, some = random_graph(3), Reweighting()
+    for row in range(5):
+        some.add(row, Loss.NONE, 3.0, edge=True)
+        some.add(row, Loss.NONE, 3.0, edge=False)
+        some.set_base_weight(row, 0.5)
+    assert len(some) == 0
+    assert some.cost(graph) == 0.0
+    assert some.changes(graph) == ({}, {})
+    assert some.all_alike(0.5) == ({}, {})
+
+
+def test_alike_are_the_base_weights_times_a_weight() -> None:
+    some = Reweighting()
+    for row in (2, 5, 9):
+        some.add(row, Loss.HUBER, 3.0, edge=True)
+        some.add(row, Loss.HUBER, 3.0, edge=False)
+    some.set_base_weight(5, 0.25)
+    some.set_base_weight(6, 0.1)    # has no loss
+    some.set_base_weight(10, 0.1)
+    assert some.all_alike(1e-2) == (
+        {2: 0.01, 5: 0.01, 9: 0.01}, {2: 0.01, 5: 0.0025, 9: 0.01})
+    assert len(some) == 6
+
+
+@pytest.mark.parametrize(('weight', 'changes'), [(0.999, False), (0.99, True), (1.01, True)])
+def test_an_update_ignores_changes_of_less_than_half_a_percent(
+    weight: float, changes: bool,
+) -> None:
+    graph, some = random_graph(1), Reweighting()
+    some.add(4, Loss.CAUCHY, 2.0, edge=True)
+    target = float(some.all_changes(graph)[0][4])
+    graph.apply(GraphUpdate(weigh_edges={4: weight * target}))
+    found, _ = some.changes(graph)
+    assert found == ({4: target} if changes else {})
+    assert some.all_changes(graph)[0] == {4: target}
+
+
+def robust_edges(graph: Graph) -> Reweighting:
+    some = Reweighting()
+    for row in range(graph.n_edges):
+        some.add(row, Loss.CAUCHY, 0.1, edge=True)
+    return some
+
+
+def test_the_newest_are_reweighted_at_every_update_and_all_others_in_turn(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr(reweighting, 'WINDOW', 4)
+    graph = random_graph(2, n_edges=20)     # with three duplicates
+    some, seen = robust_edges(graph), []
+    for _ in range(5):
+        changed = sorted(some.changes(graph)[0])
+        assert len(changed) == 8
+        assert changed[4:] == [19, 20, 21, 22]
+        seen += changed[:4]
+    # and from the beginning again
+    assert np.bincount(seen).tolist() == [2] + 18 * [1]
+
+
+def test_a_saved_state_goes_on_with_the_constraint_that_is_next(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr(reweighting, 'WINDOW', 4)
+    graph = random_graph(2, n_edges=20)
+    one, other = robust_edges(graph), Reweighting()
+    one.add(3, Loss.HUBER, 2.0, edge=False)
+    one.set_base_weight(3, 0.5)
+    for _ in range(3):
+        one.changes(graph)
+    other.restore(*one.saved())
+    assert_same_value(other.saved(), one.saved())
+    for _ in range(4):
+        assert other.changes(graph) == one.changes(graph)
+    # and it grows on
+    for each in (one, other):
+        each.add(4, Loss.CAUCHY, 1.0, edge=False)
+    assert_same_value(other.saved(), one.saved())

@@ -1,0 +1,113 @@
+# Copyright 2026 The pose_graph_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""A rollback restores every table; no memory of the pools is lost, shared or given back twice."""
+
+from hypothesis import given, settings, strategies as st
+import numpy as np
+from slow_smoother import differences, EXACT, SlowGraph, state, World, world
+
+from pose_graph_ros.core.batch.optimizer import Status
+from pose_graph_ros.core.graph import pools, tables as tb
+from pose_graph_ros.core.graph.graph import Graph, GraphUpdate
+from pose_graph_ros.core.smoother.incremental import IncrementalSmoother
+
+seeds = st.integers(0, 2**32 - 1)
+
+
+def begun(seed: int) -> tuple[World, IncrementalSmoother, SlowGraph]:
+    simulation, smoother = world(seed), IncrementalSmoother(EXACT)
+    first = GraphUpdate(hidden=np.array(simulation.truth), fix=[0])
+    smoother.update(first)
+    return simulation, smoother, SlowGraph().edited(first)
+
+
+def free_blocks(graph: Graph, heads: int, pool: np.ndarray) -> list[tuple[int, int]]:
+    """Return the blocks (begin, size) of the free lists of a pool."""
+    blocks = []
+    for size, first in enumerate(graph.memory.head[heads:heads + tb.N_SIZES].tolist()):
+        at = first
+        while at >= 0:
+            blocks.append((at, tb.SIZES[size]))
+            at = int(pool[at])
+    return blocks
+
+
+def used_blocks(graph: Graph) -> tuple[list[tuple[int, int]], list[tuple[int, int]]]:
+    """Return the blocks of the lists of nodes and of the values of all cliques."""
+    nodes, values = [], []
+    for row in graph.memory['clique_i'][:graph.memory.head[tb.N_CLIQUES]]:
+        if row[tb.N_FRONTAL] > 0:
+            frontal, separator = int(row[tb.N_FRONTAL]), int(row[tb.N_SEPARATOR])
+            nodes.append((int(row[tb.NODES]), int(pools.rounded(frontal + separator))))
+            values.append((int(row[tb.VALUES]),
+                           int(pools.rounded(pools.n_values(frontal, separator)))))
+    return nodes, values
+
+
+def assert_pools_are_whole(graph: Graph) -> None:
+    """Assert that each number of a pool is in one block, of one clique or of a free list."""
+    head = graph.memory.head
+    nodes, values = used_blocks(graph)
+    for used, heads, name, end in ((nodes, tb.FREE_I, 'pool_i', tb.POOL_I_END),
+                                   (values, tb.FREE_F, 'pool_f', tb.POOL_F_END)):
+        blocks = sorted(used + free_blocks(graph, heads, graph.memory[name]))
+        ends = np.cumsum([0, *(size for _, size in blocks)])
+        assert [begin for begin, _ in blocks] == ends[:-1].tolist()
+        assert ends[-1] == head[end]
+    assert (head[tb.LOG_F_END], head[tb.LOG_I_END], head[tb.N_FREED]) == (0, 0, 0)
+
+
+@given(seeds, st.integers(1, 30))
+@settings(max_examples=40)
+def test_every_number_of_the_pools_belongs_to_one_clique_or_to_none(
+    seed: int, steps: int,
+) -> None:
+    simulation, smoother, slow = begun(seed)
+    for _ in range(steps):
+        update = simulation.mixture(slow)
+        if smoother.update(update).status is not Status.FAILED:
+            slow = slow.edited(update)
+        del simulation.truth[len(slow.poses):]
+        assert_pools_are_whole(smoother.graph)
+
+
+@given(seeds, st.integers(1, 15), st.integers(1, 3))
+@settings(max_examples=40)
+def test_edits_without_a_step_are_rolled_back_bit_for_bit(
+    seed: int, steps: int, edits: int,
+) -> None:
+    simulation, smoother, slow = begun(seed)
+    reference = begun(seed)[1]
+    for _ in range(steps):
+        update = simulation.mixture(slow)
+        before = state(smoother.graph)
+        smoother.graph.begin()
+        smoother.graph.apply(update)
+        for _ in range(edits - 1):
+            smoother.graph.apply(GraphUpdate(fix=[0], weigh_edges=dict.fromkeys(
+                range(min(smoother.graph.n_edges, 2)), 0.5)))
+        smoother.graph.rollback()
+        assert differences(before, state(smoother.graph)) == []
+        results = [each.update(update) for each in (smoother, reference)]
+        assert results[0][:2] == results[1][:2]
+        if results[0].status is not Status.FAILED:
+            slow = slow.edited(update)
+        del simulation.truth[len(slow.poses):]
+        assert differences(state(reference.graph), state(smoother.graph)) in ([], ['cliques'])
+        assert reference.poses.tobytes() == smoother.poses.tobytes()
+
+
+def test_many_rollbacks_take_no_memory() -> None:
+    simulation, smoother, slow = begun(7)
+    for _ in range(10):
+        smoother.update(simulation.new_nodes(3))
+    ends = []
+    for _ in range(50):
+        # an edge between distant nodes, and a node that is not determined
+        update = simulation.joined(simulation.new_part('none'), edges=simulation.edges([(1, 25)]))
+        del simulation.truth[-1:]
+        assert smoother.update(update).status is Status.FAILED
+        assert_pools_are_whole(smoother.graph)
+        ends.append(smoother.graph.memory.head[[tb.POOL_F_END, tb.POOL_I_END, tb.N_CLIQUES]])
+    assert np.all(ends[-1] == ends[1])
+    del slow

@@ -1,0 +1,323 @@
+# Copyright 2026 The pose_graph_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""The g2o format: round trips bit for bit, files of other programs, and invalid files."""
+
+from pathlib import Path
+import re
+
+from hypothesis import given, strategies as st
+import numpy as np
+import pytest
+from random_graphs import random_edges, random_information, random_poses, snapshot
+
+from pose_graph_ros.core.exceptions import FileFormatError
+from pose_graph_ros.core.geometry import se2
+from pose_graph_ros.core.graph.constraints import EdgeKind, Edges, ObservedKind, ObservedNodes
+from pose_graph_ros.core.graph.graph import Graph, GraphUpdate
+from pose_graph_ros.core.io.g2o import GraphFile, read_g2o, write_g2o
+
+seeds = st.integers(0, 2**32 - 1)
+IDENTITY = '1 0 0 1 0 1'
+
+
+@pytest.fixture(scope='module')
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return tmp_path_factory.mktemp('g2o')
+
+
+def read(folder: Path, text: str, edge2_order: str | None = None) -> GraphFile:
+    path = folder / 'graph.g2o'
+    path.write_text(text, encoding='utf-8')
+    return read_g2o(path, edge2_order)
+
+
+# --- round trips -----------------------------------------------------------------------------
+
+def sorted_observed(observed: ObservedNodes) -> ObservedNodes:
+    """Return the rows sorted by their numbers: a file does not keep their order across tags."""
+    order = np.lexsort(np.vstack((observed.mean.T, observed.node)))
+    return observed.rows(order)
+
+
+def exactly(symmetric: np.ndarray) -> np.ndarray:
+    """Return matrices that are symmetric to the last bit, as a file holds only one triangle."""
+    upper = np.triu(symmetric)
+    return upper + np.swapaxes(np.triu(symmetric, 1), -1, -2)
+
+
+def graph_of_all_kinds(seed: int, n: int = 6) -> Graph:
+    rng = np.random.default_rng(seed)
+    edges = random_edges(rng, [0, 1, 4, 2, 0, 3, 5, 0], [1, 2, 0, 3, 1, 2, 0, 1])
+    kind = np.where(edges.j - edges.i == 1, EdgeKind.ODOMETRY, EdgeKind.LOOP_CLOSURE)
+    information = exactly(random_information(rng, 4))
+    mean, offset = random_poses(rng, 4, 5e6), random_poses(rng, 4)
+    information[2:, 2, :] = information[2:, :, 2] = 0.0
+    mean[2:, 2] = 0.0
+    offset[[0, 2]] = 0.0      # a pose and a position without an offset, one of each with
+    graph = Graph()
+    graph.apply(GraphUpdate(
+        hidden=random_poses(rng, n, 5e6), fix=(1, 4),
+        edges=Edges(edges.i, edges.j, edges.mean, exactly(edges.information), kind),
+        observed=ObservedNodes(
+            [5, 3, 3, 0], offset, mean, information,
+            [ObservedKind.GLOBAL_POSE] * 2 + [ObservedKind.POSITION] * 2)))
+    return graph
+
+
+def assert_bit_equal(graph: Graph, expected: Graph) -> None:
+    assert graph.poses.tobytes() == expected.poses.tobytes()
+    assert graph.fixed.tobytes() == expected.fixed.tobytes()
+    for ours, theirs in ((graph.edges, expected.edges), (
+            sorted_observed(graph.observed), sorted_observed(expected.observed))):
+        for name in ours.__dataclass_fields__:
+            assert getattr(ours, name).tobytes() == getattr(theirs, name).tobytes(), name
+
+
+@given(seed=seeds, renamed=st.booleans())
+def test_a_graph_comes_back_bit_for_bit(folder: Path, seed: int, *, renamed: bool) -> None:
+    graph = graph_of_all_kinds(seed)
+    ids = np.array([-7, 3, 4, 100, 2**40, 2**62]) if renamed else None
+    path = folder / 'round_trip.g2o'
+    if renamed:     # the ids decide whether an edge is odometry
+        edges = graph.edges
+        kind = np.where(np.diff(ids[np.column_stack((edges.i, edges.j))], axis=1)[:, 0] == 1,
+                        EdgeKind.ODOMETRY, EdgeKind.LOOP_CLOSURE)
+        other = Graph()
+        other.apply(GraphUpdate(
+            hidden=graph.poses, fix=(1, 4), observed=graph.observed,
+            edges=Edges(edges.i, edges.j, edges.mean, edges.information, kind)))
+        graph = other
+    write_g2o(graph, path, ids)
+    file = read_g2o(path)
+    assert file.has_start
+    np.testing.assert_array_equal(file.ids, np.arange(6) if ids is None else ids)
+    assert_bit_equal(file.graph, graph)
+    lines = path.read_bytes().splitlines()
+    write_g2o(file.graph, path, file.ids)
+    assert sorted(path.read_bytes().splitlines()) == sorted(lines)
+
+
+def test_other_kinds_of_constraints_have_their_own_tags(folder: Path) -> None:
+    path = folder / 'tags.g2o'
+    write_g2o(graph_of_all_kinds(1), path)
+    tags = [line.split()[0] for line in path.read_text().splitlines()]
+    assert {tag: tags.count(tag) for tag in tags} == {
+        'VERTEX_SE2': 6, 'FIX': 2, 'EDGE_SE2': 8, 'EDGE_PRIOR_SE2': 1, 'EDGE_PRIOR_SE2_XY': 1,
+        'OBSERVED_SE2_OFFSET': 2}
+
+
+# --- files of other programs -----------------------------------------------------------------
+
+def test_ids_may_have_gaps_start_anywhere_and_come_in_any_order(folder: Path) -> None:
+    file = read(folder, f"""
+        # a comment
+        EDGE_SE2 450 441 1 2 0.5 {IDENTITY}
+        VERTEX_SE2 450 4 5 6
+        FIX 450
+        VERTEX_SE2 441 1 2 3
+
+        EDGE_SE2 441 442 1 0 0 {IDENTITY}
+        VERTEX_SE2 442 7 8 9
+    """)
+    np.testing.assert_array_equal(file.ids, [441, 442, 450])
+    np.testing.assert_allclose(
+        file.graph.poses, se2.wrapped(np.array([[1, 2, 3], [7, 8, 9], [4, 5, 6.0]])))
+    np.testing.assert_array_equal(file.graph.edges.i, [2, 0])     # a reversed edge stays so
+    np.testing.assert_array_equal(file.graph.edges.j, [0, 1])
+    np.testing.assert_array_equal(file.graph.edges.mean[0], [1.0, 2.0, 0.5])
+    np.testing.assert_array_equal(
+        file.graph.edges.kind, [EdgeKind.LOOP_CLOSURE, EdgeKind.ODOMETRY])
+    np.testing.assert_array_equal(file.graph.fixed, [False, False, True])
+    assert file.has_start
+
+
+def test_duplicate_edges_are_both_kept(folder: Path) -> None:
+    edge = f'EDGE_SE2 0 1 1 0 0 {IDENTITY}\n'
+    assert len(read(folder, 2 * edge).graph.edges) == 2
+
+
+@given(seeds)
+def test_missing_vertices_are_composed_from_edges(folder: Path, seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    truth = random_poses(rng, 8)
+    order = rng.permutation(7)
+    lines = []
+    for k in order.tolist():
+        i, j = (k, k + 1) if rng.random() < 0.5 else (k + 1, k)
+        mean = ' '.join(map(repr, se2.between(truth[i], truth[j]).tolist()))
+        lines.append(f'EDGE_SE2 {10 * i} {10 * j} {mean} {IDENTITY}')
+    known = int(rng.integers(8))
+    start = ' '.join(map(repr, truth[known].tolist()))
+    file = read(folder, '\n'.join([*lines, f'VERTEX_SE2 {10 * known} {start}']))
+    assert not file.has_start
+    np.testing.assert_allclose(file.graph.poses[:, :2], truth[:, :2], atol=1e-12)
+    np.testing.assert_allclose(
+        se2.wrap(file.graph.poses[:, 2] - truth[:, 2]), 0.0, atol=1e-12)
+    # without any vertex the first node is at the origin
+    file = read(folder, '\n'.join(lines))
+    np.testing.assert_array_equal(file.graph.poses[0], 0.0)
+    expected = se2.between(truth[0], truth)
+    np.testing.assert_allclose(file.graph.poses[:, :2], expected[:, :2], atol=1e-12)
+
+
+def test_something_is_fixed_only_where_nothing_else_holds_the_graph(folder: Path) -> None:
+    edges = f'EDGE_SE2 5 3 1 0 0 {IDENTITY}\nEDGE_SE2 5 7 1 0 0 {IDENTITY}\n'
+    assert read(folder, edges).graph.fixed.tolist() == [True, False, False]
+    assert read(folder, edges + 'FIX 7 5').graph.fixed.tolist() == [False, True, True]
+    for prior in (f'EDGE_PRIOR_SE2 5 0 0 0 {IDENTITY}', 'EDGE_PRIOR_SE2_XY 5 0 0 1 0 1'):
+        assert not np.any(read(folder, edges + prior).graph.fixed)
+    assert read(folder, edges + prior + '\nFIX 3').graph.fixed.tolist() == [True, False, False]
+
+
+def test_the_numbers_behind_every_tag_land_where_they_belong(folder: Path) -> None:
+    numbers = '11 0.12 0.13 22 0.23 33'
+    matrix = np.array([[11.0, 0.12, 0.13], [0.12, 22.0, 0.23], [0.13, 0.23, 33.0]])
+    graph = read(folder, f"""
+        EDGE_SE2 0 1 1 2 4 {numbers}
+        EDGE_PRIOR_SE2 1 5 6 7 {numbers}
+        EDGE_PRIOR_SE2_XY 0 8 9 11 0.12 22
+        OBSERVED_SE2_OFFSET 1 0.1 0.2 0.3 1 2 3 {numbers}
+    """).graph
+    np.testing.assert_array_equal(graph.edges.information[0], matrix)
+    np.testing.assert_allclose(graph.edges.mean[0], [1.0, 2.0, 4.0 - 2.0 * np.pi])
+    unary = graph.observed
+    np.testing.assert_array_equal(unary.node, [1, 0, 1])
+    np.testing.assert_array_equal(unary.offset, [[0.0] * 3, [0.0] * 3, [0.1, 0.2, 0.3]])
+    np.testing.assert_allclose(
+        unary.mean, [[5.0, 6.0, 7.0 - 2.0 * np.pi], [8.0, 9.0, 0.0], [1.0, 2.0, 3.0]])
+    position = matrix.copy()
+    position[2, :] = position[:, 2] = 0.0
+    np.testing.assert_array_equal(unary.information, [matrix, position, matrix])
+    np.testing.assert_array_equal(unary.kind, [
+        ObservedKind.GLOBAL_POSE, ObservedKind.POSITION, ObservedKind.GLOBAL_POSE])
+
+
+@given(seeds)
+def test_edge2_means_what_it_is_said_to_mean(folder: Path, seed: int) -> None:
+    information = random_information(np.random.default_rng(seed), 1)[0]
+    root = np.linalg.cholesky(information).T     # upper triangular, root^T root = information
+    i = information
+    toro = [i[0, 0], i[0, 1], i[1, 1], i[2, 2], i[0, 2], i[1, 2]]
+    isam = root[np.triu_indices(3)]
+    for order, numbers in (('toro', toro), ('isam', isam)):
+        text = ' '.join(repr(float(number)) for number in numbers)
+        graph = read(folder, f'VERTEX2 0 1 2 3\nEDGE2 0 1 1 0 0 {text}', order).graph
+        np.testing.assert_allclose(graph.edges.information[0], information, rtol=1e-9, atol=1e-9)
+        np.testing.assert_array_equal(graph.poses[0], [1.0, 2.0, 3.0])
+
+
+def test_the_meaning_of_edge2_is_never_guessed(folder: Path) -> None:
+    line = f'EDGE2 0 1 1 0 0 {IDENTITY}'
+    with pytest.raises(FileFormatError, match=r'graph\.g2o:1: EDGE2 means two .*toro or isam'):
+        read(folder, line)
+    with pytest.raises(ValueError, match=r"expected one of .*'toro', 'isam'.*got 'g2o'"):
+        read(folder, line, 'g2o')
+
+
+# --- invalid files ---------------------------------------------------------------------------
+
+GOOD = f'VERTEX_SE2 0 0 0 0\nVERTEX_SE2 1 1 0 0\nEDGE_SE2 0 1 1 0 0 {IDENTITY}\n'
+HUGE_ID = 10**30
+# The text of line 4, and the message.
+MISTAKES = {
+    'tag': ('VERTEX_SE3 0 0 0 0', r"tag 'VERTEX_SE3' is not known; known are FIX, VERTEX_SE2"),
+    'few': ('VERTEX_SE2 2 0 0', r'VERTEX_SE2 is followed by 4 numbers, got 3'),
+    'many': (f'EDGE_SE2 0 1 1 0 0 {IDENTITY} 7', r'followed by 11 numbers, got 12'),
+    'word': ('VERTEX_SE2 2 0 zero 0', r"VERTEX_SE2: .*'zero'"),
+    'id': ('VERTEX_SE2 2.5 0 0 0', r"VERTEX_SE2: .*'2\.5'"),
+    'large_id': (f'VERTEX_SE2 {HUGE_ID} 0 0 0', 'VERTEX_SE2: '),
+    'large_fix': (f'FIX {HUGE_ID}', 'FIX: '),
+    'nan': ('VERTEX_SE2 2 0 nan 0', 'VERTEX_SE2 holds a number that is not finite'),
+    'inf': (f'EDGE_SE2 0 1 1e999 0 0 {IDENTITY}', 'EDGE_SE2 holds a number that is not finite'),
+    'twice': ('VERTEX_SE2 1 0 0 0', 'vertex 1 is in the file twice'),
+    'fix': ('FIX 2', 'FIX 2: there is no such vertex'),
+    'fix_word': ('FIX x', "FIX: .*'x'"),
+    'itself': (f'EDGE_SE2 1 1 0 0 0 {IDENTITY}', 'an edge leads from a node to itself'),
+    'negative': ('EDGE_SE2 0 1 1 0 0 -1 0 0 1 0 1', 'not positive semidefinite'),
+    'zero': ('EDGE_SE2 0 1 1 0 0 0 0 0 0 0 0', 'not positive semidefinite, or zero'),
+    'prior': ('EDGE_PRIOR_SE2 0 0 0 0 1 2 0 1 0 1', 'not positive semidefinite'),
+    'position': ('EDGE_PRIOR_SE2_XY 0 0 0 1 2 1', 'not positive semidefinite'),
+    'offset': ('OBSERVED_SE2_OFFSET 0 0 0 0 0 0 0 1 2 0 1 0 1', 'not positive semidefinite'),
+}
+
+
+@pytest.mark.parametrize('name', MISTAKES)
+def test_every_mistake_is_named_with_file_and_line(folder: Path, name: str) -> None:
+    line, message = MISTAKES[name]
+    where = re.escape(str(folder / 'graph.g2o'))
+    with pytest.raises(FileFormatError, match=f'^{where}:4: .*{message}'):
+        read(folder, f'{GOOD}{line}\nEDGE_SE2 1 0 1 0 0 {IDENTITY}\n')
+
+
+@pytest.mark.parametrize('text', ['', '\n\n', '# nothing\n', 'FIX 3\n'])
+def test_a_file_without_a_graph_is_refused(folder: Path, text: str) -> None:
+    with pytest.raises(FileFormatError, match=r'graph\.g2o: holds no vertex and no edge'):
+        read(folder, text)
+
+
+def test_what_is_no_text_or_no_file_is_refused(folder: Path) -> None:
+    binary = folder / 'binary.g2o'
+    binary.write_bytes(bytes(range(256)))
+    for path in (binary, folder / 'missing.g2o', folder):
+        with pytest.raises(FileFormatError, match=re.escape(str(path))):
+            read_g2o(path)
+
+
+def test_composed_poses_that_overflow_are_refused(folder: Path) -> None:
+    far = f'1.7e308 0 0 {IDENTITY}'
+    text = '\n'.join(f'EDGE_SE2 {k} {k + 1} {far}' for k in range(3))
+    with np.errstate(over='ignore', invalid='ignore'), pytest.raises(FileFormatError):
+        read(folder, text)
+
+
+words = st.one_of(
+    st.sampled_from(['VERTEX_SE2', 'EDGE_SE2', 'EDGE2', 'VERTEX2', 'FIX', 'EDGE_PRIOR_SE2',
+                     'EDGE_PRIOR_SE2_XY', 'OBSERVED_SE2_OFFSET', '#', '0', '1', '2', '-1', '1e308',
+                     'nan', 'inf', '1e-320', '99999999999999999999', '9223372036854775807']),
+    st.integers(-3, 5).map(str), st.floats().map(repr), st.text(max_size=5))
+COUNTS = {'VERTEX_SE2': (1, 3), 'EDGE_SE2': (2, 9), 'EDGE2': (2, 9), 'EDGE_PRIOR_SE2': (1, 9),
+          'EDGE_PRIOR_SE2_XY': (1, 5), 'OBSERVED_SE2_OFFSET': (1, 12)}
+
+
+@st.composite
+def plausible_lines(draw: st.DrawFn) -> str:
+    tag = draw(st.sampled_from(sorted(COUNTS)))
+    n_ids, n_numbers = COUNTS[tag]
+    ids = draw(st.lists(st.integers(-2, 5), min_size=n_ids, max_size=n_ids))
+    numbers = draw(st.lists(st.floats(allow_nan=False), min_size=n_numbers, max_size=n_numbers))
+    return ' '.join([tag, *map(str, ids), *map(repr, numbers)])
+
+
+@given(st.one_of(
+    st.text(), st.lists(st.lists(words).map(' '.join)).map('\n'.join),
+    st.lists(st.one_of(plausible_lines(), st.lists(words).map(' '.join))).map('\n'.join)),
+    st.sampled_from((None, 'toro', 'isam')))
+def test_any_text_is_read_or_refused(
+    folder: Path, text: str, edge2_order: str | None,
+) -> None:
+    path = folder / 'fuzz.g2o'
+    path.write_bytes(text.encode('utf-8', 'surrogatepass'))
+    try:
+        with np.errstate(over='ignore', invalid='ignore'):
+            file = read_g2o(path, edge2_order)
+    except FileFormatError as error:
+        problem = str(error)
+    else:
+        problem = str(path)
+        assert len(file.ids) == file.graph.n_nodes > 0
+        assert np.all(np.isfinite(file.graph.poses))
+    assert str(path) in problem
+
+
+@given(st.binary(max_size=200))
+def test_random_bytes_are_refused(folder: Path, content: bytes) -> None:
+    path = folder / 'fuzz.g2o'
+    path.write_bytes(content)
+    with pytest.raises(FileFormatError):
+        read_g2o(path)
+
+
+def test_reading_one_file_does_not_change_the_next(folder: Path) -> None:
+    first = snapshot(read(folder, GOOD).graph)
+    read(folder, f'EDGE_SE2 7 9 1 0 0 {IDENTITY}')
+    assert snapshot(read(folder, GOOD).graph) == first

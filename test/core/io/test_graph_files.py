@@ -1,0 +1,328 @@
+# Copyright 2026 The pose_graph_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""Files of saved graphs: written completely or not at all, and refused if damaged."""
+
+from collections.abc import Callable
+import copy
+import functools
+import hashlib
+import json
+import os
+from pathlib import Path
+import tempfile
+from typing import Any
+
+from hypothesis import given, settings, strategies as st
+import numpy as np
+import pytest
+from saved_graphs import assert_same_value, CORRELATED, feed_all, LINE_ODOMETRY, straight_line
+from test_delay_invariance import DRIVES
+from tum_files import read_tum
+
+from pose_graph_ros.core.backend import PoseGraphBackend
+from pose_graph_ros.core.exceptions import FileFormatError, FileWriteError
+from pose_graph_ros.core.geometry.geodesy import MapOrigin
+from pose_graph_ros.core.graph.constraints import EdgeKind
+from pose_graph_ros.core.io import atomic_files
+from pose_graph_ros.core.io.g2o import read_g2o
+from pose_graph_ros.core.io.graph_files import graph_paths, read_graph, write_graph
+from pose_graph_ros.core.io.saved_graph import SavedGraph
+
+
+@functools.cache
+def saved_drive() -> SavedGraph:
+    """Return a graph with constraints of all kinds."""
+    odometry, measurements = DRIVES[1, False]
+    backend = PoseGraphBackend(CORRELATED)
+    feed_all(backend, sorted(odometry + measurements)[:600])
+    return backend.saved(MapOrigin(48.1, 11.6, 500.0, 0.25))
+
+
+@functools.cache
+def small_graph() -> SavedGraph:
+    return straight_line().saved()
+
+
+def contents(folder: Path) -> dict[str, bytes]:
+    return {path.name: path.read_bytes() for path in folder.iterdir()}
+
+
+# --- names and contents --------------------------------------------------------------------------
+
+@pytest.mark.parametrize('name', ['map', 'map.g2o', 'map.json', 'map.tum'])
+def test_any_of_the_suffixes_or_none_names_all_three_files(tmp_path: Path, name: str) -> None:
+    folder = tmp_path / 'new' / 'deep'
+    written = write_graph(small_graph(), folder / name)
+    assert written == graph_paths(folder / name)
+    assert sorted(contents(folder)) == ['map.g2o', 'map.json', 'map.tum']
+    assert_same_value(read_graph(folder / name), small_graph())
+
+
+def test_another_dot_belongs_to_the_name(tmp_path: Path) -> None:
+    write_graph(small_graph(), tmp_path / 'map.v2')
+    assert sorted(contents(tmp_path)) == ['map.v2.g2o', 'map.v2.json', 'map.v2.tum']
+
+
+def test_other_programs_read_the_graph_and_the_path(tmp_path: Path) -> None:
+    saved = saved_drive()
+    g2o, side, tum = write_graph(saved, tmp_path / 'map')
+    rows = saved.rows
+    graph = read_g2o(g2o).graph
+    np.testing.assert_array_equal(graph.poses, rows.poses[~rows.is_bias])
+    assert graph.n_edges == np.sum(rows.edges.kind != EdgeKind.BIAS)
+    assert graph.n_observed == np.sum(~rows.is_bias[rows.observed.node])
+    path = read_tum(tum)
+    np.testing.assert_array_equal(path.stamps_ns, saved.nodes.stamps_ns)
+    np.testing.assert_array_equal(path.poses[:, :2], rows.poses[saved.nodes.rows, :2])
+    members = json.loads(side.read_text(encoding='ascii'))
+    assert members['version'] == 1
+    assert members['datum'] == {
+        'latitude': 48.1, 'longitude': 11.6, 'altitude': 500.0, 'yaw': 0.25}
+    assert members['nodes']['stamps_ns'] == saved.nodes.stamps_ns.tolist()
+    assert 'gps' in members['sources']
+
+
+# --- places -------------------------------------------------------------------------------------
+
+def test_the_file_with_the_checksums_is_renamed_last_after_all_are_on_the_disk(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    done: list[str] = []
+    replace_, fsync = os.replace, os.fsync
+
+    def replacing(source: Path, target: Path) -> None:
+        done.append(Path(target).suffix)
+        replace_(source, target)
+
+    def syncing(handle: int) -> None:
+        done.append('sync')
+        fsync(handle)
+
+    monkeypatch.setattr(atomic_files.os, 'replace', replacing)
+    monkeypatch.setattr(atomic_files.os, 'fsync', syncing)
+    write_graph(small_graph(), tmp_path / 'map')
+    assert done == ['sync', 'sync', 'sync', '.g2o', '.tum', '.json', 'sync']
+
+
+def make_folder(path: Path) -> Path:
+    path.mkdir()
+    return path
+
+
+@pytest.mark.parametrize('place', [
+    lambda folder: make_folder(folder / 'map'),             # is a folder
+    lambda folder: make_folder(folder / 'map.json').with_suffix(''),
+    lambda folder: folder / 'file' / 'map',                 # a file is no folder
+    lambda folder: folder / ('m' * 300),                    # too long
+    lambda folder: folder / 'a\0b',
+    lambda folder: Path('/proc/nowhere/map'),
+    lambda folder: Path('')])
+def test_a_place_that_cannot_be_written_to_is_refused(
+    tmp_path: Path, place: Callable[[Path], Path],
+) -> None:
+    (tmp_path / 'file').write_text('mine')
+    path = place(tmp_path)
+    before = sorted(tmp_path.rglob('*'))
+    with pytest.raises(FileWriteError):
+        write_graph(small_graph(), path)
+    assert sorted(tmp_path.rglob('*')) == before
+
+
+# --- damaged files -------------------------------------------------------------------------------
+
+def test_files_that_are_not_there_or_not_readable_are_refused(tmp_path: Path) -> None:
+    with pytest.raises(FileFormatError, match=r'map\.json: cannot be read'):
+        read_graph(tmp_path / 'map')
+    for path in (tmp_path / 'a\0b', tmp_path / ('m' * 300), Path('')):
+        with pytest.raises(FileFormatError):
+            read_graph(path)
+    write_graph(small_graph(), tmp_path / 'map')
+    (tmp_path / 'map.g2o').unlink()
+    with pytest.raises(FileFormatError, match=r'map\.g2o: cannot be read'):
+        read_graph(tmp_path / 'map')
+
+
+def test_the_g2o_file_of_another_graph_is_refused(tmp_path: Path) -> None:
+    write_graph(small_graph(), tmp_path / 'one')
+    write_graph(saved_drive(), tmp_path / 'other')
+    (tmp_path / 'one.g2o').replace(tmp_path / 'other.g2o')
+    with pytest.raises(FileFormatError, match=r'other\.g2o: is damaged, or not the file'):
+        read_graph(tmp_path / 'other')
+
+
+@functools.cache
+def files_of_a_line() -> dict[str, bytes]:
+    with tempfile.TemporaryDirectory() as folder:
+        write_graph(small_graph(), Path(folder) / 'map')
+        return contents(Path(folder))
+
+
+@given(st.sampled_from(['g2o', 'json']), st.floats(0.0, 1.0, exclude_max=True),
+       st.integers(0, 255), st.booleans())
+@settings(max_examples=300)
+def test_no_damage_goes_unnoticed(suffix: str, where: float, byte: int, cut: bool) -> None:
+    with tempfile.TemporaryDirectory() as folder:
+        for name, each in files_of_a_line().items():
+            (Path(folder) / name).write_bytes(each)
+        path = Path(folder) / f'map.{suffix}'
+        content = bytearray(path.read_bytes())
+        at = int(where * len(content))
+        if cut:
+            del content[at:]
+        else:
+            content[at] = byte
+        same = bytes(content) == path.read_bytes()
+        path.write_bytes(content)
+        if same:
+            assert_same_value(read_graph(path), small_graph())
+        else:
+            with pytest.raises(FileFormatError, match=path.name):
+                read_graph(path)
+
+
+def rewrite(path: Path, change: Callable[[dict[str, Any]], None]) -> None:
+    """Edit a JSON file and correct its checksum."""
+    members = json.loads(path.read_text(encoding='ascii'))
+    del members['sha256']
+    change(members)
+    body = (json.dumps(members)[1:]).encode('ascii')
+    digest = hashlib.sha256(body).hexdigest().encode('ascii')
+    path.write_bytes(b'{\n"sha256": "' + digest + b'",\n' + body)
+
+
+def test_another_version_is_refused_and_says_who_wrote_it(tmp_path: Path) -> None:
+    _, side, _ = write_graph(small_graph(), tmp_path / 'map')
+    rewrite(side, lambda members: None)
+    assert_same_value(read_graph(side), small_graph())  # the layout of the text does not matter
+
+    def renew(members: dict[str, Any]) -> None:
+        members['version'], members['created_by'] = 2, 'pose_graph_ros 9.9'
+
+    rewrite(side, renew)
+    with pytest.raises(FileFormatError, match=r'version 1.*9\.9'):
+        read_graph(side)
+
+
+@pytest.mark.parametrize(('place', 'value', 'expected'), [
+    (('graph', 'fixed'), [-1], r'graph\.fixed: expected hidden nodes in 0'),
+    (('graph', 'biases'), [10**6], r'graph\.biases: expected hidden nodes in 0'),
+    (('graph', 'biases'), [0], 'no biases as vertices'),
+    (('graph', 'observed_on_bias'), [-1], r'graph\.observed_on_bias: expected numbers in 0'),
+    (('graph', 'observed_on_bias'), [], r'expected \d+ observed nodes, got \d+'),
+    (('graph', 'edge_kind'), [256], 'expected'),
+    (('graph', 'edge_weight'), [1.0], r'expected \d+ weights, got 1'),
+    (('graph', 'bias_edge_bias'), [], r'expected \d+ edges to biases, got 0')])
+def test_rows_that_do_not_fit_together_are_refused_with_what_was_expected(
+    tmp_path: Path, place: tuple[str, str], value: list[Any], expected: str,
+) -> None:
+    _, side, _ = write_graph(saved_drive(), tmp_path / 'map')
+
+    def change(members: dict[str, Any]) -> None:
+        members[place[0]][place[1]] = value
+
+    rewrite(side, change)
+    with pytest.raises(FileFormatError, match=expected):
+        read_graph(side)
+
+
+def test_kinds_are_small_numbers_and_each_vertex_has_all_of_its_own(tmp_path: Path) -> None:
+    g2o, side, _ = write_graph(small_graph(), tmp_path / 'map')
+    text = g2o.read_text(encoding='ascii')
+
+    def kinds(members: dict[str, Any]) -> None:
+        members['graph']['edge_kind'][0] = 300
+
+    rewrite(side, kinds)
+    with pytest.raises(FileFormatError, match='expected kinds of edges'):
+        read_graph(side)
+    for broken in (text.replace('VERTEX_SE2 1 ', 'VERTEX_SE2 ', 1),
+                   text.replace('VERTEX_SE2 1 ', 'VERTEX_SE2 nan ', 1)):
+        write_graph(small_graph(), tmp_path / 'map')
+        g2o.write_text(broken, encoding='ascii')
+
+        def checksum(members: dict[str, Any], content: bytes = broken.encode()) -> None:
+            members['g2o_sha256'] = hashlib.sha256(content).hexdigest()
+
+        rewrite(side, checksum)
+        with pytest.raises(FileFormatError, match='finite numbers after each VERTEX_SE2'):
+            read_graph(side)
+
+
+@pytest.mark.parametrize('body', [b'', b'"format": ', b'}}', b'"a": ' + b'[' * 10**5])
+def test_what_is_no_json_is_refused_even_with_a_checksum(tmp_path: Path, body: bytes) -> None:
+    _, side, _ = write_graph(small_graph(), tmp_path / 'map')
+    digest = hashlib.sha256(body).hexdigest().encode('ascii')
+    side.write_bytes(b'{\n"sha256": "' + digest + b'",\n' + body)
+    with pytest.raises(FileFormatError, match='expected JSON'):
+        read_graph(side)
+
+
+def leaves(value: Any, place: tuple[Any, ...] = ()) -> list[tuple[Any, ...]]:
+    """Return the paths of all members and of the first items of lists, at any depth."""
+    inner = (value.items() if isinstance(value, dict)
+             else list(enumerate(value))[:2] if isinstance(value, list) else ())
+    return [place] * (len(place) > 0) + [
+        leaf for name, each in inner for leaf in leaves(each, (*place, name))]
+
+
+JUNK = (None, True, -1, 0, 1, 10**6, 2**63, 10**400, -0.5, 1e100, float('nan'), float('inf'), '',
+        'odom', [], [0], [[0.0]], [1, 'a'], [None], {}, {'odom': None}, [[1.0], [1.0, 2.0]])
+
+
+@functools.cache
+def files_of_a_drive() -> dict[str, bytes]:
+    with tempfile.TemporaryDirectory() as folder:
+        write_graph(saved_drive(), Path(folder) / 'map')
+        return contents(Path(folder))
+
+
+@functools.cache
+def members_of_a_drive() -> tuple[dict[str, Any], list[tuple[Any, ...]]]:
+    members = json.loads(files_of_a_drive()['map.json'])
+    return members, leaves(members)
+
+
+@given(st.data())
+@settings(max_examples=300)
+def test_with_any_value_of_a_member_a_file_is_refused_or_usable(data: st.DataObject) -> None:
+    members, places = members_of_a_drive()
+    place = data.draw(st.sampled_from(places))
+    junk = data.draw(st.sampled_from(JUNK) | st.just('remove'))
+
+    def change(fresh: dict[str, Any]) -> None:
+        fresh.update(copy.deepcopy(members))
+        del fresh['sha256']
+        inner: Any = fresh
+        for name in place[:-1]:
+            inner = inner[name]
+        if junk == 'remove':
+            del inner[place[-1]]
+        else:
+            inner[place[-1]] = junk
+
+    if place[0] == 'sha256':
+        return
+    with tempfile.TemporaryDirectory() as folder:
+        for name, content in files_of_a_drive().items():
+            (Path(folder) / name).write_bytes(content)
+        side = Path(folder) / 'map.json'
+        rewrite(side, change)
+        loaded = None
+        try:
+            loaded = read_graph(side)
+        except FileFormatError as error:
+            message = str(error)
+    if loaded is None:
+        assert 'map.json' in message or 'map.g2o' in message
+        return
+    backend = PoseGraphBackend.restored(CORRELATED, loaded)
+    backend.estimate()
+    backend.update()
+    backend.reports()
+
+
+def test_a_loaded_graph_can_be_used_with_other_settings(tmp_path: Path) -> None:
+    write_graph(saved_drive(), tmp_path / 'map')
+    backend = PoseGraphBackend.restored(LINE_ODOMETRY, read_graph(tmp_path / 'map'))
+    assert backend.estimate() is not None
+    backend.optimize()

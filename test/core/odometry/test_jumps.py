@@ -1,0 +1,147 @@
+# Copyright 2026 The pose_graph_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""Jumps of odometry: what is one, and the speeds from which that follows."""
+
+import math
+
+from hypothesis import assume, given, strategies as st
+import numpy as np
+import pytest
+
+from pose_graph_ros.core.geometry.scalar_se2 import compose_one, wrap_one
+from pose_graph_ros.core.odometry.jumps import (
+    is_jump,
+    LEAST_TIME,
+    MEMORY_TIME,
+    SLACK,
+    Speeds,
+    SpeedWindow,
+    UNKNOWN,
+)
+
+SECOND = 1_000_000_000
+LIMIT = 60.0
+
+rates = st.tuples(st.floats(0.0, 50.0), st.floats(0.0, 5.0))
+speeds = st.one_of(st.just(UNKNOWN), st.builds(
+    lambda recent, more: Speeds(
+        (recent[0], 0.0, recent[1]), recent, (recent[0] + more[0], recent[1] + more[1])),
+    rates, rates))
+steps = st.tuples(st.floats(0.0, 500.0), st.floats(0.0, math.pi))
+times = st.floats(1e-9, 20.0)
+stated_speeds = st.floats()     # not finite ones, too
+
+
+# --- Which steps are jumps -------------------------------------------------------------------
+
+@given(speeds, steps, steps, times, stated_speeds)
+def test_a_step_that_is_longer_than_a_jump_is_a_jump(
+    before: Speeds, step: tuple[float, float], more: tuple[float, float], elapsed: float,
+    stated: float,
+) -> None:
+    longer = step[0] + more[0], step[1] + more[1]
+    assert (is_jump(before, longer, elapsed, stated, LIMIT)
+            >= is_jump(before, step, elapsed, stated, LIMIT))
+
+
+@given(speeds, st.floats(0.0, SLACK[0]), st.floats(0.0, SLACK[1]), times, stated_speeds)
+def test_a_step_within_the_slack_is_no_jump(
+    before: Speeds, length: float, turn: float, elapsed: float, stated: float,
+) -> None:
+    assert not is_jump(before, (length, turn), elapsed, stated, 1e-6)
+
+
+@given(speeds, steps, times, st.floats(0.0, 100.0), st.floats(0.0, 100.0))
+def test_more_time_or_a_greater_stated_speed_makes_no_jump(
+    before: Speeds, step: tuple[float, float], elapsed: float, stated: float, more: float,
+) -> None:
+    assume(not is_jump(before, step, elapsed, stated, LIMIT))
+    assert not is_jump(before, step, elapsed + more, stated, LIMIT)
+    assert not is_jump(before, step, elapsed, stated + more, LIMIT)
+    assert not is_jump(before, step, elapsed, -stated - more, LIMIT)
+
+
+@given(st.floats(0.0, LIMIT), st.floats(-6.0, 6.0), st.floats(0.001, 5.0))
+def test_a_constant_speed_is_no_jump_at_any_period(
+    speed: float, turn_rate: float, period: float,
+) -> None:
+    assume(abs(turn_rate) * period < math.pi)
+    between = (speed * period, 0.0, turn_rate * period)
+    step = between[0], abs(between[2])
+    stamp_ns, pose = 1, (0.0, 0.0, 0.0)
+    window = SpeedWindow(UNKNOWN, stamp_ns, pose)
+    for _ in range(200):
+        assert not is_jump(window.speeds, step, period, math.nan, LIMIT)
+        stamp_ns, pose = stamp_ns + round(period * 1e9), compose_one(pose, between)
+        window = window.moved(stamp_ns, pose, step)
+
+
+@given(speeds, st.floats(0.1, 100.0), times, st.floats(0.0, 1e6))
+def test_no_stated_speed_permits_more_than_the_limit(
+    before: Speeds, limit: float, elapsed: float, stated: float,
+) -> None:
+    longest = SLACK[0] + limit * (elapsed + LEAST_TIME)
+    assert is_jump(before, (1.001 * longest, 0.0), elapsed, stated, limit)
+    assert not is_jump(UNKNOWN, (0.999 * longest, 0.0), elapsed, stated, limit)
+
+
+@pytest.mark.parametrize('stated', [math.nan, math.inf, -math.inf])
+def test_a_stated_speed_that_is_not_finite_is_ignored(stated: float) -> None:
+    before = Speeds((1.0, 0.0, 0.0), (1.0, 0.0), (1.0, 0.0))
+    for length in np.linspace(0.0, 3.0, 61):
+        assert (is_jump(before, (length, 0.0), 0.1, stated, LIMIT)
+                == is_jump(before, (length, 0.0), 0.1, 0.0, LIMIT))
+
+
+def test_after_standing_still_a_metre_in_a_tenth_of_a_second_is_a_jump() -> None:
+    still = Speeds((0.0, 0.0, 0.0), (0.0, 0.0), (0.0, 0.0))
+    assert is_jump(still, (1.0, 0.0), 0.1, 0.0, LIMIT)
+    assert is_jump(still, (0.0, 1.5), 0.1, 0.0, LIMIT)
+    assert not is_jump(still, (1.0, 0.0), 0.1, 8.0, LIMIT)      # the twist states the speed
+    assert not is_jump(UNKNOWN, (1.0, 0.0), 0.1, 0.0, LIMIT)
+
+
+# --- Speeds ----------------------------------------------------------------------------------
+
+ORIGIN = (0.0, 0.0, 0.0)
+
+
+def test_speeds_are_taken_over_no_less_than_the_least_time() -> None:
+    window = SpeedWindow(UNKNOWN, SECOND, ORIGIN)
+    early = SECOND + round(LEAST_TIME * 0.4e9)
+    window = window.moved(early, (0.2, 0.0, 0.0), (0.2, 0.0))
+    assert window == SpeedWindow(UNKNOWN, SECOND, ORIGIN, (0.2, 0.0))
+    late = SECOND + round(LEAST_TIME * 2e9)
+    pose = (0.1, 0.0, 0.0)     # a step back
+    window = window.moved(late, pose, (0.1, 0.0))
+    assert window.speeds.velocity == pytest.approx((0.1 / (2.0 * LEAST_TIME), 0.0, 0.0))
+    assert window.speeds.recent == pytest.approx((0.3 / (2.0 * LEAST_TIME), 0.0))
+    assert window.speeds.greatest == window.speeds.recent
+    assert window[1:] == (late, pose, (0.0, 0.0))
+
+
+@given(st.lists(rates, min_size=1, max_size=30))
+def test_the_greatest_speed_stays_and_the_recent_one_decays(
+    path: list[tuple[float, float]],
+) -> None:
+    window, stamp_ns, pose = SpeedWindow(UNKNOWN, 0, ORIGIN), 0, ORIGIN
+    seen, recent = [], (0.0, 0.0)
+    for step in path:
+        stamp_ns += SECOND // 2
+        pose = compose_one(pose, (step[0], 0.0, wrap_one(step[1])))
+        window = window.moved(stamp_ns, pose, step)
+        seen.append((step[0] / 0.5, step[1] / 0.5))
+        decay = math.exp(-0.5 / MEMORY_TIME)
+        recent = tuple(max(now, decay * one) for now, one in zip(seen[-1], recent, strict=True))
+        assert window.speeds.greatest == pytest.approx(tuple(np.max(seen, axis=0)))
+        assert window.speeds.recent == pytest.approx(recent)
+
+
+@given(st.tuples(*3 * (st.floats(-3.0, 3.0),)), st.tuples(*3 * (st.floats(-3.0, 3.0),)))
+def test_the_velocity_does_not_depend_on_the_frame(
+    between: tuple[float, float, float], start: tuple[float, float, float],
+) -> None:
+    step = math.hypot(between[0], between[1]), abs(between[2])
+    window = SpeedWindow(UNKNOWN, 0, start).moved(SECOND * 2, compose_one(start, between), step)
+    assert window.speeds.velocity == pytest.approx(tuple(b / 2.0 for b in between), abs=1e-12)
+    assert window.speeds.recent == pytest.approx((step[0] / 2.0, step[1] / 2.0))

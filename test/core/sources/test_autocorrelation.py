@@ -1,0 +1,87 @@
+# Copyright 2026 The pose_graph_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""Time constants of correlated errors, and the absence of one for white errors."""
+
+from hypothesis import given, settings, strategies as st
+import numpy as np
+import pytest
+
+from pose_graph_ros.core.sources.autocorrelation import estimate, LEAST_RESIDUALS
+
+SECOND = 1_000_000_000
+
+
+def errors(
+    rng: np.random.Generator, n: int, period: float, tau: float, white: float,
+) -> np.ndarray:
+    """Return the sum of a first-order Gauss-Markov process and white noise, of variance 1."""
+    slow = rng.standard_normal((n, 2))
+    phi = np.exp(-period / tau)
+    for k in range(1, n):
+        slow[k] = phi * slow[k - 1] + np.sqrt(1.0 - phi**2) * slow[k]
+    return np.sqrt(1.0 - white) * slow + np.sqrt(white) * rng.standard_normal((n, 2))
+
+
+def stamps(n: int, period: float) -> np.ndarray:
+    return SECOND + np.round(np.arange(n) * period * SECOND).astype(np.int64)
+
+
+@pytest.mark.parametrize(('tau', 'period', 'n', 'white'), [
+    (5.0, 0.1, 5000, 0.0), (60.0, 0.5, 5000, 0.1), (2.0, 1.0, 2000, 0.3), (60.0, 1.0, 3000, 0.5)])
+def test_tau_and_both_sigmas_are_found(tau: float, period: float, n: int, white: float) -> None:
+    found = [estimate(stamps(n, period),
+                      errors(np.random.default_rng(seed), n, period, tau, white))
+             for seed in range(10)]
+    assert all(one.significant for one in found)
+    assert np.median([one.tau for one in found]) == pytest.approx(tau, rel=0.3)
+    assert np.median([one.sigma_correlated for one in found]) == pytest.approx(
+        np.sqrt(1.0 - white), abs=0.12)
+    assert np.median([one.sigma_white for one in found]) == pytest.approx(
+        np.sqrt(white), abs=0.15)
+
+
+@settings(max_examples=50)
+@given(seed=st.integers(0, 10**6), n=st.integers(0, 600), period=st.sampled_from((0.1, 1.0)))
+def test_white_errors_are_not_called_correlated(seed: int, n: int, period: float) -> None:
+    residuals = np.random.default_rng(seed).standard_normal((n, 2))
+    found = estimate(stamps(n, period), residuals)
+    assert not found.significant
+    assert found.n == n
+    if n > 0:
+        assert found.sigma_white == pytest.approx(np.sqrt(np.mean(residuals**2)))
+
+
+def test_gaps_in_time_are_no_lags() -> None:
+    rng = np.random.default_rng(3)
+    period, n = 0.5, 4000
+    residuals, when = errors(rng, n, period, 5.0, 0.0), stamps(n, period)
+    kept = rng.random(n) < 0.4
+    found = estimate(when[kept], residuals[kept])
+    assert found.tau == pytest.approx(5.0, rel=0.4)
+
+
+@pytest.mark.parametrize('residuals', [
+    np.zeros((100, 2)), np.ones((100, 2)), np.ones((LEAST_RESIDUALS - 1, 2)), np.zeros((0, 2))])
+def test_degenerate_residuals_give_finite_numbers(residuals: np.ndarray) -> None:
+    found = estimate(stamps(len(residuals), 1.0), residuals)
+    assert np.all(np.isfinite(found))
+    same = estimate(np.full(len(residuals), SECOND), residuals)
+    assert np.all(np.isfinite(same))
+
+
+def test_errors_that_are_forgotten_after_one_lag_have_its_time_constant() -> None:
+    """A mean of two white errors: a correlation of one half at the first lag, then none."""
+    white = np.random.default_rng(4).standard_normal((3001, 2))
+    found = estimate(stamps(3000, 0.5), white[1:] + white[:-1])
+    assert found.significant
+    assert found.correlation == pytest.approx(0.5, abs=0.05)
+    assert found.tau == pytest.approx(0.5 / np.log(2.0), rel=0.1)
+    assert found.sigma_white == 0.0
+
+
+def test_bursts_without_a_period_are_called_white() -> None:
+    # two and two 0.1 s apart, with 10 s in between: no pair is a median of the periods apart
+    when = np.array([round((10.1 * (k // 2) + 0.1 * (k % 2)) * SECOND) for k in range(601)])
+    found = estimate(when, errors(np.random.default_rng(1), 601, 1.0, 50.0, 0.0))
+    assert not found.significant
+    assert np.all(np.isfinite(found))

@@ -1,0 +1,479 @@
+# Copyright 2026 The pose_graph_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""Biases: errors of the edges to them, their rows in the graph, and correlated noise."""
+
+from pathlib import Path
+
+from hypothesis import given, settings, strategies as st
+import jacobians
+import numpy as np
+import pytest
+from random_graphs import (
+    consistent_graph,
+    random_edges_to_biases,
+    random_graph,
+    random_information,
+    random_poses,
+    slow_to_bias,
+)
+from scipy.optimize import least_squares
+from slow_smoother import cliques, differences, EXACT, SlowGraph, state, world
+
+from pose_graph_ros.core.batch import chordal_start, optimizer
+from pose_graph_ros.core.batch.joint_start import joint
+from pose_graph_ros.core.batch.optimizer import Status
+from pose_graph_ros.core.config import SmootherConfig, SolverConfig
+from pose_graph_ros.core.exceptions import LinearSolveError
+from pose_graph_ros.core.geometry import se2
+from pose_graph_ros.core.geometry.se2 import FloatArray
+from pose_graph_ros.core.graph import error_functions, factors, tables as tb
+from pose_graph_ros.core.graph.constraints import EdgeKind, Edges, ObservedKind, ObservedNodes
+from pose_graph_ros.core.graph.graph import Graph, GraphUpdate
+from pose_graph_ros.core.io.g2o import read_g2o, write_g2o
+from pose_graph_ros.core.smoother import batch_fallback
+from pose_graph_ros.core.smoother.incremental import IncrementalSmoother
+
+seeds = st.integers(0, 2**32 - 1)
+
+ODOMETRY = np.diag([400.0, 900.0, 2500.0])
+THOROUGH = SolverConfig(max_iterations=200, step_tolerance=1e-11)
+
+
+def prior(bias: int) -> ObservedNodes:
+    return ObservedNodes([bias], None, np.zeros((1, 3)), [np.eye(3)], [ObservedKind.GLOBAL_POSE])
+
+
+def link(newer: int, older: int, phi: float) -> Edges:
+    """Return one step of a first-order Gauss-Markov process of unit variance."""
+    return Edges([newer], [older], np.zeros((1, 3)), [np.eye(3) / (1.0 - phi**2)],
+                 [EdgeKind.BIAS], bias=[[0.0, 0.0, phi, phi]])
+
+
+def fix(node: int, bias: int, where: FloatArray, offset: FloatArray, sigmas: FloatArray) -> Edges:
+    """Return the edge of a measured position, with the sigmas of white noise and bias."""
+    weight = sigmas[0]**-2.0
+    return Edges([node], [bias], [[*where, 0.0]], [np.diag([weight, weight, 0.0])],
+                 [EdgeKind.BIAS], bias=[[*offset, sigmas[1], 0.0]])
+
+
+# --- the error ----------------------------------------------------------------------------------
+
+def test_errors_and_jacobians_are_the_slow_ones_and_central_differences() -> None:
+    rng, n, step = np.random.default_rng(1), 40, 1e-5
+    poses = random_poses(rng, 2 * n)
+    edges = random_edges_to_biases(rng, np.arange(n), np.arange(n, 2 * n))
+    error, jacobian_i, jacobian_j = jacobians.linearize_edges(poses, edges)
+    np.testing.assert_array_equal(error, error_functions.edge_errors(poses, edges))
+    for k in range(n):
+        slow = slow_to_bias(poses[k], poses[n + k], edges.mean[k], edges.bias[k])
+        for actual, expected in zip((error, jacobian_i, jacobian_j), slow, strict=True):
+            np.testing.assert_allclose(actual[k], expected, atol=1e-13)
+    for first, jacobian in ((0, jacobian_i), (n, jacobian_j)):
+        for axis in range(3):
+            moved = []
+            for sign in (1.0, -1.0):
+                there = poses.copy()
+                there[first:first + n, axis] += sign * step
+                moved.append(error_functions.edge_errors(there, edges))
+            difference = moved[0] - moved[1]
+            difference[:, 2] = se2.wrap(difference[:, 2])
+            np.testing.assert_allclose(jacobian[:, :, axis], difference / (2.0 * step), atol=1e-8)
+
+
+@given(seeds)
+@settings(max_examples=30)
+def test_energy_linearization_error_and_scale_are_those_of_the_formulas(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    graph = Graph()
+    i, j = rng.choice(3, 12), 3 + rng.choice(2, 12)
+    edges = random_edges_to_biases(rng, i, j)
+    edges.bias[::4, :2] = 0.0
+    graph.apply(GraphUpdate(hidden=random_poses(rng, 3), biases=random_poses(rng, 2), edges=edges))
+    graph.apply(GraphUpdate(weigh_edges={0: 0.3, 1: 0.0}))
+    W, before = graph.edges.weighted_information, graph.poses.copy()
+    first = jacobians.linearize_edges(before, edges)
+    diagonals = np.einsum('mji,mjk,mki->mi', first.jacobian_i, W, first.jacobian_i)
+    expected = np.zeros((5, 3))
+    np.add.at(expected, i, diagonals)
+    np.add.at(expected, j, np.einsum('mji,mjk,mki->mi', first.jacobian_j, W, first.jacobian_j))
+    scale = graph.memory['node_f'][:5, [tb.SCALE_T, tb.SCALE_R]]
+    np.testing.assert_allclose(
+        scale[:, 0]**2, 0.5 * (expected[:, 0] + expected[:, 1]), atol=1e-9)
+    np.testing.assert_allclose(scale[3:, 1]**2, expected[3:, 2], atol=1e-9)
+    # move all nodes a little
+    moves = 0.2 * rng.normal(size=(5, 3))
+    rows = graph.memory['node_f'][:5]
+    rows[:, tb.DELTA:tb.DELTA + 3] = moves
+    rows[:, tb.POSE:tb.POSE + 3] = se2.wrapped(before + moves)
+    for e in range(12):
+        factors.check_edge(graph.memory.head, e, 0.0)
+    error = error_functions.edge_errors(graph.poses, edges)
+    linear = (first.error + np.einsum('mij,mj->mi', first.jacobian_i, moves[i])
+              + np.einsum('mij,mj->mi', first.jacobian_j, moves[j]))
+    rest = error - linear
+    rest[:, 2] = 0.0
+    energy = error_functions.energies(error, W)
+    turned = moves[i, 2]**2 * np.any(edges.bias[:, :2] != 0.0, axis=1) * energy
+    table, wrapped = graph.memory['edge_f'][:12], np.abs(error - linear)[:, 2] > 1.0
+    np.testing.assert_allclose(table[:, tb.ENERGY], energy, rtol=1e-12, atol=1e-12)
+    np.testing.assert_allclose(
+        table[~wrapped, tb.ERROR2], (error_functions.energies(rest, W) + turned)[~wrapped],
+        rtol=1e-9, atol=1e-9)
+
+
+def test_a_rigid_motion_changes_the_error_of_a_bias_so_its_cliques_stay_in_the_map() -> None:
+    smoother = IncrementalSmoother(EXACT)
+    smoother.update(GraphUpdate(
+        hidden=[[0.0, 0.0, 0.0], [1.0, 0.0, 0.0]], biases=np.zeros((1, 3)), observed=prior(2),
+        edges=Edges.joined([
+            Edges([0], [1], [[1.0, 0.0, 0.0]], [ODOMETRY], [EdgeKind.ODOMETRY]),
+            fix(0, 2, np.zeros(2), np.zeros(2), np.array([0.1, 1.0])),
+            fix(1, 2, np.array([0.0, 1.0]), np.zeros(2), np.array([0.1, 1.0]))])))
+    memory = smoother.graph.memory
+    for c in cliques(smoother.graph):
+        assert memory['clique_i'][c, tb.ANCHORED] == 1
+    # the two positions determine the heading, the bias does not
+    np.testing.assert_allclose(smoother.poses[0], [0.0, 0.0, np.pi / 2.0], atol=1e-6)
+
+
+# --- correlated noise ---------------------------------------------------------------------------
+
+def drive(n: int, rng: np.random.Generator) -> tuple[FloatArray, FloatArray]:
+    """Return true poses, and the odometry between them."""
+    truth = [np.zeros(3)]
+    for _ in range(n - 1):
+        move = np.array([1.0, 0.0, rng.normal(0.0, 0.1)])
+        truth.append(se2.wrapped(se2.compose(truth[-1], move)))
+    poses = np.array(truth)
+    moves = se2.between(poses[:-1], poses[1:])
+    return poses, moves + rng.normal(size=moves.shape) @ np.diag([0.05, 1.0 / 30.0, 0.02])
+
+
+@pytest.mark.parametrize('late', [False, True])
+def test_a_chain_of_biases_is_noise_with_its_full_covariance(*, late: bool) -> None:
+    """Compare with generalized least squares with the dense covariance, without biases."""
+    rng, n, phi, s, white = np.random.default_rng(5), 25, 0.9, 1.5, 0.3
+    truth, odometry = drive(n, rng)
+    lever = np.array([0.7, -0.4])
+    covariance = s**2 * phi**np.abs(np.subtract.outer(np.arange(n), np.arange(n))) + (
+        white**2 * np.eye(n))
+    fixes = se2.transform(truth, np.tile(lever, (n, 1))) + np.linalg.cholesky(
+        covariance) @ rng.normal(size=(n, 2))
+
+    smoother = IncrementalSmoother(EXACT)
+    smoother.update(GraphUpdate(
+        hidden=truth[:1], biases=np.zeros((1, 3)), observed=prior(1),
+        edges=fix(0, 1, fixes[0], lever, np.array([white, s])), fix=[0]))
+    smoother.update(GraphUpdate(free=[0], observed=ObservedNodes(
+        [0], None, truth[:1], [np.diag([1e-6, 1e-6, 100.0])], [ObservedKind.GLOBAL_POSE])))
+    nodes, bias = [0], 1
+    for k in range(1, n):
+        smoother.extend(odometry[k - 1], ODOMETRY)
+        nodes.append(smoother.graph.newest_pose)
+        if not late:
+            bias = add_fix(smoother, nodes[k], bias, phi, fixes[k], lever, white, s)
+    for k in range(1, n if late else 0):
+        bias = add_fix(smoother, nodes[k], bias, phi, fixes[k], lever, white, s)
+
+    root, whiten = np.linalg.cholesky(ODOMETRY).T, np.linalg.inv(np.linalg.cholesky(covariance))
+
+    def errors(x: FloatArray) -> FloatArray:
+        poses = x.reshape(-1, 3)
+        moves = error_functions.edge_errors(poses, Edges(
+            np.arange(n - 1), np.arange(1, n), odometry, np.tile(ODOMETRY, (n - 1, 1, 1)),
+            [EdgeKind.ODOMETRY] * (n - 1)))
+        off = fixes - se2.transform(poses, np.tile(lever, (n, 1)))
+        first = np.array([1e-3, 1e-3, 10.0]) * (poses[0] - truth[0])
+        return np.concatenate(((moves @ root.T).ravel(), (whiten @ off).ravel(), first))
+
+    other = least_squares(
+        errors, smoother.poses[nodes].ravel(), xtol=1e-15, ftol=1e-15, gtol=1e-15)
+    expected = other.x.reshape(-1, 3)
+    off = smoother.poses[nodes] - expected
+    off[:, 2] = se2.wrap(off[:, 2])
+    np.testing.assert_allclose(off, 0.0, atol=1e-5)
+    assert smoother.chi2() == pytest.approx(2.0 * other.cost, rel=1e-9)
+    dense = np.linalg.inv(other.jac.T @ other.jac)
+    blocks = dense.reshape(n, 3, n, 3)[np.arange(n), :, np.arange(n)]
+    np.testing.assert_allclose(smoother.covariances()[nodes], blocks, rtol=1e-4, atol=1e-6)
+    np.testing.assert_allclose(smoother.newest_covariance(), blocks[-1], rtol=1e-4, atol=1e-6)
+    # treated as white noise, the fixes would give much smaller sigmas
+    assert np.min(np.sqrt(blocks[:, 0, 0])) > 2.0 * np.hypot(white, s) / np.sqrt(n)
+
+
+def add_fix(  # noqa: PLR0917
+    smoother: IncrementalSmoother, node: int, before: int, phi: float, where: FloatArray,
+    lever: FloatArray, white: float, s: float,
+) -> int:
+    bias = smoother.graph.n_nodes
+    result = smoother.update(GraphUpdate(
+        biases=phi * smoother.poses[before][None], edges=Edges.joined([
+            link(bias, before, phi), fix(node, bias, where, lever, np.array([white, s]))])))
+    assert result.status is Status.CONVERGED
+    return bias
+
+
+def test_the_estimate_is_good_all_along_a_drive_with_default_settings() -> None:
+    rng, n, phi, s, white = np.random.default_rng(2), 400, 0.99, 1.0, 0.2
+    truth, odometry = drive(n, rng)
+    smoother, m, bias, nodes = IncrementalSmoother(), np.zeros(2), -1, [0]
+    smoother.update(GraphUpdate(hidden=truth[:1], observed=ObservedNodes(
+        [0], None, truth[:1], [np.diag([1.0, 1.0, 100.0])], [ObservedKind.GLOBAL_POSE])))
+    for k in range(1, n):
+        smoother.extend(odometry[k - 1], ODOMETRY)
+        nodes.append(smoother.graph.newest_pose)
+        m = phi * m + np.sqrt(1.0 - phi**2) * rng.normal(size=2)
+        where = truth[k, :2] + s * m + white * rng.normal(size=2)
+        if bias < 0:
+            bias = smoother.graph.n_nodes
+            smoother.update(GraphUpdate(
+                biases=np.zeros((1, 3)), observed=prior(bias),
+                edges=fix(nodes[k], bias, where, np.zeros(2), np.array([white, s]))))
+        elif k % 3 == 0:
+            bias = add_fix(smoother, nodes[k], bias, phi, where, np.zeros(2), white, s)
+        if k % 90 == 0:     # a closure, which moves all newer nodes
+            assert smoother.update(GraphUpdate(edges=Edges(
+                [nodes[k - 80]], [nodes[k]], [se2.between(truth[k - 80], truth[k])], [ODOMETRY],
+                [EdgeKind.LOOP_CLOSURE]))).reason == ''
+        if k % 40 == 0:
+            other = Graph()
+            other.fill(smoother.graph.rows()._replace(poses=smoother.poses))
+            optimizer.optimize(other, THOROUGH)
+            assert -1e-6 < smoother.chi2() - other.energies().chi2 < 0.05
+    off = np.hypot(*(smoother.poses[nodes] - truth)[:, :2].T)
+    assert np.max(off) < 5.0
+
+
+# --- rows of biases in the graph ----------------------------------------------------------------
+
+def test_biases_are_numbered_behind_the_poses_of_their_update_and_are_no_poses() -> None:
+    graph = Graph()
+    assert graph.newest_pose == -1
+    graph.apply(GraphUpdate(biases=np.full((1, 3), 0.5)))
+    assert graph.newest_pose == -1
+    graph.apply(GraphUpdate(hidden=np.ones((2, 3)), biases=np.zeros((2, 3))))
+    assert graph.is_bias.tolist() == [True, False, False, True, True]
+    assert (graph.newest_pose, graph.n_nodes) == (2, 5)
+    np.testing.assert_array_equal(graph.poses[:, 0], [0.5, 1.0, 1.0, 0.0, 0.0])
+    graph.begin()
+    graph.apply(GraphUpdate(hidden=np.ones((1, 3))))
+    assert (graph.newest_pose, graph.is_bias[-1]) == (5, False)
+    graph.rollback()
+    assert graph.newest_pose == 2
+
+
+def with_biases(config: SmootherConfig = EXACT) -> IncrementalSmoother:
+    """Return a chain of 12 poses and a chain of 4 biases, which are the last nodes."""
+    smoother, bias = IncrementalSmoother(config), 12
+    smoother.update(GraphUpdate(hidden=np.zeros((1, 3)), fix=[0]))
+    for _ in range(11):
+        smoother.extend(np.array([1.0, 0.0, 0.1]), ODOMETRY)
+    sigmas = np.array([0.1, 1.0])
+    smoother.update(GraphUpdate(
+        biases=np.zeros((1, 3)), observed=prior(12),
+        edges=fix(2, 12, np.array([2.5, 1.0]), np.ones(2), sigmas)))
+    for node in (5, 8, 10):
+        bias = add_fix(
+            smoother, node, bias, 0.8, smoother.poses[node, :2] + 0.7, np.ones(2), 0.1, 1.0)
+    return smoother
+
+
+def test_a_chain_is_extended_behind_biases_in_constant_time() -> None:
+    smoother = with_biases()
+    root = cliques(smoother.graph)[int(smoother.graph.memory['node_i'][11, tb.CLIQUE])]
+    assert (root.frontal, root.separator) == ([11], [])
+    before = smoother.poses.copy()
+    result = smoother.extend(np.array([1.0, 0.0, 0.1]), ODOMETRY)
+    assert (result.eliminated, result.visited, result.iterations) == (1, 1, 1)
+    assert smoother.graph.newest_pose == 16
+    assert (smoother.graph.edges.i[-1], smoother.graph.edges.j[-1]) == (11, 16)
+    np.testing.assert_array_equal(smoother.poses[:16], before)
+    np.testing.assert_allclose(
+        smoother.poses[16], se2.compose(before[11], np.array([1.0, 0.0, 0.1])))
+    smoother.extend(np.array([1.0, 0.0, 0.1]), ODOMETRY, smoother.poses[16] + 0.5, ODOMETRY)
+    graph = smoother.graph
+    slow = SlowGraph(graph.poses.copy(), graph.fixed, graph.edges, graph.observed)
+    assert np.max(np.abs(slow.step())) < 1e-6
+    np.testing.assert_allclose(
+        smoother.newest_covariance(), slow.covariance()[51:54, 51:54], rtol=1e-6, atol=1e-12)
+
+
+def test_without_a_chain_too_the_next_node_is_connected_to_the_newest_pose() -> None:
+    smoother = with_biases()
+    smoother.graph.set_poses(smoother.poses.copy())     # no chain any more
+    smoother.extend(np.array([1.0, 0.0, 0.1]), ODOMETRY)
+    assert (smoother.graph.edges.i[-1], smoother.graph.edges.j[-1]) == (11, 16)
+    np.testing.assert_allclose(
+        smoother.poses[16], se2.compose(smoother.poses[11], np.array([1.0, 0.0, 0.1])), atol=1e-9)
+
+
+def test_a_graph_without_poses_cannot_be_extended() -> None:
+    smoother = IncrementalSmoother(EXACT)
+    smoother.update(GraphUpdate(biases=np.zeros((1, 3)), observed=prior(0)))
+    with pytest.raises(ValueError, match='expected a graph with a hidden node'):
+        smoother.extend(np.zeros(3), ODOMETRY)
+    with pytest.raises(ValueError, match='got -1'):
+        smoother.newest_covariance()
+
+
+def test_an_update_with_an_undetermined_bias_is_rolled_back() -> None:
+    smoother = with_biases()
+    before = state(smoother.graph)
+    result = smoother.update(GraphUpdate(
+        hidden=np.zeros((1, 3)), biases=np.zeros((1, 3)), edges=Edges.joined([
+            Edges([11], [16], [[1.0, 0.0, 0.0]], [ODOMETRY], [EdgeKind.ODOMETRY]),
+            fix(16, 17, np.zeros(2), np.zeros(2), np.array([0.1, 1.0]))])))
+    # a position does not determine its angle
+    assert (result.status, result.reason) == (
+        Status.FAILED, 'hidden node 17 is not determined')
+    assert differences(before, state(smoother.graph)) == []
+    assert smoother.graph.newest_pose == 11
+
+
+def test_weights_and_removals_of_edges_to_biases_count() -> None:
+    smoother = with_biases()
+    n = smoother.graph.n_edges
+    for update in (GraphUpdate(weigh_edges={n - 1: 0.1, n - 3: 3.0}),
+                   GraphUpdate(remove_edges=[n - 1]), GraphUpdate(weigh_observed={0: 0.2}),
+                   GraphUpdate(weigh_edges={n - 1: 1.0, n - 2: 0.5})):
+        smoother.update(update)
+        graph = smoother.graph
+        slow = SlowGraph(graph.poses.copy(), graph.fixed, graph.edges, graph.observed)
+        assert np.max(np.abs(slow.step())) < 1e-6
+        assert smoother.chi2() == pytest.approx(slow.chi2(), rel=1e-9)
+
+
+# --- batch, starts, files -----------------------------------------------------------------------
+
+@pytest.mark.parametrize('seed', range(6))
+def test_the_batch_optimum_is_that_of_scipy(seed: int) -> None:
+    here, graph = world(seed), Graph()
+    for update in (GraphUpdate(hidden=np.array(here.truth), fix=[0]), here.new_nodes(8),
+                   here.new_biases(3, 9)):
+        graph.apply(update)
+    edges, observed, free = graph.edges, graph.observed, ~graph.fixed
+    roots = []
+    for table in (edges, observed):
+        values, vectors = np.linalg.eigh(table.information)
+        roots.append(np.sqrt(np.maximum(values, 0.0))[:, :, None] * np.swapaxes(vectors, 1, 2))
+
+    def errors(x: FloatArray) -> FloatArray:
+        poses = graph_poses.copy()
+        poses[free] = x.reshape(-1, 3)
+        return np.concatenate([
+            np.einsum('mij,mj->mi', root, error).ravel() for root, error in zip(
+                roots, (error_functions.edge_errors(poses, edges),
+                        error_functions.observed_errors(poses, observed)), strict=True)])
+
+    graph_poses = graph.poses.copy()
+    other = least_squares(errors, graph_poses[free].ravel(), xtol=1e-15, ftol=1e-15, gtol=1e-15)
+    result = optimizer.optimize(graph, THOROUGH)
+    assert result.status is Status.CONVERGED
+    assert result.chi2 == pytest.approx(2.0 * other.cost, rel=1e-9)
+    off = graph.poses[free] - other.x.reshape(-1, 3)
+    off[:, 2] = se2.wrap(off[:, 2])
+    np.testing.assert_allclose(off, 0.0, atol=1e-6)
+
+
+def positions_with_biases(seed: int) -> tuple[Graph, FloatArray]:
+    """Return a graph with exact odometry and positions with biases, and its poses."""
+    rng, graph = np.random.default_rng(seed), consistent_graph(seed)
+    truth, n = graph.poses.copy(), graph.n_nodes
+    offset = rng.uniform(-1.0, 1.0, (n, 2))
+    mean = np.column_stack((se2.transform(truth, offset), np.zeros(n)))
+    information = random_information(rng, n)
+    information[:, 2] = information[:, :, 2] = 0.0
+    bias = np.column_stack((offset, rng.uniform(0.3, 1.0, (n, 2))))
+    graph.apply(GraphUpdate(
+        biases=np.zeros((2, 3)), observed=prior(n), free=[0],
+        edges=Edges.joined([
+            link(n + 1, n, 0.9),
+            Edges(np.arange(n), n + rng.integers(0, 2, n), mean, information,
+                  [EdgeKind.BIAS] * n, bias=bias)])))
+    return graph, np.vstack((truth, np.zeros((2, 3))))
+
+
+@pytest.mark.parametrize('seed', range(5))
+def test_without_a_guess_the_joint_start_is_taken(seed: int) -> None:
+    graph, truth = positions_with_biases(seed)
+    with pytest.raises(LinearSolveError, match='bias'):
+        chordal_start.chordal(graph)
+    graph.set_poses(random_poses(np.random.default_rng(seed), graph.n_nodes))
+    start = joint(graph)
+    np.testing.assert_allclose(start[:, :2], truth[:, :2], atol=1e-9)
+    np.testing.assert_allclose(se2.wrap(start[:, 2] - truth[:, 2]), 0.0, atol=1e-9)
+    result = optimizer.optimize_from_linear_start(graph, THOROUGH)
+    assert result.status is Status.CONVERGED
+    assert result.chi2 < 1e-15
+    np.testing.assert_allclose(graph.poses[:, :2], truth[:, :2], atol=1e-6)
+
+
+def test_the_joint_start_weighs_positions_by_both_variances() -> None:
+    graph = Graph()
+    bad = np.array([0.0, 8.0])
+    graph.apply(GraphUpdate(
+        hidden=np.zeros((2, 3)), biases=[[9.0, 9.0, 0.0], [5.0, 5.0, 0.1]], fix=[0, 3],
+        observed=prior(2),
+        edges=Edges.joined([
+            Edges([0], [1], [[2.0, 0.0, 0.0]], [np.diag([1.0, 1.0, 1e6])], [EdgeKind.ODOMETRY]),
+            fix(1, 2, bad, np.zeros(2), np.array([1.0, np.sqrt(3.0)]))])))
+    # information 1 against 1 / (1 + 3)
+    start = joint(graph)
+    np.testing.assert_allclose(start[1, :2], 0.8 * np.array([2.0, 0.0]) + 0.2 * bad, atol=1e-4)
+    np.testing.assert_array_equal(start[2:], [[0.0, 0.0, 0.0], [5.0, 5.0, 0.1]])
+
+
+def test_a_part_connected_to_a_bias_with_a_prior_is_determined() -> None:
+    graph, _ = positions_with_biases(1)
+    assert optimizer.optimize(graph, SolverConfig()).status is Status.CONVERGED
+    graph.apply(GraphUpdate(remove_observed=[0]))
+    result = optimizer.optimize(graph, SolverConfig())
+    assert result.status is Status.FAILED
+    assert 'hidden node 0 and 9 others are connected to no' in result.reason
+
+
+def test_a_rescued_graph_has_its_biases() -> None:
+    smoother, other = with_biases(), IncrementalSmoother(EXACT)
+    smoother.extend(np.array([1.0, 0.0, 0.1]), ODOMETRY)
+    smoother.graph.begin()
+    assert batch_fallback.optimize_copy(smoother.graph, other.graph)
+    assert other.graph.is_bias.tolist() == smoother.graph.is_bias.tolist()
+    assert other.graph.newest_pose == smoother.graph.newest_pose == 16
+    for name in Edges.__dataclass_fields__:
+        np.testing.assert_array_equal(
+            getattr(other.graph.edges, name), getattr(smoother.graph.edges, name))
+    np.testing.assert_allclose(other.poses, smoother.poses, atol=1e-5)
+
+
+def test_a_closure_that_contradicts_all_is_solved_for_on_a_copy(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    smoother, copied = with_biases(SmootherConfig()), []
+    optimize_copy = batch_fallback.optimize_copy
+
+    def watched(graph: Graph, copy: Graph) -> bool:
+        copied.append(copy)
+        return optimize_copy(graph, copy)
+
+    monkeypatch.setattr(batch_fallback, 'optimize_copy', watched)
+    smoother.update(GraphUpdate(edges=Edges(
+        [2], [10], [[0.0, 0.0, 3.0]], ODOMETRY[None], [EdgeKind.LOOP_CLOSURE])))
+    assert len(copied) == 1
+    other = Graph()
+    other.fill(smoother.graph.rows()._replace(poses=smoother.poses))
+    assert optimizer.optimize(other, THOROUGH).status is Status.CONVERGED
+    assert smoother.chi2() == pytest.approx(other.energies().chi2, rel=1e-3)
+    assert smoother.extend(np.array([1.0, 0.0, 0.1]), ODOMETRY).status is Status.CONVERGED
+    assert smoother.graph.newest_pose == 16
+
+
+def test_a_file_has_no_biases_and_says_so(tmp_path: Path) -> None:
+    graph = random_graph(seed=3, fix=(0,), n_biases=2)
+    write_g2o(graph, tmp_path / 'graph.g2o')
+    text = (tmp_path / 'graph.g2o').read_text(encoding='ascii')
+    assert text.startswith('# left out: 2 biases, 7 edges to them and 1 observed ones\n')
+    read = read_g2o(tmp_path / 'graph.g2o').graph
+    same = random_graph(seed=3, fix=(0,))
+    np.testing.assert_array_equal(read.poses, same.poses)
+    np.testing.assert_array_equal(read.edges.mean, same.edges.mean)
+    assert (read.n_edges, read.n_observed) == (same.n_edges, same.n_observed)

@@ -1,0 +1,266 @@
+# Copyright 2026 The pose_graph_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""Correlated errors: the estimate is that of the full covariance, in any order of arrival."""
+
+from dataclasses import replace
+import itertools
+
+from hypothesis import given, settings, strategies as st
+import numpy as np
+import pytest
+
+from pose_graph_ros.core.backend import PoseGraphBackend
+from pose_graph_ros.core.batch.optimizer import Status
+from pose_graph_ros.core.config import (
+    BackendConfig,
+    Correlation,
+    Loss,
+    MeasurementSource,
+    NodePolicy,
+    OdometryNoise,
+    OdometrySource,
+)
+from pose_graph_ros.core.exceptions import ConfigError
+from pose_graph_ros.core.geometry import se2
+from pose_graph_ros.core.graph.constraints import EdgeKind
+from pose_graph_ros.core.measurements import (
+    GlobalPose,
+    HeadingOnly,
+    Measurement,
+    OdometrySample,
+    Position,
+)
+from pose_graph_ros.core.odometry.motion import Attachment
+from pose_graph_ros.core.sources.gauss_markov import (
+    Additions,
+    BINS,
+    GaussMarkovBias,
+    GraphSizes,
+    InflatedWeights,
+)
+
+SECOND = 1_000_000_000
+TAU = float(BINS)
+"""Time constant for which a bin is one second [s]."""
+NOWHERE = Attachment(0, np.zeros(3), np.zeros((3, 3)))
+
+
+def position(seconds: float, x: float = 0.0, y: float = 0.0, sigma: float = 1.0) -> Position:
+    return Position(round(seconds * SECOND), np.array((x, y)), sigma**2 * np.eye(2), np.zeros(2))
+
+
+def transitions(stamps: list[float]) -> set[tuple[object, ...]]:
+    """Return the edges, transitions and priors of states for fixes that arrive one by one."""
+    chain = GaussMarkovBias(MeasurementSource(correlation_time=TAU))
+    rows: dict[int, int] = {}
+    edges: dict[int, tuple[object, ...]] = {}
+    priors: dict[int, int] = {}
+    sizes = GraphSizes(1, 0, 0)
+    for stamp in stamps:
+        additions = Additions(sizes)
+        chain.begin()
+        edge = chain.add(position(stamp), NOWHERE, additions)
+        for number, table in enumerate(additions.edges, sizes.n_edges):
+            edges[number] = (int(table.i[0]), int(table.j[0]), table.information.tobytes(),
+                             table.bias.tobytes())
+        rows[edges[edge][1]] = round(stamp)
+        for number, table in enumerate(additions.observed, sizes.n_observed):
+            priors[number] = int(table.node[0])
+        for number in additions.remove_edges:
+            del edges[number]
+        for number in additions.remove_observed:
+            del priors[number]
+        sizes = GraphSizes(sizes.n_nodes + len(additions.biases),
+                           sizes.n_edges + len(additions.edges),
+                           sizes.n_observed + len(additions.observed))
+    return ({(rows.get(i, 'pose'), rows[j], *rest) for i, j, *rest in edges.values()}
+            | {('prior', rows[node]) for node in priors.values()})
+
+
+def test_the_order_of_arrival_does_not_change_the_transitions_of_states() -> None:
+    stamps = [3.0, 4.0, 7.0, 20.0, 21.0]
+    expected = transitions(stamps)
+    assert len(expected) == 5 + 4 + 1
+    for order in itertools.permutations(stamps):
+        assert transitions(list(order)) == expected
+
+
+@pytest.mark.parametrize('source', [
+    MeasurementSource(correlation_time=TAU),
+    MeasurementSource(correlation_time=TAU, correlation=Correlation.INFLATE)])
+def test_the_additions_of_a_failed_update_are_rolled_back(source: MeasurementSource) -> None:
+    def add(chain: GaussMarkovBias | InflatedWeights, seconds: float) -> Additions:
+        additions = Additions(GraphSizes(10, 20, 30))
+        if isinstance(chain, InflatedWeights):
+            chain.add(round(seconds * SECOND), None, additions)  # type: ignore[arg-type]
+        else:
+            chain.add(position(seconds), NOWHERE, additions)
+        return additions
+
+    chains = [(InflatedWeights if source.correlation is Correlation.INFLATE
+               else GaussMarkovBias)(source)
+              for _ in range(2)]
+    for chain in chains:
+        for seconds in (3.0, 9.0):
+            chain.begin()
+            add(chain, seconds)
+    chains[0].begin()
+    for seconds in (1.0, 5.0, 5.2, 30.0):
+        add(chains[0], seconds)
+    chains[0].rollback()
+    for seconds in (5.0, 2.0, 40.0, 5.5):
+        got, expected = (add(chain, seconds) for chain in chains)
+        assert got.remove_edges == expected.remove_edges
+        assert got.remove_observed == expected.remove_observed
+        assert got.weigh_observed == expected.weigh_observed
+        assert len(got.biases) == len(expected.biases)
+
+
+def test_the_weights_of_measurements_within_two_time_constants_add_up_to_one() -> None:
+    inflated = InflatedWeights(
+        MeasurementSource(correlation_time=5.0, correlation=Correlation.INFLATE))
+    weights: dict[int, float] = {}
+    sizes = GraphSizes(1, 0, 0)
+    for k, seconds in enumerate((20.5, 29.0, 31.0, 22.0)):
+        additions = Additions(sizes._replace(n_observed=k))
+        inflated.add(round(seconds * SECOND), None, additions)  # type: ignore[arg-type]
+        weights |= additions.weigh_observed
+    assert weights == {0: 1 / 3, 1: 1 / 3, 2: 1.0, 3: 1 / 3}
+
+
+STIFF = OdometrySource(
+    noise=OdometryNoise(sigma_distance=0.05, sigma_lateral=0.05, sigma_heading_distance=1e-4,
+                        sigma_heading_turn=1e-4, sigma_floor_position=1e-3,
+                        sigma_floor_heading=1e-5), reorder_window=0.0)
+"""With a known heading a straight drive is linear, and the expected estimate has a closed form."""
+
+
+def run(measurements: list[Measurement], source: MeasurementSource, seconds: int = 40,
+        **settings: object) -> PoseGraphBackend:
+    backend = PoseGraphBackend(BackendConfig(
+        nodes=NodePolicy(minimum_travel_distance=0.9), odometry={'odom': STIFF},
+        measurements={'fix': source}, **settings))
+    for second in range(1, seconds + 1):
+        backend.add_odometry(OdometrySample(second * SECOND, np.array((second - 1.0, 0.0, 0.0))))
+    # the map frame is the odometry frame, whose heading is known
+    backend.add_measurement(GlobalPose(
+        SECOND, np.zeros(3), np.diag((100.0**2, 100.0**2, 1e-8))), 'start')
+    for measurement in measurements:
+        backend.add_measurement(measurement, 'fix')
+    return backend
+
+
+def generalised_least_squares(
+    fixes: list[Position], n: int, correlation: np.ndarray,
+) -> tuple[np.ndarray, np.ndarray]:
+    """Return estimate and deviation of the x of each node from the full covariance."""
+    noise, which = STIFF.noise, [round(fix.stamp_ns / SECOND) - 1 for fix in fixes]
+    step = noise.sigma_distance**2 + noise.sigma_floor_position**2
+    prior = 100.0**2 + step * np.minimum.outer(np.arange(n), np.arange(n))
+    design = np.zeros((len(fixes), n))
+    design[np.arange(len(fixes)), which] = 1.0
+    seen = np.array([fix.position[0] for fix in fixes])
+    expected = np.arange(n, dtype=float)
+    gain = prior @ design.T @ np.linalg.inv(design @ prior @ design.T + correlation)
+    return (expected + gain @ (seen - design @ expected),
+            np.sqrt(np.diagonal(prior - gain @ design @ prior)))
+
+
+def test_poses_and_sigma_are_those_of_the_full_covariance() -> None:
+    rng = np.random.default_rng(2)
+    sigma, share = 2.0, 0.02
+    fixes = [position(second, second - 1.0 + rng.normal(0.0, sigma), 0.0, sigma)
+             for second in range(1, 41)]
+    source = MeasurementSource(correlation_time=TAU, white_share=share)
+    backend = run(fixes, source)
+    backend.optimize()
+    estimate = backend.estimate()
+    assert estimate is not None
+    gap = np.abs(np.subtract.outer(np.arange(40), np.arange(40)))
+    # the fixes lie at the ends of bins, where the states of bins are least accurate
+    correlation = sigma**2 * (np.exp(-gap / TAU) + share * np.eye(40))
+    expected, deviation = generalised_least_squares(fixes, 40, correlation)
+    np.testing.assert_allclose(estimate.path.poses[:, 0], expected, atol=0.02 * sigma)
+    assert np.sqrt(estimate.covariance[0, 0]) == pytest.approx(deviation[-1], rel=0.02)
+    alone = run(fixes, MeasurementSource())
+    alone.optimize()
+    white = alone.estimate()
+    assert white is not None
+    assert np.sqrt(white.covariance[0, 0]) < 0.4 * deviation[-1]
+
+
+def drive(seed: int) -> list[Measurement]:
+    rng = np.random.default_rng(seed)
+    return [
+        *(position(2.03 + 0.7 * k, 1.03 + 0.7 * k + rng.normal(), rng.normal())
+          for k in range(50)),
+        *(GlobalPose(round((3.1 + 3 * k) * SECOND),
+                     np.array((2.1 + 3 * k, 0.0, 0.0)) + rng.normal(0.0, (1.0, 1.0, 0.05)),
+                     np.diag((1.0, 2.0, 0.0025))) for k in range(10)),
+        *(HeadingOnly(round((4.3 + 3 * k) * SECOND), float(rng.normal(0.0, 0.1)), 0.01)
+          for k in range(10))]
+
+
+@settings(max_examples=15, deadline=None)
+@given(seed=st.integers(0, 10), data=st.data(), model=st.sampled_from(Correlation),
+       loss=st.sampled_from(Loss))
+def test_shuffled_measurements_give_the_same_path(
+    seed: int, data: st.DataObject, model: Correlation, loss: Loss,
+) -> None:
+    # with a threshold below 1 the loss acts on most of them
+    source = MeasurementSource(
+        correlation_time=5.0, correlation=model, loss=loss, rejection_threshold=0.7)
+    measurements = drive(seed)
+    paths = []
+    for order in (measurements, data.draw(st.permutations(measurements))):
+        backend = run([], source)
+        for k, measurement in enumerate(order):
+            backend.add_measurement(measurement, 'fix')
+            if k % 7 == 3:
+                assert backend.update().status is not Status.FAILED
+        assert backend.optimize().status is Status.CONVERGED
+        estimate = backend.estimate()
+        assert estimate is not None
+        paths.append(estimate.path.poses)
+    np.testing.assert_allclose(*paths, atol=1e-9)
+
+
+def test_biases_are_no_part_of_the_path_and_odometry_extends_poses() -> None:
+    backend = run(drive(1)[:20], MeasurementSource(correlation_time=5.0), seconds=20)
+    backend.update()
+    assert backend.graph.n_nodes > len(backend.node_stamps_ns)
+    assert EdgeKind.BIAS in backend.graph.edges.kind
+    for second in range(21, 41):
+        backend.add_odometry(OdometrySample(second * SECOND, np.array((second - 1.0, 0.0, 0.0))))
+    backend.optimize()
+    estimate = backend.estimate()
+    assert estimate is not None
+    assert estimate.n_hidden == len(estimate.path) == 40
+    assert (estimate.n_edges, estimate.n_observed) == (39, 21)
+    assert estimate.n_biases == backend.graph.n_nodes - 40 > 0
+    steps = se2.between(estimate.path.poses[:-1], estimate.path.poses[1:])
+    np.testing.assert_allclose(steps, np.tile((1.0, 0.0, 0.0), (39, 1)), atol=0.3)
+
+
+def test_reports_of_correlated_and_of_white_errors() -> None:
+    rng, phi = np.random.default_rng(5), np.exp(-1.0 / 20.0)
+    error = rng.standard_normal((300, 2))
+    for k in range(1, 300):
+        error[k] = phi * error[k - 1] + np.sqrt(1.0 - phi**2) * error[k]
+    fixes = [position(k + 1.0, k + error[k, 0], error[k, 1]) for k in range(300)]
+    for source in (MeasurementSource(), MeasurementSource(correlation_time=20.0)):
+        backend = run(fixes, source, seconds=300)
+        backend.optimize()
+        report = backend.reports()['fix']
+        assert report.n == 300
+        assert report.errors.significant
+        assert 5.0 < report.errors.tau < 60.0
+        assert 0.3 < report.energy < 1.7
+
+
+@pytest.mark.parametrize(('settings', 'expected'), [
+    ({'white_share': -0.1}, 'white_share'), ({'white_share': 1.5}, 'white_share'),
+    ({'correlation_time': -1.0}, 'correlation_time')])
+def test_settings_that_cannot_be_are_refused(settings: dict[str, object], expected: str) -> None:
+    with pytest.raises(ConfigError, match=expected):
+        replace(MeasurementSource(), **settings)

@@ -1,0 +1,124 @@
+# Copyright 2026 The pose_graph_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""Waiting measurements and stamps seen so far, compared with plain lists and sets."""
+
+from dataclasses import replace
+import gc
+import sys
+
+from hypothesis import given, strategies as st
+import numpy as np
+import pytest
+
+from pose_graph_ros.core.backend import PoseGraphBackend
+from pose_graph_ros.core.measurements import (
+    AnswerStatus,
+    GlobalPose,
+    HeadingOnly,
+    LoopClosure,
+    Measurement,
+    OdometrySample,
+)
+from pose_graph_ros.core.sources.waiting import due_ns, SeenStamps, WaitingMeasurements
+
+SECOND = 1_000_000_000
+
+
+def heading(stamp: int) -> HeadingOnly:
+    return HeadingOnly(stamp, 1.0, 0.1)
+
+
+def closure(stamp: int, **reference: int) -> LoopClosure:
+    return LoopClosure(stamp, np.zeros(3), np.eye(3), **reference)
+
+
+@given(st.lists(st.tuples(st.booleans(), st.integers(0, 20)), max_size=60))
+def test_what_is_due_comes_out_by_stamp_then_by_arrival(steps: list[tuple[bool, int]]) -> None:
+    pending, plain = WaitingMeasurements(), []
+    for k, (push, number) in enumerate(steps):
+        if push:
+            one = heading(number)
+            assert pending.push(f'{k}', one) is None
+            plain.append((number, k))
+        else:
+            due = sorted(item for item in plain if item[0] <= number)
+            plain = [item for item in plain if item[0] > number]
+            assert [(w.due_ns, int(w.source)) for w in pending.pop_due(number)] == due
+        assert len(pending) == len(plain)
+
+
+@given(st.lists(st.integers(0, 30), max_size=40), st.integers(1, 9))
+def test_where_there_are_too_many_the_latest_goes(stamps: list[int], most: int) -> None:
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr('pose_graph_ros.core.sources.waiting.MAX_WAITING', most)
+        pending, plain = WaitingMeasurements(), []
+        for k, stamp in enumerate(stamps):
+            gone = pending.push(f'{k}', heading(stamp))
+            plain = sorted([*plain, (stamp, k)])
+            expected = plain.pop() if len(plain) > most else None
+            assert (None if gone is None else (gone.due_ns, int(gone.source))) == expected
+        assert [(w.due_ns, int(w.source)) for w in pending.pop_due(99)] == plain
+
+
+def test_a_closure_is_due_at_the_later_of_its_ends() -> None:
+    assert due_ns(closure(5, reference_ns=9)) == due_ns(closure(9, reference_ns=5)) == 9
+    assert due_ns(closure(5, reference_node=9)) == due_ns(heading(5)) == 5
+
+
+@given(st.lists(st.tuples(
+    st.sampled_from('ab'), st.integers(1, 6), st.sampled_from((None, 'ns', 'node', 'none')),
+    st.integers(0, 3), st.booleans()), max_size=60))
+def test_what_has_come_before_is_known(
+    steps: list[tuple[str, int, str | None, int, bool]],
+) -> None:
+    seen, plain = SeenStamps(), set()
+    for source, stamp, kind, number, add in steps:
+        one: Measurement = heading(stamp)
+        if kind is not None:
+            one = closure(stamp, **({} if kind == 'none' else {f'reference_{kind}': number + 1}))
+        key = source, stamp, kind, number if kind in ('ns', 'node') else 0
+        assert seen.has(source, one) == (key in plain)
+        if add and key not in plain:
+            seen.add(source, one)
+            plain.add(key)
+        elif not add:
+            seen.remove(source, one)
+            plain.discard(key)
+
+
+def test_a_dropped_measurement_may_be_sent_again(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr('pose_graph_ros.core.sources.waiting.MAX_WAITING', 2)
+    backend = PoseGraphBackend()
+    ahead = heading(100 * SECOND)
+    for one in (ahead, heading(2 * SECOND), heading(SECOND)):
+        assert backend.add_measurement(one, 'compass').status is AnswerStatus.PENDING
+    assert backend.counts['compass', 'too_many_pending'] == 1
+    for k in range(30):
+        backend.add_odometry(OdometrySample((1 + k) * SECOND, np.array([1.0 * k, 0.0, 0.0])))
+    assert backend.n_waiting == 0
+    assert backend.add_measurement(ahead, 'compass').status is AnswerStatus.PENDING
+    assert backend.add_measurement(ahead, 'compass').reason == 'duplicate_stamp'
+
+
+def test_measurements_leave_no_objects_behind() -> None:
+    backend, n = PoseGraphBackend(), 3000
+    for k in range(n):
+        backend.add_odometry(OdometrySample((1 + k) * SECOND, np.array([0.0, 0.3 * (k % 3), 0.0])))
+    fix = GlobalPose(SECOND, np.zeros(3), 0.01 * np.eye(3))
+
+    def feed(first: int, last: int) -> int:
+        for k in range(first, last):
+            stamp = (1 + k) * SECOND
+            backend.add_measurement(replace(fix, stamp_ns=stamp), 'pose')
+            if k > 100:
+                backend.add_measurement(closure(stamp, reference_ns=stamp - 90 * SECOND), 'scan')
+            if k % 10 == 0:
+                backend.update()
+        backend.update()
+        gc.collect()
+        return sys.getallocatedblocks()
+
+    before = feed(0, 1000)
+    after = feed(1000, 2800)
+    assert backend.counts['scan', 'accepted'] > 2000
+    assert after - before < 1800     # less than one object per measurement, of 3600

@@ -1,0 +1,197 @@
+# Copyright 2026 The pose_graph_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""
+Random poses, information matrices and graphs, and a slow reference of errors and Jacobians.
+
+The reference evaluates one constraint at a time, with 3x3 homogeneous matrices and with the
+Jacobians as the source prints them; it shares no code with the package.
+"""
+
+import numpy as np
+
+from pose_graph_ros.core.geometry.se2 import FloatArray
+from pose_graph_ros.core.graph.constraints import EdgeKind, Edges, ObservedKind, ObservedNodes
+from pose_graph_ros.core.graph.graph import Graph, GraphUpdate
+
+
+def random_poses(rng: np.random.Generator, n: int, spread: float = 5.0) -> FloatArray:
+    """Return poses, shape (n, 3), with positions in a square and any heading."""
+    return np.column_stack((
+        rng.uniform(-spread, spread, (n, 2)), rng.uniform(-np.pi, np.pi, n)))
+
+
+def random_information(rng: np.random.Generator, n: int) -> FloatArray:
+    """Return well-conditioned anisotropic matrices with correlations, shape (n, 3, 3)."""
+    root = rng.uniform(-1.0, 1.0, (n, 3, 3)) + 2.0 * np.eye(3)
+    return root @ np.swapaxes(root, 1, 2) * rng.uniform(0.5, 20.0, (n, 1, 1))
+
+
+def random_edges(rng: np.random.Generator, i: list[int], j: list[int]) -> Edges:
+    """Return edges with random means: their errors are large."""
+    return Edges(i, j, random_poses(rng, len(i)), random_information(rng, len(i)),
+                 [EdgeKind.LOOP_CLOSURE] * len(i))
+
+
+def random_observed(
+    rng: np.random.Generator, node: list[int], *, offset: bool = True,
+) -> ObservedNodes:
+    """Return observed nodes with random means; every third has no information on the heading."""
+    information = random_information(rng, len(node))
+    mean = random_poses(rng, len(node))
+    information[::3, 2, :] = information[::3, :, 2] = 0.0
+    mean[::3, 2] = 0.0
+    kind = np.full(len(node), ObservedKind.GLOBAL_POSE)
+    kind[::3] = ObservedKind.POSITION
+    offsets = random_poses(rng, len(node), 2.0) if offset else np.zeros((len(node), 3))
+    return ObservedNodes(node, offsets, mean, information, kind)
+
+
+def random_graph(  # noqa: PLR0917
+    seed: int, n_nodes: int = 7, n_edges: int = 12, n_observed: int = 5,
+    fix: tuple[int, ...] = (), n_biases: int = 0,
+) -> Graph:
+    """
+    Return a connected graph with duplicate and reversed edges and large errors.
+
+    The biases are the last nodes: a chain whose first bias is observed, with edges from poses.
+    """
+    rng = np.random.default_rng(seed)
+    i, j = list(range(n_nodes - 1)), list(range(1, n_nodes))
+    for _ in range(n_edges - len(i)):
+        a, b = rng.choice(n_nodes, 2, replace=False).tolist()
+        i, j = [*i, a], [*j, b]
+    i, j = [*i, i[0], j[0], j[-1]], [*j, j[0], i[0], i[-1]]
+    graph = Graph()
+    graph.apply(GraphUpdate(
+        hidden=random_poses(rng, n_nodes), edges=random_edges(rng, i, j),
+        observed=random_observed(rng, rng.integers(0, n_nodes, n_observed).tolist()), fix=fix))
+    if n_biases > 0:
+        biases = np.arange(n_nodes, n_nodes + n_biases)
+        graph.apply(GraphUpdate(
+            biases=random_poses(rng, n_biases), observed=random_observed(rng, [0, n_nodes]).rows(
+                slice(1, 2)), edges=Edges.joined([
+                    random_edges_to_biases(rng, biases[1:], biases[:-1]),
+                    random_edges_to_biases(rng, rng.integers(0, n_nodes, 3 * n_biases),
+                                           rng.choice(biases, 3 * n_biases))])))
+    return graph
+
+
+def random_edges_to_biases(rng: np.random.Generator, i: FloatArray, j: FloatArray) -> Edges:
+    """Return edges to biases with large errors; every third has no information on the heading."""
+    edges, n = random_edges(rng, i, j), len(i)
+    edges.information[::3, 2, :] = edges.information[::3, :, 2] = 0.0
+    bias = np.column_stack((random_poses(rng, n, 2.0)[:, :2], rng.uniform(0.3, 1.5, (n, 2))))
+    return Edges(i, j, edges.mean, edges.information, [EdgeKind.BIAS] * n, bias=bias)
+
+
+def consistent_graph(seed: int, noise: float = 0.0, n_nodes: int = 8) -> Graph:
+    """
+    Return a graph of odometry and three loop closures that agree but for noise; node 0 is fixed.
+
+    Without noise the poses are the minimum; with noise they are those by odometry alone.
+    """
+    rng = np.random.default_rng(seed)
+    truth = random_poses(rng, n_nodes)
+    i = [*range(n_nodes - 1), n_nodes - 1, 0, 2]
+    j = [*range(1, n_nodes), 0, n_nodes // 2, n_nodes - 1]
+    mean = np.array([vector(np.linalg.inv(matrix(truth[a])) @ matrix(truth[b]))
+                     for a, b in zip(i, j, strict=True)])
+    mean += noise * rng.standard_normal(mean.shape)
+    poses = truth.copy()
+    for k in range(1, n_nodes):
+        poses[k] = vector(matrix(poses[k - 1]) @ matrix(mean[k - 1]))
+    graph = Graph()
+    graph.apply(GraphUpdate(
+        hidden=poses, fix=(0,),
+        edges=Edges(i, j, mean, random_information(rng, len(i)), [EdgeKind.ODOMETRY] * len(i))))
+    return graph
+
+
+def snapshot(graph: Graph) -> tuple[bytes, ...]:
+    """Return all numbers of a graph as bytes, for comparison bit by bit."""
+    tables = (graph.edges, graph.observed)
+    columns = [getattr(table, name) for table in tables for name in table.__dataclass_fields__]
+    return tuple(column.tobytes() for column in (graph.poses, graph.fixed, *columns))
+
+
+def matrix(pose: FloatArray) -> FloatArray:
+    """Return the homogeneous 3x3 matrix of one pose."""
+    x, y, theta = pose
+    c, s = np.cos(theta), np.sin(theta)
+    return np.array([[c, -s, x], [s, c, y], [0.0, 0.0, 1.0]])
+
+
+def vector(transformation: FloatArray) -> FloatArray:
+    """Return the pose of one homogeneous matrix, the heading by arctan2."""
+    return np.array([transformation[0, 2], transformation[1, 2],
+                     np.arctan2(transformation[1, 0], transformation[0, 0])])
+
+
+def slow_edge(
+    x_i: FloatArray, x_j: FloatArray, z: FloatArray,
+) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Return the error of one edge as in g2o, and its Jacobians (3.49), (3.50)."""
+    error = vector(np.linalg.inv(matrix(z)) @ np.linalg.inv(matrix(x_i)) @ matrix(x_j))
+    R_z, R_i = matrix(z)[:2, :2], matrix(x_i)[:2, :2]
+    c, s = np.cos(x_i[2]), np.sin(x_i[2])
+    dR_i_transposed = np.array([[-s, c], [-c, -s]])
+    A, B = np.zeros((3, 3)), np.zeros((3, 3))
+    A[:2, :2] = -R_z.T @ R_i.T
+    A[:2, 2] = R_z.T @ dR_i_transposed @ (x_j[:2] - x_i[:2])
+    A[2, 2] = -1.0
+    B[:2, :2] = R_z.T @ R_i.T
+    B[2, 2] = 1.0
+    return error, A, B
+
+
+def slow_to_bias(
+    x_i: FloatArray, m_j: FloatArray, z: FloatArray, bias: FloatArray,
+) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Return the error of one edge to a bias and its Jacobians."""
+    F = np.diag(bias[[2, 2, 3]])
+    error = F @ m_j + z - (matrix(x_i) @ matrix(np.append(bias[:2], 0.0)))[[0, 1, 2], 2]
+    error[2] = np.arctan2(*(f(F[2, 2] * m_j[2] + z[2] - x_i[2]) for f in (np.sin, np.cos)))
+    c, s = np.cos(x_i[2]), np.sin(x_i[2])
+    A = -np.eye(3)
+    A[:2, 2] = -np.array([[-s, -c], [c, -s]]) @ bias[:2]
+    return error, A, F
+
+
+def slow_observed(
+    x: FloatArray, offset: FloatArray, z: FloatArray,
+) -> tuple[FloatArray, FloatArray]:
+    """Return the error of one observed node and its Jacobian."""
+    error = vector(np.linalg.inv(matrix(z)) @ matrix(x) @ matrix(offset))
+    R_z = matrix(z)[:2, :2]
+    c, s = np.cos(x[2]), np.sin(x[2])
+    J = np.zeros((3, 3))
+    J[:2, :2] = R_z.T
+    J[:2, 2] = R_z.T @ np.array([[-s, -c], [c, -s]]) @ offset[:2]
+    J[2, 2] = 1.0
+    return error, J
+
+
+def dense_system(graph: Graph) -> tuple[FloatArray, FloatArray]:
+    """Return H, shape (3N, 3N), and b, shape (3N,), of all nodes, fixed or not."""
+    H, b = np.zeros((3 * graph.n_nodes,) * 2), np.zeros(3 * graph.n_nodes)
+    edges, observed = graph.edges, graph.observed
+    for k, (i, j) in enumerate(zip(edges.i, edges.j, strict=True)):
+        ends = graph.poses[i], graph.poses[j], edges.mean[k]
+        e, A, B = (slow_to_bias(*ends, edges.bias[k]) if edges.kind[k] == EdgeKind.BIAS
+                   else slow_edge(*ends))
+        for row, J_row in ((i, A), (j, B)):
+            b[3 * row:3 * row + 3] += J_row.T @ edges.information[k] @ e
+            for column, J_column in ((i, A), (j, B)):
+                H[3 * row:3 * row + 3, 3 * column:3 * column + 3] += (
+                    J_row.T @ edges.information[k] @ J_column)
+    for k, i in enumerate(observed.node):
+        e, J = slow_observed(graph.poses[i], observed.offset[k], observed.mean[k])
+        b[3 * i:3 * i + 3] += J.T @ observed.information[k] @ e
+        H[3 * i:3 * i + 3, 3 * i:3 * i + 3] += J.T @ observed.information[k] @ J
+    return H, b
+
+
+def free_part(graph: Graph, H: FloatArray, b: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Return H and b without the rows and columns of the fixed nodes."""
+    free = np.repeat(~graph.fixed, 3)
+    return H[np.ix_(free, free)], b[free]

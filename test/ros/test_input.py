@@ -1,0 +1,309 @@
+# Copyright 2026 The pose_graph_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""From messages to measurements without a node: counts, reasons, and messages held back."""
+
+from collections.abc import Iterator
+import math
+from types import SimpleNamespace as Space
+from typing import Any
+
+import numpy as np
+import pytest
+
+from pose_graph_ros.adapters.parameters import checked
+from pose_graph_ros.core.measurements import GlobalPose, OdometrySample, Position
+from pose_graph_ros.ros import input as input_module
+from pose_graph_ros.ros.input import Input, LONGEST_DOUBT
+from pose_graph_ros.ros.time_jump import Decision, EVIDENCE
+
+SECOND = 1_000_000_000
+
+
+def header(seconds: float, frame: str) -> Space:
+    sec, nanosec = divmod(round(seconds * SECOND), SECOND)
+    return Space(frame_id=frame, stamp=Space(sec=sec, nanosec=nanosec))
+
+
+def posed(x: float) -> Space:
+    return Space(covariance=np.zeros(36), pose=Space(
+        position=Space(x=x, y=0.0, z=0.0), orientation=Space(x=0.0, y=0.0, z=0.0, w=1.0)))
+
+
+def odometry(seconds: float, x: float = 0.0) -> Space:
+    return Space(header=header(seconds, 'odom'), child_frame_id='base_link', pose=posed(x),
+                 twist=Space(covariance=np.zeros(36),
+                             twist=Space(linear=Space(x=1.0, y=0.0, z=0.0))))
+
+
+def pose(seconds: float, frame: str = 'map') -> Space:
+    return Space(header=header(seconds, frame), pose=posed(0.0))
+
+
+def fix(seconds: float, latitude: float = 48.1, status: int = 0) -> Space:
+    return Space(header=header(seconds, 'gps'), status=Space(status=status), latitude=latitude,
+                 longitude=11.6, altitude=500.0, position_covariance_type=2,
+                 position_covariance=np.eye(3).ravel())
+
+
+class Engine:
+    """An inbox with a limit in place of the worker."""
+
+    def __init__(self, limit: int = 1000) -> None:
+        self.limit = limit
+        self.posted: list[tuple[str, object]] = []
+
+    def post(self, source: str, measurement: object) -> bool:
+        if len(self.posted) >= self.limit:
+            return False
+        self.posted.append((source, measurement))
+        return True
+
+
+class Clock:
+    """A monotonic clock that only the test moves."""
+
+    def __init__(self) -> None:
+        self.now = 100.0
+
+    def monotonic(self) -> float:
+        return self.now
+
+
+class Given:
+    """An input with the log and the engine that it writes to."""
+
+    def __init__(self, limit: int = 1000, **values: object) -> None:
+        self.values = {name.replace('__', '.'): value for name, value in values.items()}
+        self.log: list[str] = []
+        self.input = Input(checked(self.values), self.log.append)
+        self.engine = Engine(limit)
+
+    def receive(self, source: str, message: object, primary: str = '') -> Decision:
+        return self.input.receive(self.input.reader.sources[source], message, primary)
+
+    def use(self, source: str, message: object) -> None:
+        """Do with a message what the node does, but for jumps of time."""
+        for received in self.receive(source, message).released:
+            measurement = self.input.read(received)
+            if measurement is not None:
+                self.input.post(received.source, measurement, self.engine.post)
+
+    def rejected(self) -> dict[str, int]:
+        return {f'{source}.{reason}': count
+                for (source, reason), count in self.input.rejected.items()}
+
+
+@pytest.fixture
+def clock(monkeypatch: pytest.MonkeyPatch) -> Iterator[Clock]:
+    made = Clock()
+    monkeypatch.setattr(input_module, 'time', made)
+    return made
+
+
+def test_every_message_is_counted_and_each_measurement_reaches_the_engine() -> None:
+    given = Given()
+    for step in range(20):
+        given.use('odom', odometry(1.0 + 0.1 * step, 0.1 * step))
+    given.use('fix', fix(1.5))
+    given.use('global_pose', pose(2.0))
+    assert given.input.received == {'odom': 20, 'fix': 1, 'global_pose': 1}
+    assert given.input.posted == len(given.engine.posted) == 22
+    assert given.rejected() == {}
+    assert given.log == []
+    kinds = {source: type(measurement) for source, measurement in given.engine.posted}
+    assert kinds == {'odom': OdometrySample, 'fix': Position, 'global_pose': GlobalPose}
+
+
+def not_finite(seconds: float) -> Space:
+    return odometry(seconds, math.nan)
+
+
+@pytest.mark.parametrize(('source', 'message', 'reason'), [
+    ('odom', not_finite(2.0), 'not_finite'),
+    ('odom', odometry(2.0, 1e30), 'too_large'),
+    ('odom', odometry(2**31 - 2.0), 'stamp_out_of_range'),
+    ('global_pose', pose(2.0, 'elsewhere'), 'wrong_frame'),
+    ('fix', fix(2.0, status=-1), 'no_fix'),
+    ('fix', fix(2.0, latitude=95.0), 'out_of_range'),
+    ('fix', fix(0.0), 'zero_stamp'),
+    ('fix', Space(header=header(2.0, 'gps')), 'malformed'),
+])
+def test_an_unusable_message_is_counted_by_its_reason_and_logged_once(
+    source: str, message: Any, reason: str,
+) -> None:
+    given = Given()
+    for _ in range(3):
+        given.use(source, message)
+    assert given.input.received == {source: 3}
+    assert given.rejected() == {f'{source}.{reason}': 3}
+    assert given.input.posted == 0
+    (sentence,) = given.log
+    assert sentence.startswith(f'{source}: {reason}: ')
+    assert sentence.endswith('(logged once, counted in diagnostics)')
+
+
+def test_another_reason_and_another_source_are_logged_again() -> None:
+    given = Given(sources=['odom', 'fix', 'rear'], rear__type='fix')
+    for source in ('fix', 'rear', 'fix'):
+        given.use(source, fix(2.0, status=-1))
+        given.use(source, fix(2.0, latitude=95.0))
+    assert [sentence.split(': ')[:2] for sentence in given.log] == [
+        ['fix', 'no_fix'], ['fix', 'out_of_range'], ['rear', 'no_fix'], ['rear', 'out_of_range']]
+
+
+def test_fixes_wait_for_the_datum_that_is_to_be_set() -> None:
+    given = Given(wait_for_datum=True)
+    given.use('fix', fix(1.0))
+    assert given.rejected() == {'fix.no_datum': 1}
+    given.input.reader.datum.renew()
+    given.use('fix', fix(2.0))
+    assert given.input.posted == 1
+
+
+def test_while_paused_measurements_are_read_but_not_posted() -> None:
+    given = Given()
+    given.input.paused = True
+    for step in range(5):
+        given.use('odom', odometry(1.0 + 0.1 * step))
+    given.use('fix', fix(1.2))
+    assert given.engine.posted == []
+    assert given.rejected() == {'odom.paused': 5, 'fix.paused': 1}
+    assert not given.input.is_streaming
+    # the first fix is the datum nevertheless
+    assert given.input.reader.datum.plane is not None
+    given.input.paused = False
+    given.use('odom', odometry(1.6))
+    assert given.input.posted == 1
+    assert given.input.is_streaming
+
+
+def test_a_full_inbox_is_a_reason_and_no_measurement() -> None:
+    given = Given(limit=3)
+    for step in range(5):
+        given.use('odom', odometry(1.0 + 0.1 * step))
+    assert given.input.posted == 3
+    assert given.rejected() == {'odom.inbox_full': 2}
+    assert 'the solver does not keep up' in given.log[0]
+
+
+def test_the_time_of_the_last_posted_measurement_is_kept(clock: Clock) -> None:
+    given = Given()
+    assert (given.input.posted_at, given.input.is_streaming) == (100.0, False)
+    clock.now = 107.0
+    given.use('odom', odometry(1.0))
+    assert (given.input.posted_at, given.input.is_streaming) == (107.0, True)
+    # a message that cannot be used is as good as none
+    clock.now = 109.0
+    given.use('odom', not_finite(1.1))
+    assert given.input.posted_at == 107.0
+
+
+def test_messages_are_held_back_while_a_jump_of_time_is_in_doubt() -> None:
+    given = Given()
+    for step in range(20):
+        given.receive('odom', odometry(100.0 + 0.1 * step))
+    sent = [('odom', odometry(50.0 + 0.1 * step)) for step in range(EVIDENCE)]
+    sent.insert(2, ('fix', fix(50.15)))
+    decisions = [given.receive(source, message) for source, message in sent]
+    assert [len(decision.released) for decision in decisions] == [0] * EVIDENCE + [EVIDENCE + 1]
+    assert [decision.jump_ns > 0 for decision in decisions] == [False] * EVIDENCE + [True]
+    assert decisions[-1].jump_ns == round(51.9 * SECOND)
+    assert [(each.source, each.message) for each in decisions[-1].released] == sent
+    # held back or not, all of them have come
+    assert given.input.received == {'odom': 25, 'fix': 1}
+
+
+def test_messages_that_are_held_back_are_released_after_a_while(clock: Clock) -> None:
+    given = Given()
+    given.receive('odom', odometry(100.0))
+    given.receive('odom', odometry(50.0))
+    given.receive('fix', fix(50.1))
+    clock.now += 0.9 * LONGEST_DOUBT
+    assert given.input.release_overdue() == []
+    clock.now += 0.2 * LONGEST_DOUBT
+    assert [received.source for received in given.input.release_overdue()] == ['odom', 'fix']
+    assert given.input.release_overdue() == []
+
+
+def test_only_the_primary_odometry_is_evidence_of_a_jump() -> None:
+    given = Given(sources=['odom', 'visual'], visual__type='odometry')
+    for step in range(20):
+        given.receive('odom', odometry(100.0 + 0.1 * step), 'odom')
+    for step in range(2 * EVIDENCE):
+        decision = given.receive('visual', odometry(50.0 + 0.1 * step), 'odom')
+        assert (len(decision.released), decision.jump_ns) == (1, 0)
+    assert len(given.receive('odom', odometry(50.0), 'odom').released) == 0
+
+
+def test_after_a_jump_of_the_clock_messages_of_the_old_time_are_rejected() -> None:
+    given = Given()
+    for step in range(20):
+        given.receive('odom', odometry(100.0 + 0.1 * step))
+    given.input.time_jumps.clock_jumped(50 * SECOND)
+    decision = given.receive('odom', odometry(102.0))
+    assert (decision.is_old, decision.released) == (True, [])
+    assert given.rejected() == {'odom.before_clock_jump': 1}
+    assert len(given.receive('odom', odometry(52.0)).released) == 1
+    assert not given.receive('odom', odometry(52.1)).is_old
+
+
+def test_the_threshold_of_a_jump_can_change() -> None:
+    given = Given()
+    given.receive('odom', odometry(100.0))
+    assert given.receive('odom', odometry(98.0)).released == []
+    given.input.configure(checked({'clock_jump_threshold': 5.0}))
+    assert len(given.receive('odom', odometry(98.1)).released) == 2
+
+
+def test_another_time_offset_shifts_measurements_and_is_no_jump() -> None:
+    given = Given()
+    for step in range(20):
+        given.use('odom', odometry(100.0 + 0.1 * step))
+    given.input.configure(checked({'odom.time_offset': -30.0}))
+    for step in range(20, 30):
+        given.use('odom', odometry(100.0 + 0.1 * step))
+    assert given.input.posted == 30
+    assert given.engine.posted[-1][1].stamp_ns == round(72.9 * SECOND)
+
+
+def test_a_new_graph_forgets_all_but_what_is_held_back() -> None:
+    given = Given()
+    for step in range(20):
+        given.use('odom', odometry(100.0 + 0.1 * step))
+    given.use('fix', fix(101.0))
+    given.use('fix', fix(101.0, status=-1))
+    given.use('odom', odometry(50.0))
+    frames = given.input.reader.frames
+    given.input.start_new_graph(checked(given.values))
+    assert given.input.received == given.input.rejected == {}
+    assert (given.input.posted, given.input.is_streaming) == (0, False)
+    assert given.input.reader.datum.plane is None
+    assert given.input.liveness.silence('odom', 1e9) is None
+    assert given.input.reader.frames is frames
+    assert [received.source for received in given.input.time_jumps.release()] == ['odom']
+    # what was logged before is not logged again
+    given.use('fix', fix(101.0, status=-1))
+    assert len(given.log) == 1
+
+
+def test_a_source_that_ends_is_silent_but_loop_closures_never_are(clock: Clock) -> None:
+    given = Given()
+    reference = pose(1.0, 'x0')
+    for step in range(100):
+        clock.now = 100.0 + 0.1 * step
+        given.receive('odom', odometry(1.0 + 0.1 * step))
+        if step < 50:
+            given.receive('fix', fix(1.0 + 0.1 * step))
+            given.receive('loop_closure', reference)
+    liveness = given.input.liveness
+    assert liveness.silent(clock.now) == ['fix']
+    assert liveness.silence('fix', clock.now) == pytest.approx(5.0)
+    assert liveness.rate('odom') == pytest.approx(10.0)
+    assert liveness.rate('global_pose') == 0.0
+
+
+def test_a_sentence_is_logged_once_for_each_value() -> None:
+    given = Given()
+    for name in ('wheels', 'wheels', 'visual'):
+        given.input.warn_once('odom_frame', name, f'the frame is {name}')
+    assert given.log == ['the frame is wheels', 'the frame is visual']

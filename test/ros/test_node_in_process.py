@@ -1,0 +1,277 @@
+# Copyright 2026 The pose_graph_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""The managed node in the test's own process: its lifecycle, parameters and services."""
+
+from collections.abc import Iterator
+from pathlib import Path
+import threading
+from typing import Any
+
+import pytest
+
+pytest.importorskip('rclpy', reason='ROS 2 is not there: no rclpy')
+
+from circle import PLANE
+from harness import PREPARE_PATIENCE
+from lifecycle_msgs.msg import Transition
+from lifecycle_msgs.srv import ChangeState
+from local_node import Driver, LocalNode
+from rclpy.context import Context
+from rclpy.lifecycle import TransitionCallbackReturn
+from rclpy.parameter import Parameter
+from std_srvs.srv import SetBool, Trigger
+
+from pose_graph_ros.core.exceptions import ConfigError
+from pose_graph_ros.core.warm_up import warm_up
+from pose_graph_ros.ros import memory
+from pose_graph_ros.ros.node import PoseGraphNode
+from pose_graph_ros.ros.services import REPLACED
+from pose_graph_ros.ros.session import Session
+
+pytestmark = pytest.mark.timeout(PREPARE_PATIENCE)
+SUCCESS, RAISED = TransitionCallbackReturn.SUCCESS, TransitionCallbackReturn.ERROR
+
+
+@pytest.fixture(autouse=True, scope='module')
+def _compiled() -> Iterator[None]:
+    """Compile the kernels, which may take half a minute, outside of the tests."""
+    warm_up(lambda: False)
+    with pytest.MonkeyPatch.context() as patch:
+        # the process of the tests would have to read the pages again for each session
+        patch.setattr(memory, 'release_memory', lambda: None)
+        yield
+
+
+class Managed(Driver):
+    """The node with parameters, and a client that calls its services."""
+
+    def call(self, name: str, request: Any = None, kind: type = Trigger) -> Any:
+        client = self.local.client.create_client(kind, f'/pose_graph/{name}')
+        self.wait(client.service_is_ready, f'{name} is there')
+        future = client.call_async(kind.Request() if request is None else request)
+        self.wait(future.done, f'{name} answers')
+        self.local.client.destroy_client(client)
+        return future.result()
+
+    def pause(self, *, data: bool) -> SetBool.Response:
+        return self.call('pause', SetBool.Request(data=data), SetBool)
+
+    def set(self, name: str, value: object) -> tuple[bool, str]:
+        (result,) = self.local.node.set_parameters([Parameter(name, value=value)])
+        return result.successful, result.reason
+
+    def start(self) -> None:
+        self.local.node.start()
+        self.connect()
+
+
+@pytest.fixture
+def managed(tmp_path: Path, request: pytest.FixtureRequest) -> Iterator[Managed]:
+    values = {'frequency': 50, 'diagnostics_period': 0.02} | getattr(request, 'param', {})
+    overrides = [Parameter(name, value=value) for name, value in values.items()]
+
+    def make(context: Context) -> PoseGraphNode:
+        return PoseGraphNode(context=context, parameter_overrides=overrides)
+    with LocalNode(tmp_path, make) as local:
+        yield Managed(local)
+        local.node.close()
+
+
+def test_it_goes_through_all_its_states_and_back(managed: Managed) -> None:
+    node = managed.local.node
+    assert node.autostarts
+    managed.start()
+    managed.drive(2.0)
+    worker = managed.session.worker
+    assert node.trigger_deactivate() is SUCCESS
+    assert node.trigger_activate() is SUCCESS
+    assert managed.session.worker is worker
+    assert node.trigger_deactivate() is SUCCESS
+    assert node.trigger_cleanup() is SUCCESS
+    assert not worker.alive
+    assert list(node.subscriptions) == []
+    node.start()
+    assert managed.session.worker.estimate is None
+    assert node.trigger_shutdown() is SUCCESS
+
+
+def test_a_configuration_that_fails_says_why_and_can_be_repaired(managed: Managed) -> None:
+    node = managed.local.node
+    assert managed.set('fix.sigma_ceiling', 0.001)[0] is False
+    node._given = node._given | {'fix.sigma_ceiling': 0.001}
+    with pytest.raises(ConfigError, match='ceiling'):
+        node.start()
+    assert managed.set('fix.sigma_ceiling', 100.0) == (True, '')
+    node.start()
+
+
+def test_a_transition_that_raises_leaves_the_node_unconfigured(
+    managed: Managed, monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    node = managed.local.node
+    assert node.trigger_configure() is SUCCESS
+
+    def fail(_: Session) -> None:
+        raise OSError('no memory')
+    with monkeypatch.context() as patch:
+        patch.setattr(Session, 'activate', fail)
+        assert node.trigger_activate() is RAISED
+    assert node.failure == 'OSError: no memory'
+    assert node._session is None
+    node.start()
+
+
+def test_a_transition_that_is_not_possible_is_answered(managed: Managed) -> None:
+    def change(transition: int) -> bool:
+        return managed.call('change_state', ChangeState.Request(
+            transition=Transition(id=transition)), ChangeState).success
+    assert not change(Transition.TRANSITION_ACTIVATE)
+    assert change(Transition.TRANSITION_CONFIGURE)
+    assert not change(Transition.TRANSITION_CONFIGURE)
+    assert change(Transition.TRANSITION_ACTIVATE)
+
+
+def test_parameters_are_checked_and_reach_the_session(managed: Managed) -> None:
+    assert managed.set('map_frame', 'world') == (True, '')
+    managed.start()
+    assert managed.session.out.map_frame == 'world'
+    assert managed.set('clock_jump_threshold', 3.0) == (True, '')
+    assert managed.session.input.time_jumps.guard.limit_ns == 3_000_000_000
+    for name, value in (('map_frame', 'elsewhere'), ('frequency', -1.0), ('fix.topic', 'other')):
+        successful, reason = managed.set(name, value)
+        assert not successful
+        assert reason != ''
+    assert managed.session.out.map_frame == 'world'
+    assert managed.session.values['frequency'] == 50.0
+
+
+@pytest.mark.parametrize('managed', [
+    {'sources': ['odom', 'rear'], 'rear.type': 'fix', 'rear.topic': 'rear/fix', 'datum': [48, 11],
+     'wheels.type': 'odometry', 'other_node.gain': 1.0}], indirect=True)
+def test_parameters_may_be_whole_numbers_and_unknown_ones_are_warned_of(
+    managed: Managed, capfd: pytest.CaptureFixture[str],
+) -> None:
+    node = managed.local.node
+    node._warn_of_unknown()
+    log = capfd.readouterr().err
+    assert 'parameter wheels.type is not known: wheels is not in sources' in log
+    assert 'other_node' not in log
+    node.start()
+    assert managed.session.input.reader.sources['rear'].topic == 'rear/fix'
+    plane = managed.session.input.reader.datum.plane
+    assert (plane.latitude, plane.longitude) == (48.0, 11.0)
+    assert not node.has_parameter('fix.topic')
+
+
+def test_optimize_and_reset_answer_what_was_done(managed: Managed) -> None:
+    managed.start()
+    answer = managed.call('optimize')
+    assert (answer.success, answer.message) == (False, 'there is no odometry yet')
+    managed.drive(4.0)
+    answer = managed.call('optimize')
+    assert answer.success
+    assert answer.message.startswith('converged after ')
+    n_hidden = managed.session.worker.estimate.n_hidden
+    answer = managed.call('reset')
+    assert answer.success
+    assert answer.message == (
+        f'{n_hidden} hidden nodes are gone; the next good fix will be the datum')
+    assert managed.session.n_resets == 1
+
+
+def test_a_new_graph_while_it_is_optimised_is_answered(managed: Managed) -> None:
+    managed.start()
+    managed.drive(2.0)
+    running, release = threading.Event(), threading.Event()
+    managed.session.worker.call(lambda _: (running.set(), release.wait(10.0)))
+    assert running.wait(10.0)
+    client = managed.local.client.create_client(Trigger, '/pose_graph/optimize')
+    managed.wait(client.service_is_ready, 'the service is there')
+    answer = client.call_async(Trigger.Request())
+    worker = managed.session.worker
+    managed.wait(lambda: len(worker._jobs) > 0, 'the optimisation waits')
+    managed.session.reset()
+    release.set()
+    managed.wait(answer.done, 'it answers')
+    assert (answer.result().success, answer.result().message) == (False, REPLACED)
+
+
+def test_an_error_of_the_engine_is_answered(
+    managed: Managed, monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    managed.start()
+    managed.drive(2.0)
+
+    def fail() -> None:
+        raise MemoryError('no memory')
+    monkeypatch.setattr(managed.session.worker._backend, 'optimize', fail)
+    answer = managed.call('optimize')
+    assert (answer.success, answer.message) == (False, 'failed: no memory')
+    assert managed.session.worker.alive
+
+
+def test_pause_answers_whether_it_changed_something(managed: Managed) -> None:
+    managed.start()
+    assert managed.pause(data=False).message == 'was not paused'
+    assert managed.pause(data=True).message.startswith('paused: ')
+    assert managed.session.input.paused
+    assert managed.pause(data=True).message == 'paused already'
+    assert managed.pause(data=False).message == 'resumed'
+    assert not managed.session.input.paused
+
+
+def test_the_datum_can_be_set_until_the_graph_refers_to_it(managed: Managed) -> None:
+    managed.start()
+    assert managed.call('set_datum').success
+    managed.drive(2.0, fixes=False)
+    datum = managed.session.input.reader.datum
+    # read, but not posted: nothing refers to it
+    datum.plane_for(48.0, 11.0, 0.0)
+    assert managed.call('set_datum').success
+    assert datum.plane is None
+    managed.drive(4.0, 2.0)
+    answer = managed.call('set_datum')
+    assert not answer.success
+    assert '4 fixes in the graph refer to the datum [48.' in answer.message
+    datum.keep(PLANE.origin)
+    assert 'graph that was loaded' in managed.call('set_datum').message
+
+
+def test_a_graph_is_saved_and_loaded(managed: Managed, tmp_path: Path) -> None:
+    managed.start()
+    for name in ('save_graph', 'load_graph'):
+        assert 'set the parameter graph_file first' in managed.call(name).message
+    assert managed.set('graph_file', str(tmp_path / 'map.g2o')) == (True, '')
+    assert not managed.call('load_graph').success
+    assert 'no graph to save' in managed.call('save_graph').message
+    managed.drive(8.0)
+    before = managed.session.worker.estimate
+    answer = managed.call('save_graph')
+    assert answer.success, answer.message
+    assert f'{before.n_hidden} hidden nodes in ' in answer.message
+    managed.call('reset')
+    answer = managed.call('load_graph')
+    assert answer.success, answer.message
+    assert str(tmp_path / 'map.g2o') in answer.message
+    managed.wait(lambda: managed.session.worker.estimate is not None, 'there is an estimate')
+    assert managed.session.worker.estimate.n_hidden == before.n_hidden
+    # the reset of a graph keeps no datum of it, so that another site is refused
+    managed.call('reset')
+    managed.session.input.reader.datum.plane_for(50.0, 8.0, 0.0)
+    answer = managed.call('load_graph')
+    assert not answer.success
+    assert 'another site' in answer.message
+
+
+def test_an_error_of_a_file_is_answered(
+    managed: Managed, tmp_path: Path, monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    managed.start()
+    managed.drive(2.0)
+    managed.set('graph_file', str(tmp_path / 'map.g2o'))
+
+    def fail(*_: object) -> None:
+        raise OSError('no space')
+    monkeypatch.setattr('pose_graph_ros.ros.services.write_graph', fail)
+    answer = managed.call('save_graph')
+    assert (answer.success, answer.message) == (False, 'failed: OSError: no space')

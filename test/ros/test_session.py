@@ -1,0 +1,487 @@
+# Copyright 2026 The pose_graph_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""A session in a node of the test's own process: states, new graphs, counts and diagnostics."""
+
+from collections.abc import Iterator
+from concurrent.futures import CancelledError
+from dataclasses import replace
+from pathlib import Path
+import threading
+from types import SimpleNamespace as Space
+
+import pytest
+
+pytest.importorskip('rclpy', reason='ROS 2 is not there: no rclpy')
+
+from circle import fix_at, odometry_at, START, true_pose
+from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
+from geometry_msgs.msg import PoseWithCovarianceStamped
+from harness import LATCHED, odometry, pose, PREPARE_PATIENCE, stamp_ns, TFMessage
+from local_node import Driver, LocalNode
+from nav_msgs.msg import Odometry, Path as PathMessage
+import numpy as np
+from rclpy.time import Time
+from visualization_msgs.msg import MarkerArray
+
+from pose_graph_ros.adapters.parameters import checked
+from pose_graph_ros.adapters.sources import backend_config
+from pose_graph_ros.core.alignment.monitor import AlignmentState
+from pose_graph_ros.core.backend import PoseGraphBackend
+from pose_graph_ros.core.batch.optimizer import Status
+from pose_graph_ros.core.estimate import UpdateReport
+from pose_graph_ros.core.warm_up import warm_up
+from pose_graph_ros.ros import diagnostics, memory, session as session_module
+from pose_graph_ros.ros.session import Session
+from pose_graph_ros.ros.time_jump import EVIDENCE
+
+pytestmark = pytest.mark.timeout(PREPARE_PATIENCE)
+OK, WARN, ERROR = DiagnosticStatus.OK, DiagnosticStatus.WARN, DiagnosticStatus.ERROR
+PERIODS = {'diagnostics_period': 0.02, 'frequency': 50.0, 'path_period': 0.0, 'graph_period': 0.1}
+
+
+@pytest.fixture(autouse=True, scope='module')
+def _compiled() -> Iterator[None]:
+    """Compile the kernels, which may take half a minute, outside of the tests."""
+    warm_up(lambda: False)
+    with pytest.MonkeyPatch.context() as patch:
+        # the process of the tests would have to read the pages again for each session
+        patch.setattr(memory, 'release_memory', lambda: None)
+        yield
+
+
+class Robot(Driver):
+    """A session of a node, and its client."""
+
+    def __init__(self, local: LocalNode, **values: object) -> None:
+        super().__init__(local)
+        self.given = PERIODS | {name.replace('__', '.'): value for name, value in values.items()}
+        self._session = Session(local.node, checked(self.given))
+
+    @property
+    def session(self) -> Session:
+        return self._session
+
+    def activate(self) -> None:
+        self.session.activate()
+        self.connect()
+
+    def configure(self, **values: object) -> None:
+        self.given |= {name.replace('__', '.'): value for name, value in values.items()}
+        self.session.configure(checked(self.given))
+
+    def values(self) -> dict[str, str]:
+        return {key: str(value) for key, value in diagnostics.values(self.session).items()}
+
+    def health(self) -> tuple[bytes, str]:
+        return diagnostics.health(self.session)
+
+
+@pytest.fixture
+def robot(tmp_path: Path, request: pytest.FixtureRequest) -> Iterator[Robot]:
+    with LocalNode(tmp_path) as local:
+        made = Robot(local, **getattr(request, 'param', {}))
+        yield made
+        made.session.close()
+
+
+@pytest.fixture
+def active(robot: Robot) -> Robot:
+    robot.activate()
+    return robot
+
+
+def test_measurements_come_in_and_poses_path_and_diagnostics_go_out(
+    active: Robot, monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr(session_module, 'ENERGY_PERIOD', 0.1)
+    poses = active.local.subscribe(PoseWithCovarianceStamped, 'pose')
+    paths = active.local.subscribe(PathMessage, 'path', LATCHED)
+    graphs = active.local.subscribe(MarkerArray, 'graph', LATCHED)
+    active.drive(10.0)
+    active.wait(lambda: len(paths) > 0, 'a path comes')
+    # from now on only after an optimisation
+    active.configure(path_period=1000.0)
+    active.session.worker.call(lambda _: None).result(10.0)
+    newest_ns = active.session.out._path_stamp_ns
+    report = active.session.optimize()
+    active.wait(report.done, 'it is optimised')
+    assert report.result().status is Status.CONVERGED
+    active.wait(lambda: stamp_ns(paths[-1]) > newest_ns, 'the optimised path comes')
+    n_hidden = active.session.worker.estimate.n_hidden
+    assert len(paths[-1].poses) == n_hidden + 1
+    for item in paths[-1].poses:
+        truth = true_pose(stamp_ns(item) * 1e-9 - START)
+        assert (item.pose.position.x, item.pose.position.y) == pytest.approx(truth[:2], abs=0.05)
+    active.wait(lambda: len(graphs) > 0, 'markers come')
+    assert len(poses) > 80
+    assert np.all(np.diff([stamp_ns(message) for message in poses]) > 0)
+
+    active.wait(lambda: len(active.session.largest_energies) == 3, 'energies are known')
+    values = active.values()
+    assert (values['received'], values['processed']) == ('120', '120')
+    assert (values['odom.accepted'], values['fix.accepted']) == ('100', '20')
+    assert (values['active'], values['paused'], values['resets']) == ('1', '0', '0')
+    assert (values['odometry'], values['alignment']) == ('odom', 'aligned')
+    assert (values['hidden_nodes'], values['observed_nodes']) == (str(n_hidden), '20')
+    assert float(values['alignment_yaw_deg']) == pytest.approx(122.0, abs=1.0)
+    assert values['datum'].startswith('[48.1')
+    assert values['fix.lever_arm'] == '[0.000, 0.000] from none'
+    assert values['global_pose.silence_s'] == 'never received'
+    assert float(values['odom.rate_hz']) > 0.0
+    assert 0.0 <= float(values['fix.squared_residual']) < 0.1
+    assert {f'largest_energy.{rank}' for rank in (1, 2, 3)} < values.keys()
+    assert float(values['memory_mb']) > 10.0
+    assert active.health() == (OK, 'Running.')
+
+
+def test_before_it_is_active_nothing_is_received(robot: Robot) -> None:
+    assert 'Inactive' in robot.health()[1]
+    assert list(robot.local.node.subscriptions) == []
+    robot.wait(lambda: robot.session.worker.prepared, 'the kernels are there')
+    robot.activate()
+    assert robot.health() == (WARN, 'No odometry yet: check /odom.')
+    assert robot.session.odometry_topics == ['/odom']
+
+
+def test_an_inactive_session_keeps_its_graph_and_grows_it_when_it_is_active_again(
+    active: Robot,
+) -> None:
+    active.drive(5.0)
+    active.session.deactivate()
+    # an update that was requested before
+    active.session.worker.call(lambda _: None).result(10.0)
+    before = active.session.worker.estimate
+    assert not active.session.active
+    assert list(active.local.node.subscriptions) == []
+    assert active.session._timers.keys() == {'diagnostics'}
+    active.wait(lambda: active.publishers['odom'].get_subscription_count() == 0, 'none is left')
+    active.publishers['odom'].publish(odometry_at(5.0))
+    came = active.local.subscribe(DiagnosticArray, '/diagnostics')
+    active.wait(lambda: len(came) >= 2, 'diagnostics come nevertheless')
+    assert came[-1].status[0].message.startswith('Inactive')
+    assert active.session.input.received['odom'] == 50
+    assert active.session.worker.estimate is before
+    active.activate()
+    active.drive(8.0, 5.0)
+    after = active.session.worker.estimate
+    assert after.n_hidden > before.n_hidden
+    assert active.session.n_resets == 0
+
+
+def test_parameters_reach_input_outputs_and_engine(active: Robot) -> None:
+    session = active.session
+    active.drive(3.0)
+    configs = []
+    engine = session.worker._backend
+    configure = engine.configure
+    engine.configure = lambda config: (configs.append(config), configure(config))
+    handle = session._jump_handle
+    active.configure(publish_tf=False, clock_jump_threshold=7.0, path_period=3.0,
+                     odom__maximum_speed=4.5, fix__rejection_threshold=2.0)
+    assert session.out.transforms is None
+    assert session.input.time_jumps.guard.limit_ns == 7_000_000_000
+    assert session._continuity['odom'].maximum_speed == 4.5
+    assert session._jump_handle is not handle
+    assert session._timers['views'].timer_period_ns == 500_000_000
+    active.wait(lambda: len(configs) > 0, 'the engine has them')
+    assert configs[0].measurements['fix'].rejection_threshold == 2.0
+    assert session.n_resets == 0
+    active.drive(4.0, 3.0)
+
+
+def test_parameters_can_change_while_the_session_is_inactive(robot: Robot) -> None:
+    robot.configure(diagnostics_period=0.5, frequency=5.0)
+    assert robot.session._timers['diagnostics'].timer_period_ns == 500_000_000
+    assert 'update' not in robot.session._timers
+    robot.activate()
+    assert robot.session._timers['update'].timer_period_ns == 200_000_000
+
+
+def test_a_reset_starts_a_new_graph_and_new_counts(active: Robot) -> None:
+    paths = active.local.subscribe(PathMessage, 'path', LATCHED)
+    active.drive(6.0)
+    old = active.session.worker
+    active.session.reset()
+    values = active.values()
+    assert (values['resets'], values['received'], values['datum']) == ('1', '0', 'none')
+    assert values['reset_reason'] == 'a new graph was started: a call of ~/reset'
+    assert active.session.worker is not old
+    assert active.session.worker.estimate is None
+    active.wait(lambda: not old.alive, 'the old worker ends')
+    active.wait(lambda: len(paths) > 0 and len(paths[-1].poses) == 0, 'the path is empty')
+    assert old.call(lambda backend: backend.counts).cancelled()
+    # any stamps may follow
+    active.drive(3.0)
+    assert active.values()['resets'] == '1'
+    assert active.session.worker.estimate.stamp_ns == stamp_ns(odometry_at(2.9))
+
+
+def test_odometry_that_starts_again_starts_a_new_graph_without_a_loss(active: Robot) -> None:
+    active.drive(6.0)
+    active.send('odom', *(odometry_at(0.1 * step) for step in range(EVIDENCE - 1)))
+    active.send('fix', fix_at(0.2))
+    assert active.session.n_resets == 0
+    active.publishers['odom'].publish(odometry_at(0.1 * (EVIDENCE - 1)))
+    active.wait(lambda: active.session.n_resets == 1, 'a new graph is started')
+    assert active.session.reset_reason.endswith('the stamps of odom jumped back by 5.900 s')
+    assert active.session.input.received == {'odom': EVIDENCE, 'fix': 1}
+    active.drive(3.0, 0.5)
+    assert active.session.worker.status.counts['fix', 'accepted'] == 6
+
+
+def test_odometry_behind_that_does_not_continue_is_released_after_a_while(
+    active: Robot, monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr('pose_graph_ros.ros.input.LONGEST_DOUBT', 0.05)
+    active.drive(6.0)
+    posted = active.session.input.posted
+    active.send('odom', odometry_at(0.05))
+    active.wait(lambda: active.session.input.posted == posted + 1, 'it is released')
+    assert active.session.n_resets == 0
+
+
+def test_a_clock_that_is_set_back_starts_a_new_graph(active: Robot) -> None:
+    clock = active.local.node.get_clock()
+    clock._set_ros_time_is_active(True)
+    clock.set_ros_time_override(Time(seconds=START + 6.0, clock_type=clock.clock_type))
+    active.drive(6.0)
+    clock.set_ros_time_override(Time(seconds=START + 5.5, clock_type=clock.clock_type))
+    assert active.session.n_resets == 0
+    clock.set_ros_time_override(Time(seconds=START, clock_type=clock.clock_type))
+    assert active.session.reset_reason.endswith('the clock jumped back by 5.500 s')
+    # of the old time, and of the new one
+    active.send('odom', odometry_at(6.0))
+    active.drive(3.0)
+    values = active.values()
+    assert (values['resets'], values['odom.before_clock_jump']) == ('1', '1')
+    active.session.deactivate()
+    clock.set_ros_time_override(Time(seconds=START - 9.0, clock_type=clock.clock_type))
+    assert active.session.n_resets == 1
+
+
+def test_rejected_messages_are_counted_with_those_of_the_engine(active: Robot) -> None:
+    active.drive(3.0)
+    active.send('odom', odometry(START + 3.0, np.nan, 0.0, 0.0), odometry_at(2.9))
+    bad = fix_at(2.0)
+    bad.status.status = -1
+    active.send('fix', bad, bad)
+    active.update()
+    values = active.values()
+    assert (values['odom.not_finite'], values['fix.no_fix']) == ('1', '2')
+    assert (values['odom.duplicate_stamp'], values['odom.accepted']) == ('1', '30')
+    assert values['received'] == values['processed'] == '40'
+
+
+def test_while_paused_nothing_reaches_the_engine_but_poses_follow_odometry(active: Robot) -> None:
+    active.drive(3.0)
+    poses = active.local.subscribe(PoseWithCovarianceStamped, 'pose')
+    active.session.input.paused = True
+    active.send('odom', *(odometry_at(3.0 + 0.1 * step) for step in range(5)))
+    active.wait(lambda: len(poses) >= 5, 'poses come')
+    values = active.values()
+    assert (values['odom.paused'], values['odom.accepted'], values['paused']) == ('5', '30', '1')
+    assert active.health() == (WARN, 'Paused: call ~/pause with false to resume.')
+    # even over a jump of the odometry no update is requested
+    active.send('odom', odometry(START + 3.6, 500.0, 0.0, 0.0))
+    setting = active.local.advertise(PoseWithCovarianceStamped, 'set_pose')
+    setting.publish(pose(START + 3.6, 1.0, 2.0, 0.0))
+    active.wait(lambda: active.values().get('set_pose.paused') == '1', 'the pose is rejected')
+
+
+@pytest.mark.parametrize(('first', 'second'), [
+    (odometry(START + 5.0, 500.0, 0.0, 0.0, speed=2.0),
+     odometry(START + 5.1, 500.2, 0.0, 0.0, speed=2.0)),
+    (odometry_at(16.0), odometry_at(16.1))], ids=['jump', 'gap'])
+@pytest.mark.parametrize('robot', [{'frequency': 0.01}], indirect=True, ids=['no timer'])
+def test_no_pose_is_published_over_a_jump_or_a_gap_before_an_update(
+    active: Robot, first: Odometry, second: Odometry,
+) -> None:
+    active.drive(5.0)
+    poses = active.local.subscribe(PoseWithCovarianceStamped, 'pose')
+    active.send('odom', first)
+    # which does not wait for the timer
+    active.wait(lambda: active.session.worker.estimate.stamp_ns == stamp_ns(first), 'an update')
+    active.send('odom', second)
+    active.wait(lambda: len(poses) > 0, 'a pose comes')
+    assert stamp_ns(poses[0]) == stamp_ns(second)
+    assert active.session.n_resets == 0
+
+
+def test_a_pose_that_is_set_puts_the_robot_there(
+    active: Robot, monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    jumps: list[int] = []
+    monkeypatch.setattr(active.session.out, 'jump', lambda: jumps.append(1))
+    setting = active.local.advertise(PoseWithCovarianceStamped, 'initialpose')
+    setting.publish(pose(START, 0.0, 0.0, 0.0, 'elsewhere'))
+    active.wait(lambda: active.values().get('set_pose.wrong_frame') == '1', 'it is rejected')
+    # before any odometry: it is for the first
+    setting.publish(pose(0.0, 30.0, -20.0, 1.0, variances=(1e-6, 1e-6, 1e-6)))
+    active.wait(lambda: active.session._set_pose_input._waiting is not None, 'it waits')
+    active.drive(2.0, fixes=False)
+    worker = active.session.worker
+    active.wait(lambda: worker.estimate.alignment is AlignmentState.ALIGNED, 'it is used')
+    begin, now = true_pose(0.0), true_pose(1.9)
+    active.wait(lambda: np.hypot(*(worker.estimate.T_map_base - [30.0, -20.0, 0.0])[:2])
+                == pytest.approx(np.hypot(*(now - begin)[:2]), abs=0.2), 'the robot is there')
+    assert worker.status.counts['set_pose', 'accepted'] == len(jumps) == 1
+
+
+def test_frames_that_differ_from_the_parameters_are_warned_of_once(
+    active: Robot, monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    log: list[str] = []
+    monkeypatch.setattr(active.session.input, '_warn', log.append)
+    active.drive(2.0)
+    for at in (2.0, 2.1, 2.2):
+        message = odometry_at(at)
+        message.header.frame_id, message.child_frame_id = '/wheels', '/base_link'
+        active.send('odom', message)
+    assert len(log) == 1
+    assert "the odometry has the frame 'wheels', but the parameter odom_frame is 'odom'" in log[0]
+
+
+@pytest.mark.parametrize('robot', [{'closing_silence': 0.05}], indirect=True)
+def test_the_graph_is_optimised_once_when_the_stream_ends(active: Robot) -> None:
+    finals = []
+    active.drive(3.0)
+    active.wait(lambda: not active.session.input.is_streaming, 'a silence is noticed')
+    worker = active.session.worker
+    request = worker.request_final_optimization
+    worker.request_final_optimization = lambda: finals.append(request())
+    assert worker.call(lambda backend: backend.n_waiting).result(10.0) == 0
+    for _ in range(2):
+        active.session._on_silence_timer()
+    assert finals == []
+    active.send('odom', odometry_at(3.0))
+    active.wait(lambda: len(finals) > 0, 'it is optimised again')
+    assert finals[0].result(10.0).status is Status.CONVERGED
+
+
+def test_a_loaded_graph_is_continued_with_its_datum(active: Robot) -> None:
+    active.drive(8.0)
+    session = active.session
+    plane = session.input.reader.datum.plane
+    saved = session.worker.call(lambda backend: backend.saved(plane.origin)).result(10.0)
+    before = session.worker.estimate
+    active.session.reset()
+    backend = PoseGraphBackend.restored(backend_config(session.values), saved)
+    session.load(saved, backend, 'map.g2o')
+    active.wait(lambda: session.worker.estimate is not None, 'there is an estimate')
+    assert session.worker.estimate.n_hidden == before.n_hidden
+    assert session.reset_reason == 'the graph in map.g2o was loaded'
+    assert session.n_resets == 2
+    assert session.input.reader.datum.is_of_graph
+    assert active.values()['datum'].startswith(f'[{plane.latitude:.9f}')
+    active.drive(12.0, 8.0)
+    assert session.worker.estimate.n_hidden > before.n_hidden
+    assert session.worker.estimate.n_observed > before.n_observed
+
+
+def test_a_new_graph_cancels_an_optimisation(active: Robot) -> None:
+    active.drive(3.0)
+    running, release = threading.Event(), threading.Event()
+    active.session.worker.call(lambda _: (running.set(), release.wait(10.0)))
+    assert running.wait(10.0)
+    optimisation = active.session.optimize()
+    active.session.reset()
+    release.set()
+    with pytest.raises(CancelledError):
+        optimisation.result(10.0)
+
+
+@pytest.mark.skipif(TFMessage is None, reason='tf2_msgs is not built: no /tf')
+def test_transforms_of_antennas_are_subscribed_to_if_there_are_fixes(tmp_path: Path) -> None:
+    for sources, expected in ((['odom', 'fix'], True), (['odom', 'global_pose'], False)):
+        with LocalNode(tmp_path) as local:
+            session = Session(local.node, checked({'sources': sources}))
+            session.activate()
+            topics = {subscription.topic_name for subscription in local.node.subscriptions}
+            session.close()
+            assert list(local.node.subscriptions) == list(local.node.timers) == []
+        assert ('/tf_static' in topics) is expected
+        assert {'/odom', '/loop_closure', '/initialpose', '/set_pose'} < topics
+
+
+def test_the_end_waits_only_so_long_for_a_solve(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr(session_module, 'STOP_TIMEOUT', 0.01)
+    running, release = threading.Event(), threading.Event()
+
+    def solve(_: PoseGraphBackend) -> None:
+        running.set()
+        release.wait(10.0)
+    with LocalNode(tmp_path) as local:
+        robot = Robot(local)
+        worker = robot.session.worker
+        worker.call(solve)
+        assert running.wait(10.0)
+        robot.session.close()
+        assert worker.alive
+        release.set()
+        local.spin_until(lambda: not worker.alive, 'it ends after the solve')
+
+
+def test_the_most_urgent_state_is_said_with_what_to_do(active: Robot) -> None:
+    active.drive(3.0, fixes=False)
+    level, text = active.health()
+    assert (level, text.startswith('Running without measurements in the map')) == (OK, True)
+    session = active.session
+    worker = Space(alive=True, prepared=True, status=session.worker.status,
+                   estimate=replace(session.worker.estimate, alignment=AlignmentState.UNALIGNED))
+    seen = Space(worker=worker, active=True, input=session.input, silent=[], odometry_topics=[],
+                 out=Space(transforms=Space(other='')))
+
+    def said(expected: bytes, *words: str) -> None:
+        level, text = diagnostics.health(seen)
+        assert level == expected
+        assert all(word in text for word in words), text
+
+    said(WARN, 'Unaligned')
+    # each is more urgent than the one before
+    seen.silent = ['fix']
+    said(WARN, 'fix is silent', 'check the drivers')
+    seen.silent = ['fix', 'imu']
+    said(WARN, 'fix and imu are silent')
+    seen.out.transforms.other = 'another node publishes map -> odom on /tf'
+    said(WARN, 'Another node publishes map -> odom on /tf.')
+    worker.prepared = False
+    said(WARN, 'Compiling')
+    seen.active = False
+    said(OK, 'Inactive')
+    worker.status = replace(worker.status, report=UpdateReport(
+        Status.FAILED, 'singular', 0, 0, 0.0))
+    said(ERROR, 'solver failed', 'log')
+    worker.alive = False
+    said(ERROR, 'restart')
+
+
+def test_errors_that_are_correlated_but_treated_as_white_are_warned_of(
+    active: Robot, monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    active.drive(8.0)
+    status = active.session.worker.status
+    correlated = status.sources['fix']._replace(
+        errors=Space(significant=True, tau=12.0, sigma_correlated=0.8), energy=2.0, white=True)
+    with monkeypatch.context() as patch:
+        patch.setattr(active.session, 'worker', Space(
+            alive=True, prepared=True, estimate=active.session.worker.estimate,
+            status=replace(status, sources={'fix': correlated})))
+        values, (level, text) = active.values(), active.health()
+    assert values['fix.errors_live'] == (
+        '12 s, with a sigma of 0.8 m; treated as white: set fix.correlation_time')
+    assert level == WARN
+    assert 'set fix.correlation_time to about 12 s' in text
+
+
+def test_a_source_that_ends_is_said_to_be_silent_once(
+    active: Robot, monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    active.drive(2.0)
+    liveness = active.session.input.liveness
+    monkeypatch.setattr(liveness, 'silent', lambda now: ['fix'])
+    active.wait(lambda: active.session.silent == ['fix'], 'it is noticed')
+    assert 'fix is silent' in active.health()[1]
+    active.session.deactivate()
+    active.wait(lambda: active.session.silent == [], 'an inactive node misses nobody')

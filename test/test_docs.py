@@ -1,0 +1,77 @@
+# Copyright 2026 The pose_graph_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""The documentation names only what there is: files, links, modules, classes and functions."""
+
+import ast
+from pathlib import Path
+import re
+
+import pytest
+
+import pose_graph_ros
+
+PACKAGE = Path(pose_graph_ros.__file__).parent
+ROOT = Path(__file__).resolve().parents[1]
+PAGES = [page for page in (
+    *ROOT.glob('*.md'), *ROOT.glob('docs/*.md')) if page.name != 'LICENSE']
+README_LINES = 110
+
+
+def definitions() -> set[str]:
+    """Return the names of modules, classes, functions and `Class.member`s of the package."""
+    names = set()
+    for path in PACKAGE.rglob('*.py'):
+        names.add(path.stem)
+        tree = ast.parse(path.read_text(encoding='utf-8'))
+        for node in ast.walk(tree):
+            if isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef | ast.ClassDef):
+                names.add(node.name)
+                names.add(f'{path.stem}.{node.name}')
+            if isinstance(node, ast.ClassDef):
+                names |= {f'{node.name}.{item.name}' for item in node.body
+                          if isinstance(item, ast.FunctionDef | ast.AsyncFunctionDef)}
+    return names
+
+
+NAMES = definitions()
+
+
+def quoted(page: Path) -> list[str]:
+    """Return what stands in backticks outside blocks of code."""
+    text = re.sub(r'^```.*?^```', '', page.read_text(encoding='utf-8'), flags=re.M | re.S)
+    return re.findall(r'`([^`\n]+)`', text)
+
+
+@pytest.mark.parametrize('page', PAGES, ids=lambda page: page.name)
+def test_files_that_are_named_exist(page: Path) -> None:
+    for name in quoted(page):
+        if re.fullmatch(r'[\w/{},]+/\w+\.py', name) is None:
+            continue
+        places = (ROOT, PACKAGE, PACKAGE / 'core')
+        assert any((place / name).is_file() for place in places), f'{page.name}: {name}'
+
+
+@pytest.mark.parametrize('page', PAGES, ids=lambda page: page.name)
+def test_links_lead_somewhere(page: Path) -> None:
+    for link in re.findall(r'\]\(([^)#]+)(?:#[^)]*)?\)', page.read_text(encoding='utf-8')):
+        if '://' not in link:
+            assert (page.parent / link).exists(), f'{page.name}: {link}'
+
+
+@pytest.mark.parametrize('page', PAGES, ids=lambda page: page.name)
+def test_classes_and_their_members_that_are_named_exist(page: Path) -> None:
+    for name in (quoted_name.removesuffix('()') for quoted_name in quoted(page)):
+        if re.fullmatch(r'[A-Z][a-zA-Z]+\.[a-z_]+', name) and name.partition('.')[0] in NAMES:
+            assert name in NAMES, f'{page.name}: {name}'
+
+
+def test_the_stories_of_the_design_name_only_what_there_is() -> None:
+    text = (ROOT / 'docs' / 'design.md').read_text(encoding='utf-8')
+    stories = text[text.index('### One odometry message'):text.index('## Saved graphs')]
+    for name in re.findall(r'`([A-Za-z_.]+)(?:\(\))?`', stories):
+        if not name.endswith('.py') and '/' not in name:
+            assert name in NAMES, name
+
+
+def test_the_readme_fits_on_two_screens() -> None:
+    assert len((ROOT / 'README.md').read_text(encoding='utf-8').splitlines()) <= README_LINES
