@@ -4,9 +4,25 @@
 Coverage is measured in the processes that run tests, and not in the nodes that these start.
 
 Nodes would take twice as long under a tracer, and what they run has tests without a process.
+Tests that repeat the same lines a thousand times are marked `untraced` and run without it too.
 """
 
+from collections.abc import Iterator
 import os
+import sys
+
+import pytest
 
 if 'PYTEST_XDIST_WORKER' in os.environ:
     os.environ.pop('COVERAGE_PROCESS_CONFIG', None)
+
+
+@pytest.fixture(autouse=True)
+def _without_tracer(request: pytest.FixtureRequest) -> Iterator[None]:
+    tracer = sys.gettrace()
+    if request.node.get_closest_marker('untraced') is None:
+        yield
+        return
+    sys.settrace(None)
+    yield
+    sys.settrace(tracer)

@@ -181,6 +181,7 @@ def test_a_quick_robot_makes_no_more_nodes_than_the_interval_allows() -> None:
 
 # --- Order of arrival ------------------------------------------------------------------------
 
+@pytest.mark.untraced
 @settings(max_examples=15)
 @given(st.data())
 def test_any_interleaving_of_the_topics_gives_the_same_path(data: st.DataObject) -> None:
@@ -194,6 +195,7 @@ def test_any_interleaving_of_the_topics_gives_the_same_path(data: st.DataObject)
     assert_same_path(run(events, data.draw(st.sampled_from((0, 11, 40)))), REFERENCE_PATH)
 
 
+@pytest.mark.untraced
 @settings(max_examples=15)
 @given(st.randoms(use_true_random=False), st.integers(0, 141), st.sampled_from((0, 7, 50)))
 def test_shuffled_measurements_give_the_same_path(
@@ -207,6 +209,7 @@ def test_shuffled_measurements_give_the_same_path(
     assert_same_path(run(events, update_every), REFERENCE_PATH)
 
 
+@pytest.mark.untraced
 @settings(max_examples=10)
 @given(st.randoms(use_true_random=False), st.sampled_from((0, 1, 9)))
 def test_with_positions_alone_any_order_gives_the_same_path(
@@ -711,6 +714,7 @@ def long_drive(backend: PoseGraphBackend, n: int, *, closures: bool) -> list[Upd
 
 # Of an update when the graph has ten times the nodes; rounds on top of each other make the tree of
 # cliques a little deeper.
+@pytest.mark.untraced
 @pytest.mark.parametrize(('closures', 'growth'), [(False, 1.1), (True, 2.0)])
 def test_the_work_of_an_update_does_not_grow_with_the_graph(
     closures: bool, growth: float,
@@ -725,6 +729,7 @@ def test_the_work_of_an_update_does_not_grow_with_the_graph(
     assert np.mean(late) < 100.0
 
 
+@pytest.mark.untraced
 def test_the_path_is_current_after_every_update() -> None:
     backend = PoseGraphBackend(prompt(measurements=LEAST_SQUARES))
     late = [*DRIVE.positions[::2], *DRIVE.global_poses[1:], *DRIVE.closures]
@@ -995,6 +1000,7 @@ def drive_with_outage(
 
 
 # with seed 1 a step is only 8 % shorter than the one before
+@pytest.mark.untraced
 @pytest.mark.parametrize(
     ('drift', 'seed'), [(-2.0, 5), (-1.0, 5), (0.5, 5), (1.0, 5), (2.0, 5), (2.0, 1)])
 def test_a_heading_that_drifts_far_in_a_long_outage_is_wound_the_right_way(

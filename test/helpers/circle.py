@@ -65,10 +65,10 @@ def drive(client: Client, end: float, *, begin: float = 0.0, fixes: bool = True)
 
 
 def path_error(client: Client) -> float:
-    """Return the largest distance of the newest path from the truth."""
-    return max(math.hypot(item.pose.position.x - x, item.pose.position.y - y)
-               for item in client.paths[-1].poses
-               for x, y, _ in [true_pose(stamp_ns(item) * 1e-9 - START)])
+    """Return the largest distance of the newest path from the truth, infinite if it is empty."""
+    return max((math.hypot(item.pose.position.x - x, item.pose.position.y - y)
+                for item in client.paths[-1].poses
+                for x, y, _ in [true_pose(stamp_ns(item) * 1e-9 - START)]), default=math.inf)
 
 
 def check_pose(message: object) -> None:

@@ -110,7 +110,7 @@ class Client:
         listens: Sequence[str] = ('odom', 'global_pose', 'fix', 'loop_closure'),
         more: Mapping[str, type] | None = None,
     ) -> None:
-        self._listens, self._name = listens, name
+        self.domain, self._listens, self._name = domain, listens, name
         self._status = f'/{namespace}/{name}: pose graph'.replace('//', '/')
         self._context = Context()
         rclpy.init(context=self._context, domain_id=domain)
@@ -240,12 +240,19 @@ class Client:
         return self._services[name]
 
     def start_new_graph(self) -> None:
-        """Make the node start a new graph, and forget the messages that it has published."""
+        """Make the node start a new graph, without messages that were sent before."""
+        self.spin_until(self._is_idle, 'the node has received all that was sent')
         before = int(self.values['resets'])
         assert self.trigger('reset').success
         self.spin_until(lambda: int(self.values['resets']) > before, 'a new graph is started')
         for kept in (self.poses, self.filtered, self.fixes, self.paths, self.transforms):
             kept.clear()
+
+    def _is_idle(self) -> bool:
+        """Whether nothing was received and nothing waits in the newest three diagnostics."""
+        received = [{item.key: item.value for item in message.status[0].values}['received']
+                    for message in self.diagnostics[-3:]]
+        return len(received) == 3 and len(set(received)) == 1
 
     def _has_whole_path(self) -> bool:
         if len(self.paths) == 0:

@@ -25,6 +25,7 @@ def _on_this_machine_alone(tmp_path_factory: pytest.TempPathFactory) -> Iterator
 
 @pytest.fixture
 def node(tmp_path: Path, request: pytest.FixtureRequest) -> Iterator[Any]:
+    """Start a node of the test's own, with the arguments that it is parametrized with."""
     from harness import NodeProcess  # noqa: PLC0415  (needs ROS, which other tests do not)
 
     with NodeProcess(tmp_path, getattr(request, 'param', ())) as process:
@@ -32,25 +33,25 @@ def node(tmp_path: Path, request: pytest.FixtureRequest) -> Iterator[Any]:
 
 
 @pytest.fixture
-def client(node: Any) -> Iterator[Any]:
+def client(request: pytest.FixtureRequest) -> Iterator[Any]:
+    """Yield a client of the test's own node, or else of the shared one, with a new graph."""
     from harness import Client  # noqa: PLC0415
 
-    with Client(int(node.env['ROS_DOMAIN_ID'])) as connected:
+    is_own = 'node' in request.fixturenames
+    process = request.getfixturevalue('node' if is_own else '_shared_node')
+    with Client(int(process.env['ROS_DOMAIN_ID'])) as connected:
+        if not is_own:
+            connected.start_new_graph()
         yield connected
-
-
-@pytest.fixture(scope='module')
-def _one_node(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Any]:
-    from harness import Client, NodeProcess  # noqa: PLC0415
-
-    with NodeProcess(tmp_path_factory.mktemp('node')) as process, \
-            Client(int(process.env['ROS_DOMAIN_ID'])) as connected:
-        yield connected
+    if not is_own:
+        assert process.process.poll() is None
         assert 'Traceback' not in process.stderr()
 
 
-@pytest.fixture
-def shared(_one_node: Any) -> Any:
-    """A client of the node that the tests of a module share, with a new graph."""
-    _one_node.start_new_graph()
-    return _one_node
+@pytest.fixture(scope='session')
+def _shared_node(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Any]:
+    """Start a node with the default parameters, for all tests that leave them as they are."""
+    from harness import NodeProcess  # noqa: PLC0415
+
+    with NodeProcess(tmp_path_factory.mktemp('node')) as process:
+        yield process

@@ -43,7 +43,7 @@ def managed(tmp_path: Path) -> Iterator[tuple[Client, Manager]]:
         assert 'Traceback' not in node.stderr()
 
 
-def test_by_default_it_is_active(node: NodeProcess, client: Client) -> None:
+def test_by_default_it_is_active(client: Client) -> None:
     assert Manager(client).state == State.PRIMARY_STATE_ACTIVE
 
 

@@ -2,6 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """The real node, driven over DDS by an independent process: this one."""
 
+from collections.abc import Sequence
 from contextlib import ExitStack
 import math
 from pathlib import Path
@@ -37,7 +38,7 @@ from rclpy.serialization import serialize_message
 from pose_graph_ros.core.geometry import se2
 
 
-def test_every_message_of_a_drive_is_sound(node: NodeProcess, client: Client) -> None:
+def test_every_message_of_a_drive_is_sound(client: Client) -> None:
     drive(client, 30.0)
     answer = client.optimize()
     assert answer.success, answer.message
@@ -79,7 +80,7 @@ def test_every_message_of_a_drive_is_sound(node: NodeProcess, client: Client) ->
 
 
 @pytest.mark.skipif(TFMessage is None, reason='tf2_msgs is not built: no /tf')
-def test_the_transform_times_odometry_is_the_pose(node: NodeProcess, client: Client) -> None:
+def test_the_transform_times_odometry_is_the_pose(client: Client) -> None:
     drive(client, 1.0)
     client.spin_until(lambda: len(client.paths) > 0, 'the first estimate comes')
     drive(client, 15.0, begin=1.0)
@@ -105,9 +106,7 @@ def test_the_transform_times_odometry_is_the_pose(node: NodeProcess, client: Cli
     assert compared > 100
 
 
-def test_the_output_says_that_it_is_unaligned_until_the_angle_is_known(
-    node: NodeProcess, client: Client,
-) -> None:
+def test_the_output_says_that_it_is_unaligned_until_the_angle_is_known(client: Client) -> None:
     drive(client, 2.0)
     client.spin_until(lambda: client.values.get('alignment') == 'unaligned', 'it is unaligned')
     assert client.diagnostics[-1].status[0].level == b'\x01'
@@ -126,7 +125,7 @@ def test_the_output_says_that_it_is_unaligned_until_the_angle_is_known(
     assert client.diagnostics[-1].status[0].level == b'\x00'
 
 
-def test_a_global_pose_and_a_loop_closure_are_heard(node: NodeProcess, client: Client) -> None:
+def test_a_global_pose_and_a_loop_closure_are_heard(client: Client) -> None:
     client.global_pose.publish(pose(START + 1.0, *true_pose(1.0).tolist()))
     client.global_pose.publish(pose(START + 1.5, 0.0, 0.0, 0.0, frame='elsewhere'))
     drive(client, 10.0, fixes=False)
@@ -157,7 +156,7 @@ def test_a_silence_ends_with_the_full_optimisation(tmp_path: Path) -> None:
                           'the optimised path comes')
 
 
-def test_the_path_is_current_without_an_optimisation(node: NodeProcess, client: Client) -> None:
+def test_the_path_is_current_without_an_optimisation(client: Client) -> None:
     """A pose that comes 18 s late turns the whole path; a loop closure mends what has drifted."""
     drive(client, 20.0, fixes=False)
     client.spin_until(lambda: len(client.paths) > 0 and path_error(client) > 1.0, 'a path comes')
@@ -276,23 +275,29 @@ BAD = (
     ('fix.lever_arm:=[1.0]', 'fix.lever_arm'),
     ('sources:=[odom, wheels]', 'wheels.type'), ('sources:=[fix]', 'odometry'),
     ('odom.robust_loss:=l1', 'none, huber, cauchy'), ('fix.sigma_ceiling:=0.001', 'ceiling'))
+UNREADABLE = (('-p', 'frequency'), ('--params-file', '/no/such.yaml'), ('--no-such',))
+
+
+def errors_of(folder: Path, several: Sequence[Sequence[str]]) -> list[str]:
+    """Return what nodes with these arguments, started at the same time, say before they end."""
+    with ExitStack() as stack:
+        nodes = []
+        for k, arguments in enumerate(several):
+            (folder / str(k)).mkdir()
+            nodes.append(stack.enter_context(NodeProcess(folder / str(k), arguments)))
+        assert [node.process.wait(PATIENCE) for node in nodes] == [2] * len(nodes)
+        return [node.stderr() for node in nodes]
 
 
 @pytest.mark.parametrize('some', [BAD[:3], BAD[3:6], BAD[6:]])
 def test_a_bad_parameter_is_one_line_and_no_traceback(
     tmp_path: Path, some: tuple[tuple[str, str], ...],
 ) -> None:
-    with ExitStack() as stack:
-        nodes = []
-        for k, (parameter, _) in enumerate(some):
-            (tmp_path / str(k)).mkdir()
-            nodes.append(stack.enter_context(
-                NodeProcess(tmp_path / str(k), ('-p', parameter))))
-        for node, (_, expected) in zip(nodes, some, strict=True):
-            assert node.process.wait(PATIENCE) == 2
-            lines = node.stderr().splitlines()
-            assert len(lines) == 1, lines
-            assert expected in lines[0]
+    errors = errors_of(tmp_path, [('-p', parameter) for parameter, _ in some])
+    for error, (_, expected) in zip(errors, some, strict=True):
+        lines = error.splitlines()
+        assert len(lines) == 1, lines
+        assert expected in lines[0]
 
 
 def test_whole_numbers_are_numbers_and_optimizing_nothing_says_so(tmp_path: Path) -> None:
@@ -305,11 +310,9 @@ def test_whole_numbers_are_numbers_and_optimizing_nothing_says_so(tmp_path: Path
 
 
 def test_arguments_that_ros_cannot_read_end_the_node_without_a_traceback(tmp_path: Path) -> None:
-    for arguments in (('-p', 'frequency'), ('--params-file', '/no/such.yaml'), ('--no-such',)):
-        with NodeProcess(tmp_path, arguments) as node:
-            assert node.process.wait(PATIENCE) == 2
-            assert 'pose_graph_node: ' in node.stderr()
-            assert 'Traceback' not in node.stderr()
+    for error in errors_of(tmp_path, UNREADABLE):
+        assert 'pose_graph_node: ' in error
+        assert 'Traceback' not in error
 
 
 def test_a_signal_during_the_start_ends_the_node_as_quietly(tmp_path: Path) -> None:
@@ -337,13 +340,10 @@ def test_a_namespace_a_remap_and_a_frame(node: NodeProcess) -> None:
                 '/diagnostics'} - ({'/tf'} if TFMessage is None else set()) <= names
 
 
-def test_best_effort_senders_are_heard_and_a_late_subscriber_gets_the_path(
-    node: NodeProcess, client: Client,
-) -> None:
+def test_best_effort_senders_are_heard_and_a_late_subscriber_gets_the_path(client: Client) -> None:
     drive(client, 8.0)
     client.optimize()
-    domain = int(node.env['ROS_DOMAIN_ID'])
-    with Client(domain) as late:
+    with Client(client.domain) as late:
         late.spin_until(lambda: len(late.paths) > 0, 'the latched path comes')
         assert len(late.paths[-1].poses) == len(client.paths[-1].poses)
     info = client.node.get_subscriptions_info_by_topic('/odom')

@@ -16,7 +16,7 @@ import yaml
 from pose_graph_ros.adapters.parameters import all_parameters, Change
 
 
-def test_every_parameter_is_described(node: NodeProcess, client: Client) -> None:
+def test_every_parameter_is_described(client: Client) -> None:
     names = client.call(client.node.create_client(
         ListParameters, 'pose_graph/list_parameters'), ListParameters.Request()).result.names
     own = {parameter.name: parameter for parameter in all_parameters({})}

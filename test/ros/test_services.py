@@ -33,8 +33,7 @@ def go_on(client: Client, begin: float, end: float) -> None:
     client.spin_for(0.2)
 
 
-def test_a_reset_begins_a_new_graph(shared: Client) -> None:
-    client = shared
+def test_a_reset_begins_a_new_graph(client: Client) -> None:
     drive(client, 8.0)
     assert client.optimize().success
     answer = client.trigger('reset')
@@ -51,10 +50,7 @@ def test_a_reset_begins_a_new_graph(shared: Client) -> None:
     assert math.hypot(first.x, first.y) < 1e-2
 
 
-def test_a_pause_lets_nothing_in_and_the_outputs_go_on(
-    shared: Client,
-) -> None:
-    client = shared
+def test_a_pause_lets_nothing_in_and_the_outputs_go_on(client: Client) -> None:
     pause = client.node.create_client(SetBool, 'pose_graph/pause')
     drive(client, 10.0)
     assert client.optimize().success
@@ -78,8 +74,7 @@ def test_a_pause_lets_nothing_in_and_the_outputs_go_on(
     assert int(client.values['hidden_nodes']) > int(nodes)
 
 
-def test_a_reset_and_optimize_while_there_is_nothing(shared: Client) -> None:
-    client = shared
+def test_a_reset_and_optimize_while_there_is_nothing(client: Client) -> None:
     answer = client.trigger('optimize')
     assert not answer.success
     assert answer.message == 'there is no odometry yet'
@@ -89,9 +84,8 @@ def test_a_reset_and_optimize_while_there_is_nothing(shared: Client) -> None:
 @pytest.mark.parametrize(('topic', 'frame'), [
     ('initialpose', 'map'), ('set_pose', 'odom'), ('initialpose', 'base_link')])
 def test_a_pose_is_set_in_the_frame_that_it_names(
-    shared: Client, topic: str, frame: str,
+    client: Client, topic: str, frame: str,
 ) -> None:
-    client = shared
     setter = client.node.create_publisher(PoseWithCovarianceStamped, topic, RELIABLE)
     client.spin_until(lambda: setter.get_subscription_count() > 0, f'{topic} is heard')
     drive(client, 8.0)
@@ -115,10 +109,7 @@ def test_a_pose_is_set_in_the_frame_that_it_names(
                       client.paths[-1].poses[0].pose.position.y) < 0.05
 
 
-def test_a_pose_that_is_set_before_there_is_odometry_waits_for_it(
-    shared: Client,
-) -> None:
-    client = shared
+def test_a_pose_that_is_set_before_there_is_odometry_waits_for_it(client: Client) -> None:
     setter = client.node.create_publisher(PoseWithCovarianceStamped, 'initialpose', RELIABLE)
     client.spin_until(lambda: setter.get_subscription_count() > 0, 'it is heard')
     setter.publish(pose(START, 0.0, 0.0, 0.0, frame='elsewhere'))
@@ -135,10 +126,7 @@ def test_a_pose_that_is_set_before_there_is_odometry_waits_for_it(
     assert abs(se2.wrap(yaw(first.orientation) - 1.0)) < 1e-3
 
 
-def test_the_markers_show_the_graph_while_someone_looks(
-    shared: Client,
-) -> None:
-    client = shared
+def test_the_markers_show_the_graph_while_someone_looks(client: Client) -> None:
     drive(client, 10.0)
     assert client.optimize().success
     arrays: list[MarkerArray] = []

@@ -191,7 +191,7 @@ def test_late_shuffled_and_repeated_fixes_give_the_same_path(tmp_path: Path) -> 
     assert 0.01 < max(error) < 1.0
 
 
-def test_a_reset_of_the_odometry_shows_in_no_output(node: NodeProcess, client: Client) -> None:
+def test_a_reset_of_the_odometry_shows_in_no_output(client: Client) -> None:
     def reset_odometry(seconds: float) -> Odometry:
         if seconds < 10.0:
             return odometry_at(seconds)
@@ -270,7 +270,7 @@ def test_the_pose_comes_back_in_latitude_and_longitude(node: NodeProcess, client
         assert covariance[2, 2] > 1e3
 
 
-def test_without_fixes_there_is_no_latitude(node: NodeProcess, client: Client) -> None:
+def test_without_fixes_there_is_no_latitude(client: Client) -> None:
     play(client, range(20), every(1, client.odom, odometry_at))
     client.spin_until(lambda: len(client.poses) > 10, 'poses come')
     assert len(client.fixes) == 0
@@ -327,7 +327,7 @@ def test_an_imu_turns_the_map_before_the_robot_has_moved_far(tmp_path: Path) -> 
         assert newest.pose.position.y == pytest.approx(turned[1], abs=EXACT)
 
 
-def test_an_imu_is_not_listened_to_unasked(node: NodeProcess, client: Client) -> None:
+def test_an_imu_is_not_listened_to_unasked(client: Client) -> None:
     assert client.node.count_subscribers('imu/data') == 0
     assert client.node.count_subscribers('gps/fix') == 1
 
@@ -340,9 +340,7 @@ def drifting(seconds: float) -> Odometry:
                     angle)
 
 
-def test_a_loop_closure_waits_until_odometry_has_reached_both_ends(
-    node: NodeProcess, client: Client,
-) -> None:
+def test_a_loop_closure_waits_until_odometry_has_reached_both_ends(client: Client) -> None:
     # the other end is later than the stamp; both lie ahead
     seen = se2.between(true_pose(66.0), true_pose(3.0))
     client.loop_closure.publish(pose(
@@ -366,7 +364,7 @@ def test_a_loop_closure_waits_until_odometry_has_reached_both_ends(
     assert math.hypot(raw_early.x - raw_late.x, raw_early.y - raw_late.y) > 6.0
 
 
-def test_headings_alone_can_be_tied(node: NodeProcess, client: Client) -> None:
+def test_headings_alone_can_be_tied(client: Client) -> None:
     """The walls of a building: the robot points the other way round, wherever it is."""
     play(client, range(400), every(1, client.odom, drifting))
     turn = true_pose(35.0)[2] - true_pose(5.0)[2]
@@ -415,9 +413,7 @@ def test_the_datum_can_be_moved_as_long_as_no_fix_is_used(tmp_path: Path) -> Non
         assert 'wait for odometry' in answer.message
 
 
-def test_the_frame_of_the_odometry_decides_on_the_transform(
-    node: NodeProcess, client: Client,
-) -> None:
+def test_the_frame_of_the_odometry_decides_on_the_transform(client: Client) -> None:
     def named(frame: str) -> Callable[[float], Odometry]:
         def make(seconds: float) -> Odometry:
             message = odometry_at(seconds)

@@ -14,8 +14,8 @@ import pytest
 def test_nothing_is_lost_while_kernels_are_compiled(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    # what the batch optimisation needs is compiled: some ten seconds
-    copy_kernels(tmp_path / 'kernels', without='batch')
+    # what the elimination needs is compiled: some eight seconds
+    copy_kernels(tmp_path / 'kernels', without='elimination')
     monkeypatch.setenv('NUMBA_CACHE_DIR', str(tmp_path / 'kernels'))
     with NodeProcess(tmp_path) as node:
         client = Client(int(node.env['ROS_DOMAIN_ID']))
@@ -49,8 +49,8 @@ def test_nothing_is_lost_while_kernels_are_compiled(
 def test_a_signal_while_kernels_are_compiled_ends_the_node(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    # what the batch optimisation needs is compiled: some ten seconds
-    copy_kernels(tmp_path / 'kernels', without='batch')
+    # what the elimination needs is compiled: some eight seconds
+    copy_kernels(tmp_path / 'kernels', without='elimination')
     monkeypatch.setenv('NUMBA_CACHE_DIR', str(tmp_path / 'kernels'))
     with NodeProcess(tmp_path) as node:
         client = Client(int(node.env['ROS_DOMAIN_ID']))

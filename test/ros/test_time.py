@@ -2,15 +2,15 @@
 # SPDX-License-Identifier: Apache-2.0
 """Clocks that jump, bags in a loop and at ten times their speed: the real node over DDS."""
 
-from pathlib import Path
-
 from circle import drive, fix_at, odometry_at, path_error, START
-from harness import Client, NodeProcess, RELIABLE, stamp_ns
+from harness import Client, NodeProcess, RELIABLE, stamp_ns, TFMessage
 import numpy as np
 import pytest
 from rosgraph_msgs.msg import Clock
 
 LOOPS = 10
+# Stamp of the newest odometry of a lap [ns].
+LAST = round((START + 7.9) * 1e9)
 DATUM = ('-p', 'datum:=[48.1, 11.6]')
 
 
@@ -59,7 +59,9 @@ def test_ten_loops_of_a_bag_with_its_clock(node: NodeProcess, client: Client) ->
         drive(client, 8.0, begin=4.0)
         set_clock(clock, 8.0)
         check_one_lap(client)
-        for messages in (client.poses, client.transforms):
+        for messages in (client.poses, client.transforms)[:1 if TFMessage is None else 2]:
+            # those of this lap are not to come in the next one
+            client.spin_until(lambda sent=messages: stamp_ns(sent[-1]) >= LAST, 'all have come')
             assert np.all(np.diff([stamp_ns(message) for message in messages]) > 0)
         # nothing is counted of the laps before
         assert client.values['odom.accepted'] == '80'
@@ -94,25 +96,23 @@ def test_small_corrections_and_jumps_forward_of_the_clock_change_nothing(
     assert client.values['resets'] == '0'
 
 
-def test_a_single_stamp_of_the_past_or_the_future_changes_nothing(
-    node: NodeProcess, client: Client,
-) -> None:
+def test_a_single_stamp_of_the_past_or_the_future_changes_nothing(client: Client) -> None:
+    resets = client.values['resets']
     drive(client, 4.0)
     for seconds in (-100.0, 20.0, 2000.0, 1.0):
         client.odom.publish(odometry_at(seconds))
         client.spin_for(0.02)
     client.wait_processed(48 + 4)
     drive(client, 25.0, begin=4.0)
-    assert client.values['resets'] == '0'
+    assert client.values['resets'] == resets
     assert client.optimize().success
 
 
-def test_a_drive_at_many_times_its_speed_is_not_lost(tmp_path: Path) -> None:
+def test_a_drive_at_many_times_its_speed_is_not_lost(client: Client) -> None:
     """Ten messages a millisecond: 20 s within a fraction of one."""
-    with NodeProcess(tmp_path, DATUM) as node, Client(int(node.env['ROS_DOMAIN_ID'])) as client:
-        for step in range(200):
-            client.odom.publish(odometry_at(step / 10.0))
-        client.wait_processed(200)
-        assert client.values['odom.accepted'] == '200'
-        assert client.optimize().success
-        assert len(client.paths[-1].poses) > 19
+    for step in range(200):
+        client.odom.publish(odometry_at(step / 10.0))
+    client.wait_processed(200)
+    assert client.values['odom.accepted'] == '200'
+    assert client.optimize().success
+    assert len(client.paths[-1].poses) > 19

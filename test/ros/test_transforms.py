@@ -56,7 +56,7 @@ def test_frames_and_offset_are_as_asked(node: NodeProcess, client: Client) -> No
     assert np.all(np.diff([stamp_ns(item) for item in client.transforms]) > 0)
 
 
-def test_the_same_stamp_is_never_sent_twice(node: NodeProcess, client: Client) -> None:
+def test_the_same_stamp_is_never_sent_twice(client: Client) -> None:
     drive(client, 5.0)
     for seconds in (4.9, 4.9, 4.8, 4.7, 4.9):
         client.odom.publish(odometry_at(seconds))
@@ -101,7 +101,7 @@ def test_the_published_transform_moves_no_faster_than_asked(tmp_path: Path) -> N
         assert np.hypot(estimate.x - wanted[0, 0], estimate.y - wanted[0, 1]) > 0.2
 
 
-def test_it_is_not_sent_when_it_is_not_wanted(node: NodeProcess, client: Client) -> None:
+def test_it_is_not_sent_when_it_is_not_wanted(client: Client) -> None:
     drive(client, 3.0)
     assert len(client.transforms) > 0
     assert client.set_parameter('publish_tf', value=False) == (True, '')

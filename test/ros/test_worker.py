@@ -70,7 +70,8 @@ def test_every_update_hands_out_a_path_that_is_current() -> None:
     already = len(estimates)
     worker.request_update()
     wait_until(lambda: len(estimates) > already)
-    assert worker.status.updates == 2
+    # the status follows the estimate
+    wait_until(lambda: worker.status.updates == 2)
     assert estimates[-1].path.poses[-1, 1] > 0.1
     assert worker.status.report.new_constraints == 1
     assert worker.stop(PATIENCE)

@@ -266,6 +266,7 @@ def normalised_errors(
     return np.array(squares)
 
 
+@pytest.mark.untraced
 @pytest.mark.parametrize(('n', 'gap', 'arguments'), [
     (20, 1.0, {}), (60, 1.0, {}), (200, 1.0, {}),
     (10, 15.0, {'speed': 15.0}), (60, 15.0, {'speed': 15.0, 'curvature': 0.01}),
@@ -277,6 +278,7 @@ def test_the_sigma_is_honest_for_white_errors(n: int, gap: float, arguments: dic
     assert 0.7 < np.mean(normalised_errors(n, gap, **arguments)) < 1.4
 
 
+@pytest.mark.untraced
 @pytest.mark.parametrize(('n', 'gap', 'arguments'), [
     (20, 1.0, {}), (60, 1.0, {}), (300, 1.0, {}), (60, 15.0, {'speed': 15.0, 'curvature': 0.01})])
 def test_the_sigma_is_no_smaller_than_errors_with_a_correlation_time_of_a_minute(

@@ -125,6 +125,7 @@ def test_the_minimum_is_that_of_the_robust_cost(loss: Loss, seed: int) -> None:
     assert weights[0] == 1.0
 
 
+@pytest.mark.untraced
 @pytest.mark.parametrize('seed', range(4))
 @pytest.mark.parametrize('off', [5.0, 20.0, 1000.0])
 def test_a_fifth_of_outliers_hardly_shows_with_cauchy(seed: int, off: float) -> None:

@@ -282,6 +282,7 @@ def members_of_a_drive() -> tuple[dict[str, Any], list[tuple[Any, ...]]]:
     return members, leaves(members)
 
 
+@pytest.mark.untraced
 @given(st.data())
 @settings(max_examples=300)
 def test_with_any_value_of_a_member_a_file_is_refused_or_usable(data: st.DataObject) -> None:
