@@ -17,6 +17,11 @@ if 'PYTEST_XDIST_WORKER' in os.environ:
     os.environ.pop('COVERAGE_PROCESS_CONFIG', None)
 
 
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    """Begin with the files that wait for other processes, so that none of them is the last."""
+    items.sort(key=lambda item: item.path.parent.name not in ('ros', 'test'))
+
+
 @pytest.fixture(autouse=True)
 def _without_tracer(request: pytest.FixtureRequest) -> Iterator[None]:
     tracer = sys.gettrace()

@@ -190,6 +190,13 @@ class Client:
         self.spin_until(lambda: int(self.values['processed']) >= count,
                         f'{count} messages are processed')
 
+    def wait_answered(self, seconds: float) -> None:
+        """Wait until the pose and the transform for the odometry at a stamp [s] have come."""
+        last = round(seconds * NANOSECONDS)
+        for messages in (self.poses, self.transforms)[:1 if TFMessage is None else 2]:
+            self.spin_until(lambda sent=messages: len(sent) > 0 and stamp_ns(sent[-1]) >= last,
+                            f'the outputs at {seconds} s come')
+
     def call(self, service: object, request: object) -> object:
         """Call a service and return its answer."""
         self.spin_until(service.service_is_ready, 'the service is there')

@@ -30,7 +30,7 @@ def go_on(client: Client, begin: float, end: float) -> None:
         client.odom.publish(odometry_at(step / 10.0))
         client.spin_for(0.01)
     client.wait_processed(already + round((end - begin) * 10))
-    client.spin_for(0.2)
+    client.wait_answered(START + end - 0.1)
 
 
 def test_a_reset_begins_a_new_graph(client: Client) -> None:
