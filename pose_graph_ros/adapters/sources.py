@@ -23,6 +23,7 @@ from pose_graph_ros.core.config import (
     NoiseFrom,
     OdometryNoise,
     OdometrySource,
+    SET_POSES,
 )
 from pose_graph_ros.core.exceptions import ConfigError
 
@@ -50,6 +51,8 @@ MESSAGE_TYPES = {
     Kind.FIX: 'sensor_msgs/msg/NavSatFix', Kind.IMU: 'sensor_msgs/msg/Imu',
     Kind.LOOP_CLOSURE: _POSE}
 
+SET_POSE = 'set_pose'
+"""Name under which poses that a user sets are counted."""
 CLOSURES = 'loop_closure'
 """Name of the source of loop closures that always exists."""
 KNOWN_SOURCES = {
@@ -107,7 +110,7 @@ def backend_config(values: Mapping[str, Any]) -> BackendConfig:
 
     """
     odometry: dict[str, OdometrySource] = {}
-    measurements: dict[str, MeasurementSource] = {}
+    measurements = {SET_POSE: SET_POSES}
     for source in source_list(values):
         own = {name.removeprefix(f'{source.name}.'): value for name, value in values.items()
                if name.startswith(f'{source.name}.')}

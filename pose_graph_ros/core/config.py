@@ -194,6 +194,8 @@ POSITIONS = MeasurementSource(loss=Loss.HUBER)
 """Defaults of a source of global poses or positions."""
 HEADINGS = MeasurementSource(minimum_period=0.5)
 """Defaults of a source of headings; thinned, as an IMU sends many redundant ones."""
+SET_POSES = MeasurementSource()
+"""Settings of poses that a user sets: without a robust loss, as the user is believed."""
 LOOP_CLOSURES = MeasurementSource(covariance=CovariancePolicy(repair=False))
 """Defaults of a source of loop closures; those with an invalid covariance are rejected."""
 

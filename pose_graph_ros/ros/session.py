@@ -33,7 +33,7 @@ from rclpy.timer import Timer
 from sensor_msgs.msg import Imu, NavSatFix
 
 from pose_graph_ros.adapters.conversions import frame, Message
-from pose_graph_ros.adapters.sources import backend_config, Kind, Source
+from pose_graph_ros.adapters.sources import backend_config, Kind, SET_POSE, Source
 from pose_graph_ros.core.backend import PoseGraphBackend
 from pose_graph_ros.core.estimate import UpdateReport
 from pose_graph_ros.core.io.saved_graph import SavedGraph
@@ -256,7 +256,7 @@ class Session:
         answer = PAUSED if self.input.paused else self._set_pose_input.receive(
             message, early=self.worker.estimate is None)
         if answer is not None:
-            self.input.reject('set_pose', answer)
+            self.input.reject(SET_POSE, answer)
         self._set_pose()
 
     def _set_pose(self) -> None:
@@ -268,7 +268,7 @@ class Session:
         self.node.get_logger().info(
             f'the pose is set to ({x:.3f}, {y:.3f}, {yaw:.3f}) in {self.out.map_frame}')
         self.out.jump()
-        self.worker.call(lambda backend: backend.set_pose(pose, 'set_pose'))
+        self.worker.call(lambda backend: backend.set_pose(pose, SET_POSE))
         self.worker.request_update()
 
     # ---- time

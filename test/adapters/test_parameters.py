@@ -24,7 +24,7 @@ from pose_graph_ros.adapters.parameters import (
     PARAMETERS,
     SOURCE_PARAMETERS,
 )
-from pose_graph_ros.adapters.sources import backend_config, Kind, Source, source_list
+from pose_graph_ros.adapters.sources import backend_config, Kind, SET_POSE, Source, source_list
 from pose_graph_ros.core.config import (
     BackendConfig,
     Correlation,
@@ -34,8 +34,16 @@ from pose_graph_ros.core.config import (
     MeasurementSource,
     NoiseFrom,
     OdometrySource,
+    SET_POSES,
 )
 from pose_graph_ros.core.exceptions import ConfigError
+from pose_graph_ros.core.measurements import (
+    GlobalPose,
+    HeadingOnly,
+    LoopClosure,
+    Measurement,
+    Position,
+)
 
 ROOT = Path(__file__).resolve().parents[2]
 
@@ -100,12 +108,29 @@ def test_defaults_make_the_default_engine_with_a_loss_for_what_is_in_the_map() -
     robust = MeasurementSource(loss=Loss.HUBER)
     assert config == BackendConfig(
         odometry={'odom': OdometrySource()},
-        measurements={'global_pose': robust, 'fix': robust, 'loop_closure': LOOP_CLOSURES})
+        measurements={SET_POSE: SET_POSES, 'global_pose': robust, 'fix': robust,
+                      'loop_closure': LOOP_CLOSURES})
     assert source_list(checked({})) == (
         Source('odom', Kind.ODOMETRY, 'odom'),
         Source('global_pose', Kind.GLOBAL_POSE, 'global_pose'),
         Source('fix', Kind.FIX, 'gps/fix'),
         Source('loop_closure', Kind.LOOP_CLOSURE, 'loop_closure'))
+
+
+@pytest.mark.parametrize(('kind', 'sends'), [
+    (Kind.GLOBAL_POSE, GlobalPose), (Kind.FIX, Position), (Kind.IMU, HeadingOnly),
+    (Kind.LOOP_CLOSURE, LoopClosure)])
+def test_a_source_has_the_same_defaults_in_the_node_and_in_the_core(
+    kind: Kind, sends: type[Measurement],
+) -> None:
+    config = backend_config(checked({'sources': ['odom', 'mine'], 'mine.type': kind.value}))
+    assert config.measurements['mine'] == BackendConfig().measurement_source('mine', sends)
+    assert config.odometry['odom'] == BackendConfig().odometry_source('odom')
+
+
+def test_a_pose_that_is_set_has_no_robust_loss() -> None:
+    config = backend_config(checked({}))
+    assert config.measurement_source(SET_POSE, GlobalPose).loss is Loss.NONE
 
 
 NUMBERS = [p for p in (*all_parameters({}), *all_parameters({'sources': ['imu']}))
