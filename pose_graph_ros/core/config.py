@@ -29,10 +29,8 @@ def require(settings: object, *names: str, positive: bool = False) -> None:
     Parameters
     ----------
     settings : object
-    *names : str
-        Attributes of `settings`.
-    positive : bool
-        Whether 0 is invalid, too.
+    *names : str, attributes of `settings`
+    positive : bool, whether 0 is invalid, too
 
     """
     for name in names:
@@ -44,7 +42,7 @@ def require(settings: object, *names: str, positive: bool = False) -> None:
 
 
 class Loss(Enum):
-    """Loss of a constraint as a function of its energy; see `graph.losses`."""
+    """Loss of a constraint as a function of its energy; see `graph.reweighting`."""
 
     NONE = 'none'
     HUBER = 'huber'
@@ -318,8 +316,7 @@ class BackendConfig:
         Parameters
         ----------
         name : str
-        kind : type
-            Of the measurement; selects the defaults of a source without settings.
+        kind : type, of the measurement; selects the defaults of a source without settings
 
         """
         defaults = {LoopClosure: LOOP_CLOSURES, HeadingOnly: HEADINGS}

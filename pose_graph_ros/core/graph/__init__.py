@@ -8,6 +8,6 @@ at all, and gives out poses, constraints and energies. `constraints` describes e
 nodes as arrays and validates them; `tables` holds all rows in memory that compiled kernels share,
 and names every column. The kernels in `rows` and `editing` write rows, those in `factors` evaluate
 and linearize constraints, and `transaction_log` logs changes for a rollback. `error_functions`
-has the errors in NumPy, `losses` and `reweighting` the robust losses, and `graph_view` what is
-shown of a graph. Solving is done in `elimination`, `smoother` and `batch`.
+has the errors in NumPy, `reweighting` the robust losses, and `graph_view` what is shown of a
+graph. Solving is done in `elimination`, `smoother` and `batch`.
 """

@@ -119,15 +119,13 @@ class Edges(_Table):
 
     Parameters
     ----------
-    i, j : array_like of int, shape (M,)
-        Nodes that the edges start from and lead to.
+    i, j : array_like of int, shape (M,), nodes that the edges start from and lead to
     mean : array_like, shape (M, 3)
         Measured poses of j in i [m, m, rad]; of edges to a bias those of i in the map.
     information : array_like, shape (M, 3, 3)
         Inverse covariances of the errors (3.48), in the frames of the measured poses; of edges to
         a bias in map axes.
-    kind : array_like of int, shape (M,)
-        `EdgeKind`.
+    kind : array_like of int, shape (M,), `EdgeKind`
     weight : array_like, shape (M,), optional
         Factors on the information, 1 by default; 0 for a removed edge.
     bias : array_like, shape (M, 4), optional
@@ -169,18 +167,15 @@ class ObservedNodes(_Table):
 
     Parameters
     ----------
-    node : array_like of int, shape (K,)
-        Hidden nodes that are observed.
+    node : array_like of int, shape (K,), hidden nodes that are observed
     offset : array_like, shape (K, 3), optional
         Poses of the observed frames in the hidden nodes [m, m, rad]: motion by odometry since the
         hidden node, then the lever arm. The identity, which is the default, makes the error that
         of (3.52).
-    mean : array_like, shape (K, 3)
-        Observed poses in the map [m, m, rad].
+    mean : array_like, shape (K, 3), observed poses in the map [m, m, rad]
     information : array_like, shape (K, 3, 3)
         Inverse covariances of the errors (3.52), in the frames of the observed poses.
-    kind : array_like of int, shape (K,)
-        `ObservedKind`.
+    kind : array_like of int, shape (K,), `ObservedKind`
     weight : array_like, shape (K,), optional
         Factors on the information, 1 by default; 0 for a removed observed node.
 
@@ -237,8 +232,7 @@ def check(table: Edges | ObservedNodes, is_bias: npt.NDArray[np.bool_]) -> None:
     Parameters
     ----------
     table : Edges or ObservedNodes
-    is_bias : ndarray of bool, shape (N,)
-        Which of the hidden nodes are biases.
+    is_bias : ndarray of bool, shape (N,), which of the hidden nodes are biases
 
     Raises
     ------

@@ -29,17 +29,8 @@ def touch(head, v):  # type: ignore[no-untyped-def]
 
 
 @kernel
-def start_nodes(head, first, first_bias, last):  # type: ignore[no-untyped-def]
-    """
-    Initialise new hidden nodes whose poses have been written.
-
-    Parameters
-    ----------
-    first, first_bias, last : int
-        The new poses are the rows from `first` to `first_bias` - 1, the new biases those from
-        `first_bias` to `last` - 1.
-
-    """
+def _start_nodes(head, first, first_bias, last):  # type: ignore[no-untyped-def]
+    """Initialise rows of new hidden nodes: the poses before `first_bias`, the biases from it."""
     node_f, node_i = tb.node_f(head), tb.node_i(head)
     for v in range(first, last):
         f, i = node_f[v], node_i[v]
@@ -72,8 +63,7 @@ def scale_by_edge(head, e, weight):  # type: ignore[no-untyped-def]
     Parameters
     ----------
     e : int
-    weight : float
-        Its weight, or the change of it.
+    weight : float, its weight, or the change of it
 
     """
     edge_f, edge_i = tb.edge_f(head), tb.edge_i(head)
@@ -97,8 +87,7 @@ def scale_by_observed(head, k, weight):  # type: ignore[no-untyped-def]
     Parameters
     ----------
     k : int
-    weight : float
-        Its weight, or the change of it.
+    weight : float, its weight, or the change of it
 
     """
     observed_f, observed_i = tb.observed_f(head), tb.observed_i(head)
@@ -140,16 +129,8 @@ def _touch_edge(head, e):  # type: ignore[no-untyped-def]
 
 
 @kernel
-def start_edges(head, first, last):  # type: ignore[no-untyped-def]
-    """
-    Add new edges to the lists of their ends, and linearize them.
-
-    Parameters
-    ----------
-    first, last : int
-        The new edges are the rows from `first` to `last` - 1.
-
-    """
+def _start_edges(head, first, last):  # type: ignore[no-untyped-def]
+    """Add the edges in new rows to the lists of their ends, and linearize them."""
     edge_f = tb.edge_f(head)
     scalars = tb.scalars(head)
     node_i = tb.node_i(head)
@@ -173,16 +154,8 @@ def start_edges(head, first, last):  # type: ignore[no-untyped-def]
 
 
 @kernel
-def start_observed(head, first, last):  # type: ignore[no-untyped-def]
-    """
-    Add new observed nodes to the lists of their hidden nodes, and linearize them.
-
-    Parameters
-    ----------
-    first, last : int
-        The new observed nodes are the rows from `first` to `last` - 1.
-
-    """
+def _start_observed(head, first, last):  # type: ignore[no-untyped-def]
+    """Add the observed nodes in new rows to the lists of their hidden nodes; linearize them."""
     observed_f = tb.observed_f(head)
     scalars = tb.scalars(head)
     node_i = tb.node_i(head)
@@ -192,7 +165,7 @@ def start_observed(head, first, last):  # type: ignore[no-untyped-def]
         v = row[tb.OBS_NODE]
         transaction_log.log_node(head, v)
         row[tb.OBS_NEXT], node_i[v, tb.OBSERVED_LIST] = node_i[v, tb.OBSERVED_LIST], k
-        row[tb.OBS_CHECKED] = row[tb.OBS_WAITS] = 0
+        row[tb.OBS_WAITS] = 0
         row[tb.OBS_LOGGED] = head[tb.UPDATE]
         scale_by_observed(head, k, f[tb.WEIGHT])
         factors.linearize_observed(head, k)
@@ -202,17 +175,8 @@ def start_observed(head, first, last):  # type: ignore[no-untyped-def]
 
 
 @kernel
-def weigh_edge(head, e, weight):  # type: ignore[no-untyped-def]
-    """
-    Set the weight of an edge.
-
-    Parameters
-    ----------
-    e : int
-    weight : float
-        0 removes the edge.
-
-    """
+def _weigh_edge(head, e, weight):  # type: ignore[no-untyped-def]
+    """Set the weight of an edge; 0 removes it."""
     edge_f, scalars = tb.edge_f(head), tb.scalars(head)
     f = edge_f[e]
     transaction_log.log_edge(head, e)
@@ -226,17 +190,8 @@ def weigh_edge(head, e, weight):  # type: ignore[no-untyped-def]
 
 
 @kernel
-def weigh_observed(head, k, weight):  # type: ignore[no-untyped-def]
-    """
-    Set the weight of an observed node.
-
-    Parameters
-    ----------
-    k : int
-    weight : float
-        0 removes the observed node.
-
-    """
+def _weigh_observed(head, k, weight):  # type: ignore[no-untyped-def]
+    """Set the weight of an observed node; 0 removes it."""
     observed_f, scalars, observed_i = tb.observed_f(head), tb.scalars(head), tb.observed_i(head)
     f, v = observed_f[k], observed_i[k, tb.OBS_NODE]
     transaction_log.log_observed(head, k)
@@ -251,17 +206,8 @@ def weigh_observed(head, k, weight):  # type: ignore[no-untyped-def]
 
 
 @kernel
-def set_fixed(head, v, fixed):  # type: ignore[no-untyped-def]
-    """
-    Fix a hidden node at its present pose, or free it.
-
-    Parameters
-    ----------
-    v : int
-    fixed : int
-        1 or 0.
-
-    """
+def _set_fixed(head, v, fixed):  # type: ignore[no-untyped-def]
+    """Fix a hidden node at its present pose, or free it."""
     node_i = tb.node_i(head)
     if node_i[v, tb.FIXED] != fixed:
         transaction_log.log_node(head, v)
@@ -276,20 +222,17 @@ def edit(head, what, number, value):  # type: ignore[no-untyped-def]
 
     Parameters
     ----------
-    what : int
-        WEIGH_EDGE, WEIGH_OBSERVED or FIX.
-    number : int
-        Row of the edge, the observed node or the hidden node.
-    value : float
-        The weight, or 1 to fix and 0 to free a hidden node.
+    what : int, WEIGH_EDGE, WEIGH_OBSERVED or FIX
+    number : int, row of the edge, the observed node or the hidden node
+    value : float, the weight, or 1 to fix and 0 to free a hidden node
 
     """
     if what == WEIGH_EDGE:
-        weigh_edge(head, number, value)
+        _weigh_edge(head, number, value)
     elif what == WEIGH_OBSERVED:
-        weigh_observed(head, number, value)
+        _weigh_observed(head, number, value)
     else:
-        set_fixed(head, number, value)
+        _set_fixed(head, number, value)
 
 
 @kernel
@@ -310,12 +253,10 @@ def add_rows(  # type: ignore[no-untyped-def]
     ----------
     hidden, biases : ndarray, shapes (N, 3) and (S, 3)
         Poses of new hidden nodes, then values of new biases.
-    i, j, mean, information, kind, weight, bias : ndarray
-        Columns of `Edges`.
+    i, j, mean, information, kind, weight, bias : ndarray, columns of `Edges`
     node, offset, observed_mean, observed_information, observed_kind, observed_weight : ndarray
         Columns of `ObservedNodes`.
-    checked : bool
-        Whether `constraints.check` has accepted the rows.
+    checked : bool, whether `constraints.check` has accepted the rows
 
     Returns
     -------
@@ -350,11 +291,11 @@ def add_rows(  # type: ignore[no-untyped-def]
     if not valid and not checked:
         return UNSOUND
     head[tb.N_NODES] = n_nodes
-    start_nodes(head, first, first_bias, n_nodes)
+    _start_nodes(head, first, first_bias, n_nodes)
     first, head[tb.N_EDGES] = head[tb.N_EDGES], n_edges
-    start_edges(head, first, n_edges)
+    _start_edges(head, first, n_edges)
     first, head[tb.N_OBSERVED] = head[tb.N_OBSERVED], n_observed
-    start_observed(head, first, n_observed)
+    _start_observed(head, first, n_observed)
     return ADDED
 
 

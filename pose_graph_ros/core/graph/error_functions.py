@@ -40,8 +40,7 @@ def edge_errors(poses: FloatArray, edges: Edges) -> FloatArray:
 
     Parameters
     ----------
-    poses : ndarray, shape (N, 3)
-        Hidden nodes in the map [m, m, rad].
+    poses : ndarray, shape (N, 3), hidden nodes in the map [m, m, rad]
     edges : Edges
 
     """
@@ -67,8 +66,7 @@ def observed_errors(poses: FloatArray, observed: ObservedNodes) -> FloatArray:
 
     Parameters
     ----------
-    poses : ndarray, shape (N, 3)
-        Hidden nodes in the map [m, m, rad].
+    poses : ndarray, shape (N, 3), hidden nodes in the map [m, m, rad]
     observed : ObservedNodes
 
     """
@@ -86,8 +84,7 @@ def energies(error: FloatArray, information: FloatArray) -> FloatArray:
     Parameters
     ----------
     error : ndarray, shape (M, 3)
-    information : ndarray, shape (M, 3, 3)
-        In the frames of the errors.
+    information : ndarray, shape (M, 3, 3), in the frames of the errors
 
     """
     return np.einsum('mi,mij,mj->m', error, information, error)

@@ -146,19 +146,12 @@ def check_edge(head, e, phi):  # type: ignore[no-untyped-def]
 @kernel
 def error_to_bias(f, start, end):  # type: ignore[no-untyped-def]
     """
-    Return the error of an edge to a bias, and its arm, both in map axes.
+    Return the error of an edge to a bias [m, m, rad], and its arm [m, m], both in map axes.
 
     Parameters
     ----------
-    f : ndarray
-        Row of the edge in edge_f.
-    start, end : ndarray
-        Rows of its nodes in node_f.
-
-    Returns
-    -------
-    ex, ey, eth, ax, ay : float
-        [m, m, rad, m, m], eth in [-pi, pi).
+    f : ndarray, row of the edge in edge_f
+    start, end : ndarray, rows of its nodes in node_f
 
     """
     ax = ay = 0.0
@@ -225,8 +218,7 @@ def add_edge(head, e, a, b, front, ld):  # type: ignore[no-untyped-def]
     Parameters
     ----------
     e : int
-    a, b : int
-        Rows of the front at which the blocks of its ends i and j begin.
+    a, b : int, rows of the front at which the blocks of its ends i and j begin
     front : ndarray, flat
         Upper triangle, stored by rows of `ld` numbers, the last of which is the right-hand side.
     ld : int
@@ -355,10 +347,8 @@ def add_observed(head, k, a, front, ld):  # type: ignore[no-untyped-def]
     Parameters
     ----------
     k : int
-    a : int
-        Row of the front at which the block of its hidden node begins.
-    front, ld : ndarray, int
-        As for `add_edge`.
+    a : int, row of the front at which the block of its hidden node begins
+    front, ld : ndarray, int, as for `add_edge`
 
     """
     node_f, observed_f, observed_i = tb.node_f(head), tb.observed_f(head), tb.observed_i(head)
@@ -400,8 +390,7 @@ def energies(head, edges, observed):  # type: ignore[no-untyped-def]
 
     Parameters
     ----------
-    edges, observed : ndarray, shapes (M,) and (K,)
-        Output [sigma^2].
+    edges, observed : ndarray, shapes (M,) and (K,), output [sigma^2]
 
     """
     node_f, edge_f, observed_f = tb.node_f(head), tb.edge_f(head), tb.observed_f(head)

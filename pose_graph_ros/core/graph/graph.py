@@ -1,11 +1,6 @@
 # Copyright 2026 The pose_graph_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""
-The pose graph: hidden nodes, edges and observed nodes, as struct of arrays.
-
-A `Graph` is edited by `GraphUpdate`s only, each applied whole or not at all. Solvers work on its
-tables and write the poses of the hidden nodes.
-"""
+"""The pose graph: hidden nodes, edges and observed nodes, as struct of arrays."""
 
 from collections.abc import Iterable, Mapping, Sequence
 from types import MappingProxyType
@@ -90,19 +85,20 @@ class GraphRows(NamedTuple):
     poses: FloatArray
     """Estimates of all hidden nodes, biases included, shape (N, 3) [m, m, rad]."""
     is_bias: BoolArray
-    """Shape (N,)."""
     fixed: BoolArray
-    """Shape (N,)."""
     edges: Edges
     observed: ObservedNodes
 
 
 class Graph:
-    """A pose graph."""
+    """
+    A pose graph, edited by `GraphUpdate`s only, each applied whole or not at all.
+
+    Solvers work on its tables and write the poses of the hidden nodes.
+    """
 
     def __init__(self) -> None:
         self.memory = Memory()
-        """Tables, which solvers work on."""
         compile_only(editing.add_rows, _ADD_ROWS)   # `apply` converts other arrays
 
     @property
@@ -182,15 +178,7 @@ class Graph:
                 self.memory['observed_f'][:self.n_observed, tb.WEIGHT].copy())
 
     def apply(self, update: GraphUpdate) -> None:
-        """
-        Apply an update, all of it or nothing.
-
-        Raises
-        ------
-        GraphUpdateError
-            If a part of it is invalid; the graph is unchanged then.
-
-        """
+        """Apply an update; a GraphUpdateError for an invalid part leaves the graph unchanged."""
         hidden, edges, observed, *by_number, biases = update
         edits = any(map(len, by_number))
         if edits:
@@ -257,8 +245,7 @@ class Graph:
 
         Parameters
         ----------
-        n_nodes, n_edges, n_observed : int
-            Numbers of hidden nodes, edges and observed nodes.
+        n_nodes, n_edges, n_observed : int, numbers of hidden nodes, edges and observed nodes
 
         """
         memory, head = self.memory, self.memory.head
@@ -291,13 +278,8 @@ class Graph:
         """
         Set the estimates of all hidden nodes, shape (N, 3) [m, m, rad]; headings are wrapped.
 
-        All constraints are linearized there, and the next step eliminates all nodes.
-
-        Raises
-        ------
-        GraphUpdateError
-            If the shape is wrong or a number is not finite.
-
+        All constraints are linearized there, and the next step eliminates all nodes. A wrong shape
+        or a number that is not finite raises GraphUpdateError.
         """
         if poses.shape != (self.n_nodes, 3) or not np.all(np.isfinite(poses)):
             raise GraphUpdateError(
@@ -314,15 +296,7 @@ class Graph:
             ObservedNodes(*(column.copy() for column in self.observed.columns)))
 
     def fill(self, rows: GraphRows) -> None:
-        """
-        Add all rows of another graph to this empty one.
-
-        Raises
-        ------
-        GraphUpdateError
-            If a row is invalid.
-
-        """
+        """Add all rows of another graph to this empty one; GraphUpdateError if one is invalid."""
         poses, is_bias, fixed, edges, observed = rows
         self.apply(GraphUpdate(hidden=poses))
         memory, head = self.memory, self.memory.head

@@ -25,9 +25,7 @@ def row_start(k, n):  # type: ignore[no-untyped-def]
 
     Parameters
     ----------
-    k : int
-    n : int
-        Number of columns, without the right-hand side.
+    k, n : int, row, and number of columns without the right-hand side
 
     """
     return k * n - k * (k - 1) // 2
@@ -40,9 +38,7 @@ def triangle_size(rows, n):  # type: ignore[no-untyped-def]
 
     Parameters
     ----------
-    rows : int
-    n : int
-        Number of columns, without the right-hand side.
+    rows, n : int, number of rows, and of columns without the right-hand side
 
     """
     return rows * (n + 1) - rows * (rows - 1) // 2
@@ -90,10 +86,7 @@ def give_values(head, at, n):  # type: ignore[no-untyped-def]
 
     Parameters
     ----------
-    at : int
-        Index of the block.
-    n : int
-        The number that it was taken for.
+    at, n : int, index of the block, and the number that it was taken for
 
     """
     pool_f = tb.pool_f(head)
@@ -123,10 +116,7 @@ def give_nodes(head, at, n):  # type: ignore[no-untyped-def]
 
     Parameters
     ----------
-    at : int
-        Index of the block.
-    n : int
-        The number that it was taken for.
+    at, n : int, as for `give_values`
 
     """
     pool_i = tb.pool_i(head)
@@ -142,8 +132,7 @@ def n_values(n_frontal, n_separator):  # type: ignore[no-untyped-def]
 
     Parameters
     ----------
-    n_frontal, n_separator : int
-        Numbers of nodes.
+    n_frontal, n_separator : int, numbers of nodes
 
     """
     rows, rest = 3 * n_frontal, 3 * n_separator

@@ -9,6 +9,15 @@ repeatedly, starting from weights that do not depend on earlier updates.
 
 The *base weight* of a constraint is its weight without the loss: 1, or less where the errors of
 several measurements are correlated.
+
+With s the square root of the energy e^T information e and k the threshold of a loss [sigma], the
+cost of a constraint is rho(s) instead of s^2, and its weight in H and b is w(s) = rho'(s) / (2 s):
+
+    none     rho = s^2                          w = 1
+    Huber    rho = s^2 up to k, 2 k s - k^2     w = 1, then k / s
+    Cauchy   rho = k^2 log(1 + s^2 / k^2)       w = 1 / (1 + s^2 / k^2)
+
+The weights depend on the estimate and the estimate on the weights, so both are computed in turn.
 """
 
 from collections.abc import Mapping
@@ -19,7 +28,6 @@ import numpy as np
 from pose_graph_ros.core.compiled.growing_array import GrowingArray
 from pose_graph_ros.core.config import Loss
 from pose_graph_ros.core.geometry.se2 import FloatArray, IntArray
-from pose_graph_ros.core.graph import losses
 from pose_graph_ros.core.graph.constraints import Edges, ObservedNodes
 from pose_graph_ros.core.graph.error_functions import edge_errors, energies, observed_errors
 from pose_graph_ros.core.graph.graph import Graph
@@ -31,6 +39,27 @@ WINDOW = 200
 LEAST_CHANGE = 0.005
 
 _LOSSES = tuple(Loss)
+
+
+def _weights(loss: Loss, energy: FloatArray, threshold: float) -> FloatArray:
+    """Return the weights of constraints with these unweighted energies, shape (M,), in (0, 1]."""
+    ratio = np.maximum(energy, 0.0) / threshold**2
+    if loss is Loss.HUBER:
+        return np.asarray(1.0 / np.sqrt(np.maximum(ratio, 1.0)))
+    if loss is Loss.CAUCHY:
+        return np.asarray(1.0 / (1.0 + ratio))
+    return np.ones_like(ratio)
+
+
+def _costs(loss: Loss, energy: FloatArray, threshold: float) -> FloatArray:
+    """Return the costs rho of constraints with these unweighted energies, shape (M,) [sigma^2]."""
+    square = threshold**2
+    ratio = np.maximum(energy, 0.0) / square
+    if loss is Loss.HUBER:
+        return np.where(ratio > 1.0, square * (2.0 * np.sqrt(ratio) - 1.0), square * ratio)
+    if loss is Loss.CAUCHY:
+        return np.asarray(square * np.log1p(ratio))
+    return np.asarray(energy)
 
 
 @dataclass(frozen=True, slots=True)
@@ -61,11 +90,6 @@ class _Rows:
     """Index of the loss in `Loss`, and its threshold [sigma]."""
     base_weights: GrowingArray = field(default_factory=lambda: GrowingArray((), np.float64))
     cursor: int = 0
-
-    def alike(self, weight: float) -> Mapping[int, float]:
-        """Return the base weights times a weight, by row."""
-        weights = weight * self.base_weights.values
-        return dict(zip(self.rows.values.tolist(), weights.tolist(), strict=True))
 
     def saved(self) -> SavedLosses:
         losses = self.losses.values
@@ -99,7 +123,7 @@ class _Rows:
         energy, weight = self.energies(graph, rows)
         wanted = np.empty(len(index))
         for loss, threshold, chosen in self.groups(index):
-            wanted[chosen] = losses.weights(loss, energy[chosen], widened * threshold)
+            wanted[chosen] = _weights(loss, energy[chosen], widened * threshold)
         wanted *= self.base_weights.values[index]
         changed = np.abs(wanted - weight) > least * np.minimum(wanted, weight)
         return dict(zip(rows[changed].tolist(), wanted[changed].tolist(), strict=True))
@@ -137,13 +161,10 @@ class Reweighting:
 
         Parameters
         ----------
-        row : int
-            Row in the graph, above those of its kind that were added before.
+        row : int, row in the graph, above those of its kind that were added before
         loss : Loss
-        threshold : float
-            Threshold of the loss [sigma].
-        edge : bool
-            Whether it is an edge.
+        threshold : float, threshold of the loss [sigma]
+        edge : bool, whether it is an edge
 
         """
         if loss is not Loss.NONE:
@@ -158,8 +179,7 @@ class Reweighting:
 
         Parameters
         ----------
-        row : int
-            Row in the graph.
+        row : int, row in the graph
         weight : float
 
         """
@@ -174,7 +194,7 @@ class Reweighting:
 
     def restore(self, edges: SavedLosses, observed: SavedLosses) -> None:
         """
-        Restore the state that `saved` returned; nothing may have been added before.
+        Restore what `saved` returned; nothing may have been added before.
 
         Parameters
         ----------
@@ -203,8 +223,7 @@ class Reweighting:
         Parameters
         ----------
         graph : Graph
-        widened : float
-            Factor on all thresholds.
+        widened : float, factor on all thresholds
 
         """
         edges, observed = (
@@ -218,7 +237,10 @@ class Reweighting:
 
         The weight 1 makes it a plain least-squares problem.
         """
-        return self._edges.alike(weight), self._observed.alike(weight)
+        edges, observed = (
+            dict(zip(table.rows.values.tolist(), (weight * table.base_weights.values).tolist(),
+                     strict=True)) for table in (self._edges, self._observed))
+        return edges, observed
 
     def cost(self, graph: Graph) -> float:
         """Return the sum of the robust costs minus the sum of the weighted energies."""
@@ -226,7 +248,7 @@ class Reweighting:
         for table in (self._edges, self._observed):
             energy, weight = table.energies(graph, table.rows.values)
             for loss, threshold, chosen in table.groups(np.arange(len(table.rows))):
-                costs = losses.costs(loss, energy[chosen], threshold)
+                costs = _costs(loss, energy[chosen], threshold)
                 total += float(np.sum(table.base_weights.values[chosen] * costs
                                       - weight[chosen] * energy[chosen]))
         return total

@@ -18,27 +18,17 @@ _TOLERANCE = 1e-6
 
 
 @kernel
-def is_finite(x):  # type: ignore[no-untyped-def]
+def _is_finite(x):  # type: ignore[no-untyped-def]
     """Tell whether the magnitude of a number is at most 1e300; neither infinite nor NaN is."""
     return abs(x) <= 1e300
 
 
 @kernel
-def pack_information(to, w):  # type: ignore[no-untyped-def]
+def _pack_information(to, w):  # type: ignore[no-untyped-def]
     """
-    Write the upper triangle of an information matrix to a row.
+    Write the upper triangle of an information matrix to a row of edge_f or observed_f.
 
-    Parameters
-    ----------
-    to : ndarray
-        Row of edge_f or observed_f.
-    w : ndarray, shape (3, 3)
-
-    Returns
-    -------
-    bool
-        Whether it is finite, symmetric, positive semidefinite and not zero.
-
+    Return whether the matrix is finite, symmetric, positive semidefinite and not zero.
     """
     at = tb.INFO
     xx, yy, tt = w[0, 0], w[1, 1], w[2, 2]
@@ -46,7 +36,7 @@ def pack_information(to, w):  # type: ignore[no-untyped-def]
     to[at], to[at + 1], to[at + 2] = xx, xy, xt
     to[at + 3], to[at + 4], to[at + 5] = yy, yt, tt
     total = xx + yy + tt
-    if not (is_finite(total) and xx >= 0.0 and yy >= 0.0 and tt >= 0.0 and total > 0.0):
+    if not (_is_finite(total) and xx >= 0.0 and yy >= 0.0 and tt >= 0.0 and total > 0.0):
         return False
     sx, sy, st = math.sqrt(xx), math.sqrt(yy), math.sqrt(tt)
     skew = max(abs(w[0, 1] - w[1, 0]) - _TOLERANCE * sx * sy,
@@ -67,7 +57,7 @@ def pack_information(to, w):  # type: ignore[no-untyped-def]
 def _copy_pose(to, at, pose):  # type: ignore[no-untyped-def]
     """Write a pose to three columns of a row; return whether it is finite."""
     to[at], to[at + 1], to[at + 2] = pose[0], pose[1], pose[2]
-    return is_finite(pose[0]) and is_finite(pose[1]) and is_finite(pose[2])
+    return _is_finite(pose[0]) and _is_finite(pose[1]) and _is_finite(pose[2])
 
 
 @kernel
@@ -77,23 +67,20 @@ def write_edge(head, e, i, j, mean, information, kind, weight):  # type: ignore[
 
     Parameters
     ----------
-    e : int
-        Row.
-    i, j, mean, information, kind, weight : int, ndarray or float
-        Values of the columns of `Edges`.
+    e : int, row
+    i, j, mean, information, kind, weight : int, ndarray or float, values of the columns of `Edges`
 
     Returns
     -------
-    bool
-        Whether the row is valid; its nodes, its kind and its bias are not checked.
+    bool, whether the row is valid; its nodes, its kind and its bias are not checked
 
     """
     edge_f, edge_i = tb.edge_f(head), tb.edge_i(head)
     f, row = edge_f[e], edge_i[e]
     row[tb.END_I], row[tb.END_J], row[tb.EDGE_KIND] = i, j, kind
     f[tb.WEIGHT] = weight
-    valid = _copy_pose(f, tb.MEAN, mean) and is_finite(weight) and weight >= 0.0 and i != j
-    return pack_information(f, information) and valid
+    valid = _copy_pose(f, tb.MEAN, mean) and _is_finite(weight) and weight >= 0.0 and i != j
+    return _pack_information(f, information) and valid
 
 
 @kernel
@@ -105,24 +92,22 @@ def write_observed(  # type: ignore[no-untyped-def]
 
     Parameters
     ----------
-    k : int
-        Row.
+    k : int, row
     node, offset, mean, information, kind, weight : int, ndarray or float
         Values of the columns of `ObservedNodes`.
 
     Returns
     -------
-    bool
-        Whether the row is valid; its node and its kind are not checked.
+    bool, whether the row is valid; its node and its kind are not checked
 
     """
     observed_f, observed_i = tb.observed_f(head), tb.observed_i(head)
     f, row = observed_f[k], observed_i[k]
     row[tb.OBS_NODE], row[tb.OBS_KIND] = node, kind
     f[tb.WEIGHT] = weight
-    valid = _copy_pose(f, tb.MEAN, mean) and is_finite(weight) and weight >= 0.0
+    valid = _copy_pose(f, tb.MEAN, mean) and _is_finite(weight) and weight >= 0.0
     valid = _copy_pose(f, tb.OBS_OFFSET, offset) and valid
-    return pack_information(f, information) and valid
+    return _pack_information(f, information) and valid
 
 
 @kernel
@@ -132,15 +117,12 @@ def write_nodes(head, first, poses):  # type: ignore[no-untyped-def]
 
     Parameters
     ----------
-    first : int
-        First row.
-    poses : ndarray, shape (N, 3)
-        [m, m, rad].
+    first : int, first row
+    poses : ndarray, shape (N, 3) [m, m, rad]
 
     Returns
     -------
-    bool
-        Whether all are finite.
+    bool, whether all are finite
 
     """
     node_f = tb.node_f(head)
@@ -170,17 +152,13 @@ def write_edges(  # type: ignore[no-untyped-def]
 
     Parameters
     ----------
-    n_nodes : int
-        Number of hidden nodes, with the new ones.
-    first_bias : int
-        First row of the new biases.
-    i, j, mean, information, kind, weight, bias : ndarray
-        Columns of `Edges`.
+    n_nodes : int, number of hidden nodes, with the new ones
+    first_bias : int, first row of the new biases
+    i, j, mean, information, kind, weight, bias : ndarray, columns of `Edges`
 
     Returns
     -------
-    bool
-        Whether all are valid.
+    bool, whether all are valid
 
     """
     edge_f = tb.edge_f(head)
@@ -195,7 +173,7 @@ def write_edges(  # type: ignore[no-untyped-def]
             f[tb.BIAS_OFFSET], f[tb.BIAS_OFFSET + 1] = bias[k, 0], bias[k, 1]
             f[tb.FACTOR_T], f[tb.FACTOR_TH] = bias[k, 2], bias[k, 3]
             for m in range(4):
-                valid = is_finite(bias[k, m]) and valid
+                valid = _is_finite(bias[k, m]) and valid
             valid = valid and _is_bias(head, j[k], first_bias)
         elif valid:
             valid = not (_is_bias(head, i[k], first_bias) or _is_bias(head, j[k], first_bias))
@@ -211,15 +189,12 @@ def write_all_observed(  # type: ignore[no-untyped-def]
 
     Parameters
     ----------
-    n_nodes : int
-        Number of hidden nodes, with the new ones.
-    node, offset, mean, information, kind, weight : ndarray
-        Columns of `ObservedNodes`.
+    n_nodes : int, number of hidden nodes, with the new ones
+    node, offset, mean, information, kind, weight : ndarray, columns of `ObservedNodes`
 
     Returns
     -------
-    bool
-        Whether all are valid.
+    bool, whether all are valid
 
     """
     valid = True

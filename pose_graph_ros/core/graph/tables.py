@@ -97,9 +97,8 @@ OBS_OFFSET, OBS_TH, OBS_K, OBS_ERROR2, OBS_ENERGY, OBS_F = 10, 13, 14, 15, 16, 1
 #   OBS_NODE: hidden node that is observed
 #   OBS_NEXT: next entry of its list of observed nodes
 #   OBS_KIND: `ObservedKind`
-#   OBS_CHECKED: unused, 0
 #   OBS_WAITS, OBS_LOGGED: as EDGE_WAITS and EDGE_LOGGED
-OBS_NODE, OBS_NEXT, OBS_KIND, OBS_CHECKED, OBS_WAITS, OBS_LOGGED, OBS_I = range(7)
+OBS_NODE, OBS_NEXT, OBS_KIND, OBS_WAITS, OBS_LOGGED, OBS_I = range(6)
 
 # clique_i
 #   PARENT, CHILD, SIBLING: rows of the parent, the first child and the next child of the parent;
@@ -193,7 +192,7 @@ COUNTERS_OF_STAMPS: Final = (UPDATE, ITERATION, FRONT_SERIAL)
 STAMPS: Final = {
     'node_i': (FRONT, CHANGED, NODE_LOGGED, SOLUTION_LOGGED),
     'edge_i': (EDGE_CHECKED, EDGE_LOGGED, ENERGY_LOGGED),
-    'observed_i': (OBS_CHECKED, OBS_LOGGED),
+    'observed_i': (OBS_LOGGED,),
     'clique_i': (MARKED, BUILT, BORN, VALUES_BORN, CLIQUE_LOGGED),
 }
 
@@ -299,8 +298,7 @@ class Memory:
         ----------
         name : str
         rows : int
-        keep : int
-            Rows in use, which are copied; the rows after them may be lost.
+        keep : int, rows in use, which are copied; the rows after them may be lost
 
         """
         at = 2 * NAMES.index(name)

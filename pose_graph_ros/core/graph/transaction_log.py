@@ -112,8 +112,7 @@ def take_clique(head, n_frontal, n_separator):  # type: ignore[no-untyped-def]
 
     Parameters
     ----------
-    n_frontal, n_separator : int
-        Numbers of nodes.
+    n_frontal, n_separator : int, numbers of nodes
 
     """
     clique_i, log_i = tb.clique_i(head), tb.log_i(head)
@@ -186,14 +185,9 @@ def renew_values(head, c):  # type: ignore[no-untyped-def]
 @kernel
 def begin(head):  # type: ignore[no-untyped-def]
     """
-    Begin an update: log the counters, scalars and lists.
+    Log counters, scalars and lists; return whether the counters of stamps are within `LAST_STAMP`.
 
-    Returns
-    -------
-    bool
-        Whether the counters of stamps are within `LAST_STAMP`. If not, `Memory.restart_stamps` is
-        due, and `begin` again.
-
+    If they are not, `Memory.restart_stamps` is due, and `begin` again.
     """
     scalars, touched, waiting = tb.scalars(head), tb.touched(head), tb.waiting(head)
     log_f, log_i = tb.log_f(head), tb.log_i(head)
@@ -308,15 +302,7 @@ def rollback(head):  # type: ignore[no-untyped-def]
 
 @kernel
 def poses_before(head, poses):  # type: ignore[no-untyped-def]
-    """
-    Write the poses as they were when the update began; new nodes have their present ones.
-
-    Parameters
-    ----------
-    poses : ndarray, shape (N, 3)
-        Output [m, m, rad].
-
-    """
+    """Write the poses, shape (N, 3), as the update found them; those of new nodes as they are."""
     node_f, log_f, log_i = tb.node_f(head), tb.log_f(head), tb.log_i(head)
     for v in range(head[tb.N_NODES]):
         for k in range(3):

@@ -71,11 +71,7 @@ def _eliminate_3(front, n, least):  # type: ignore[no-untyped-def]
     """
     Factorise the first three of n rows of n + 1 numbers, and subtract them from the others.
 
-    Returns
-    -------
-    int
-        First row with a bad pivot, or -1.
-
+    Return the first row with a bad pivot, or -1.
     """
     ld = n + 1
     for k in range(3):
@@ -111,8 +107,7 @@ def extend(  # type: ignore[no-untyped-def]
 
     Parameters
     ----------
-    mean, information : ndarray, shapes (3,) and (3, 3)
-        Of the edge.
+    mean, information : ndarray, shapes (3,) and (3, 3), of the edge
     observed_mean, observed_information : ndarray, shapes (3,) and (3, 3)
         Of the observed node; any numbers if there is none.
     with_observed : bool
@@ -217,7 +212,7 @@ def extend(  # type: ignore[no-untyped-def]
     head[tb.N_NODES], head[tb.N_EDGES], head[tb.NEWEST] = v + 1, e + 1, v
     if with_observed:
         observed_i[k, tb.OBS_NEXT], node_i[v, tb.OBSERVED_LIST] = -1, k
-        observed_i[k, tb.OBS_CHECKED] = observed_i[k, tb.OBS_WAITS] = 0
+        observed_i[k, tb.OBS_WAITS] = 0
         observed_i[k, tb.OBS_LOGGED] = head[tb.UPDATE]
         factors.check_observed(head, k)
         scalars[tb.CHI2] += observed_f[k, tb.OBS_ENERGY]

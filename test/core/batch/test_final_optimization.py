@@ -21,7 +21,7 @@ from pose_graph_ros.core.config import (
 )
 from pose_graph_ros.core.geometry import se2
 from pose_graph_ros.core.geometry.se2 import FloatArray
-from pose_graph_ros.core.graph import error_functions, losses
+from pose_graph_ros.core.graph import error_functions, reweighting
 from pose_graph_ros.core.graph.graph import Graph
 from pose_graph_ros.core.measurements import (
     GlobalPose,
@@ -98,7 +98,7 @@ def robust_cost(backend: PoseGraphBackend, loss: Loss, threshold: float,
     rest = error_functions.energies(error_functions.edge_errors(poses, edges), edges.information)
     has_loss = observed.kind == 1
     return float(np.sum(rest) + np.sum(fixes[~has_loss])
-                 + np.sum(losses.costs(loss, fixes[has_loss], threshold)))
+                 + np.sum(reweighting._costs(loss, fixes[has_loss], threshold)))
 
 
 @pytest.mark.parametrize('loss', ROBUST)

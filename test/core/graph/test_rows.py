@@ -26,7 +26,7 @@ def is_valid(matrix: np.ndarray) -> bool:
 
 def packed(matrix: np.ndarray) -> tuple[bool, np.ndarray]:
     row = np.zeros(tb.EDGE_F)
-    valid = rows.pack_information(row, matrix)
+    valid = rows._pack_information(row, matrix)
     return valid, full(row[None, tb.INFO:tb.INFO + 6])[0]
 
 
@@ -75,4 +75,4 @@ def test_a_matrix_of_zeros_is_refused() -> None:
 @pytest.mark.parametrize(('number', 'finite'), [
     (0.0, True), (-1e300, True), (np.inf, False), (-np.inf, False), (np.nan, False)])
 def test_what_is_finite(number: float, finite: bool) -> None:
-    assert rows.is_finite(number) is finite
+    assert rows._is_finite(number) is finite
