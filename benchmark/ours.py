@@ -24,6 +24,7 @@ from benchmark.runs import Plan, quiet, Run
 from benchmark.worlds import chain, laps, World
 from pose_graph_ros.core.batch import chordal_start, optimizer
 from pose_graph_ros.core.config import SolverConfig
+from pose_graph_ros.core.elimination import symbolic
 from pose_graph_ros.core.geometry import se2
 from pose_graph_ros.core.geometry.se2 import FloatArray, IntArray
 from pose_graph_ros.core.graph import error_functions
@@ -203,7 +204,8 @@ def polished(world: World, poses: FloatArray) -> float:
 
 def start_of_batch(world: World) -> FloatArray:
     """Return the start that both tools are given in the batch comparison, shape (N, 3)."""
-    return chordal_start.chordal(world.graph(world.dead_reckoning()))
+    head = world.graph(world.dead_reckoning()).memory.head
+    return chordal_start.chordal(head, symbolic.analyse(head).cliques)
 
 
 def _jacobians(

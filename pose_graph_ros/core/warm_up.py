@@ -21,7 +21,6 @@ import numpy as np
 
 from pose_graph_ros.core.backend import PoseGraphBackend
 from pose_graph_ros.core.batch import complex_system, gauss_newton, optimizer
-from pose_graph_ros.core.batch.optimizer import optimize_from_two_starts
 from pose_graph_ros.core.compiled import jit
 from pose_graph_ros.core.config import SmootherConfig, SolverConfig
 from pose_graph_ros.core.elimination import symbolic
@@ -186,8 +185,6 @@ def _optimize() -> None:
     graph.apply(GraphUpdate(edges=_closures(N_NODES - 5), observed=_pose_of(3), free=(0,)))
     optimizer.optimize(graph, SolverConfig())
     optimizer.optimize_from_linear_start(graph, SolverConfig())
-    # without the joint start, which has no kernels and would load SciPy
-    optimize_from_two_starts(graph, SolverConfig(), optimizer.optimize, both=False)
     # optimisations call these only if they stall or take many iterations
     right = np.zeros((graph.n_nodes, 3))
     gauss_newton.product_with_step(graph.memory.head, right)

@@ -524,7 +524,7 @@ class FlakySolver:
         graph.set_poses(graph.poses + 17.0)
         if self.broken == 'raises':
             raise ValueError('broken on purpose')
-        return BatchResult(Status.FAILED, 'broken on purpose', 0, 1.0, 1.0)
+        return BatchResult(Status.FAILED, 'broken on purpose', 0, 1.0)
 
 
 FAR = {'GlobalPose': MeasurementSource(covariance=CovariancePolicy(position_ceiling=1e6))}
@@ -1072,7 +1072,7 @@ def test_an_alignment_that_cannot_be_done_over_leaves_the_one_in_use(
 ) -> None:
     def solve(graph: Graph, config: SolverConfig) -> BatchResult:
         if fails:
-            return BatchResult(Status.FAILED, 'on purpose', 0, 0.0, 0.0)
+            return BatchResult(Status.FAILED, 'on purpose', 0, 0.0)
         return optimizer.optimize(graph, config)
 
     backend = PoseGraphBackend(BackendConfig(odometry=PROMPT), solve=solve)

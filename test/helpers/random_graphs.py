@@ -9,6 +9,8 @@ Jacobians as the source prints them; it shares no code with the package.
 
 import numpy as np
 
+from pose_graph_ros.core.batch import chordal_start
+from pose_graph_ros.core.elimination import symbolic
 from pose_graph_ros.core.geometry.se2 import FloatArray
 from pose_graph_ros.core.graph.constraints import EdgeKind, Edges, ObservedKind, ObservedNodes
 from pose_graph_ros.core.graph.graph import Graph, GraphUpdate
@@ -195,3 +197,9 @@ def free_part(graph: Graph, H: FloatArray, b: FloatArray) -> tuple[FloatArray, F
     """Return H and b without the rows and columns of the fixed nodes."""
     free = np.repeat(~graph.fixed, 3)
     return H[np.ix_(free, free)], b[free]
+
+
+def chordal(graph: Graph) -> FloatArray:
+    """Return the chordal start of a graph, shape (N, 3)."""
+    head = graph.memory.head
+    return chordal_start.chordal(head, symbolic.analyse(head).cliques)

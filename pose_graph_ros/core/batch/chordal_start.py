@@ -17,7 +17,6 @@ If no heading is measured, `joint_start` gets the headings from the positions.
 import math
 
 import numpy as np
-import numpy.typing as npt
 
 from pose_graph_ros.core.batch import complex_system
 from pose_graph_ros.core.batch.complex_system import Terms
@@ -27,45 +26,17 @@ from pose_graph_ros.core.exceptions import LinearSolveError
 from pose_graph_ros.core.geometry.se2 import FloatArray
 from pose_graph_ros.core.graph import tables as tb
 from pose_graph_ros.core.graph.factors import wrap
-from pose_graph_ros.core.graph.graph import Graph
 
 # Smallest |u| before normalisation; below it the measured headings cancel each other out.
 SMALLEST_ROTATION = 1e-9
 
-ComplexArray = npt.NDArray[np.complex128]
 
-
-def chordal(graph: Graph) -> FloatArray:
+def chordal(head: tb.IntHead, cliques: symbolic.Cliques) -> FloatArray:
     """
     Return initial poses, shape (N, 3), from the constraints and the poses of fixed nodes alone.
 
-    Raises
-    ------
-    LinearSolveError
-        If headings or positions are not determined, for example if only positions are observed,
-        or if the graph has biases.
-
-    """
-    head = graph.memory.head
-    return chordal_poses(head, symbolic.analyse(head).cliques)
-
-
-def chordal_poses(head: tb.IntHead, cliques: symbolic.Cliques) -> FloatArray:
-    """
-    Return the same poses as `chordal` for known cliques.
-
-    Parameters
-    ----------
-    head : ndarray
-        Head of the tables of the graph.
-    cliques : Cliques
-        Cliques of the whole graph.
-
-    Raises
-    ------
-    LinearSolveError
-        As `chordal`.
-
+    The cliques are those of the whole graph. Raises LinearSolveError if headings or positions are
+    not determined, for example if only positions are observed, or if the graph has biases.
     """
     if _n_biases(head) > 0:
         raise LinearSolveError('chordal start: a bias has no heading')

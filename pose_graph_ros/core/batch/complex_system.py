@@ -56,20 +56,12 @@ class _Front(NamedTuple):
 @kernel(allocates=True)
 def solve(head, cliques, terms):  # type: ignore[no-untyped-def]
     """
-    Minimise the objective over v.
+    Return the minimum v, real and imaginary parts in shape (N, 2), and an undetermined node or -1.
 
     Parameters
     ----------
-    cliques : symbolic.Cliques
-        Cliques of the whole graph.
+    cliques : symbolic.Cliques, cliques of the whole graph
     terms : Terms
-
-    Returns
-    -------
-    v : ndarray, shape (N, 2)
-        Real and imaginary parts.
-    bad : int
-        Node that is not determined, or -1.
 
     """
     first, n_frontal, parent, nodes = cliques
@@ -119,17 +111,8 @@ def _sizes(cliques):  # type: ignore[no-untyped-def]
     """
     Return the sizes of all arrays of a factorisation.
 
-    Returns
-    -------
-    widest : int
-        Number of nodes of the largest clique.
-    n_values : int
-        Number of values in all rows of R.
-    update_size : ndarray, shape (C,)
-        Number of values in the update matrix of each clique.
-    deepest : int
-        Largest number of values on the stack of update matrices.
-
+    These are the number of nodes of the largest clique, the number of values in all rows of R, in
+    the update matrix of each clique, and at most on the stack of update matrices.
     """
     n_cliques = len(cliques.n_frontal)
     update_size = np.zeros(n_cliques, np.int64)

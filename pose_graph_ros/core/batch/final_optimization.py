@@ -38,35 +38,29 @@ def optimize(
     graph: Graph, reweighting: Reweighting, config: SolverConfig, solve: Solve,
 ) -> BatchResult:
     """
-    Optimise a whole graph in place, with the weights of robust losses.
+    Return the result of optimising a whole graph in place, with the weights of robust losses.
 
-    All poses and weights are restored if it fails, by an exception too.
+    With robust losses, chi2 is the robust cost. All poses and weights are restored if it fails;
+    an exception of `solve` counts as a failure.
 
     Parameters
     ----------
     graph : Graph
-    reweighting : Reweighting
-        Constraints of the graph that have a robust loss.
+    reweighting : Reweighting, constraints of the graph that have a robust loss
     config : SolverConfig
-    solve : callable
-        Optimises a graph in place.
-
-    Returns
-    -------
-    BatchResult
-        With robust losses, chi2 is the robust cost. FAILED after an exception of `solve`.
+    solve : callable, optimises a graph in place
 
     """
     poses, weights = graph.poses.copy(), graph.weights
     try:
         if len(reweighting) == 0:
-            result = optimize_from_two_starts(graph, config, solve, both=True)
+            result = optimize_from_two_starts(graph, config, solve)
         else:
             result = _optimize_robustly(graph, reweighting, config, solve)
     except Exception as error:
         # whatever the error is, the poses and weights must be restored
         reason = f'{type(error).__name__}: {error}'
-        result = BatchResult(Status.FAILED, reason, 0, float('nan'), float('nan'))
+        result = BatchResult(Status.FAILED, reason, 0, float('nan'))
     if result.status is Status.FAILED:
         if len(reweighting) > 0:
             _restore_weights(graph, weights)
@@ -87,7 +81,7 @@ def _optimize_robustly(
     best, poses, weights = None, graph.poses, graph.weights
     for weight, widened in ((1.0, WIDENED), (SMALL_WEIGHT, ())):
         _set_weights(graph, *reweighting.all_alike(weight))
-        result = optimize_from_two_starts(graph, config, solve, both=True)
+        result = optimize_from_two_starts(graph, config, solve)
         for factor in widened:
             if result.status is not Status.FAILED:
                 _set_weights(graph, *reweighting.all_changes(graph, factor))

@@ -40,11 +40,11 @@ def put_poses(head, poses):  # type: ignore[no-untyped-def]
     for v in range(head[tb.N_NODES]):
         for k in range(3):
             node_f[v, tb.POSE + k] = poses[v, k]
-    refer_to_poses(head)
+    _refer_to_poses(head)
 
 
 @kernel
-def refer_to_poses(head):  # type: ignore[no-untyped-def]
+def _refer_to_poses(head):  # type: ignore[no-untyped-def]
     """Make the poses the references of the unknowns."""
     node_f = tb.node_f(head)
     for v in range(head[tb.N_NODES]):
@@ -54,7 +54,7 @@ def refer_to_poses(head):  # type: ignore[no-untyped-def]
 @kernel
 def linearize(head):  # type: ignore[no-untyped-def]
     """Make the poses the references and linearize all constraints there."""
-    refer_to_poses(head)
+    _refer_to_poses(head)
     for e in range(head[tb.N_EDGES]):
         factors.linearize_edge(head, e)
     for k in range(head[tb.N_OBSERVED]):
@@ -64,18 +64,9 @@ def linearize(head):  # type: ignore[no-untyped-def]
 @kernel
 def eliminate(head, damping):  # type: ignore[no-untyped-def]
     """
-    Eliminate all cliques.
+    Eliminate all cliques with a damping lambda, which is 0 for a Gauss-Newton step.
 
-    Parameters
-    ----------
-    damping : float
-        Lambda of Levenberg-Marquardt; 0 for a Gauss-Newton step.
-
-    Returns
-    -------
-    bool
-        False if a node is not determined, which is `BAD_NODE` of the head.
-
+    Return False if a node is not determined, which is `BAD_NODE` of the head.
     """
     scalars = tb.scalars(head)
     scalars[tb.DAMPING] = damping
@@ -135,16 +126,8 @@ def chord_step(head, right):  # type: ignore[no-untyped-def]
     """
     Move all nodes by a step from the present poses, with the factorisation of an earlier step.
 
-    Parameters
-    ----------
-    right : ndarray, shape (N, 3)
-        -b at the poses, from `evaluate`; overwritten by the step.
-
-    Returns
-    -------
-    float
-        Largest change of a coordinate [m, rad].
-
+    `right`, -b at the poses from `evaluate`, shape (N, 3), is overwritten by the step. Return the
+    largest change of a coordinate [m, rad].
     """
     node_f = tb.node_f(head)
     pool_f = tb.pool_f(head)
@@ -205,19 +188,9 @@ def _larger(largest, number):  # type: ignore[no-untyped-def]
 @kernel
 def evaluate(head, right):  # type: ignore[no-untyped-def]
     """
-    Compute chi2 and its gradient at the poses.
+    Return chi2 at the poses and an estimate of its rounding error.
 
-    Parameters
-    ----------
-    right : ndarray, shape (N, 3)
-        Receives -b: half the gradient of chi2, with negative sign.
-
-    Returns
-    -------
-    chi2 : float
-    rounding : float
-        Estimate of the rounding error of chi2.
-
+    `right`, shape (N, 3), receives -b: half the gradient of chi2, with negative sign.
     """
     node_f = tb.node_f(head)
     edge_f = tb.edge_f(head)

@@ -33,13 +33,7 @@ def joint(graph: Graph) -> FloatArray:
     Gauss-Newton from the drifted poses does not find that solution.
 
     Biases start at zero. A measurement with a bias is treated as an observed node whose variance
-    includes that of the bias.
-
-    Raises
-    ------
-    LinearSolveError
-        If the poses are not determined.
-
+    includes that of the bias. Raises LinearSolveError if the poses are not determined.
     """
     n, is_bias, fixed = graph.n_nodes, graph.is_bias, graph.fixed
     edges, observed = _of_poses(graph.edges, graph.observed, is_bias)

@@ -68,22 +68,16 @@ class Minimum(NamedTuple):
 
 def minimize(head: tb.IntHead, chi2: float, config: SolverConfig) -> Minimum:
     """
-    Move all nodes to a local minimum of chi2.
+    Return the result of moving all nodes to a local minimum of chi2.
 
     Unless the result is UNDETERMINED, the poses are those of the lowest chi2 found and the tables
     are in the state after a step of the smoother.
 
     Parameters
     ----------
-    head : ndarray
-        Head of tables that hold the cliques of the whole graph (`symbolic.plant`).
-    chi2 : float
-        chi2 at the present poses.
+    head : ndarray, head of tables that hold the cliques of the whole graph (`symbolic.plant`)
+    chi2 : float, chi2 at the present poses
     config : SolverConfig
-
-    Returns
-    -------
-    Minimum
 
     """
     n_nodes = int(head[tb.N_NODES])

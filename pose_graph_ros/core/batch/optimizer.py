@@ -10,7 +10,7 @@ poses, with which the incremental smoother can continue.
 
 from collections.abc import Callable
 import contextlib
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from enum import Enum
 
 import numpy as np
@@ -46,8 +46,6 @@ class BatchResult:
     """One sentence when the status is FAILED, else empty."""
     iterations: int
     """Number of steps."""
-    chi2_before: float
-    """chi2 at the poses before the call."""
     chi2: float
     """chi2 at the poses after the call."""
 
@@ -64,7 +62,7 @@ _STATUS = {Termination.CONVERGED: Status.CONVERGED, Termination.STALLED: Status.
 
 def optimize(graph: Graph, config: SolverConfig) -> BatchResult:
     """
-    Move the hidden nodes from their present poses to a local minimum of chi2.
+    Return the result of moving the hidden nodes from their poses to a local minimum of chi2.
 
     If the optimisation fails numerically, the result says so, the poses are as before the call,
     and the smoother eliminates everything anew at its next step. All cliques are replaced, so this
@@ -74,10 +72,6 @@ def optimize(graph: Graph, config: SolverConfig) -> BatchResult:
     ----------
     graph : Graph
     config : SolverConfig
-
-    Returns
-    -------
-    BatchResult
 
     """
     chi2, answer = _check_before(graph)
@@ -89,7 +83,7 @@ def optimize(graph: Graph, config: SolverConfig) -> BatchResult:
 
 def optimize_from_linear_start(graph: Graph, config: SolverConfig) -> BatchResult:
     """
-    Move the hidden nodes to a local minimum of chi2, from a start that needs no initial poses.
+    Return the result of moving the hidden nodes to a minimum from a start without initial poses.
 
     If the linear start leads to a higher chi2 than that of the present poses, the optimisation
     starts from the present poses instead. Failures are treated as in `optimize`.
@@ -99,10 +93,6 @@ def optimize_from_linear_start(graph: Graph, config: SolverConfig) -> BatchResul
     graph : Graph
     config : SolverConfig
 
-    Returns
-    -------
-    BatchResult
-
     """
     chi2, answer = _check_before(graph)
     if answer is not None:
@@ -111,7 +101,7 @@ def optimize_from_linear_start(graph: Graph, config: SolverConfig) -> BatchResul
     head = graph.memory.head
     result = None
     with contextlib.suppress(LinearSolveError):
-        gauss_newton.put_poses(head, linear_start(graph, cliques))
+        gauss_newton.put_poses(head, _linear_start(graph, cliques))
         result = _minimize(graph, config, cliques, _chi2(graph))
     if result is None or result.status is Status.FAILED or not result.chi2 <= chi2:
         gauss_newton.put_poses(head, poses)
@@ -119,11 +109,9 @@ def optimize_from_linear_start(graph: Graph, config: SolverConfig) -> BatchResul
     return _finished(graph, poses, chi2, result)
 
 
-def optimize_from_two_starts(
-    graph: Graph, config: SolverConfig, solve: Solve = optimize, *, both: bool,
-) -> BatchResult:
+def optimize_from_two_starts(graph: Graph, config: SolverConfig, solve: Solve) -> BatchResult:
     """
-    Optimise a graph from the present poses and, if that does not converge, from a linear start.
+    Return the better result of optimising a graph from the present poses and a linear start.
 
     After a long time without a position the heading may have drifted far. Gauss-Newton can then
     converge to a minimum with the heading wrapped the wrong way round, which takes many
@@ -131,23 +119,14 @@ def optimize_from_two_starts(
 
     Parameters
     ----------
-    graph : Graph
-        Is optimised in place; without observed nodes, from the present poses only.
+    graph : Graph, is optimised in place; without observed nodes, from the present poses only
     config : SolverConfig
-    solve : callable
-        Optimises a graph in place.
-    both : bool
-        Always use both starts, so that the result does not depend on earlier updates.
-
-    Returns
-    -------
-    BatchResult
+    solve : callable, optimises a graph in place
 
     """
     before = graph.poses.copy()
     result = solve(graph, config)
-    not_converged = result.status in (Status.MAX_ITERATIONS, Status.STALLED)
-    if len(graph.observed) == 0 or not (not_converged or both):
+    if len(graph.observed) == 0:
         return result
     poses = graph.poses.copy()
     try:
@@ -162,29 +141,15 @@ def optimize_from_two_starts(
     return other
 
 
-def linear_start(graph: Graph, cliques: symbolic.Cliques | None = None) -> FloatArray:
+def _linear_start(graph: Graph, cliques: symbolic.Cliques) -> FloatArray:
     """
     Return initial poses, shape (N, 3), from the constraints and the poses of fixed nodes alone.
 
     The chordal start is used if the constraints determine the headings; otherwise the joint start,
-    which solves for headings and positions together.
-
-    Parameters
-    ----------
-    graph : Graph
-    cliques : Cliques, optional
-        Cliques of the whole graph, if they are known.
-
-    Raises
-    ------
-    LinearSolveError
-        If the poses are not determined.
-
+    which solves for headings and positions together, or raises LinearSolveError.
     """
-    head = graph.memory.head
     try:
-        return chordal_start.chordal_poses(
-            head, symbolic.analyse(head).cliques if cliques is None else cliques)
+        return chordal_start.chordal(graph.memory.head, cliques)
     except LinearSolveError:
         return _joint(graph)
 
@@ -203,7 +168,7 @@ def _check_before(graph: Graph) -> tuple[float, BatchResult | None]:
     if not np.isfinite(chi2):
         return chi2, _failed('chi2 is not finite', chi2)
     if np.all(graph.fixed):
-        return chi2, BatchResult(Status.CONVERGED, '', 0, chi2, chi2)
+        return chi2, BatchResult(Status.CONVERGED, '', 0, chi2)
     node, count = symbolic.loose_part(head)
     if node >= 0:
         return chi2, _failed(
@@ -235,7 +200,7 @@ def _minimize(
     termination, iterations, after = minimize(head, chi2, config)
     if termination is Termination.UNDETERMINED:
         return _failed(f'hidden node {head[tb.BAD_NODE]} is not determined', chi2)
-    return BatchResult(_STATUS[termination], '', iterations, chi2, after)
+    return BatchResult(_STATUS[termination], '', iterations, after)
 
 
 def _finished(graph: Graph, poses: FloatArray, chi2: float, result: BatchResult) -> BatchResult:
@@ -244,8 +209,8 @@ def _finished(graph: Graph, poses: FloatArray, chi2: float, result: BatchResult)
         gauss_newton.put_poses(graph.memory.head, poses)
         editing.restart(graph.memory.head)
         return _failed(result.reason, chi2)
-    return replace(result, chi2_before=chi2)
+    return result
 
 
 def _failed(reason: str, chi2: float) -> BatchResult:
-    return BatchResult(Status.FAILED, reason, 0, chi2, chi2)
+    return BatchResult(Status.FAILED, reason, 0, chi2)

@@ -6,9 +6,9 @@ from hypothesis import given, strategies as st
 import numpy as np
 import numpy.typing as npt
 import pytest
-from random_graphs import consistent_graph, random_graph, random_observed, random_poses
+from random_graphs import chordal, consistent_graph, random_graph, random_observed, random_poses
 
-from pose_graph_ros.core.batch import chordal_start, optimizer
+from pose_graph_ros.core.batch import optimizer
 from pose_graph_ros.core.config import SolverConfig
 from pose_graph_ros.core.exceptions import LinearSolveError
 from pose_graph_ros.core.geometry import se2
@@ -52,7 +52,7 @@ def test_without_noise_it_is_exact_whichever_node_is_fixed(seed: int, fixed: int
     graph.apply(GraphUpdate(free=(0,)))
     graph.apply(GraphUpdate(fix=(fixed,)))
     scattered(graph, np.random.default_rng(seed))
-    start = chordal_start.chordal(graph)
+    start = chordal(graph)
     assert_poses_equal(start, truth)
     assert np.all((start[:, 2] >= -np.pi) & (start[:, 2] < np.pi))
 
@@ -63,7 +63,7 @@ def test_without_noise_it_is_exact_with_several_fixed_nodes(seed: int) -> None:
     truth = graph.poses.copy()
     graph.apply(GraphUpdate(fix=(0, 3, 6)))
     scattered(graph, np.random.default_rng(seed))
-    assert_poses_equal(chordal_start.chordal(graph), truth)
+    assert_poses_equal(chordal(graph), truth)
 
 
 @given(seeds)
@@ -74,16 +74,16 @@ def test_without_noise_it_is_exact_with_observed_nodes_and_offsets_alone(seed: i
     graph.apply(GraphUpdate(free=(0,)))
     observe_exactly(graph, [5, 2, 7, 2], rng)
     scattered(graph, rng)
-    assert_poses_equal(chordal_start.chordal(graph), truth)
+    assert_poses_equal(chordal(graph), truth)
 
 
 @given(seeds)
 def test_it_reads_no_pose_that_is_not_fixed(seed: int) -> None:
     graph = consistent_graph(seed, noise=0.3)
-    first = chordal_start.chordal(graph)
+    first = chordal(graph)
     scattered(graph, np.random.default_rng(seed))
     before = graph.poses.copy()
-    np.testing.assert_array_equal(chordal_start.chordal(graph), first)
+    np.testing.assert_array_equal(chordal(graph), first)
     np.testing.assert_array_equal(graph.poses, before)     # nor does it write any
     np.testing.assert_array_equal(first[0], graph.poses[0])
 
@@ -130,7 +130,7 @@ def test_it_solves_two_linear_problems(
         graph, poses @ TO_COMPLEX, *position, factor=np.ones(len(edges)),
         shift=u[edges.i] * (edges.mean @ TO_COMPLEX),
         target=observed.mean @ TO_COMPLEX - u[observed.node] * (observed.offset @ TO_COMPLEX))
-    start = chordal_start.chordal(graph)
+    start = chordal(graph)
     np.testing.assert_allclose(np.exp(1j * start[:, 2]), u, atol=1e-7)
     np.testing.assert_allclose(start @ TO_COMPLEX, t, atol=1e-6)
 
@@ -138,7 +138,7 @@ def test_it_solves_two_linear_problems(
 @pytest.mark.parametrize('seed', range(10))
 def test_with_noise_it_is_near_the_optimum(seed: int) -> None:
     graph = consistent_graph(seed, noise=0.01)
-    start = chordal_start.chordal(graph)
+    start = chordal(graph)
     graph.set_poses(start)
     assert optimizer.optimize(graph, SolverConfig()).iterations <= 6
     np.testing.assert_allclose(start[:, :2], graph.poses[:, :2], atol=0.2)     # 20 sigma
@@ -151,7 +151,7 @@ def test_positions_alone_do_not_determine_it() -> None:
         [0, 1], None, [[0.0, 0.0, 0.0], [1.0, 0.0, 0.0]], [np.diag([1.0, 1.0, 0.0])] * 2,
         [ObservedKind.POSITION] * 2)))
     with pytest.raises(LinearSolveError):
-        chordal_start.chordal(graph)
+        chordal(graph)
 
 
 def test_headings_that_cancel_are_an_error() -> None:
@@ -160,7 +160,7 @@ def test_headings_that_cancel_are_an_error() -> None:
         [0, 0], None, [[0.0, 0.0, 0.0], [0.0, 0.0, np.pi]], [np.eye(3)] * 2,
         [ObservedKind.GLOBAL_POSE] * 2)))
     with pytest.raises(LinearSolveError, match='cancel'):
-        chordal_start.chordal(graph)
+        chordal(graph)
 
 
 def test_headings_alone_do_not_determine_positions() -> None:
@@ -168,4 +168,4 @@ def test_headings_alone_do_not_determine_positions() -> None:
     graph.apply(GraphUpdate(hidden=np.zeros((2, 3)), fix=(0,), edges=Edges(
         [0], [1], [[1.0, 0.0, 0.5]], [np.diag([0.0, 0.0, 1.0])], [EdgeKind.LOOP_CLOSURE])))
     with pytest.raises(LinearSolveError, match='position of hidden node 1 is not determined'):
-        chordal_start.chordal(graph)
+        chordal(graph)

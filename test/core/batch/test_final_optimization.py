@@ -225,7 +225,7 @@ class Failing:
         graph.set_poses(graph.poses + 17.0)
         if self.raises:
             raise ValueError('broken on purpose')
-        return BatchResult(Status.FAILED, 'broken on purpose', 0, 1.0, 1.0)
+        return BatchResult(Status.FAILED, 'broken on purpose', 0, 1.0)
 
 
 @pytest.mark.parametrize('raises', [False, True])

@@ -10,6 +10,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from random_graphs import (
+    chordal,
     consistent_graph,
     dense_system,
     free_part,
@@ -24,7 +25,7 @@ from random_graphs import (
 from scipy.optimize import least_squares
 from slow_smoother import EXACT
 
-from pose_graph_ros.core.batch import chordal_start, optimizer
+from pose_graph_ros.core.batch import optimizer
 from pose_graph_ros.core.batch.optimizer import Status
 from pose_graph_ros.core.config import SolverConfig
 from pose_graph_ros.core.geometry import se2
@@ -117,12 +118,10 @@ def test_the_optimum_is_that_of_scipy(seed: int) -> None:
 @pytest.mark.parametrize('seed', range(20))
 def test_a_converged_result_is_stationary_and_reports_what_was_done(seed: int) -> None:
     graph = consistent_graph(seed, noise=0.2)
-    chi2_before = graph.energies().chi2
     result = optimizer.optimize(graph, THOROUGH)
     assert result.status is Status.CONVERGED
     assert result.reason == ''
     assert result.iterations > 1
-    assert result.chi2_before == pytest.approx(chi2_before, rel=SAME_CHI2)
     assert result.chi2 == pytest.approx(graph.energies().chi2, rel=SAME_CHI2)
     np.testing.assert_allclose(gradient(graph), 0.0, atol=STATIONARY)
 
@@ -358,7 +357,6 @@ def test_from_nothing_it_finds_the_minimum_from_anywhere(seed: int) -> None:
     graph.set_poses(poses)
     result = optimizer.optimize_from_linear_start(graph, THOROUGH)
     assert result.status is Status.CONVERGED
-    assert result.chi2_before > 1e3 * result.chi2
     np.testing.assert_allclose(graph.poses, optimum, atol=1e-9)
 
 
@@ -436,13 +434,13 @@ def test_without_new_data_the_smoother_has_nothing_to_do_after_it() -> None:
 # --- Stored optima ---------------------------------------------------------------------------
 
 @pytest.mark.parametrize('name', GOLDEN)
-@pytest.mark.parametrize('chordal', [False, True])
-def test_small_graphs_reach_their_stored_optima(name: str, *, chordal: bool) -> None:
+@pytest.mark.parametrize('from_chordal', [False, True])
+def test_small_graphs_reach_their_stored_optima(name: str, *, from_chordal: bool) -> None:
     path = DATA / name
     assert hashlib.sha256(path.read_bytes()).hexdigest() == GOLDEN[name]['sha256']
     graph = read_g2o(path).graph
-    if chordal:
-        graph.set_poses(chordal_start.chordal(graph))
+    if from_chordal:
+        graph.set_poses(chordal(graph))
     result = optimizer.optimize(graph, SolverConfig())
     assert result.status is Status.CONVERGED
     assert result.chi2 == pytest.approx(GOLDEN[name]['chi2'], rel=SAME_CHI2)
@@ -461,7 +459,7 @@ def test_public_graphs_reach_their_known_optima(name: str, *, from_nothing: bool
         result = optimizer.optimize_from_linear_start(graph, SolverConfig())
     else:
         if name in NEEDS_CHORDAL_START:
-            graph.set_poses(chordal_start.chordal(graph))
+            graph.set_poses(chordal(graph))
         result = optimizer.optimize(graph, SolverConfig())
     assert result.status is Status.CONVERGED
     assert result.chi2 == pytest.approx(chi2, rel=1e-5)

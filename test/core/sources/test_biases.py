@@ -9,6 +9,7 @@ import jacobians
 import numpy as np
 import pytest
 from random_graphs import (
+    chordal,
     consistent_graph,
     random_edges_to_biases,
     random_graph,
@@ -19,7 +20,7 @@ from random_graphs import (
 from scipy.optimize import least_squares
 from slow_smoother import cliques, differences, EXACT, SlowGraph, state, world
 
-from pose_graph_ros.core.batch import chordal_start, optimizer
+from pose_graph_ros.core.batch import optimizer
 from pose_graph_ros.core.batch.joint_start import joint
 from pose_graph_ros.core.batch.optimizer import Status
 from pose_graph_ros.core.config import SmootherConfig, SolverConfig
@@ -397,7 +398,7 @@ def positions_with_biases(seed: int) -> tuple[Graph, FloatArray]:
 def test_without_a_guess_the_joint_start_is_taken(seed: int) -> None:
     graph, truth = positions_with_biases(seed)
     with pytest.raises(LinearSolveError, match='bias'):
-        chordal_start.chordal(graph)
+        chordal(graph)
     graph.set_poses(random_poses(np.random.default_rng(seed), graph.n_nodes))
     start = joint(graph)
     np.testing.assert_allclose(start[:, :2], truth[:, :2], atol=1e-9)
