@@ -247,7 +247,10 @@ def add_rows(  # type: ignore[no-untyped-def]
     observed_mean, observed_information, observed_kind, observed_weight, checked,
 ):
     """
-    Add hidden nodes, edges and observed nodes, all of them or none.
+    Return ADDED after adding hidden nodes, edges and observed nodes, all of them, or why none.
+
+    NO_ROOM: a table is full. UNSOUND: the rows fail the quick validation of `rows`, and were not
+    checked.
 
     Parameters
     ----------
@@ -257,12 +260,6 @@ def add_rows(  # type: ignore[no-untyped-def]
     node, offset, observed_mean, observed_information, observed_kind, observed_weight : ndarray
         Columns of `ObservedNodes`.
     checked : bool, whether `constraints.check` has accepted the rows
-
-    Returns
-    -------
-    int
-        ADDED; NO_ROOM: a table is full; UNSOUND: the rows fail the quick validation of `rows`, and
-        were not checked.
 
     """
     first = head[tb.N_NODES]

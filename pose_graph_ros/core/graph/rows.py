@@ -63,16 +63,12 @@ def _copy_pose(to, at, pose):  # type: ignore[no-untyped-def]
 @kernel
 def write_edge(head, e, i, j, mean, information, kind, weight):  # type: ignore[no-untyped-def]
     """
-    Write one edge.
+    Return whether an edge is valid after writing it; its nodes, kind and bias are not checked.
 
     Parameters
     ----------
     e : int, row
     i, j, mean, information, kind, weight : int, ndarray or float, values of the columns of `Edges`
-
-    Returns
-    -------
-    bool, whether the row is valid; its nodes, its kind and its bias are not checked
 
     """
     edge_f, edge_i = tb.edge_f(head), tb.edge_i(head)
@@ -88,17 +84,13 @@ def write_observed(  # type: ignore[no-untyped-def]
     head, k, node, offset, mean, information, kind, weight,
 ):
     """
-    Write one observed node.
+    Return whether an observed node is valid after writing it; its node and kind are not checked.
 
     Parameters
     ----------
     k : int, row
     node, offset, mean, information, kind, weight : int, ndarray or float
         Values of the columns of `ObservedNodes`.
-
-    Returns
-    -------
-    bool, whether the row is valid; its node and its kind are not checked
 
     """
     observed_f, observed_i = tb.observed_f(head), tb.observed_i(head)
@@ -113,16 +105,12 @@ def write_observed(  # type: ignore[no-untyped-def]
 @kernel
 def write_nodes(head, first, poses):  # type: ignore[no-untyped-def]
     """
-    Write the poses of hidden nodes, with wrapped headings.
+    Return whether the poses of new hidden nodes are finite after writing them, headings wrapped.
 
     Parameters
     ----------
     first : int, first row
     poses : ndarray, shape (N, 3) [m, m, rad]
-
-    Returns
-    -------
-    bool, whether all are finite
 
     """
     node_f = tb.node_f(head)
@@ -148,17 +136,13 @@ def write_edges(  # type: ignore[no-untyped-def]
     head, n_nodes, first_bias, i, j, mean, information, kind, weight, bias,
 ):
     """
-    Write edges behind the last row.
+    Return whether new edges are all valid after writing them behind the last row.
 
     Parameters
     ----------
     n_nodes : int, number of hidden nodes, with the new ones
     first_bias : int, first row of the new biases
     i, j, mean, information, kind, weight, bias : ndarray, columns of `Edges`
-
-    Returns
-    -------
-    bool, whether all are valid
 
     """
     edge_f = tb.edge_f(head)
@@ -185,16 +169,12 @@ def write_all_observed(  # type: ignore[no-untyped-def]
     head, n_nodes, node, offset, mean, information, kind, weight,
 ):
     """
-    Write observed nodes behind the last row.
+    Return whether new observed nodes are all valid after writing them behind the last row.
 
     Parameters
     ----------
     n_nodes : int, number of hidden nodes, with the new ones
     node, offset, mean, information, kind, weight : ndarray, columns of `ObservedNodes`
-
-    Returns
-    -------
-    bool, whether all are valid
 
     """
     valid = True

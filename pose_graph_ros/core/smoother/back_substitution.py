@@ -137,12 +137,8 @@ def _update_child(head, c, stack, depth):  # type: ignore[no-untyped-def]
     """
     Update a clique after its parent was visited, as far as that takes no solve.
 
-    Returns
-    -------
-    int
-        LEFT: its separator has not moved; PROPAGATED: its separator has moved as a rigid body, and
-        all nodes at and below the clique were moved with it; SOLVED: it is to be solved for.
-
+    Return LEFT: its separator has not moved; PROPAGATED: its separator has moved as a rigid body,
+    and all nodes at and below the clique were moved with it; or SOLVED: it is to be solved for.
     """
     node_i, clique_i, pool_i = tb.node_i(head), tb.clique_i(head), tb.pool_i(head)
     clique_f = tb.clique_f(head)

@@ -23,19 +23,12 @@ _CONFIG = SolverConfig(max_iterations=50, step_tolerance=1e-6)
 
 def optimize_copy(graph: Graph, copy: Graph) -> bool:
     """
-    Copy a graph into an empty one, and optimise the copy.
+    Return whether the batch optimiser finds a solution for a copy of the graph.
 
     Parameters
     ----------
-    graph : Graph
-        In the middle of an update; not changed.
-    copy : Graph
-        Empty; afterwards all its nodes are touched, to be eliminated at the next step.
-
-    Returns
-    -------
-    bool
-        Whether the batch optimiser found a solution.
+    graph : Graph, in the middle of an update; not changed
+    copy : Graph, empty; afterwards all its nodes are touched, to be eliminated at the next step
 
     """
     poses = np.empty((graph.n_nodes, 3))

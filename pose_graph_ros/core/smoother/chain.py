@@ -103,7 +103,11 @@ def extend(  # type: ignore[no-untyped-def]
     head, mean, information, observed_mean, observed_information, with_observed,
 ):
     """
-    Append a node to the newest pose, by an edge and optionally with an observed node.
+    Return EXTENDED after appending a node to the newest pose by an edge, or why that failed.
+
+    If there is an observed node, the back-substitution is left to do, and the new root is on its
+    stack. NO_ROOM: a table is full. NOT_A_CHAIN: a general update is necessary. After these two
+    the graph is unchanged.
 
     Parameters
     ----------
@@ -111,13 +115,6 @@ def extend(  # type: ignore[no-untyped-def]
     observed_mean, observed_information : ndarray, shapes (3,) and (3, 3)
         Of the observed node; any numbers if there is none.
     with_observed : bool
-
-    Returns
-    -------
-    int
-        EXTENDED: done, except for the back-substitution if there is an observed node, for which
-        the new root is on the stack; NO_ROOM: a table is full; NOT_A_CHAIN: a general update is
-        necessary. After the last two the graph is unchanged.
 
     """
     clique_f = tb.clique_f(head)

@@ -33,11 +33,7 @@ def newest_covariance(head, out):  # type: ignore[no-untyped-def]
     """
     Write the covariance of the newest pose, shape (3, 3), in constant time if alone in a root.
 
-    Returns
-    -------
-    bool
-        False, with nothing written, if there is no pose or edits are not solved for.
-
+    Return False, with nothing written, if there is no pose or edits are not solved for.
     """
     v = head[tb.NEWEST]
     if v < 0 or head[tb.N_TOUCHED] > 0:
@@ -70,8 +66,7 @@ def node_covariance(head, v, out):  # type: ignore[no-untyped-def]
 
     Parameters
     ----------
-    v : int
-        Node.
+    v : int, node
     out : ndarray, shape (3, 3)
 
     """
@@ -88,8 +83,7 @@ def pair_covariance(head, i, j, out):  # type: ignore[no-untyped-def]
     Parameters
     ----------
     i, j : int
-    out : ndarray, shape (6, 6)
-        Zeros.
+    out : ndarray, shape (6, 6), zeros
 
     """
     clique_i = tb.clique_i(head)
@@ -130,15 +124,7 @@ def _path_to_root(head, v):  # type: ignore[no-untyped-def]
 
 @kernel(allocates=True)
 def _solution(head, v, path, n_rows):  # type: ignore[no-untyped-def]
-    """
-    Solve `R^T Y = E` for a node.
-
-    Returns
-    -------
-    ndarray, shape (3, n_rows)
-        Y^T in the frontal rows of the cliques of `path`.
-
-    """
+    """Return Y^T of `R^T Y = E` for a node, in the frontal rows of the cliques of `path`."""
     pool_f = tb.pool_f(head)
     node_i = tb.node_i(head)
     clique_i = tb.clique_i(head)

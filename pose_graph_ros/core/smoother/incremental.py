@@ -1,15 +1,6 @@
 # Copyright 2026 The pose_graph_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""
-The incremental smoother, which keeps the estimate of all poses at the minimum of chi2.
-
-The cost of an update is proportional to what it changes. The cliques from the edited nodes up to
-the root of the Bayes tree are eliminated again (`tree_update`); back-substitution descends as far
-as values change (`back_substitution`); constraints with a large linearization error are
-linearized again (`relinearization`); and `step` repeats this until the error that remains is
-within a budget. Appending a node to a chain takes constant time (`chain`). `docs/solver.md`
-describes the method.
-"""
+"""The incremental smoother; `docs/solver.md` describes the method."""
 
 from typing import Any, NamedTuple
 
@@ -65,8 +56,9 @@ class IncrementalSmoother:
     """
     Keep the estimate of a growing pose graph at the minimum of chi2, within a budget.
 
-    Every connected part of the graph needs a fixed or an observed node. An update that leaves a
-    node undetermined is rolled back, bit for bit.
+    The cost of an update is proportional to what it changes. Every connected part of the graph
+    needs a fixed or an observed node. An update that leaves a node undetermined is rolled back,
+    bit for bit.
     """
 
     def __init__(self, config: SmootherConfig | None = None) -> None:
@@ -89,12 +81,8 @@ class IncrementalSmoother:
         """
         Edit the graph and bring the estimate up to date.
 
-        Raises
-        ------
-        GraphUpdateError
-            If a part of the update does not fit the graph. The graph is unchanged then, as after
-            any other exception.
-
+        A GraphUpdateError, for a part that does not fit the graph, leaves the graph unchanged, as
+        any other exception does.
         """
         self.graph.begin()
         try:
@@ -110,30 +98,19 @@ class IncrementalSmoother:
         observed_mean: FloatArray | None = None, observed_information: FloatArray | None = None,
     ) -> UpdateResult:
         """
-        Append a hidden node to the newest pose by an odometry edge, and update the estimate.
+        Return the result of appending a hidden node to the newest pose by an odometry edge.
 
         Equal to an update with one hidden node at the pose that odometry predicts, one edge and
-        at most one observed node, at a fraction of the cost.
+        at most one observed node, at a fraction of the cost. Raises GraphUpdateError as `update`
+        does, and if the graph has no hidden node.
 
         Parameters
         ----------
-        mean : ndarray, shape (3,)
-            Pose of the new node in the newest one [m, m, rad].
-        information : ndarray, shape (3, 3)
-            In the frame of the new node.
+        mean : ndarray, shape (3,), pose of the new node in the newest one [m, m, rad]
+        information : ndarray, shape (3, 3), in the frame of the new node
         observed_mean : ndarray, shape (3,), optional
             Observed pose of the new node in the map [m, m, rad].
-        observed_information : ndarray, shape (3, 3), optional
-            In the frame of the observed pose.
-
-        Returns
-        -------
-        UpdateResult
-
-        Raises
-        ------
-        GraphUpdateError
-            As in `update`, and if the graph has no hidden node.
+        observed_information : ndarray, shape (3, 3), optional, in the frame of the observed pose
 
         """
         head = self._memory.head
@@ -174,11 +151,7 @@ class IncrementalSmoother:
         """
         Return the covariance of a hidden node in map axes, shape (3, 3).
 
-        Raises
-        ------
-        ValueError
-            If there is no such node, or edits of the graph are not solved for.
-
+        Raises ValueError if there is no such node, or edits of the graph are not solved for.
         """
         self._require_eliminated(node)
         out = np.empty((3, 3))
@@ -191,12 +164,7 @@ class IncrementalSmoother:
 
         Parameters
         ----------
-        i, j : int
-
-        Raises
-        ------
-        ValueError
-            As in `covariance`.
+        i, j : int, the nodes; raises as `covariance`
 
         """
         self._require_eliminated(i, j)

@@ -110,7 +110,7 @@ def _check_turned(head):  # type: ignore[no-untyped-def]
 
 
 @kernel
-def forget_waiting(head):  # type: ignore[no-untyped-def]
+def _forget_waiting(head):  # type: ignore[no-untyped-def]
     """Empty the lists of waiting constraints and turned frames without linearizing them again."""
     edge_i, observed_i, waiting = tb.edge_i(head), tb.observed_i(head), tb.waiting(head)
     for n in range(head[tb.N_WAITING]):
@@ -133,10 +133,9 @@ def _error2(head, entry):  # type: ignore[no-untyped-def]
 @kernel
 def _relinearize_worst(head, allowed):  # type: ignore[no-untyped-def]
     """
-    Linearize the worst waiting constraints again, so that the errors of the rest are small.
+    Linearize the worst waiting constraints again; the errors of the rest add up to `allowed`.
 
-    The squared linearization errors of the rest add up to `allowed` at most. The nodes of the
-    relinearized constraints are touched, and the lists of the waiting are emptied.
+    The nodes of the relinearized constraints are touched; the lists of the waiting are emptied.
     """
     work_f = tb.work_f(head)
     edge_i = tb.edge_i(head)
@@ -212,14 +211,9 @@ def _budget(head):  # type: ignore[no-untyped-def]
 @kernel
 def solve(head):  # type: ignore[no-untyped-def]
     """
-    Solve from the roots on the stack down, and check the linearization errors.
+    Solve from the roots on the stack down; return whether the linearization errors are small.
 
-    Returns
-    -------
-    bool
-        Whether their sum is within the budget. If not, the constraints with large errors wait to
-        be linearized again.
-
+    If their sum exceeds the budget, the constraints with large errors wait to be linearized again.
     """
     scalars = tb.scalars(head)
     back_substitute(head)
@@ -227,7 +221,7 @@ def solve(head):  # type: ignore[no-untyped-def]
     _check_turned(head)
     head[tb.N_ITERATIONS] += 1
     if scalars[tb.ERROR2_SUM] <= _budget(head):
-        forget_waiting(head)
+        _forget_waiting(head)
         return True
     return False
 

@@ -22,21 +22,17 @@ from pose_graph_ros.core.graph import factors, tables as tb, transaction_log
 @kernel
 def rigid_motion(head, c, limit):  # type: ignore[no-untyped-def]
     """
-    Fit a rigid motion to the moves of the nodes of a clique's separator in this iteration.
+    Return the rigid motion that fits this iteration's moves of the nodes of a clique's separator.
 
     Parameters
     ----------
-    c : int
-        Clique.
-    limit : float
-        Deviation at which the fit stops [sigma].
+    c : int, clique
+    limit : float, deviation at which the fit stops [sigma]
 
     Returns
     -------
-    deviation : float
-        Largest deviation of a node from the motion, or any above the limit [sigma].
-    turn : float
-        Angle of the motion `x -> R_turn (x - pivot) + goal` [rad].
+    deviation : float, largest deviation of a node from the motion, or any above the limit [sigma]
+    turn : float, angle of the motion `x -> R_turn (x - pivot) + goal` [rad]
     pivot_x, pivot_y, goal_x, goal_y : float
         Mean position of the separator before and after the motion, in the map [m].
 
@@ -84,22 +80,14 @@ def rigid_motion(head, c, limit):  # type: ignore[no-untyped-def]
 @kernel
 def propagate(head, c, motion, stack, depth):  # type: ignore[no-untyped-def]
     """
-    Apply a rigid motion to all nodes that are eliminated at or below a clique.
+    Return the number of nodes at or below a clique, after moving them by a rigid motion.
 
     Parameters
     ----------
-    c : int
-        Clique.
-    motion : tuple
-        From `rigid_motion`.
-    stack : ndarray of int32
-        Work space from `depth` on.
+    c : int, clique
+    motion : tuple, from `rigid_motion`
+    stack : ndarray of int32, work space from `depth` on
     depth : int
-
-    Returns
-    -------
-    int
-        Number of moved nodes.
 
     """
     node_f, clique_i, pool_i = tb.node_f(head), tb.clique_i(head), tb.pool_i(head)

@@ -55,8 +55,7 @@ def run(head, max_iterations, entered):  # type: ignore[no-untyped-def]
     Parameters
     ----------
     max_iterations : int
-    entered : int
-        FIRST, RESUMED, AFTER_BATCH or EXTENDED.
+    entered : int, FIRST, RESUMED, AFTER_BATCH or EXTENDED
 
     Returns
     -------

@@ -29,13 +29,8 @@ def mark(head):  # type: ignore[no-untyped-def]
     """
     Mark the cliques from all touched nodes up to the roots.
 
-    Returns
-    -------
-    marked : ndarray of int32
-        These cliques, in no particular order.
-    affected : ndarray of int32
-        Their frontal nodes and the touched nodes without a clique.
-
+    Return these cliques, in no particular order, and the affected nodes: their frontal nodes and
+    the touched nodes without a clique.
     """
     node_i = tb.node_i(head)
     clique_i = tb.clique_i(head)
@@ -83,8 +78,7 @@ def rebuild(head, marked, affected):  # type: ignore[no-untyped-def]
 
     Parameters
     ----------
-    marked, affected : ndarray of int32
-        From `mark`; `affected` is reordered.
+    marked, affected : ndarray of int32, from `mark`; `affected` is reordered
 
     Returns
     -------
@@ -185,11 +179,7 @@ def _attach_child(head, parent, child):  # type: ignore[no-untyped-def]
 
 @kernel(inline='always')
 def refresh(head, marked):  # type: ignore[no-untyped-def]
-    """
-    Eliminate the marked cliques again with the same structure, as only values have changed.
-
-    Return codes are those of `rebuild`.
-    """
+    """Eliminate the marked cliques again with the same structure; return codes as `rebuild`."""
     pool_f = tb.pool_f(head)
     work_f = tb.work_f(head)
     clique_i = tb.clique_i(head)
@@ -253,12 +243,8 @@ def eliminate(head):  # type: ignore[no-untyped-def]
     """
     Eliminate all cliques from the touched nodes up to the roots again.
 
-    Returns
-    -------
-    int
-        DONE: no node is touched any more, and the roots are on the stack for the
-        back-substitution; MORE_MEMORY or BAD_PIVOT as in `rebuild`.
-
+    Return DONE: no node is touched any more, and the roots are on the stack for the
+    back-substitution; or MORE_MEMORY or BAD_PIVOT as `rebuild` does.
     """
     node_i, touched = tb.node_i(head), tb.touched(head)
     marked, affected = mark(head)
