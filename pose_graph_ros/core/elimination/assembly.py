@@ -13,20 +13,16 @@ from pose_graph_ros.core.graph.pools import row_start, triangle_size
 @kernel
 def eliminate_clique(head, c, relinearize):  # type: ignore[no-untyped-def]
     """
-    Assemble the front of a clique, factorise it, and store the rows of R and the update matrix.
+    Return a node with a bad pivot, or -1, after the elimination of a clique.
+
+    Its front is assembled and factorised, and the rows of R and the update matrix are stored.
 
     Parameters
     ----------
-    c : int
-        Row of the clique.
+    c : int, row of the clique
     relinearize : bool
         Linearize the constraints at the present estimate before they are added: the frame in which
         they were linearized may have turned since. Their rows are logged for a rollback.
-
-    Returns
-    -------
-    int
-        Node with a bad pivot, or -1.
 
     """
     node_f = tb.node_f(head)

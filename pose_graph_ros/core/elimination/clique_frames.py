@@ -65,12 +65,9 @@ def local_delta(f, px, py, cos, sin, phi):  # type: ignore[no-untyped-def]
 
     Parameters
     ----------
-    f : ndarray
-        Row of the node in `node_f`.
-    px, py : float
-        Point P in the map [m].
-    cos, sin, phi : float
-        Angle of the frame [rad], with its cosine and sine.
+    f : ndarray, row of the node in `node_f`
+    px, py : float, point P in the map [m]
+    cos, sin, phi : float, angle of the frame [rad], with its cosine and sine
 
     """
     x, y = f[tb.REF] + f[tb.DELTA] - px, f[tb.REF + 1] + f[tb.DELTA + 1] - py
@@ -85,12 +82,9 @@ def map_delta(f, x, y, px, py, cos, sin):  # type: ignore[no-untyped-def]
 
     Parameters
     ----------
-    f : ndarray
-        Row of the node in `node_f`.
-    x, y : float
-        Position part of delta' [m].
-    px, py, cos, sin : float
-        As for `local_delta`.
+    f : ndarray, row of the node in `node_f`
+    x, y : float, position part of delta' [m]
+    px, py, cos, sin : float, as for `local_delta`
 
     """
     x, y = x + f[tb.REF] - px, y + f[tb.REF + 1] - py
@@ -106,16 +100,11 @@ def turned_update(update, n, nodes, node_f, phi, to):  # type: ignore[no-untyped
     ----------
     update : ndarray, flat
         Upper triangle of 3n columns and the right-hand side, laid out by `pools.row_start`.
-    n : int
-        Number of separator nodes.
-    nodes : ndarray of int32, shape (n,)
-        Separator nodes.
-    node_f : ndarray
-        Table of the nodes.
-    phi : float
-        Angle of the clique's frame [rad].
-    to : ndarray, flat
-        Receives the result, laid out as `update`.
+    n : int, number of separator nodes
+    nodes : ndarray of int32, shape (n,), separator nodes
+    node_f : ndarray, table of the nodes
+    phi : float, angle of the clique's frame [rad]
+    to : ndarray, flat, receives the result, laid out as `update`
 
     """
     size = 3 * n
@@ -191,12 +180,9 @@ def interface_error2(head, c, beta, work):  # type: ignore[no-untyped-def]
 
     Parameters
     ----------
-    c : int
-        Row of the clique; it has a parent.
-    beta : float
-        Slip [rad].
-    work : ndarray
-        Work space of 9 numbers for each separator node.
+    c : int, row of the clique; it has a parent
+    beta : float, slip [rad]
+    work : ndarray, work space of 9 numbers for each separator node
 
     """
     clique_i = tb.clique_i(head)

@@ -118,23 +118,17 @@ def _factorize_3(front, k, ld, least):  # type: ignore[no-untyped-def]
 @kernel
 def factorize(front, rows, n, ld, least):  # type: ignore[no-untyped-def]
     """
-    Factorise the first rows of a front in place; the other rows become its update matrix.
+    Return the first row with a bad pivot, or -1, after factorising the first rows of a front.
+
+    They are replaced by rows of R; the other rows become the update matrix.
 
     Parameters
     ----------
     front : ndarray, flat
         n rows of `ld` numbers; only the upper triangle and the last column are used.
-    rows, n : int
-        Rows to factorise and all rows, both multiples of 3.
-    ld : int
-        `padded(n)`.
-    least : ndarray, shape (rows,)
-        Lower bound of each pivot, itself excluded.
-
-    Returns
-    -------
-    int
-        First row with a bad pivot, or -1.
+    rows, n : int, rows to factorise and all rows, both multiples of 3
+    ld : int, `padded(n)`
+    least : ndarray, shape (rows,), lower bound of each pivot, itself excluded
 
     """
     k = 0
@@ -166,10 +160,8 @@ def forward_rows(values, rows, n, x):  # type: ignore[no-untyped-def]
     ----------
     values : ndarray, flat
         First `rows` rows of R of an upper triangle of n columns, laid out by `pools.row_start`.
-    rows, n : int
-        Rows of the frontal nodes and of all nodes of the clique, both multiples of 3.
-    x : ndarray, shape (n,)
-        Right-hand side; receives y in the frontal part.
+    rows, n : int, rows of the frontal nodes and of all nodes of the clique, both multiples of 3
+    x : ndarray, shape (n,), right-hand side; receives y in the frontal part
 
     """
     for k in range(0, rows, 3):
@@ -205,8 +197,7 @@ def backward_rows(values, rows, n, x):  # type: ignore[no-untyped-def]
 
     Parameters
     ----------
-    values, rows, n
-        As for `forward_rows`.
+    values, rows, n : as for `forward_rows`
     x : ndarray, shape (n,)
         y, then the solution of the separator; y is replaced by the solution of the frontal nodes.
 
@@ -222,8 +213,7 @@ def solve_rows(values, rows, n, x):  # type: ignore[no-untyped-def]
 
     Parameters
     ----------
-    values, rows, n
-        As for `forward_rows`.
+    values, rows, n : as for `forward_rows`
     x : ndarray, shape (n,)
         Solution of the separator, from index `rows` on; receives that of the frontal nodes.
 

@@ -65,10 +65,8 @@ def minimum_degree(n, n_elements, n_last, start, adjacency):  # type: ignore[no-
 
     Parameters
     ----------
-    n, n_elements : int
-        Nodes are 0 to n - 1, elements from the start n to n + n_elements - 1.
-    n_last : int
-        Number of nodes, the last of the list, that are eliminated last, in their order.
+    n, n_elements : int, nodes are 0 to n - 1, elements from the start n to n + n_elements - 1
+    n_last : int, number of nodes, the last of the list, that are eliminated last, in their order
     start : ndarray of int32, shape (n + n_elements + 1,)
         Where the list of each node and element begins in `adjacency`.
     adjacency : ndarray of int32
@@ -85,8 +83,7 @@ def minimum_degree(n, n_elements, n_last, start, adjacency):  # type: ignore[no-
     parent : ndarray of int32, shape (n_cliques + n_elements,)
         Parent of each clique, -1 for a root, then of each element from the start. The nodes of the
         parent include the separator, or the nodes of the element.
-    nodes : ndarray of int32
-        Nodes of all cliques.
+    nodes : ndarray of int32, nodes of all cliques
 
     """
     iw = np.empty(start[n + n_elements] + 4 * n + 16, np.int32)

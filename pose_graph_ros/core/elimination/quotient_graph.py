@@ -21,10 +21,8 @@ def newest_last(affected, newest):  # type: ignore[no-untyped-def]
 
     Parameters
     ----------
-    affected : ndarray of int32
-        Nodes to be ordered; sorted in place.
-    newest : int
-        Newest node that is a pose, or -1.
+    affected : ndarray of int32, nodes to be ordered; sorted in place
+    newest : int, newest node that is a pose, or -1
 
     """
     n = len(affected)
@@ -43,21 +41,16 @@ def newest_last(affected, newest):  # type: ignore[no-untyped-def]
 @kernel(allocates=True)
 def structure(head, marked, affected):  # type: ignore[no-untyped-def]
     """
-    Return the quotient graph of the affected nodes, with the orphans as elements.
+    Return the orphans, and the quotient graph of the affected nodes with them as elements.
+
+    Orphans are children of marked cliques that are not marked themselves. The graph is given as
+    `start` and `adjacency` of `ordering.minimum_degree`; node k is `affected[k]`.
 
     Parameters
     ----------
     marked : ndarray of int32
         Cliques that are to be replaced, with FRONT_SERIAL of the head in their column MARKED.
-    affected : ndarray of int32
-        Nodes to be ordered.
-
-    Returns
-    -------
-    orphans : ndarray of int32
-        Children of marked cliques that are not marked themselves.
-    start, adjacency : ndarray of int32
-        Lists of neighbours as for `ordering.minimum_degree`; node k is `affected[k]`.
+    affected : ndarray of int32, nodes to be ordered
 
     """
     edge_f = tb.edge_f(head)
@@ -159,19 +152,13 @@ def amalgamate(  # type: ignore[no-untyped-def]
 
     Parameters
     ----------
-    n_cliques, n_frontal, offset, parent
-        As returned by `ordering.minimum_degree`.
-    most_zeros : int
-        Largest number of explicit zero blocks in a merged clique.
-    most_frontal : int
-        Largest number of frontal nodes of a merged clique.
+    n_cliques, n_frontal, offset, parent : as returned by `ordering.minimum_degree`
+    most_zeros, most_frontal : int, limits of the zero blocks and frontal nodes of a merged clique
 
     Returns
     -------
-    into : ndarray of int32
-        For each clique the one that it is merged into: itself, or a later one.
-    frontal : ndarray of int32
-        Number of frontal nodes after merging.
+    into : ndarray of int32, for each clique the one that it is merged into: itself, or a later one
+    frontal : ndarray of int32, number of frontal nodes after merging
 
     """
     into = np.arange(n_cliques).astype(np.int32)

@@ -191,11 +191,6 @@ def plant(head, cliques):  # type: ignore[no-untyped-def]
     The pools must have been enlarged by what `Analysis` requires. Clique k is stored in row k, so
     that the order of the rows is that of the elimination. No node is touched afterwards, and the
     log of the update is empty: a rollback is not possible.
-
-    Parameters
-    ----------
-    cliques : Cliques
-
     """
     node_i, clique_i, pool_i = tb.node_i(head), tb.clique_i(head), tb.pool_i(head)
     touched = tb.touched(head)
@@ -227,13 +222,7 @@ def loose_part(head):  # type: ignore[no-untyped-def]
     """
     Find the parts of the graph that contain no fixed and no observed node.
 
-    Returns
-    -------
-    node : int
-        First hidden node in such a part, or -1.
-    count : int
-        Number of hidden nodes in all such parts.
-
+    Return the first hidden node in such a part, or -1, and the number of nodes in all of them.
     """
     edge_f = tb.edge_f(head)
     observed_f = tb.observed_f(head)
