@@ -31,24 +31,16 @@ def gap_motion(
     """
     Return the estimated motion during a gap in odometry, and its covariance.
 
-    The robot is assumed to keep its mean speed, for at most `MEMORY_TIME`. After a long gap at the
-    end of a loaded graph it is assumed to stand where it was.
+    The motion is the pose at the end of the gap in the frame at its begin, shape (3,) [m, m, rad];
+    the covariance is in the frame at the end. The robot is assumed to keep its mean speed, for at
+    most `MEMORY_TIME`. After a long gap at the end of a loaded graph it is assumed to stand where
+    it was.
 
     Parameters
     ----------
-    timeline : OdometryTimeline
-        Samples before the gap.
-    last_ns, until_ns : int
-        Stamps of the last sample before the gap, and of its end [ns].
-    saved_ns : int
-        Newest stamp of a graph that was loaded; -1 if none was [ns].
-
-    Returns
-    -------
-    mean : ndarray, shape (3,)
-        Pose at the end of the gap in the frame at its begin [m, m, rad].
-    noise : ndarray, shape (3, 3)
-        Its covariance, in the frame at the end.
+    timeline : OdometryTimeline, samples before the gap
+    last_ns, until_ns : int, stamps of the last sample before the gap, and of its end [ns]
+    saved_ns : int, newest stamp of a graph that was loaded; -1 if none was [ns]
 
     """
     if last_ns <= saved_ns and until_ns - last_ns > RESUMED_WITHIN * 1e9:

@@ -1,12 +1,6 @@
 # Copyright 2026 The pose_graph_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""
-Hidden nodes, which are made from odometry alone.
-
-A settled sample of the primary source (`primary_source`) makes a node if one is due by the node
-policy, with an edge from the node before. The other sources add edges between the nodes
-(`secondary_edges`). A stamp between two nodes is given by the node before it and the motion since.
-"""
+"""Hidden nodes, which are made from odometry alone."""
 
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
@@ -70,13 +64,13 @@ class SavedNodes:
     """By the name of the source."""
 
 
-MakeNode = Callable[[FloatArray, FloatArray | None, str], int]
-"""Argument `make_node` of `HiddenNodes`."""
-
-
 class HiddenNodes:
     """
     The hidden nodes by stamp, and the odometry that makes them.
+
+    A settled sample of the primary source (`primary_source`) makes a node if one is due by the
+    node policy, with an edge from the node before. The other sources add edges between the nodes
+    (`secondary_edges`).
 
     Parameters
     ----------
@@ -88,7 +82,10 @@ class HiddenNodes:
 
     """
 
-    def __init__(self, config: BackendConfig, make_node: MakeNode) -> None:
+    def __init__(
+        self, config: BackendConfig,
+        make_node: Callable[[FloatArray, FloatArray | None, str], int],
+    ) -> None:
         self._config = config
         self._make_node = make_node
         self._stamps = GrowingArray((), np.int64)
@@ -165,18 +162,12 @@ class HiddenNodes:
 
     def add_sample(self, sample: OdometrySample, source: str) -> Answer:
         """
-        Add an odometry sample, and make the nodes and edges that are due.
+        Return the answer to an odometry sample, after making the nodes and edges that are due.
 
         Parameters
         ----------
         sample : OdometrySample
-        source : str
-            Name of the odometry source.
-
-        Returns
-        -------
-        Answer
-            Accepted, or rejected with the reason.
+        source : str, name of the odometry source
 
         """
         stream = self.streams.get(source) or self._make_stream(source)
@@ -274,10 +265,8 @@ class HiddenNodes:
 
         Parameters
         ----------
-        mean : ndarray, shape (3,)
-            Pose of the robot in the newest node [m, m, rad].
-        noise : ndarray, shape (3, 3)
-            Covariance of that pose, in the frame at its end.
+        mean : ndarray, shape (3,), pose of the robot in the newest node [m, m, rad]
+        noise : ndarray, shape (3, 3), covariance of that pose, in the frame at its end
 
         """
         timeline = self.streams[self.primary].timeline
@@ -373,17 +362,10 @@ class HiddenNodes:
 
     def newest(self) -> tuple[FloatArray, FloatArray, FloatArray]:
         """
-        Return the motion since the newest node.
+        Return the motion from the newest node to the newest sample, and its covariance.
 
-        Returns
-        -------
-        motion : ndarray, shape (3,)
-            From the newest node to the newest sample [m, m, rad].
-        noise : ndarray, shape (3, 3)
-            Its covariance, in the frame at its end.
-        odometry : ndarray, shape (3,)
-            Newest pose of the primary source as received [m, m, rad].
-
+        The motion has the shape (3,) [m, m, rad], its covariance is in the frame at its end, and
+        third comes the newest pose of the primary source as received, shape (3,) [m, m, rad].
         """
         stream = self.streams[self.primary]
         motion, raw = stream.newest(self._base_ns)

@@ -56,12 +56,9 @@ class SpeedWindow(NamedTuple):
 
         Parameters
         ----------
-        stamp_ns : int
-            Stamp of the sample at the end of the step [ns].
-        pose : tuple
-            Pose of that sample, in a frame without jumps [m, m, rad].
-        step : tuple of float
-            Length [m] and absolute turn [rad] of the step.
+        stamp_ns : int, stamp of the sample at the end of the step [ns]
+        pose : tuple, pose of that sample, in a frame without jumps [m, m, rad]
+        step : tuple of float, length [m] and absolute turn [rad] of the step
 
         """
         path = self.path[0] + step[0], self.path[1] + step[1]
@@ -90,16 +87,11 @@ def is_jump(
 
     Parameters
     ----------
-    speeds : Speeds
-        Speeds before the step.
-    step : tuple of float
-        Length [m] and absolute turn [rad] of the step.
-    elapsed : float
-        Duration of the step [s].
-    stated : float
-        Speed by the twist that came with the sample [m/s]; not finite if there is none.
-    limit : float
-        Speed limit of the source [m/s].
+    speeds : Speeds, speeds before the step
+    step : tuple of float, length [m] and absolute turn [rad] of the step
+    elapsed : float, duration of the step [s]
+    stated : float, speed by the twist that came with the sample [m/s]; not finite if there is none
+    limit : float, speed limit of the source [m/s]
 
     """
     if step[0] <= SLACK[0] and step[1] <= SLACK[1]:

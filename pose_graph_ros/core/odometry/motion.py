@@ -59,11 +59,9 @@ def odometry_covariance(
 
     Parameters
     ----------
-    noise : OdometryNoise
-        Noise per path length and turn; it is added to `motion.variance`.
+    noise : OdometryNoise, noise per path length and turn; it is added to `motion.variance`
     motion : Motion
-    floor : bool
-        Whether to add the floors of the noise, which every increment has once.
+    floor : bool, whether to add the floors of the noise, which every increment has once
 
     """
     increment, distance, turn, variance = motion

@@ -52,14 +52,10 @@ def choose_first(
     Parameters
     ----------
     streams : mapping of str to OdometryStream
-    names : sequence of str
-        Sources in the order of preference.
-    preferred : str
-        Source that becomes the primary one without waiting; it may have no samples yet.
-    settled_ns : int
-        Stamp up to which the samples of all sources are known [ns].
-    patience_ns : int
-        Time by which another source must have begun before the preferred one [ns].
+    names : sequence of str, sources in the order of preference
+    preferred : str, source that need not wait to become it; it may have no samples yet
+    settled_ns : int, stamp up to which the samples of all sources are known [ns]
+    patience_ns : int, time by which another source must have begun before the preferred one [ns]
 
     """
     ready_ns = []
@@ -81,10 +77,8 @@ def first_with_sample(
     Parameters
     ----------
     streams : mapping of str to OdometryStream
-    names : sequence of str
-        Sources in the order of preference.
-    after_ns, until_ns : int
-        Stamps [ns].
+    names : sequence of str, sources in the order of preference
+    after_ns, until_ns : int, stamps [ns]
 
     """
     return next(name for name in names
@@ -101,14 +95,10 @@ def find_silence(
     Parameters
     ----------
     streams : mapping of str to OdometryStream
-    names : sequence of str
-        The primary source, then the others in the order of preference.
-    last_ns : int
-        Stamp of the sample of the primary source from which the search starts [ns].
-    settled : tuple of str and int
-        Source and stamp [ns] of a settled sample: the samples before it are known.
-    patience_ns : int
-        Longest silence that is tolerated [ns].
+    names : sequence of str, the primary source, then the others in the order of preference
+    last_ns : int, stamp of the sample of the primary source from which the search starts [ns]
+    settled : tuple, source and stamp [ns] of a settled sample; the samples before it are known
+    patience_ns : int, longest silence that is tolerated [ns]
 
     """
     primary, *others = names

@@ -29,8 +29,7 @@ class SecondaryEdges:
         Parameters
         ----------
         source : str
-        node : int
-            Number of the hidden node, in the order of stamps.
+        node : int, number of the hidden node, in the order of stamps
         reached : bool
             True if the next edge begins at this node; False if it begins at the first node, from
             this one on, that the samples of the source cover.
@@ -47,8 +46,7 @@ class SecondaryEdges:
         Parameters
         ----------
         source : str
-        stream : OdometryStream
-            Samples of the source.
+        stream : OdometryStream, samples of the source
         stamps_ns, rows : ndarray of int64, shape (N,)
             Stamps [ns] of all hidden nodes, and their rows in the graph.
 

@@ -15,10 +15,8 @@ class StampGuard:
 
     Parameters
     ----------
-    limit_ns : int
-        Distance from the newest stamp beyond which a stamp is far [ns].
-    behind : bool
-        Whether stamps behind the newest one can be far, and not only those ahead of it.
+    limit_ns : int, distance from the newest stamp beyond which a stamp is far [ns]
+    behind : bool, whether stamps behind the newest one can be far, and not only those ahead of it
 
     """
 

@@ -1,13 +1,6 @@
 # Copyright 2026 The pose_graph_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""
-One source of odometry: its samples in the order of their stamps, without jumps.
-
-A sample is settled when it is older than the newest one by the reorder window; older samples are
-rejected then. Where odometry jumps farther than the robot can have moved, it was reset: the motion
-of that step is predicted from the speeds before, with a large covariance, and the later samples
-are appended to the predicted pose.
-"""
+"""One source of odometry: its samples in the order of their stamps, without jumps."""
 
 import bisect
 from collections.abc import Iterator
@@ -126,7 +119,14 @@ class _Instant(NamedTuple):
 
 
 class OdometryStream:
-    """The samples of one source of odometry."""
+    """
+    The samples of one source of odometry.
+
+    A sample is settled when it is older than the newest one by the reorder window; older samples
+    are rejected then. Where odometry jumps farther than the robot can have moved, it was reset:
+    the motion of that step is predicted from the speeds before, with a large covariance, and the
+    later samples are appended to the predicted pose.
+    """
 
     def __init__(self, source: OdometrySource) -> None:
         self.timeline = OdometryTimeline()
@@ -272,10 +272,8 @@ class OdometryStream:
 
         Parameters
         ----------
-        nodes_ns : ndarray of int64, shape (N,)
-            Stamps of the hidden nodes [ns]; N >= 1.
-        tied : tuple of int
-            Progress of the secondary edges of this source, see `SecondaryEdges.progress`.
+        nodes_ns : ndarray of int64, shape (N,), stamps of the hidden nodes [ns]; N >= 1
+        tied : tuple of int, `SecondaryEdges.progress` of this source
 
         """
         stamps, rows, dense = self.timeline.thinned(
@@ -308,8 +306,7 @@ class OdometryStream:
 
         Parameters
         ----------
-        motion, floor
-            As in `odometry_covariance`.
+        motion, floor : as in `odometry_covariance`
 
         """
         return np.asarray(self._source.covariance_scale * odometry_covariance(
@@ -319,17 +316,8 @@ class OdometryStream:
         """
         Return the motion from a settled instant [ns] to the newest sample, settled or not.
 
-        Returns
-        -------
-        motion : Motion
-        raw : ndarray, shape (3,)
-            Pose of the newest sample as received [m, m, rad].
-
-        Raises
-        ------
-        ValueError
-            If there are no samples, or they do not cover the instant.
-
+        With it comes the pose of that sample as received, shape (3,) [m, m, rad]. Raises
+        ValueError if there are no samples, or they do not cover the instant.
         """
         self._compute_ahead()
         last = self._ahead[-1] if self._ahead else self._last

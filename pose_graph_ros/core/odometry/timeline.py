@@ -63,16 +63,13 @@ def next_row(
 
     Parameters
     ----------
-    before : Row, optional
-        Row of the sample before; None for the first sample.
+    before : Row, optional, row of the sample before; None for the first sample
     stamp_ns : int
-    pose : tuple
-        `T_odom_base` [m, m, rad].
+    pose : tuple, `T_odom_base` [m, m, rad]
     variance : tuple
         Variance of (x, y, theta) of the motion since the sample before, in the robot's frame; it
         is added only if the robot moves.
-    loose : tuple
-        Variance that is added in any case.
+    loose : tuple, variance that is added in any case
 
     """
     if before is None:
@@ -128,15 +125,7 @@ class OdometryTimeline:
         return self._samples.read_only[:, :3]
 
     def append(self, row: Row) -> None:
-        """
-        Append a sample as returned by `next_row`.
-
-        Raises
-        ------
-        ValueError
-            If the stamp is not newer than the newest one.
-
-        """
+        """Append a row of `next_row`; raise ValueError if its stamp is not after the newest."""
         last, same = self._last, False
         if last is not None:
             if row.stamp_ns <= last.stamp_ns:
@@ -186,25 +175,16 @@ class OdometryTimeline:
         self, instants_ns: IntArray, since_ns: int,
     ) -> tuple[IntArray, FloatArray, npt.NDArray[np.bool_]]:
         """
-        Return the samples that are needed for the motions between some instants.
+        Return stamps, rows and `dense` of the samples for the motions between some instants.
 
         These are the first sample, those at the instants or else on both sides of them, and all
-        from a later instant on. Motions between these instants do not depend on other samples.
+        from a later instant on. Motions between these instants do not depend on other samples. The
+        rows, shape (T, 8), are pose, path length, sum of absolute turns, and sums of variances.
 
         Parameters
         ----------
-        instants_ns : ndarray of int64, shape (N,)
-            Covered instants [ns].
-        since_ns : int
-            Stamp from which all samples are returned [ns].
-
-        Returns
-        -------
-        stamps_ns : ndarray of int64, shape (T,)
-        rows : ndarray, shape (T, 8)
-            Pose, path length, sum of absolute turns, sums of variances.
-        dense : ndarray of bool, shape (T,)
-            As `dense`.
+        instants_ns : ndarray of int64, shape (N,), covered instants [ns]
+        since_ns : int, stamp from which all samples are returned [ns]
 
         """
         stamps = self.stamps_ns
@@ -228,12 +208,9 @@ class OdometryTimeline:
 
         Parameters
         ----------
-        stamps_ns, rows, dense
-            As returned by `thinned`.
-        last : Row
-            The newest sample.
-        resting : bool
-            As `resting`.
+        stamps_ns, rows, dense : as returned by `thinned`
+        last : Row, the newest sample
+        resting : bool, as `resting`
 
         """
         self._stamps.append(stamps_ns)
@@ -245,17 +222,11 @@ class OdometryTimeline:
 
     def motion(self, start_ns: int, end_ns: int) -> Motion:
         """
-        Return the motion between two covered instants.
+        Return the motion between two instants; raise ValueError if one is not covered.
 
         Parameters
         ----------
-        start_ns, end_ns : int
-            Stamps [ns], the start not after the end.
-
-        Raises
-        ------
-        ValueError
-            If an instant is not covered, or they are in the wrong order.
+        start_ns, end_ns : int, stamps [ns]; ValueError if the start is after the end
 
         """
         if start_ns > end_ns:
@@ -270,18 +241,12 @@ class OdometryTimeline:
 
     def motion_to(self, start_ns: int, end: Row) -> Motion:
         """
-        Return the motion from a covered instant to a row that is not in the timeline yet.
+        Return the motion from an instant to a row that may not be in the timeline yet.
 
         Parameters
         ----------
-        start_ns : int
-        end : Row
-            The newest row of the timeline, or one made from it by `next_row`.
-
-        Raises
-        ------
-        ValueError
-            If the instant is not covered.
+        start_ns : int, stamp [ns]; ValueError if it is not covered
+        end : Row, the newest row of the timeline, or one made from it by `next_row`
 
         """
         start, start_variance = self._at(start_ns)
@@ -293,11 +258,7 @@ class OdometryTimeline:
         """
         Return the interpolated pose in the odometry frame at an instant, shape (3,) [m, m, rad].
 
-        Raises
-        ------
-        ValueError
-            If the instant is not covered.
-
+        Raises ValueError if the instant is not covered.
         """
         return self._at(stamp_ns)[0][:3]
 
