@@ -6,8 +6,8 @@ Time constant of the errors of a source, from the autocorrelation of its residua
 The sum of a first-order Gauss-Markov process and white noise has the autocovariance
 `c(h) = s_c^2 exp(-h / tau)` for h > 0 and `c(0) = s_c^2 + s_w^2`. This model is fitted to the
 sample autocovariance of the residuals at lags of whole periods of the source. Residuals are
-smaller than the errors, because the estimate follows the measurements: both sigmas come out a
-little too small, and so does tau.
+smaller than the errors, because the estimate follows the measurements: s_c comes out a little too
+small, and so does tau.
 """
 
 from typing import NamedTuple
@@ -33,16 +33,10 @@ LEAST_CORRELATION = 0.3
 class Autocorrelation(NamedTuple):
     """Estimated statistics of the errors of a source."""
 
-    n: int
-    """Number of residuals."""
-    correlation: float
-    """Correlation coefficient of consecutive residuals."""
     tau: float
     """Time constant of the correlated part [s]; 0 if nothing is significant."""
     sigma_correlated: float
     """Standard deviation of the correlated part of a coordinate, in the unit of the residuals."""
-    sigma_white: float
-    """Standard deviation of the white part, likewise."""
 
     @property
     def significant(self) -> bool:
@@ -52,19 +46,17 @@ class Autocorrelation(NamedTuple):
 
 def estimate(stamps_ns: IntArray, residuals: FloatArray) -> Autocorrelation:
     """
-    Return the time constant of errors, and the variances of their correlated and white parts.
+    Return the time constant of errors, and the sigma of their correlated part.
 
     Parameters
     ----------
-    stamps_ns : ndarray of int64, shape (N,)
-        Stamps of the residuals [ns], increasing.
-    residuals : ndarray, shape (N, d)
-        Coordinates must be independent and have the same statistics.
+    stamps_ns : ndarray of int64, shape (N,), stamps of the residuals [ns], increasing
+    residuals : ndarray, shape (N, d), coordinates must be independent and have the same statistics
 
     """
     n = len(stamps_ns)
     variance = float(np.mean(residuals**2)) if n > 0 else 0.0
-    white = Autocorrelation(n, 0.0, 0.0, 0.0, float(np.sqrt(variance)))
+    white = Autocorrelation(0.0, 0.0)
     if n < LEAST_RESIDUALS or variance <= 0.0:
         return white
     times = (stamps_ns - stamps_ns[0]) * 1e-9
@@ -77,7 +69,7 @@ def estimate(stamps_ns: IntArray, residuals: FloatArray) -> Autocorrelation:
     first = float(covariance[0]) / variance
     deviation = 1.0 / np.sqrt(n * residuals.shape[1])
     if first < max(LEAST_CORRELATION, SIGNIFICANT * deviation):
-        return white._replace(correlation=first)
+        return white
     faded = np.flatnonzero(covariance < FADED * covariance[0])
     end = int(faded[0]) if len(faded) > 0 else len(lags)
     if end < 2:
@@ -89,8 +81,7 @@ def estimate(stamps_ns: IntArray, residuals: FloatArray) -> Autocorrelation:
             lags[:end] * period, np.log(covariance[:end]), 1, w=covariance[:end])
         tau = -1.0 / slope if slope < 0.0 else float(lags[end - 1] * period)
         correlated = min(float(np.exp(level)), variance)
-    return Autocorrelation(
-        n, first, float(tau), float(np.sqrt(correlated)), float(np.sqrt(variance - correlated)))
+    return Autocorrelation(float(tau), float(np.sqrt(correlated)))
 
 
 def _covariances(ticks: IntArray, residuals: FloatArray) -> tuple[IntArray, FloatArray]:

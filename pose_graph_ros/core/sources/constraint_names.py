@@ -43,10 +43,8 @@ def largest(
     ----------
     graph : Graph
     nodes : HiddenNodes
-    factors : FactorBuilder
-        Knows the sources of the constraints.
-    n : int
-        Number of constraints at most; those without energy are left out.
+    factors : FactorBuilder, knows the sources of the constraints
+    n : int, number of constraints at most; those without energy are left out
 
     """
     tables = constraint_tables(graph)

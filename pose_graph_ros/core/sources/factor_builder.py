@@ -1,13 +1,6 @@
 # Copyright 2026 The pose_graph_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""
-From attached measurements to one update of the graph.
-
-A measurement with a white error becomes an observed node. If the errors of its source are
-correlated in time, it becomes an edge to a state of the source's bias (`GaussMarkovBias`), or an
-observed node with a lower weight (`InflatedWeights`). Once the graph has taken the update, the
-builder registers the constraints for reweighting and records to which source they belong.
-"""
+"""From attached measurements to one update of the graph."""
 
 from dataclasses import dataclass, field
 from typing import NamedTuple
@@ -137,11 +130,15 @@ class FactorBuilder:
     """
     Builds updates of the graph from queues of constraints.
 
+    A measurement with a white error becomes an observed node. If the errors of its source are
+    correlated in time, it becomes an edge to a state of the source's bias (`GaussMarkovBias`), or
+    an observed node with a lower weight (`InflatedWeights`). Once the graph has taken the update,
+    the constraints are registered for reweighting, and the source of each is recorded.
+
     Parameters
     ----------
     config : BackendConfig
-    reweighting : Reweighting
-        Where constraints with a robust loss are registered.
+    reweighting : Reweighting, where constraints with a robust loss are registered
 
     """
 
@@ -178,8 +175,7 @@ class FactorBuilder:
         Parameters
         ----------
         queue : Queue
-        graph : Graph
-            It is not changed.
+        graph : Graph, it is not changed
 
         """
         additions = Additions(GraphSizes(graph.n_nodes, graph.n_edges, graph.n_observed))
@@ -252,10 +248,8 @@ class FactorBuilder:
 
         Parameters
         ----------
-        row : int
-            In the table of edges or of observed nodes.
-        edge : bool
-            Whether it is an edge.
+        row : int, in the table of edges or of observed nodes
+        edge : bool, whether it is an edge
 
         """
         for source, constraints in self._constraints.items():

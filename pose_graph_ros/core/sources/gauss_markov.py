@@ -153,19 +153,13 @@ class GaussMarkovBias:
 
     def add(self, measurement: Absolute, attachment: Attachment, additions: Additions) -> int:
         """
-        Add a measurement, and the state of its bin if it is new.
+        Return the row of the new edge from a measurement's hidden node to the state of its bin.
 
         Parameters
         ----------
         measurement : GlobalPose, Position or HeadingOnly
         attachment : Attachment
-        additions : Additions
-            Receives the new rows.
-
-        Returns
-        -------
-        int
-            Row of the edge from the measurement's hidden node to the state.
+        additions : Additions, receives the edge, and the state if it is new
 
         """
         number, rest_ns = divmod(measurement.stamp_ns, self._width_ns)
@@ -241,20 +235,13 @@ class InflatedWeights:
 
     def add(self, stamp_ns: int, observed: ObservedNodes, additions: Additions) -> int:
         """
-        Add a measurement, and set the weights of all measurements in its bin.
+        Return the row of a new observed node.
 
         Parameters
         ----------
         stamp_ns : int
-        observed : ObservedNodes
-            One row.
-        additions : Additions
-            Receives the new row and the weights.
-
-        Returns
-        -------
-        int
-            Row of the observed node.
+        observed : ObservedNodes, one row
+        additions : Additions, receives the row, and the weights of all measurements in its bin
 
         """
         row = additions.add_observed(observed)

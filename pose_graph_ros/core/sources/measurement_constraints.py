@@ -30,10 +30,8 @@ def attach(nodes: HiddenNodes, stamp_ns: int) -> Attachment | Answer:
 
     Parameters
     ----------
-    nodes : HiddenNodes
-        With at least one node.
-    stamp_ns : int
-        Not later than what odometry covers.
+    nodes : HiddenNodes, with at least one node
+    stamp_ns : int, not later than what odometry covers
 
     """
     first_ns = int(nodes.stamps_ns[0])
@@ -52,8 +50,7 @@ def attach_reference(nodes: HiddenNodes, closure: LoopClosure) -> Attachment | A
     Parameters
     ----------
     nodes : HiddenNodes
-    closure : LoopClosure
-        Names its reference by stamp or by number of the hidden node.
+    closure : LoopClosure, names its reference by stamp or by number of the hidden node
 
     """
     if closure.reference_ns is not None:
@@ -74,8 +71,7 @@ def absolute_constraint(measurement: Absolute, attachment: Attachment) -> Observ
     Parameters
     ----------
     measurement : GlobalPose, Position or HeadingOnly
-    attachment : Attachment
-        Its motion is the offset of the observed node.
+    attachment : Attachment, its motion is the offset of the observed node
 
     """
     offset, noise, information = attachment.motion, attachment.noise, np.zeros((3, 3))
@@ -127,8 +123,7 @@ def loop_closure_constraint(
     Parameters
     ----------
     measurement : LoopClosure
-    reference, attachment : Attachment
-        Of the reference pose and of the later pose.
+    reference, attachment : Attachment, of the reference pose and of the later pose
 
     """
     z = measurement.pose

@@ -1,11 +1,6 @@
 # Copyright 2026 The pose_graph_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""
-From a received measurement to a constraint in the queue, in any order of stamps.
-
-A measurement is validated by the policy of its source, waits until odometry has reached its stamp,
-and is attached to the hidden node before that stamp. Its outcome is counted.
-"""
+"""From a received measurement to a constraint in the queue, in any order of stamps."""
 
 from collections import Counter
 
@@ -46,10 +41,12 @@ class MeasurementPipeline:
     """
     Measurements between their arrival and the update that adds them to the graph.
 
+    A measurement is validated by the policy of its source, waits until odometry has reached its
+    stamp, and is attached to the hidden node before that stamp. Its outcome is counted.
+
     Parameters
     ----------
-    nodes : HiddenNodes
-        What measurements are attached to.
+    nodes : HiddenNodes, what measurements are attached to
     config : BackendConfig
 
     """
@@ -71,17 +68,12 @@ class MeasurementPipeline:
 
     def add(self, measurement: Measurement, source: str) -> Answer:
         """
-        Add a measurement and count the answer.
+        Return the answer to a measurement, which is counted.
 
         Parameters
         ----------
         measurement : Measurement
         source : str
-
-        Returns
-        -------
-        Answer
-            Accepted, pending, or rejected with the reason.
 
         """
         return self.count(source, self._add(measurement, source))
@@ -149,8 +141,7 @@ class MeasurementPipeline:
         ----------
         measurement : GlobalPose, Position or HeadingOnly
         source : str
-        node : int
-            Row of the node in the graph.
+        node : int, row of the node in the graph
 
         """
         self._enqueue(measurement, source, Attachment(node, np.zeros(3), np.zeros((3, 3))))
@@ -179,18 +170,12 @@ class MeasurementPipeline:
 
     def count(self, source: str, answer: Answer) -> Answer:
         """
-        Count an answer and return it.
+        Return an answer after counting it.
 
         Parameters
         ----------
         source : str
-        answer : Answer
-            One that is pending is not counted.
-
-        Returns
-        -------
-        Answer
-            The same one.
+        answer : Answer, one that is pending is not counted
 
         """
         if answer.status is AnswerStatus.ACCEPTED:

@@ -46,10 +46,8 @@ def report(graph: Graph, rows: IntArray, *, biased: bool, white: bool) -> Source
     graph : Graph
     rows : ndarray of int64, shape (K, 2)
         Stamp [ns] and row of each constraint of the source, in the order of their addition.
-    biased : bool
-        Whether the constraints are edges to a bias; else they are observed nodes.
-    white : bool
-        Whether the errors are treated as white.
+    biased : bool, whether the constraints are edges to a bias; else they are observed nodes
+    white : bool, whether the errors are treated as white
 
     """
     newest = rows[-MOST_RESIDUALS:]

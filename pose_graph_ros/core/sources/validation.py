@@ -96,8 +96,7 @@ def repaired(cov: FloatArray, policy: CovariancePolicy) -> FloatArray:
 
     Parameters
     ----------
-    cov : ndarray, shape (d, d)
-        Of x, y and, for d = 3, yaw.
+    cov : ndarray, shape (d, d), of x, y and, for d = 3, yaw
     policy : CovariancePolicy
 
     """

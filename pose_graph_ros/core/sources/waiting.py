@@ -40,18 +40,15 @@ class WaitingMeasurements:
 
     def push(self, source: str, measurement: Measurement) -> WaitingMeasurement | None:
         """
-        Add a measurement.
+        Return the measurement that has to go if there are too many with the one added, else None.
+
+        Of more than `MAX_WAITING` it is the one due last. A sender whose clock is ahead thus does
+        not displace the measurements of others.
 
         Parameters
         ----------
         source : str
         measurement : Measurement
-
-        Returns
-        -------
-        WaitingMeasurement or None
-            If there are more than `MAX_WAITING`, the one that is due last, which is removed. A
-            sender whose clock is ahead thus does not displace the measurements of others.
 
         """
         waiting = WaitingMeasurement(due_ns(measurement), next(self._arrival), source, measurement)
@@ -105,8 +102,7 @@ class SeenStamps:
         Parameters
         ----------
         source : str
-        stamp_ns, period_ns : int
-            [ns]
+        stamp_ns, period_ns : int [ns]
 
         """
         stamps = self._stamps.get(source, _NO_STAMPS)

@@ -28,7 +28,7 @@ def stamps(n: int, period: float) -> np.ndarray:
 
 @pytest.mark.parametrize(('tau', 'period', 'n', 'white'), [
     (5.0, 0.1, 5000, 0.0), (60.0, 0.5, 5000, 0.1), (2.0, 1.0, 2000, 0.3), (60.0, 1.0, 3000, 0.5)])
-def test_tau_and_both_sigmas_are_found(tau: float, period: float, n: int, white: float) -> None:
+def test_tau_and_the_sigma_are_found(tau: float, period: float, n: int, white: float) -> None:
     found = [estimate(stamps(n, period),
                       errors(np.random.default_rng(seed), n, period, tau, white))
              for seed in range(10)]
@@ -36,19 +36,13 @@ def test_tau_and_both_sigmas_are_found(tau: float, period: float, n: int, white:
     assert np.median([one.tau for one in found]) == pytest.approx(tau, rel=0.3)
     assert np.median([one.sigma_correlated for one in found]) == pytest.approx(
         np.sqrt(1.0 - white), abs=0.12)
-    assert np.median([one.sigma_white for one in found]) == pytest.approx(
-        np.sqrt(white), abs=0.15)
 
 
 @settings(max_examples=50)
 @given(seed=st.integers(0, 10**6), n=st.integers(0, 600), period=st.sampled_from((0.1, 1.0)))
 def test_white_errors_are_not_called_correlated(seed: int, n: int, period: float) -> None:
     residuals = np.random.default_rng(seed).standard_normal((n, 2))
-    found = estimate(stamps(n, period), residuals)
-    assert not found.significant
-    assert found.n == n
-    if n > 0:
-        assert found.sigma_white == pytest.approx(np.sqrt(np.mean(residuals**2)))
+    assert not estimate(stamps(n, period), residuals).significant
 
 
 def test_gaps_in_time_are_no_lags() -> None:
@@ -74,9 +68,7 @@ def test_errors_that_are_forgotten_after_one_lag_have_its_time_constant() -> Non
     white = np.random.default_rng(4).standard_normal((3001, 2))
     found = estimate(stamps(3000, 0.5), white[1:] + white[:-1])
     assert found.significant
-    assert found.correlation == pytest.approx(0.5, abs=0.05)
     assert found.tau == pytest.approx(0.5 / np.log(2.0), rel=0.1)
-    assert found.sigma_white == 0.0
 
 
 def test_bursts_without_a_period_are_called_white() -> None:
