@@ -15,7 +15,6 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from pose_graph_ros.core.alignment import estimator
 from pose_graph_ros.core.geometry import se2
 from pose_graph_ros.core.geometry.se2 import FloatArray, IntArray
 from pose_graph_ros.core.geometry.trajectory import Trajectory
@@ -103,7 +102,11 @@ def fit_rigid(source: FloatArray, target: FloatArray) -> FloatArray:
     if source.shape != target.shape or source.ndim != 2 or len(source) == 0:
         raise ValueError(
             f'expected equally many points (N, 2), N > 0, got {source.shape} and {target.shape}')
-    return se2.wrapped(estimator.align(source, target, np.ones(len(source))).T_map_odom)
+    source_mean, target_mean = np.mean(source, axis=0), np.mean(target, axis=0)
+    p, q = source - source_mean, target - target_mean
+    cross = np.sum(p[:, 0] * q[:, 1] - p[:, 1] * q[:, 0])
+    theta = np.arctan2(cross, np.sum(np.sum(p * q, axis=1)))
+    return se2.wrapped(np.append(target_mean - se2.rotation(theta) @ source_mean, theta))
 
 
 def place_odometry(drive: Drive) -> Trajectory:

@@ -119,13 +119,10 @@ def positions_along(
 
     Parameters
     ----------
-    poses : ndarray, shape (N, 3)
-        Poses of the hidden nodes by odometry [m, m, rad].
-    observed : ObservedNodes
-        K >= 1 positions or global poses, whose headings are not used.
+    poses : ndarray, shape (N, 3), poses of the hidden nodes by odometry [m, m, rad]
+    observed : ObservedNodes, K >= 1 positions or global poses, whose headings are not used
     noise : OdometryNoise
-    correlation : TimeCorrelation, optional
-        Correlation of the errors; None for white noise.
+    correlation : TimeCorrelation, optional, correlation of the errors; None for white noise
 
     """
     none = np.zeros(len(observed))
@@ -235,8 +232,7 @@ def mirrored(positions: Positions, found: Consensus, noise: OdometryNoise) -> bo
     Parameters
     ----------
     positions : Positions
-    found : Consensus
-        Result of `consensus` for the same positions.
+    found : Consensus, result of `consensus` for the same positions
     noise : OdometryNoise
 
     """
@@ -317,18 +313,8 @@ def _heading_variance(
     An error e_k of position k, seen in the odometry frame, changes the angle by
     Im(sum conj(lever_k) e_k). The errors of the observed positions are white or correlated in
     time, whichever gives the larger variance. An error of odometry between two positions moves all
-    positions after it, by a turn about the middle of the step and a shift.
-
-    Parameters
-    ----------
-    positions : Positions
-        The inliers.
-    lever : ndarray, shape (K,)
-        w p / sum w |p|^2 with p centred, complex [1/m].
-    z : complex
-        Rotation and scale of the fitted motion.
-    noise : OdometryNoise
-
+    positions after it, by a turn about the middle of the step and a shift. `lever` is
+    w p / sum w |p|^2 with p centred [1/m]; z is rotation and scale of the fitted motion.
     """
     c = lever.conj() / z
     errors = np.einsum('kij,ki->kj', positions.root, np.column_stack((c.imag, c.real)))

@@ -9,7 +9,6 @@ a fit of positions is only valid near them: each stretch of the drive gets its o
 the first few positions is checked again when there are more.
 """
 
-from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
@@ -52,51 +51,6 @@ DISAGREEMENT = 4.0
 LEAST_CORRECTION = 0.3
 
 
-@dataclass(frozen=True, slots=True)
-class Alignment:
-    """Pose of the odometry frame in the map, fitted to positions."""
-
-    T_map_odom: FloatArray
-    """Shape (3,) [m, m, rad]."""
-    sigma_heading: float
-    """Standard deviation of the heading [rad]; infinite without a baseline."""
-    baseline: float
-    """Diagonal of the box around the positions in the odometry frame [m]."""
-    sigma_position: float
-    """Standard deviation of a position, by the mean weight: few poor ones hardly raise it [m]."""
-    scale: float
-    """Ratio of lengths in the map to lengths by odometry."""
-
-
-def align(odometry: FloatArray, observed: FloatArray, variance: FloatArray) -> Alignment:
-    """
-    Return the least-squares pose of the odometry frame in the map, without outlier rejection.
-
-    Parameters
-    ----------
-    odometry, observed : ndarray, shape (K, 2)
-        The same positions in the odometry frame and in the map [m]; K >= 1.
-    variance : ndarray, shape (K,)
-        Variance of each coordinate of the observed positions, as white noise [m^2].
-
-    """
-    weight = 1.0 / variance
-    p_mean = np.average(odometry, axis=0, weights=weight)
-    q_mean = np.average(observed, axis=0, weights=weight)
-    p, q = odometry - p_mean, observed - q_mean
-    cross = np.sum(weight * (p[:, 0] * q[:, 1] - p[:, 1] * q[:, 0]))
-    dot = np.sum(weight * np.sum(p * q, axis=1))
-    theta = float(np.arctan2(cross, dot))
-    spread = float(np.sum(weight * np.sum(p**2, axis=1)))
-    shift = q_mean - se2.rotation(theta) @ p_mean
-    return Alignment(
-        T_map_odom=np.array([shift[0], shift[1], theta]),
-        sigma_heading=1.0 / np.sqrt(spread) if spread > 0.0 else np.inf,
-        baseline=float(np.hypot(*np.ptp(odometry, axis=0))),
-        sigma_position=float(np.sqrt(1.0 / np.mean(weight))),
-        scale=float(np.hypot(cross, dot)) / spread if spread > 0.0 else 0.0)
-
-
 class GraphAlignment(NamedTuple):
     """Pose of a graph in the map, from observed nodes."""
 
@@ -109,23 +63,20 @@ class GraphAlignment(NamedTuple):
 
 
 def find_alignment(
-    poses: FloatArray, observed: ObservedNodes, policy: AlignmentPolicy,
-    noise: OdometryNoise | None = None, correlation: TimeCorrelation | None = None,
+    poses: FloatArray, observed: ObservedNodes, policy: AlignmentPolicy, noise: OdometryNoise,
+    correlation: TimeCorrelation | None = None,
 ) -> GraphAlignment:
     """
     Return the rigid motion that takes a graph into the map, if it is known well enough.
 
     Parameters
     ----------
-    poses : ndarray, shape (N, 3)
-        Hidden nodes in the frame of the graph [m, m, rad].
+    poses : ndarray, shape (N, 3), hidden nodes in the frame of the graph [m, m, rad]
     observed : ObservedNodes
         Positions and global poses on these hidden nodes, in any order; K >= 1.
     policy : AlignmentPolicy
-    noise : OdometryNoise, optional
-        Noise of the odometry between the nodes.
-    correlation : TimeCorrelation, optional
-        Correlation of the errors of the positions; None for white noise.
+    noise : OdometryNoise, noise of the odometry between the nodes
+    correlation : TimeCorrelation, optional, that of the errors; None for white noise
 
     """
     sigma = np.full(len(observed), np.inf)
@@ -136,15 +87,13 @@ def find_alignment(
         predicted = se2.compose(poses[observed.node[best]], observed.offset[best])
         return GraphAlignment(se2.compose(observed.mean[best], se2.inverse(predicted)),
                               float(sigma[best]), int(observed.node[best]))
-    noise = OdometryNoise() if noise is None else noise
     positions = positions_along(poses, observed, noise, correlation)
     return _from_positions(positions, policy, noise)
 
 
 def recheck(
     solved: FloatArray, odometry: FloatArray, observed: ObservedNodes, policy: AlignmentPolicy,
-    noise: OdometryNoise | None = None, *, correlation: TimeCorrelation | None = None,
-    sigma: float = 0.0,
+    noise: OdometryNoise, *, correlation: TimeCorrelation | None = None, sigma: float = 0.0,
 ) -> GraphAlignment | None:
     """
     Return a new alignment if more positions show that the angle in use is wrong.
@@ -155,19 +104,13 @@ def recheck(
 
     Parameters
     ----------
-    solved : ndarray, shape (N, 3)
-        Hidden nodes in the map by the present solution [m, m, rad].
-    odometry : ndarray, shape (N, 3)
-        The same nodes by odometry alone, in the odometry frame [m, m, rad].
-    observed : ObservedNodes
-        All positions and global poses so far, on these nodes; K >= 1.
-    policy, noise, correlation
-        As in `find_alignment`.
-    sigma : float
-        Standard deviation of the angle in use [rad].
+    solved : ndarray, shape (N, 3), hidden nodes in the map by the present solution [m, m, rad]
+    odometry : ndarray, shape (N, 3), the same nodes by odometry alone, in its frame [m, m, rad]
+    observed : ObservedNodes, all positions and global poses so far, on these nodes; K >= 1
+    policy, noise, correlation : as in `find_alignment`
+    sigma : float, standard deviation of the angle in use [rad]
 
     """
-    noise = OdometryNoise() if noise is None else noise
     positions = positions_along(odometry, observed, noise, correlation)
     found = _from_positions(positions, policy, noise)
     if found.T_map_graph is None:
@@ -178,16 +121,8 @@ def recheck(
     return found if difference > limit else None
 
 
-def certain(found: Consensus, policy: AlignmentPolicy) -> bool:
-    """
-    Tell whether the angle of a fit is known well enough to align the graph.
-
-    Parameters
-    ----------
-    found : Consensus
-    policy : AlignmentPolicy
-
-    """
+def _certain(found: Consensus, policy: AlignmentPolicy) -> bool:
+    """Tell whether the angle of a fit is known well enough to align the graph."""
     sigmas = policy.baseline_in_sigmas
     if found.count < 3:
         # only a third position could show that one of the two is wrong
@@ -263,7 +198,7 @@ def _supported(
     """Return the newest certain fit that enough stretches agree with, up to odometry's drift."""
     candidates, n_relevant = [], 0
     for stretch, item in zip(stretches, found, strict=True):
-        if (item is not None and certain(item, policy)
+        if (item is not None and _certain(item, policy)
                 and not mirrored(stretch, item, noise)):
             candidates.append(item)
             n_relevant += 1
@@ -291,31 +226,22 @@ def _supported(
     return candidates[int(np.argmax(good))]
 
 
-class Guess(NamedTuple):
-    """Pose of the robot while the angle is not known."""
-
-    shift: FloatArray
-    """Shift of the graph into the map, shape (3,) [m, m, rad]; that of the heading is 0."""
-    covariance: FloatArray
-    """Covariance of the shifted pose of the robot in map axes, shape (3, 3)."""
-
-
-def guess(poses: FloatArray, newest: FloatArray, observed: ObservedNodes) -> Guess:
+def guess(
+    poses: FloatArray, newest: FloatArray, observed: ObservedNodes,
+) -> tuple[FloatArray, FloatArray]:
     """
     Return a shift of the graph into the map and a covariance while the angle is not known.
 
-    The graph is shifted onto the most certain position. With d the distance from there and an
-    angle that is uniform on the circle, the mean square error of each coordinate is d^2, that of
-    the heading pi^2 / 3.
+    The graph is shifted, without a turn, onto the most certain position. The covariance is that of
+    the shifted pose of the robot in map axes. With d the distance from there and an angle that is
+    uniform on the circle, the mean square error of each coordinate is d^2, that of the heading
+    pi^2 / 3.
 
     Parameters
     ----------
-    poses : ndarray, shape (N, 3)
-        Hidden nodes in the frame of the graph [m, m, rad].
-    newest : ndarray, shape (3,)
-        Pose of the robot in the same frame [m, m, rad].
-    observed : ObservedNodes
-        Positions or global poses on these hidden nodes; K >= 1.
+    poses : ndarray, shape (N, 3), hidden nodes in the frame of the graph [m, m, rad]
+    newest : ndarray, shape (3,), pose of the robot in the same frame [m, m, rad]
+    observed : ObservedNodes, positions or global poses on these hidden nodes; K >= 1
 
     """
     certainty = np.trace(observed.information[:, :2, :2], axis1=1, axis2=2)
@@ -327,4 +253,4 @@ def guess(poses: FloatArray, newest: FloatArray, observed: ObservedNodes) -> Gue
     shift[2] = 0.0
     where = se2.compose(poses[first.node], first.offset)[0]
     variance = float(np.sum((newest[:2] - where[:2])**2) + 2.0 / certainty[best])
-    return Guess(shift, np.diag((variance, variance, UNKNOWN_HEADING_VARIANCE)))
+    return shift, np.diag((variance, variance, UNKNOWN_HEADING_VARIANCE))

@@ -1,11 +1,6 @@
 # Copyright 2026 The pose_graph_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""
-Decision when to align the graph with the map, and when to correct that.
-
-The graph is aligned as soon as measurements determine the angle. Whenever the number of
-measurements has doubled, the angle is checked with all of them, as the first few may be wrong.
-"""
+"""Decision when to align the graph with the map, and when to correct that."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -75,7 +70,12 @@ class Evidence(NamedTuple):
 
 
 class AlignmentMonitor:
-    """Aligns the graph with the map, and checks the alignment as measurements are added."""
+    """
+    Aligns the graph with the map as soon as measurements determine the angle between them.
+
+    Whenever the number of measurements has doubled, the angle is checked with all of them, as the
+    first few may be wrong.
+    """
 
     def __init__(self, config: BackendConfig) -> None:
         self._config = config
@@ -100,12 +100,9 @@ class AlignmentMonitor:
 
         Parameters
         ----------
-        poses : ndarray, shape (N, 3)
-            Hidden nodes in the frame of the graph [m, m, rad].
-        waiting : list of AttachedMeasurement
-            Measurements on these nodes that are not in the graph yet.
-        primary : str
-            Name of the primary odometry source.
+        poses : ndarray, shape (N, 3), hidden nodes in the frame of the graph [m, m, rad]
+        waiting : list of AttachedMeasurement, on these nodes, not in the graph yet
+        primary : str, name of the primary odometry source
 
         """
         if self.state is AlignmentState.ALIGNED or len(waiting) == 0:
@@ -145,8 +142,7 @@ class AlignmentMonitor:
 
         Parameters
         ----------
-        solved : ndarray, shape (N, 3)
-            All rows of the graph in the map, by the present solution.
+        solved : ndarray, shape (N, 3), all rows of the graph in the map, by the present solution
         nodes : HiddenNodes
 
         """
