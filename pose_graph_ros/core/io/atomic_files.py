@@ -22,13 +22,8 @@ def write_files(contents: Mapping[Path, bytes]) -> None:
     """
     Write files of one folder, all of them or none; missing folders are created.
 
-    They are renamed in the order of `contents`.
-
-    Raises
-    ------
-    FileWriteError
-        If that fails. Previous files are then unchanged, and no temporary ones are left.
-
+    They are renamed in the order of `contents`. After a FileWriteError previous files are
+    unchanged, and no temporary ones are left.
     """
     suffix = f'.{secrets.token_hex(4)}'
     fresh = {path: path.with_name(f'.{path.name}{suffix}.new') for path in contents}

@@ -56,21 +56,14 @@ def capture(
     Return the state of an engine as a value.
 
     Measurements that wait are left out and do not count as seen. Edges in the queue for the next
-    update are saved.
+    update are saved. Raises NothingToSaveError if there is no hidden node.
 
     Parameters
     ----------
-    parts : Parts
-        They are not changed.
-    newest_covariance : ndarray, shape (3, 3)
-        Of the newest hidden node, in map axes.
+    parts : Parts, they are not changed
+    newest_covariance : ndarray, shape (3, 3), of the newest hidden node, in map axes
     chi2 : float
     datum : MapOrigin or None
-
-    Raises
-    ------
-    NothingToSaveError
-        If there is no hidden node.
 
     """
     if len(parts.nodes) == 0:
@@ -101,14 +94,8 @@ def restore(parts: Parts, saved: SavedGraph) -> None:
 
     Parameters
     ----------
-    parts : Parts
-        Of an engine that has received nothing yet.
-    saved : SavedGraph
-
-    Raises
-    ------
-    GraphUpdateError
-        If the rows of the graph are not valid.
+    parts : Parts, of an engine that has received nothing yet
+    saved : SavedGraph, GraphUpdateError is raised if its rows of the graph are not valid
 
     """
     parts.graph.fill(saved.rows)

@@ -90,28 +90,17 @@ class _Rows:
 
 def read_g2o(path: Path, edge2_order: str | None = None) -> GraphFile:
     """
-    Read a planar graph.
+    Return the planar graph in a file, its hidden nodes in the order of their ids.
+
+    Without `FIX` and without priors the node with the smallest id is fixed. The pose of a node
+    without `VERTEX_SE2` is composed from edges, breadth-first from the nodes with a pose, else
+    from the smallest id. If the file is not such a graph, a FileFormatError names the file and
+    the line, what was expected and what was found.
 
     Parameters
     ----------
     path : Path
-    edge2_order : {'toro', 'isam'}, optional
-        Format of `EDGE2` in this file.
-
-    Returns
-    -------
-    GraphFile
-        Hidden nodes in the order of their ids. Without `FIX` and without priors the node with the
-        smallest id is fixed. The pose of a node without `VERTEX_SE2` is composed from edges,
-        breadth-first from the nodes with a pose, else from the smallest id.
-
-    Raises
-    ------
-    FileFormatError
-        If the file is not such a graph; the message names the file and the line, what was expected
-        and what was found.
-    ValueError
-        If `edge2_order` is unknown.
+    edge2_order : {'toro', 'isam'}, optional, format of `EDGE2` in this file, else ValueError
 
     """
     if edge2_order is not None and edge2_order not in EDGE2_ORDERS:
@@ -308,8 +297,7 @@ def write_g2o(graph: Graph, path: Path, ids: IntArray | None = None) -> None:
     ----------
     graph : Graph
     path : Path
-    ids : ndarray, shape (N,), optional
-        Id of each hidden node; by default its row in the graph.
+    ids : ndarray, shape (N,), optional, id of each hidden node; by default its row in the graph
 
     """
     path.write_text(g2o_text(graph.rows(), ids), encoding='ascii')
@@ -322,8 +310,7 @@ def g2o_text(rows: GraphRows, ids: IntArray | None = None) -> str:
     Parameters
     ----------
     rows : GraphRows
-    ids : ndarray, shape (N,), optional
-        Id of each hidden node; by default its row in the graph.
+    ids : ndarray, shape (N,), optional, id of each hidden node; by default its row in the graph
 
     """
     ids = np.arange(len(rows.poses)) if ids is None else ids

@@ -87,23 +87,15 @@ def graph_paths(path: Path) -> tuple[Path, Path, Path]:
 
 def write_graph(saved: SavedGraph, path: Path) -> tuple[Path, Path, Path]:
     """
-    Write the files of a saved graph, all or none; missing folders are created.
+    Return the paths of the g2o, JSON and TUM file of a saved graph, written all or none.
+
+    Missing folders are created. If that fails, or the path is a folder, a FileWriteError is
+    raised, and previous files are unchanged.
 
     Parameters
     ----------
     saved : SavedGraph
-    path : Path
-        Path of the g2o file, with or without suffix; the other files are beside it.
-
-    Returns
-    -------
-    tuple of Path
-        The written files: g2o, JSON, TUM.
-
-    Raises
-    ------
-    FileWriteError
-        If that fails, or the path is a folder. Previous files are then unchanged.
+    path : Path, path of the g2o file, with or without suffix; the other files are beside it
 
     """
     if path.name == '' or os.path.isdir(path):
@@ -127,12 +119,8 @@ def read_graph(path: Path) -> SavedGraph:
     """
     Read a saved graph, given the path of its g2o file with or without suffix.
 
-    Raises
-    ------
-    FileFormatError
-        If a file is missing, damaged, truncated, of another version or of another graph than the
-        one beside it. The message names the file, what was expected and what was found.
-
+    Raises FileFormatError if a file is missing, damaged, truncated, of another version or of
+    another graph than the one beside it; the message names it, what was expected and found.
     """
     if path.name == '':
         raise FileFormatError(f'{path}: expected the name of a file')

@@ -41,22 +41,15 @@ def annotations(kind: Any) -> Mapping[str, Any]:
 
 def decoded(kind: Any, plain: Any, where: str) -> Any:
     """
-    Return the value that `encoded` was given.
+    Return the value that `encoded` was given, or raise ValueError if it is not of its kind.
+
+    The message names the place, what was expected and what was found.
 
     Parameters
     ----------
-    kind : type
-        Annotation of the value.
-    plain : object
-        Value of the JSON file.
-    where : str
-        Name of the value in error messages.
-
-    Raises
-    ------
-    ValueError
-        If the value is not of that kind; the message names the place, what was expected and what
-        was found.
+    kind : type, annotation of the value
+    plain : object, value of the JSON file
+    where : str, name of the value in error messages
 
     """
     origin, arguments = get_origin(kind), get_args(kind)

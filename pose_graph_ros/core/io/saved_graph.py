@@ -57,14 +57,9 @@ class SavedGraph:
 
     def check(self) -> None:
         """
-        Check that all sizes, indices and stamps are consistent.
+        Raise ValueError unless all sizes, indices and stamps are consistent; it names the place.
 
-        Raises
-        ------
-        ValueError
-            If they are not; the message names the place. For rows of the graph it is the subclass
-            GraphUpdateError.
-
+        For rows of the graph it is the subclass GraphUpdateError.
         """
         rows, nodes = self.rows, self.nodes
         for table in (rows.edges, rows.observed):
