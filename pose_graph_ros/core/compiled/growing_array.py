@@ -14,10 +14,8 @@ class GrowingArray:
 
     Parameters
     ----------
-    row_shape : tuple of int
-        Shape of one row; `()` for numbers.
-    dtype : dtype
-        Type of the elements.
+    row_shape : tuple of int, shape of one row; `()` for numbers
+    dtype : dtype, type of the elements
 
     """
 

@@ -53,8 +53,7 @@ def kernel(
     allocates : bool
         Whether the kernel allocates arrays, or calls a kernel that returns a new array. Only then
         are references counted; without it all arrays must belong to the caller or the tables.
-    **options
-        Options of `numba.njit`, which override `OPTIONS`.
+    **options : options of `numba.njit`, which override `OPTIONS`
 
     """
     if function is None:
@@ -99,13 +98,8 @@ def is_cached(*kernels: Function) -> bool:
     """
     Tell whether all kernels have valid code in the cache, for at least one signature each.
 
-    This takes about a millisecond per kernel, and neither loads nor compiles code.
-
-    Parameters
-    ----------
-    *kernels : kernel
-        Default: all kernels imported so far.
-
+    This takes about a millisecond per kernel, and neither loads nor compiles code. By default it
+    tells so of all kernels imported so far.
     """
     caches = [kernel._cache for kernel in kernels or _registered.values()  # noqa: SLF001
               if isinstance(kernel, Dispatcher)]

@@ -227,20 +227,7 @@ class _Contents(CompileResultCacheImpl):  # type: ignore[misc]  # Numba is untyp
 
 
 class KernelCache(FunctionCache):  # type: ignore[misc]
-    """
-    The cache of one kernel.
-
-    Parameters
-    ----------
-    dispatcher : Dispatcher
-        The kernel.
-
-    Raises
-    ------
-    RuntimeError
-        If no folder is writeable.
-
-    """
+    """The cache of one kernel; RuntimeError if no folder is writeable."""
 
     _impl_class = _Contents
 
@@ -255,8 +242,7 @@ class KernelCache(FunctionCache):  # type: ignore[misc]
 
         Parameters
         ----------
-        signature, target_context
-            As Numba passes them.
+        signature, target_context : as Numba passes them
 
         """
         try:
@@ -275,8 +261,7 @@ class KernelCache(FunctionCache):  # type: ignore[misc]
 
         Parameters
         ----------
-        signature, result
-            As Numba passes them.
+        signature, result : as Numba passes them
 
         """
         try:

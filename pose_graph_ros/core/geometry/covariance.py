@@ -53,8 +53,7 @@ def floored(covariance: FloatArray, floors: FloatArray) -> FloatArray:
     Parameters
     ----------
     covariance : ndarray, shape (d, d)
-    floors : ndarray, shape (d,)
-        Lower bounds of the variances.
+    floors : ndarray, shape (d,), lower bounds of the variances
 
     """
     covariance = 0.5 * (covariance + covariance.T)
@@ -73,8 +72,7 @@ def turned(covariance: FloatArray, theta: float) -> FloatArray:
     Parameters
     ----------
     covariance : ndarray, shape (2, 2) or (3, 3)
-    theta : float
-        Angle from the old axes to the new ones [rad].
+    theta : float, angle from the old axes to the new ones [rad]
 
     """
     axes = np.eye(len(covariance))
@@ -96,14 +94,10 @@ def propagated(
 
     Parameters
     ----------
-    pose : ndarray, shape (3,)
-        `T_map_a` [m, m, rad].
-    covariance : ndarray, shape (3, 3)
-        Of the pose, in map axes.
-    increment : ndarray, shape (3,)
-        `T_a_b` [m, m, rad].
-    noise : ndarray, shape (3, 3)
-        Covariance of the increment, in frame b.
+    pose : ndarray, shape (3,), `T_map_a` [m, m, rad]
+    covariance : ndarray, shape (3, 3), of the pose, in map axes
+    increment : ndarray, shape (3,), `T_a_b` [m, m, rad]
+    noise : ndarray, shape (3, 3), covariance of the increment, in frame b
 
     """
     end = se2.compose(pose, increment)

@@ -41,21 +41,13 @@ class MapOrigin(NamedTuple):
 
 class TangentPlane:
     """
-    Local tangent plane at a datum.
+    Local tangent plane at a datum; ValueError if that is out of range or not finite.
 
     Parameters
     ----------
-    latitude, longitude : float
-        Of the datum, WGS 84 [degrees].
-    altitude : float
-        Of the datum above the ellipsoid [m].
-    yaw : float
-        Angle of the map's x axis from east, counter-clockwise [rad].
-
-    Raises
-    ------
-    ValueError
-        If latitude or longitude are out of range, or a number is not finite.
+    latitude, longitude : float, of the datum, WGS 84 [degrees]
+    altitude : float, of the datum above the ellipsoid [m]
+    yaw : float, angle of the map's x axis from east, counter-clockwise [rad]
 
     """
 
@@ -88,10 +80,8 @@ class TangentPlane:
 
         Parameters
         ----------
-        latitude, longitude : array_like, shape (...)
-            WGS 84 [degrees].
-        altitude : array_like, shape (...)
-            Above the ellipsoid [m].
+        latitude, longitude : array_like, shape (...), WGS 84 [degrees]
+        altitude : array_like, shape (...), above the ellipsoid [m]
 
         """
         east, north, _ = self._projection.transform(longitude, latitude, altitude)
@@ -103,8 +93,7 @@ class TangentPlane:
 
         Parameters
         ----------
-        position : ndarray, shape (..., 2)
-            In the map [m].
+        position : ndarray, shape (..., 2), in the map [m]
         altitude : float, optional
             Of all points above the ellipsoid [m]. Default: the points lie in the plane.
 
@@ -127,8 +116,7 @@ def distances(point: MapOrigin, latitude: npt.ArrayLike, longitude: npt.ArrayLik
     Parameters
     ----------
     point : MapOrigin
-    latitude, longitude : array_like, shape (N,) or ()
-        WGS 84 [degrees].
+    latitude, longitude : array_like, shape (N,) or (), WGS 84 [degrees]
 
     """
     latitude, longitude = (

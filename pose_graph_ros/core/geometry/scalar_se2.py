@@ -26,8 +26,7 @@ def compose_one(a: Pose, b: Pose) -> Pose:
 
     Parameters
     ----------
-    a, b : Pose
-        `T_a_b` and `T_b_c`.
+    a, b : Pose, `T_a_b` and `T_b_c`
 
     """
     c, s = math.cos(a[2]), math.sin(a[2])
@@ -40,8 +39,7 @@ def between_one(a: Pose, b: Pose) -> Pose:
 
     Parameters
     ----------
-    a, b : Pose
-        `T_w_a` and `T_w_b`, in the same frame w.
+    a, b : Pose, `T_w_a` and `T_w_b`, in the same frame w
 
     """
     c, s = math.cos(a[2]), math.sin(a[2])

@@ -56,10 +56,8 @@ def transform(pose: FloatArray, point: FloatArray) -> FloatArray:
 
     Parameters
     ----------
-    pose : ndarray, shape (..., 3)
-        `T_w_a`.
-    point : ndarray, shape (..., 2)
-        In frame a [m].
+    pose : ndarray, shape (..., 3), `T_w_a`
+    point : ndarray, shape (..., 2), in frame a [m]
 
     """
     c, s = np.cos(pose[..., 2]), np.sin(pose[..., 2])
@@ -73,8 +71,7 @@ def compose(a: FloatArray, b: FloatArray) -> FloatArray:
 
     Parameters
     ----------
-    a, b : ndarray, shape (..., 3)
-        `T_a_b` and `T_b_c`.
+    a, b : ndarray, shape (..., 3), `T_a_b` and `T_b_c`
 
     """
     position = transform(a, b[..., :2])
@@ -95,8 +92,7 @@ def between(a: FloatArray, b: FloatArray) -> FloatArray:
 
     Parameters
     ----------
-    a, b : ndarray, shape (..., 3)
-        `T_w_a` and `T_w_b`, in the same frame w.
+    a, b : ndarray, shape (..., 3), `T_w_a` and `T_w_b`, in the same frame w
 
     """
     c, s = np.cos(a[..., 2]), np.sin(a[..., 2])
@@ -111,8 +107,7 @@ def interpolate(a: FloatArray, b: FloatArray, fraction: npt.ArrayLike) -> FloatA
     Parameters
     ----------
     a, b : ndarray, shape (..., 3)
-    fraction : array_like, shape (...)
-        0 gives a; 1 gives b, except for rounding errors.
+    fraction : array_like, shape (...), 0 gives a; 1 gives b, except for rounding errors
 
     """
     f = np.asarray(fraction, dtype=np.float64)[..., None]

@@ -16,11 +16,7 @@ class Trajectory:
     """
     Poses of the robot at strictly increasing stamps; the arrays are read-only.
 
-    Raises
-    ------
-    ValueError
-        If the shapes do not match or the stamps do not increase.
-
+    Raises ValueError if the shapes do not match or the stamps do not increase.
     """
 
     stamps_ns: IntArray
@@ -57,11 +53,7 @@ class Trajectory:
         """
         Return the interpolated poses, shape (..., 3), at stamps [ns], shape (...).
 
-        Raises
-        ------
-        ValueError
-            If a stamp lies outside the trajectory: poses are not extrapolated.
-
+        Raises ValueError if a stamp lies outside the trajectory: poses are not extrapolated.
         """
         stamps = np.asarray(stamps_ns, dtype=np.int64)
         inside = self.covers(stamps)
