@@ -91,12 +91,8 @@ def _update_pose(f):  # type: ignore[no-untyped-def]
 @kernel
 def gauss_newton_step(head):  # type: ignore[no-untyped-def]
     """Solve for all nodes and move them; return the largest change of a coordinate [m, rad]."""
-    node_f = tb.node_f(head)
-    pool_f = tb.pool_f(head)
-    work_f = tb.work_f(head)
-    node_i = tb.node_i(head)
-    clique_i = tb.clique_i(head)
-    pool_i = tb.pool_i(head)
+    node_f, pool_f, work_f = tb.node_f(head), tb.pool_f(head), tb.work_f(head)
+    node_i, clique_i, pool_i = tb.node_i(head), tb.clique_i(head), tb.pool_i(head)
     largest = 0.0
     for c in range(head[tb.N_CLIQUES] - 1, -1, -1):
         row = clique_i[c]
@@ -129,12 +125,8 @@ def chord_step(head, right):  # type: ignore[no-untyped-def]
     `right`, -b at the poses from `evaluate`, shape (N, 3), is overwritten by the step. Return the
     largest change of a coordinate [m, rad].
     """
-    node_f = tb.node_f(head)
-    pool_f = tb.pool_f(head)
-    work_f = tb.work_f(head)
-    node_i = tb.node_i(head)
-    clique_i = tb.clique_i(head)
-    pool_i = tb.pool_i(head)
+    node_f, pool_f, work_f = tb.node_f(head), tb.pool_f(head), tb.work_f(head)
+    node_i, clique_i, pool_i = tb.node_i(head), tb.clique_i(head), tb.pool_i(head)
     n_cliques = head[tb.N_CLIQUES]
     for c in range(n_cliques):
         row = clique_i[c]
@@ -192,11 +184,8 @@ def evaluate(head, right):  # type: ignore[no-untyped-def]
 
     `right`, shape (N, 3), receives -b: half the gradient of chi2, with negative sign.
     """
-    node_f = tb.node_f(head)
-    edge_f = tb.edge_f(head)
-    observed_f = tb.observed_f(head)
-    edge_i = tb.edge_i(head)
-    observed_i = tb.observed_i(head)
+    node_f, edge_f, observed_f = tb.node_f(head), tb.edge_f(head), tb.observed_f(head)
+    edge_i, observed_i = tb.edge_i(head), tb.observed_i(head)
     right[:] = 0.0
     chi2 = gradient_sum = reach = 0.0
     for e in range(head[tb.N_EDGES]):

@@ -25,18 +25,10 @@ def eliminate_clique(head, c, relinearize):  # type: ignore[no-untyped-def]
         they were linearized may have turned since. Their rows are logged for a rollback.
 
     """
-    node_f = tb.node_f(head)
-    edge_f = tb.edge_f(head)
-    observed_f = tb.observed_f(head)
-    pool_f = tb.pool_f(head)
-    work_f = tb.work_f(head)
-    scalars = tb.scalars(head)
-    node_i = tb.node_i(head)
-    edge_i = tb.edge_i(head)
-    observed_i = tb.observed_i(head)
-    clique_f = tb.clique_f(head)
-    clique_i = tb.clique_i(head)
-    pool_i = tb.pool_i(head)
+    node_f, edge_f, observed_f = tb.node_f(head), tb.edge_f(head), tb.observed_f(head)
+    pool_f, work_f, scalars = tb.pool_f(head), tb.work_f(head), tb.scalars(head)
+    node_i, edge_i, observed_i = tb.node_i(head), tb.edge_i(head), tb.observed_i(head)
+    clique_f, clique_i, pool_i = tb.clique_f(head), tb.clique_i(head), tb.pool_i(head)
     row = clique_i[c]
     n_frontal, n_separator = row[tb.N_FRONTAL], row[tb.N_SEPARATOR]
     n_all = n_frontal + n_separator
@@ -129,12 +121,8 @@ def eliminate_clique(head, c, relinearize):  # type: ignore[no-untyped-def]
 @kernel
 def _extend_add(head, child, front, ld):  # type: ignore[no-untyped-def]
     """Add the update matrix of a child to the front; INDEX of the front's nodes must be set."""
-    pool_f = tb.pool_f(head)
-    node_i = tb.node_i(head)
-    clique_f = tb.clique_f(head)
-    node_f = tb.node_f(head)
-    work_f = tb.work_f(head)
-    clique_i = tb.clique_i(head)
+    pool_f, node_i, clique_f = tb.pool_f(head), tb.node_i(head), tb.clique_f(head)
+    node_f, work_f, clique_i = tb.node_f(head), tb.work_f(head), tb.clique_i(head)
     pool_i = tb.pool_i(head)
     row = clique_i[child]
     n_frontal, n_separator = row[tb.N_FRONTAL], row[tb.N_SEPARATOR]

@@ -98,8 +98,7 @@ def turned_update(update, n, nodes, node_f, phi, to):  # type: ignore[no-untyped
 
     Parameters
     ----------
-    update : ndarray, flat
-        Upper triangle of 3n columns and the right-hand side, laid out by `pools.row_start`.
+    update : ndarray, flat, 3n columns and the right-hand side, laid out by `pools.row_start`
     n : int, number of separator nodes
     nodes : ndarray of int32, shape (n,), separator nodes
     node_f : ndarray, table of the nodes

@@ -198,8 +198,7 @@ def backward_rows(values, rows, n, x):  # type: ignore[no-untyped-def]
     Parameters
     ----------
     values, rows, n : as for `forward_rows`
-    x : ndarray, shape (n,)
-        y, then the solution of the separator; y is replaced by the solution of the frontal nodes.
+    x : ndarray, shape (n,), y, then the solution of the separator; y becomes the solution
 
     """
     for k in range(rows - 3, -1, -3):
@@ -214,8 +213,7 @@ def solve_rows(values, rows, n, x):  # type: ignore[no-untyped-def]
     Parameters
     ----------
     values, rows, n : as for `forward_rows`
-    x : ndarray, shape (n,)
-        Solution of the separator, from index `rows` on; receives that of the frontal nodes.
+    x : ndarray, shape (n,), solution of the separator; receives that of the frontal nodes
 
     """
     for k in range(rows - 3, -1, -3):

@@ -67,8 +67,7 @@ def minimum_degree(n, n_elements, n_last, start, adjacency):  # type: ignore[no-
     ----------
     n, n_elements : int, nodes are 0 to n - 1, elements from the start n to n + n_elements - 1
     n_last : int, number of nodes, the last of the list, that are eliminated last, in their order
-    start : ndarray of int32, shape (n + n_elements + 1,)
-        Where the list of each node and element begins in `adjacency`.
+    start : ndarray of int32, shape (n + n_elements + 1,), where each list begins in `adjacency`
     adjacency : ndarray of int32
         For a node, first the elements that it is a member of (numbers from n on), then its
         neighbours, without repetitions; for an element, its nodes.
@@ -76,10 +75,8 @@ def minimum_degree(n, n_elements, n_last, start, adjacency):  # type: ignore[no-
     Returns
     -------
     n_cliques : int
-    offset : ndarray of int32
-        Where the nodes of clique k begin in `nodes`; they end where those of k + 1 begin.
-    n_frontal : ndarray of int32
-        Number of frontal nodes of each clique, which come first; the others are the separator.
+    offset : ndarray of int32, where the nodes of each clique begin in `nodes`, and the last end
+    n_frontal : ndarray of int32, number of frontal nodes, which come before the separator
     parent : ndarray of int32, shape (n_cliques + n_elements,)
         Parent of each clique, -1 for a root, then of each element from the start. The nodes of the
         parent include the separator, or the nodes of the element.

@@ -53,11 +53,8 @@ def structure(head, marked, affected):  # type: ignore[no-untyped-def]
     affected : ndarray of int32, nodes to be ordered
 
     """
-    edge_f = tb.edge_f(head)
-    node_i = tb.node_i(head)
-    edge_i = tb.edge_i(head)
-    clique_i = tb.clique_i(head)
-    pool_i = tb.pool_i(head)
+    edge_f, node_i, edge_i = tb.edge_f(head), tb.node_i(head), tb.edge_i(head)
+    clique_i, pool_i = tb.clique_i(head), tb.pool_i(head)
     n = len(affected)
     serial = head[tb.FRONT_SERIAL] + 1
     head[tb.FRONT_SERIAL] = serial
@@ -146,19 +143,15 @@ def amalgamate(  # type: ignore[no-untyped-def]
     n_cliques, n_frontal, offset, parent, most_zeros, most_frontal,
 ):
     """
-    Merge cliques into their parents where that stores few explicit zero blocks.
+    Return into which clique to merge each: a parent where that stores few explicit zero blocks.
 
-    Nothing is merged into the last clique, that of the newest pose: the next edge changes it.
+    That is itself, or a later one, but never the last, that of the newest pose: the next edge
+    changes it. With them come the numbers of frontal nodes after merging.
 
     Parameters
     ----------
     n_cliques, n_frontal, offset, parent : as returned by `ordering.minimum_degree`
     most_zeros, most_frontal : int, limits of the zero blocks and frontal nodes of a merged clique
-
-    Returns
-    -------
-    into : ndarray of int32, for each clique the one that it is merged into: itself, or a later one
-    frontal : ndarray of int32, number of frontal nodes after merging
 
     """
     into = np.arange(n_cliques).astype(np.int32)

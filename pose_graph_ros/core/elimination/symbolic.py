@@ -224,11 +224,8 @@ def loose_part(head):  # type: ignore[no-untyped-def]
 
     Return the first hidden node in such a part, or -1, and the number of nodes in all of them.
     """
-    edge_f = tb.edge_f(head)
-    observed_f = tb.observed_f(head)
-    node_i = tb.node_i(head)
-    edge_i = tb.edge_i(head)
-    observed_i = tb.observed_i(head)
+    edge_f, observed_f, node_i = tb.edge_f(head), tb.observed_f(head), tb.node_i(head)
+    edge_i, observed_i = tb.edge_i(head), tb.observed_i(head)
     n = head[tb.N_NODES]
     part = np.arange(n).astype(np.int32)  # union-find: an earlier node of the same part
     for e in range(head[tb.N_EDGES]):

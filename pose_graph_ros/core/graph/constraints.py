@@ -126,8 +126,7 @@ class Edges(_Table):
         Inverse covariances of the errors (3.48), in the frames of the measured poses; of edges to
         a bias in map axes.
     kind : array_like of int, shape (M,), `EdgeKind`
-    weight : array_like, shape (M,), optional
-        Factors on the information, 1 by default; 0 for a removed edge.
+    weight : array_like, shape (M,), optional, factors on the information: 0 removed, default 1
     bias : array_like, shape (M, 4), optional
         Measured offset in i and factors of the bias, `(o_x, o_y, f_t, f_th)` [m, m, m, rad]; used
         for edges to a bias only.
@@ -176,8 +175,7 @@ class ObservedNodes(_Table):
     information : array_like, shape (K, 3, 3)
         Inverse covariances of the errors (3.52), in the frames of the observed poses.
     kind : array_like of int, shape (K,), `ObservedKind`
-    weight : array_like, shape (K,), optional
-        Factors on the information, 1 by default; 0 for a removed observed node.
+    weight : array_like, shape (K,), optional, factors on the information: 0 removed, default 1
 
     """
 
@@ -227,20 +225,16 @@ _ROW_SHAPES = {'mean': (3,), 'offset': (3,), 'information': (3, 3), 'bias': (4,)
 
 def check(table: Edges | ObservedNodes, is_bias: npt.NDArray[np.bool_]) -> None:
     """
-    Validate constraints.
+    Raise GraphUpdateError for invalid constraints, with the row, what was expected and the value.
+
+    Invalid are wrong shapes, kinds or nodes, negative weights, an edge from a node to itself, an
+    edge to a bias that is not of the kind BIAS or an edge of that kind to a pose, numbers that are
+    not finite, an information matrix that is zero, not symmetric or not positive semidefinite.
 
     Parameters
     ----------
     table : Edges or ObservedNodes
     is_bias : ndarray of bool, shape (N,), which of the hidden nodes are biases
-
-    Raises
-    ------
-    GraphUpdateError
-        With the row, what was expected and the value: wrong shapes, kinds or nodes, negative
-        weights, an edge from a node to itself, an edge to a bias that is not of the kind BIAS or
-        an edge of that kind to a pose, numbers that are not finite, an information matrix that is
-        zero, not symmetric or not positive semidefinite.
 
     """
     name, n_nodes = type(table).__name__, len(is_bias)

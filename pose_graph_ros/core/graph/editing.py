@@ -131,9 +131,7 @@ def _touch_edge(head, e):  # type: ignore[no-untyped-def]
 @kernel
 def _start_edges(head, first, last):  # type: ignore[no-untyped-def]
     """Add the edges in new rows to the lists of their ends, and linearize them."""
-    edge_f = tb.edge_f(head)
-    scalars = tb.scalars(head)
-    node_i = tb.node_i(head)
+    edge_f, scalars, node_i = tb.edge_f(head), tb.scalars(head), tb.node_i(head)
     edge_i = tb.edge_i(head)
     for e in range(first, last):
         f, row = edge_f[e], edge_i[e]
@@ -156,9 +154,7 @@ def _start_edges(head, first, last):  # type: ignore[no-untyped-def]
 @kernel
 def _start_observed(head, first, last):  # type: ignore[no-untyped-def]
     """Add the observed nodes in new rows to the lists of their hidden nodes; linearize them."""
-    observed_f = tb.observed_f(head)
-    scalars = tb.scalars(head)
-    node_i = tb.node_i(head)
+    observed_f, scalars, node_i = tb.observed_f(head), tb.scalars(head), tb.node_i(head)
     observed_i = tb.observed_i(head)
     for k in range(first, last):
         f, row = observed_f[k], observed_i[k]
@@ -254,8 +250,7 @@ def add_rows(  # type: ignore[no-untyped-def]
 
     Parameters
     ----------
-    hidden, biases : ndarray, shapes (N, 3) and (S, 3)
-        Poses of new hidden nodes, then values of new biases.
+    hidden, biases : ndarray, shapes (N, 3) and (S, 3), poses of new nodes, values of new biases
     i, j, mean, information, kind, weight, bias : ndarray, columns of `Edges`
     node, offset, observed_mean, observed_information, observed_kind, observed_weight : ndarray
         Columns of `ObservedNodes`.
@@ -299,12 +294,8 @@ def add_rows(  # type: ignore[no-untyped-def]
 @kernel
 def restart(head):  # type: ignore[no-untyped-def]
     """Remove all cliques, linearize all constraints at the present poses and touch all nodes."""
-    node_f = tb.node_f(head)
-    edge_f = tb.edge_f(head)
-    observed_f = tb.observed_f(head)
-    scalars = tb.scalars(head)
-    node_i = tb.node_i(head)
-    edge_i = tb.edge_i(head)
+    node_f, edge_f, observed_f = tb.node_f(head), tb.edge_f(head), tb.observed_f(head)
+    scalars, node_i, edge_i = tb.scalars(head), tb.node_i(head), tb.edge_i(head)
     observed_i = tb.observed_i(head)
     head[tb.N_CLIQUES] = head[tb.POOL_F_END] = head[tb.POOL_I_END] = 0
     head[tb.FREE_CLIQUE] = -1

@@ -96,8 +96,7 @@ def check_edge(head, e, phi):  # type: ignore[no-untyped-def]
     Parameters
     ----------
     e : int
-    phi : float
-        Turn of the frame of the edge's clique since the linearization [rad]; see `clique_frames`.
+    phi : float, turn of its clique's frame since the linearization [rad]; see `clique_frames`
 
     """
     node_f, edge_f, edge_i = tb.node_f(head), tb.edge_f(head), tb.edge_i(head)
@@ -219,9 +218,8 @@ def add_edge(head, e, a, b, front, ld):  # type: ignore[no-untyped-def]
     ----------
     e : int
     a, b : int, rows of the front at which the blocks of its ends i and j begin
-    front : ndarray, flat
+    front, ld : ndarray, int
         Upper triangle, stored by rows of `ld` numbers, the last of which is the right-hand side.
-    ld : int
 
     """
     node_f, edge_f, edge_i = tb.node_f(head), tb.edge_f(head), tb.edge_i(head)

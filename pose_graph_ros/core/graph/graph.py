@@ -258,7 +258,7 @@ class Graph:
             for suffix in ('_f', '_i'):
                 memory.ensure(name + suffix, needed, keep=used)
         nodes, edges, observed = (
-            memory.capacity(name) for name in ('node_f', 'edge_f', 'observed_f'))
+            len(memory[name]) for name in ('node_f', 'edge_f', 'observed_f'))
         # the rest costs address space: little of the log and the work space is ever written to
         for name in ('clique_f', 'clique_i'):
             memory.ensure(name, 2 * nodes, keep=int(head[tb.N_CLIQUES]))

@@ -286,10 +286,6 @@ class Memory:
         """Return a table with all its capacity; invalid after the next `ensure`."""
         return self._tables[name]
 
-    def capacity(self, name: str) -> int:
-        """Return how many rows a table has room for."""
-        return int(self.head[2 * NAMES.index(name) + 1])
-
     def ensure(self, name: str, rows: int, *, keep: int = 0) -> None:
         """
         Make a table grow to at least a given number of rows.

@@ -47,9 +47,7 @@ def log_node(head, v):  # type: ignore[no-untyped-def]
 @kernel
 def log_solution(head, v):  # type: ignore[no-untyped-def]
     """Log the columns of a node that a solve changes, before they change."""
-    node_f = tb.node_f(head)
-    log_f = tb.log_f(head)
-    node_i = tb.node_i(head)
+    node_f, log_f, node_i = tb.node_f(head), tb.log_f(head), tb.node_i(head)
     log_i = tb.log_i(head)
     row = node_i[v]
     if row[tb.SOLUTION_LOGGED] != head[tb.UPDATE] and row[tb.NODE_LOGGED] != head[tb.UPDATE]:
@@ -64,9 +62,7 @@ def log_solution(head, v):  # type: ignore[no-untyped-def]
 @kernel
 def log_energy(head, e):  # type: ignore[no-untyped-def]
     """Log the linearization error and the energy of an edge, before they change."""
-    edge_f = tb.edge_f(head)
-    log_f = tb.log_f(head)
-    edge_i = tb.edge_i(head)
+    edge_f, log_f, edge_i = tb.edge_f(head), tb.log_f(head), tb.edge_i(head)
     log_i = tb.log_i(head)
     row = edge_i[e]
     if row[tb.ENERGY_LOGGED] != head[tb.UPDATE] and row[tb.EDGE_LOGGED] != head[tb.UPDATE]:
@@ -243,15 +239,9 @@ def commit(head):  # type: ignore[no-untyped-def]
 @kernel
 def rollback(head):  # type: ignore[no-untyped-def]
     """End an update: restore all rows logged since `begin`, the newest entry first."""
-    node_f = tb.node_f(head)
-    edge_f = tb.edge_f(head)
-    observed_f = tb.observed_f(head)
-    log_f = tb.log_f(head)
-    node_i = tb.node_i(head)
-    edge_i = tb.edge_i(head)
-    observed_i = tb.observed_i(head)
-    clique_i = tb.clique_i(head)
-    clique_f = tb.clique_f(head)
+    node_f, edge_f, observed_f = tb.node_f(head), tb.edge_f(head), tb.observed_f(head)
+    log_f, node_i, edge_i = tb.log_f(head), tb.node_i(head), tb.edge_i(head)
+    observed_i, clique_i, clique_f = tb.observed_i(head), tb.clique_i(head), tb.clique_f(head)
     log_i = tb.log_i(head)
     end_f, end_i = head[tb.LOG_F_END], head[tb.LOG_I_END]
     while end_i > 0:

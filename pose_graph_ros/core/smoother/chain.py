@@ -112,23 +112,14 @@ def extend(  # type: ignore[no-untyped-def]
     Parameters
     ----------
     mean, information : ndarray, shapes (3,) and (3, 3), of the edge
-    observed_mean, observed_information : ndarray, shapes (3,) and (3, 3)
-        Of the observed node; any numbers if there is none.
+    observed_mean, observed_information : ndarray, likewise, any numbers if there is none
     with_observed : bool
 
     """
-    clique_f = tb.clique_f(head)
-    node_f = tb.node_f(head)
-    edge_f = tb.edge_f(head)
-    observed_f = tb.observed_f(head)
-    pool_f = tb.pool_f(head)
-    work_f = tb.work_f(head)
-    scalars = tb.scalars(head)
-    node_i = tb.node_i(head)
-    edge_i = tb.edge_i(head)
-    observed_i = tb.observed_i(head)
-    clique_i = tb.clique_i(head)
-    pool_i = tb.pool_i(head)
+    clique_f, node_f, edge_f = tb.clique_f(head), tb.node_f(head), tb.edge_f(head)
+    observed_f, pool_f, work_f = tb.observed_f(head), tb.pool_f(head), tb.work_f(head)
+    scalars, node_i, edge_i = tb.scalars(head), tb.node_i(head), tb.edge_i(head)
+    observed_i, clique_i, pool_i = tb.observed_i(head), tb.clique_i(head), tb.pool_i(head)
     work_i = tb.work_i(head)
     v, e, k = head[tb.N_NODES], head[tb.N_EDGES], head[tb.N_OBSERVED]
     if (v >= head[tb.NODE_ROOM] or e >= head[tb.EDGE_ROOM] or k >= head[tb.OBSERVED_ROOM]

@@ -125,9 +125,7 @@ def _path_to_root(head, v):  # type: ignore[no-untyped-def]
 @kernel(allocates=True)
 def _solution(head, v, path, n_rows):  # type: ignore[no-untyped-def]
     """Return Y^T of `R^T Y = E` for a node, in the frontal rows of the cliques of `path`."""
-    pool_f = tb.pool_f(head)
-    node_i = tb.node_i(head)
-    clique_i = tb.clique_i(head)
+    pool_f, node_i, clique_i = tb.pool_f(head), tb.node_i(head), tb.clique_i(head)
     pool_i = tb.pool_i(head)
     y = np.empty((3, n_rows))
     # right-hand sides of the present clique and of its parent

@@ -108,8 +108,7 @@ class IncrementalSmoother:
         ----------
         mean : ndarray, shape (3,), pose of the new node in the newest one [m, m, rad]
         information : ndarray, shape (3, 3), in the frame of the new node
-        observed_mean : ndarray, shape (3,), optional
-            Observed pose of the new node in the map [m, m, rad].
+        observed_mean : ndarray, shape (3,), optional, observed pose in the map [m, m, rad]
         observed_information : ndarray, shape (3, 3), optional, in the frame of the observed pose
 
         """

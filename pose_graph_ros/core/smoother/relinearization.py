@@ -64,12 +64,8 @@ def _check_observed(head, k):  # type: ignore[no-untyped-def]
 @kernel
 def _check(head):  # type: ignore[no-untyped-def]
     """Check the constraints of all listed nodes, each constraint once."""
-    edge_f = tb.edge_f(head)
-    observed_f = tb.observed_f(head)
-    scalars = tb.scalars(head)
-    node_i = tb.node_i(head)
-    edge_i = tb.edge_i(head)
-    observed_i = tb.observed_i(head)
+    edge_f, observed_f, scalars = tb.edge_f(head), tb.observed_f(head), tb.scalars(head)
+    node_i, edge_i, observed_i = tb.node_i(head), tb.edge_i(head), tb.observed_i(head)
     work_i = tb.work_i(head)
     iteration = head[tb.ITERATION]
     checks = work_i[head[tb.NODE_ROOM]:]
@@ -137,9 +133,7 @@ def _relinearize_worst(head, allowed):  # type: ignore[no-untyped-def]
 
     The nodes of the relinearized constraints are touched; the lists of the waiting are emptied.
     """
-    work_f = tb.work_f(head)
-    edge_i = tb.edge_i(head)
-    observed_i = tb.observed_i(head)
+    work_f, edge_i, observed_i = tb.work_f(head), tb.edge_i(head), tb.observed_i(head)
     waiting = tb.waiting(head)
     clique_f, clique_i, pool_i = tb.clique_f(head), tb.clique_i(head), tb.pool_i(head)
     work_i = tb.work_i(head)

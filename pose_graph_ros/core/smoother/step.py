@@ -50,21 +50,18 @@ def _reset_counters(head):  # type: ignore[no-untyped-def]
 @kernel(allocates=True)    # the elimination does
 def run(head, max_iterations, entered):  # type: ignore[no-untyped-def]
     """
-    Bring the estimate up to date with all touched nodes and waiting constraints.
+    Return SETTLED once the estimate is up to date with all touched nodes and waiting constraints.
+
+    LEFT_OVER: linearization errors above the budget wait for the next update. MORE_MEMORY: the
+    pools and the work space must grow to `NEED_F`, `NEED_I` and `NEED_WORK` of the head, and the
+    step be entered again as RESUMED (AFTER_BATCH if it was that before). BAD_PIVOT: node
+    `BAD_NODE` of the head is not determined. DIVERGED. After the last two the caller has to roll
+    the update back.
 
     Parameters
     ----------
     max_iterations : int
     entered : int, FIRST, RESUMED, AFTER_BATCH or EXTENDED
-
-    Returns
-    -------
-    int
-        SETTLED; LEFT_OVER: linearization errors above the budget wait for the next update;
-        MORE_MEMORY: the pools and the work space must grow to `NEED_F`, `NEED_I` and `NEED_WORK`
-        of the head, and the step be entered again as RESUMED (AFTER_BATCH if it was that before);
-        BAD_PIVOT: node `BAD_NODE` of the head is not determined; DIVERGED. After the last two the
-        caller has to roll the update back.
 
     """
     extended = entered == EXTENDED

@@ -32,9 +32,7 @@ def mark(head):  # type: ignore[no-untyped-def]
     Return these cliques, in no particular order, and the affected nodes: their frontal nodes and
     the touched nodes without a clique.
     """
-    node_i = tb.node_i(head)
-    clique_i = tb.clique_i(head)
-    pool_i = tb.pool_i(head)
+    node_i, clique_i, pool_i = tb.node_i(head), tb.clique_i(head), tb.pool_i(head)
     touched = tb.touched(head)
     stamp = head[tb.FRONT_SERIAL] + 1
     head[tb.FRONT_SERIAL] = stamp
@@ -74,25 +72,18 @@ def mark(head):  # type: ignore[no-untyped-def]
 @kernel(allocates=True, inline='always')    # callees compile once
 def rebuild(head, marked, affected):  # type: ignore[no-untyped-def]
     """
-    Replace the marked cliques: order the affected nodes anew and eliminate them.
+    Return DONE after replacing the marked cliques: their nodes are ordered and eliminated anew.
+
+    MORE_MEMORY: no clique was changed, the pools and the work space must grow to `NEED_F`,
+    `NEED_I` and `NEED_WORK` of the head. BAD_PIVOT: node `BAD_NODE` of the head is not determined.
 
     Parameters
     ----------
     marked, affected : ndarray of int32, from `mark`; `affected` is reordered
 
-    Returns
-    -------
-    int
-        DONE; MORE_MEMORY: no clique was changed, the pools and the work space must grow to
-        `NEED_F`, `NEED_I` and `NEED_WORK` of the head; BAD_PIVOT: node `BAD_NODE` of the head is
-        not determined.
-
     """
-    pool_f = tb.pool_f(head)
-    work_f = tb.work_f(head)
-    node_i = tb.node_i(head)
-    clique_i = tb.clique_i(head)
-    pool_i = tb.pool_i(head)
+    pool_f, work_f, node_i = tb.pool_f(head), tb.work_f(head), tb.node_i(head)
+    clique_i, pool_i = tb.clique_i(head), tb.pool_i(head)
     n_last = newest_last(affected, head[tb.NEWEST])
     orphans, start, adjacency = structure(head, marked, affected)
     n_cliques, offset, n_frontal, parent, nodes = minimum_degree(
@@ -180,9 +171,7 @@ def _attach_child(head, parent, child):  # type: ignore[no-untyped-def]
 @kernel(inline='always')
 def refresh(head, marked):  # type: ignore[no-untyped-def]
     """Eliminate the marked cliques again with the same structure; return codes as `rebuild`."""
-    pool_f = tb.pool_f(head)
-    work_f = tb.work_f(head)
-    clique_i = tb.clique_i(head)
+    pool_f, work_f, clique_i = tb.pool_f(head), tb.work_f(head), tb.clique_i(head)
     work_i = tb.work_i(head)
     need, largest = np.int64(0), np.int64(0)
     for k in range(len(marked)):
