@@ -1,16 +1,6 @@
 # Copyright 2026 The pose_graph_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""
-The facade of the engine, for the node, the offline tools and the tests.
-
-Odometry creates the hidden nodes and the edges between them, and the smoother solves for each new
-node at once. A measurement waits until odometry has reached its stamp, is attached to the hidden
-node before that stamp, and is added to the graph by the next update. An update first aligns the
-odometry frame with the map, if they are not aligned yet. It then passes all new constraints to
-the smoother, whose work does not grow with the graph. If the update fails, it is rolled back, and
-its constraints are set aside until the next full optimisation. Stamps are integer nanoseconds; the
-back end has no clock.
-"""
+"""The facade of the engine, for the node, the offline tools and the tests."""
 
 from collections import Counter
 from dataclasses import replace
@@ -63,11 +53,18 @@ class PoseGraphBackend:
     """
     Online back end of pose-graph SLAM.
 
+    Odometry creates the hidden nodes and the edges between them, and the smoother solves for each
+    new node at once. A measurement waits until odometry has reached its stamp, is attached to the
+    hidden node before that stamp, and is added to the graph by the next update. An update first
+    aligns the odometry frame with the map, if they are not aligned yet. It then passes all new
+    constraints to the smoother, whose work does not grow with the graph. If the update fails, it
+    is rolled back, and its constraints are set aside until the next full optimisation. Stamps are
+    integer nanoseconds; the back end has no clock.
+
     Parameters
     ----------
     config : BackendConfig, optional
-    solve : callable
-        Optimises a whole graph in place; only tests replace it.
+    solve : callable, optimises a whole graph in place; only tests replace it
     smoother : IncrementalSmoother, optional
         With an empty graph; only tests pass one. Default: one with the settings in `config`.
 
@@ -96,11 +93,8 @@ class PoseGraphBackend:
         """
         Change the settings for all later input.
 
-        Raises
-        ------
-        ConfigError
-            If a setting that cannot change at run time differs; see `BackendConfig.changed_to`.
-
+        Raises ConfigError if a setting that cannot change at run time differs; see
+        `BackendConfig.changed_to`.
         """
         self._config = self._config.changed_to(config)
         self._nodes.configure(config)
@@ -153,17 +147,12 @@ class PoseGraphBackend:
 
     def add_odometry(self, sample: OdometrySample, source: str = 'odom') -> Answer:
         """
-        Add an odometry sample; create a hidden node and its edge if `NodePolicy` requires one.
+        Return whether a sample is accepted or why not; make a hidden node if one is due by it.
 
         Parameters
         ----------
         sample : OdometrySample
         source : str
-
-        Returns
-        -------
-        Answer
-            Accepted, or rejected with the reason.
 
         """
         answer = self._pipeline.count(source, self._nodes.add_sample(sample, source))
@@ -199,40 +188,29 @@ class PoseGraphBackend:
 
     def add_measurement(self, measurement: Measurement, source: str) -> Answer:
         """
-        Add a measurement; any order of stamps gives the same graph.
+        Return the answer to a measurement; any order of stamps gives the same graph.
+
+        It is pending if odometry has not reached its stamp; `counts` contains the later answer.
 
         Parameters
         ----------
         measurement : Measurement
         source : str
 
-        Returns
-        -------
-        Answer
-            Accepted, rejected with the reason, or pending if odometry has not reached its stamp;
-            `counts` contains the later answer.
-
         """
         return self._pipeline.add(measurement, source)
 
     def set_pose(self, pose: GlobalPose, source: str) -> Answer:
         """
-        Set the pose of the robot.
+        Return the answer to a pose that the user sets.
 
         Before the graph is aligned, this adds a global pose. Afterwards it means that the robot
         was moved without odometry: a new node at the pose follows the last one by a loose edge.
 
         Parameters
         ----------
-        pose : GlobalPose
-            A stamp outside the odometry is replaced by the nearest one inside.
-        source : str
-            Key of the counts and of the settings for its covariance.
-
-        Returns
-        -------
-        Answer
-            Accepted, pending, or rejected with the reason.
+        pose : GlobalPose, a stamp outside the odometry is replaced by the nearest one inside
+        source : str, key of the counts and of the settings for its covariance
 
         """
         self.finish()

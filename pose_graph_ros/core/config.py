@@ -223,8 +223,7 @@ class NodePolicy:
 
         Parameters
         ----------
-        distance, turned, elapsed : float
-            Since the last hidden node: straight distance [m], angle [rad] and time [s].
+        distance, turned, elapsed : float, since the last node: straight [m], angle [rad], time [s]
 
         """
         far = distance >= self.minimum_travel_distance or turned >= self.minimum_travel_heading
@@ -328,12 +327,7 @@ class BackendConfig:
 
         Settings of stored data cannot change: `noise_from`, as noise is summed up sample by
         sample, the correlation of errors, as the graph contains states for it, and the smoother.
-
-        Raises
-        ------
-        ConfigError
-            If one of these differs; the message names it with both values.
-
+        Raises ConfigError if one of these differs; the message names it with both values.
         """
         _require_same('SmootherConfig', self.smoother, wanted.smoother)
         for name in sorted({*self.odometry, *wanted.odometry}):

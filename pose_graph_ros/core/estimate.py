@@ -71,15 +71,7 @@ class Estimate:
 
     @property
     def path(self) -> Trajectory:
-        """
-        `T_map_base` at all hidden nodes, and last at the newest odometry.
-
-        Raises
-        ------
-        ValueError
-            If the estimate was made without its path.
-
-        """
+        """`T_map_base` at all hidden nodes, last at the newest odometry; ValueError without it."""
         if self.trajectory is None:
             raise ValueError('the estimate was made without its path')
         return self.trajectory

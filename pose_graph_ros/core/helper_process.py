@@ -34,8 +34,7 @@ class HelperProcess:
 
     Parameters
     ----------
-    module, name : str
-        The function, without arguments; it calls `end_with_parent` first.
+    module, name : str, the function, without arguments; it calls `end_with_parent` first
 
     """
 
@@ -67,10 +66,8 @@ class HelperProcess:
 
         Parameters
         ----------
-        patience : float
-            Maximum time [s].
-        stopped : callable
-            Ends the wait once it returns True.
+        patience : float, maximum time [s]
+        stopped : callable, ends the wait once it returns True
 
         """
         deadline = time.monotonic() + patience

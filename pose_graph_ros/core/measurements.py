@@ -128,8 +128,7 @@ def rejected(reason: str, detail: str = '') -> Answer:
 
     Parameters
     ----------
-    reason, detail : str
-        As in `Answer`.
+    reason, detail : str, as in `Answer`
 
     """
     return Answer(AnswerStatus.REJECTED, reason, detail)

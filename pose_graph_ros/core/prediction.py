@@ -37,8 +37,7 @@ def predict(estimate: Estimate, T_odom_base: FloatArray) -> Prediction:
     Parameters
     ----------
     estimate : Estimate
-    T_odom_base : ndarray, shape (3,)
-        [m, m, rad].
+    T_odom_base : ndarray, shape (3,) [m, m, rad]
 
     """
     x, y, theta = between_one(estimate.T_odom_base.tolist(), T_odom_base.tolist())

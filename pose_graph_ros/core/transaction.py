@@ -29,8 +29,7 @@ class Transaction:
     graph : Graph
     alignment : AlignmentMonitor
     factors : FactorBuilder
-    quarantine : Queue
-        Receives the constraints of a failed update.
+    quarantine : Queue, receives the constraints of a failed update
 
     """
 
