@@ -147,7 +147,7 @@ class PoseGraphBackend:
 
     def add_odometry(self, sample: OdometrySample, source: str = 'odom') -> Answer:
         """
-        Return whether a sample is accepted or why not; make a hidden node if one is due by it.
+        Return the answer to a sample that is added; `NodePolicy` may ask for a hidden node at it.
 
         Parameters
         ----------
@@ -188,9 +188,10 @@ class PoseGraphBackend:
 
     def add_measurement(self, measurement: Measurement, source: str) -> Answer:
         """
-        Return the answer to a measurement; any order of stamps gives the same graph.
+        Return the answer to a measurement that is added, in any order of stamps.
 
-        It is pending if odometry has not reached its stamp; `counts` contains the later answer.
+        The graph does not depend on the order. The answer is pending if odometry has not reached
+        the stamp; `counts` contains the later answer.
 
         Parameters
         ----------
@@ -202,7 +203,7 @@ class PoseGraphBackend:
 
     def set_pose(self, pose: GlobalPose, source: str) -> Answer:
         """
-        Return the answer to a pose that the user sets.
+        Return the answer to a pose of the robot that the user sets.
 
         Before the graph is aligned, this adds a global pose. Afterwards it means that the robot
         was moved without odometry: a new node at the pose follows the last one by a loose edge.

@@ -223,7 +223,7 @@ class NodePolicy:
 
         Parameters
         ----------
-        distance, turned, elapsed : float, since the last node: straight [m], angle [rad], time [s]
+        distance, turned, elapsed : float, since the last node: straight [m], turn [rad], time [s]
 
         """
         far = distance >= self.minimum_travel_distance or turned >= self.minimum_travel_heading

@@ -71,7 +71,7 @@ class Evidence(NamedTuple):
 
 class AlignmentMonitor:
     """
-    Aligns the graph with the map as soon as measurements determine the angle between them.
+    Aligns the graph with the map as soon as measurements determine the angle of odometry in it.
 
     Whenever the number of measurements has doubled, the angle is checked with all of them, as the
     first few may be wrong.

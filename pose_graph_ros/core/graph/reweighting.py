@@ -91,6 +91,11 @@ class _Rows:
     base_weights: GrowingArray = field(default_factory=lambda: GrowingArray((), np.float64))
     cursor: int = 0
 
+    def alike(self, weight: float) -> Mapping[int, float]:
+        """Return the base weights times a weight, by row."""
+        weights = weight * self.base_weights.values
+        return dict(zip(self.rows.values.tolist(), weights.tolist(), strict=True))
+
     def saved(self) -> SavedLosses:
         losses = self.losses.values
         return SavedLosses(
@@ -237,10 +242,7 @@ class Reweighting:
 
         The weight 1 makes it a plain least-squares problem.
         """
-        edges, observed = (
-            dict(zip(table.rows.values.tolist(), (weight * table.base_weights.values).tolist(),
-                     strict=True)) for table in (self._edges, self._observed))
-        return edges, observed
+        return self._edges.alike(weight), self._observed.alike(weight)
 
     def cost(self, graph: Graph) -> float:
         """Return the sum of the robust costs minus the sum of the weighted energies."""

@@ -95,7 +95,7 @@ def restore(parts: Parts, saved: SavedGraph) -> None:
     Parameters
     ----------
     parts : Parts, of an engine that has received nothing yet
-    saved : SavedGraph, GraphUpdateError is raised if its rows of the graph are not valid
+    saved : SavedGraph, invalid rows of which raise GraphUpdateError
 
     """
     parts.graph.fill(saved.rows)

@@ -153,7 +153,7 @@ class GaussMarkovBias:
 
     def add(self, measurement: Absolute, attachment: Attachment, additions: Additions) -> int:
         """
-        Return the row of the new edge from a measurement's hidden node to the state of its bin.
+        Return the row of the edge that is added, from a measurement's node to its bin's state.
 
         Parameters
         ----------
@@ -235,7 +235,7 @@ class InflatedWeights:
 
     def add(self, stamp_ns: int, observed: ObservedNodes, additions: Additions) -> int:
         """
-        Return the row of a new observed node.
+        Return the row of the observed node that is added.
 
         Parameters
         ----------

@@ -68,7 +68,7 @@ class MeasurementPipeline:
 
     def add(self, measurement: Measurement, source: str) -> Answer:
         """
-        Return the answer to a measurement, which is counted.
+        Return the answer to a measurement that is added, after counting it.
 
         Parameters
         ----------

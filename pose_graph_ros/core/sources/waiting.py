@@ -40,7 +40,7 @@ class WaitingMeasurements:
 
     def push(self, source: str, measurement: Measurement) -> WaitingMeasurement | None:
         """
-        Return the measurement that has to go if there are too many with the one added, else None.
+        Return the measurement that is dropped if too many wait with the one added, else None.
 
         Of more than `MAX_WAITING` it is the one due last. A sender whose clock is ahead thus does
         not displace the measurements of others.
