@@ -9,11 +9,8 @@ annotated with the types of this module, which `io` uses to read, check and writ
 
 from typing import Annotated, NamedTuple
 
-import numpy as np
-import numpy.typing as npt
-
 from pose_graph_ros.core.geometry.scalar_se2 import Pose
-from pose_graph_ros.core.geometry.se2 import FloatArray, IntArray
+from pose_graph_ros.core.geometry.se2 import BoolArray, FloatArray, IntArray
 
 
 class Column(NamedTuple):
@@ -24,7 +21,7 @@ class Column(NamedTuple):
 
 
 Integers = Annotated[IntArray, Column(int)]
-Flags = Annotated[npt.NDArray[np.bool_], Column(bool)]
+Flags = Annotated[BoolArray, Column(bool)]
 Numbers = Annotated[FloatArray, Column(float)]
 Rows3 = Annotated[FloatArray, Column(float, (3,))]
 Rows4 = Annotated[FloatArray, Column(float, (4,))]

@@ -19,15 +19,11 @@ from dataclasses import dataclass, fields
 from typing import NamedTuple, Self
 
 import numpy as np
-import numpy.typing as npt
 
 from pose_graph_ros.core.config import OdometryNoise
 from pose_graph_ros.core.geometry import se2
-from pose_graph_ros.core.geometry.se2 import FloatArray, IntArray
+from pose_graph_ros.core.geometry.se2 import BoolArray, ComplexArray, FloatArray, IntArray
 from pose_graph_ros.core.graph.constraints import ObservedKind, ObservedNodes
-
-BoolArray = npt.NDArray[np.bool_]
-ComplexArray = npt.NDArray[np.complex128]
 
 # Least fraction of positions that must agree on a motion, or of parts of a drive on an angle.
 LEAST_AGREEMENT = 0.6

@@ -11,17 +11,14 @@ The module loads SciPy, which takes time and memory: import it only where a join
 """
 
 import numpy as np
-import numpy.typing as npt
 import scipy.sparse
 import scipy.sparse.linalg
 
 from pose_graph_ros.core.exceptions import LinearSolveError
 from pose_graph_ros.core.geometry import se2
-from pose_graph_ros.core.geometry.se2 import FloatArray
+from pose_graph_ros.core.geometry.se2 import BoolArray, ComplexArray, FloatArray
 from pose_graph_ros.core.graph.constraints import EdgeKind, Edges, ObservedKind, ObservedNodes
 from pose_graph_ros.core.graph.graph import Graph
-
-ComplexArray = npt.NDArray[np.complex128]
 
 
 def joint(graph: Graph) -> FloatArray:
@@ -70,7 +67,7 @@ def joint(graph: Graph) -> FloatArray:
 
 
 def _of_poses(
-    edges: Edges, observed: ObservedNodes, is_bias: npt.NDArray[np.bool_],
+    edges: Edges, observed: ObservedNodes, is_bias: BoolArray,
 ) -> tuple[Edges, ObservedNodes]:
     """Return the constraints without biases, their variance added to that of the measurements."""
     to_bias = edges.kind == EdgeKind.BIAS
@@ -101,7 +98,7 @@ def _isotropic(information: FloatArray) -> FloatArray:
 
 def _least_squares(
     matrix: scipy.sparse.csc_array, right: ComplexArray, known: ComplexArray,
-    fixed: npt.NDArray[np.bool_],
+    fixed: BoolArray,
 ) -> ComplexArray:
     """Return v that minimises |matrix v - right|^2, equal to `known` where it is fixed."""
     solution = np.where(fixed, known, 0.0)

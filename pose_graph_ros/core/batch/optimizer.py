@@ -102,7 +102,7 @@ def optimize_from_linear_start(graph: Graph, config: SolverConfig) -> BatchResul
     result = None
     with contextlib.suppress(LinearSolveError):
         gauss_newton.put_poses(head, _linear_start(graph, cliques))
-        result = _minimize(graph, config, cliques, _chi2(graph))
+        result = _minimize(graph, config, cliques, chi2_of(graph))
     if result is None or result.status is Status.FAILED or not result.chi2 <= chi2:
         gauss_newton.put_poses(head, poses)
         result = _minimize(graph, config, cliques, chi2)
@@ -164,7 +164,7 @@ def _joint(graph: Graph) -> FloatArray:
 def _check_before(graph: Graph) -> tuple[float, BatchResult | None]:
     """Return chi2, and a result if there is nothing to optimise or the poses are undetermined."""
     head = graph.memory.head
-    chi2 = _chi2(graph)
+    chi2 = chi2_of(graph)
     if not np.isfinite(chi2):
         return chi2, _failed('chi2 is not finite', chi2)
     if np.all(graph.fixed):
@@ -177,7 +177,8 @@ def _check_before(graph: Graph) -> tuple[float, BatchResult | None]:
     return chi2, None
 
 
-def _chi2(graph: Graph) -> float:
+def chi2_of(graph: Graph) -> float:
+    """Return the energy of all constraints, in time proportional to the size of the graph."""
     return float(gauss_newton.evaluate(graph.memory.head, np.empty((graph.n_nodes, 3)))[0])
 
 

@@ -8,7 +8,7 @@ import numpy as np
 import numpy.typing as npt
 
 from pose_graph_ros.core.geometry import se2
-from pose_graph_ros.core.geometry.se2 import FloatArray, IntArray
+from pose_graph_ros.core.geometry.se2 import BoolArray, FloatArray, IntArray
 
 
 @dataclass(frozen=True, slots=True)
@@ -42,7 +42,7 @@ class Trajectory:
     def __len__(self) -> int:
         return len(self.stamps_ns)
 
-    def covers(self, stamps_ns: npt.ArrayLike) -> npt.NDArray[np.bool_]:
+    def covers(self, stamps_ns: npt.ArrayLike) -> BoolArray:
         """Return which stamps [ns] lie between the first and the last one of the trajectory."""
         stamps = np.asarray(stamps_ns, dtype=np.int64)
         if len(self) == 0:

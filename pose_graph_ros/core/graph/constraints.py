@@ -22,7 +22,7 @@ import numpy as np
 import numpy.typing as npt
 
 from pose_graph_ros.core.exceptions import GraphUpdateError
-from pose_graph_ros.core.geometry.se2 import FloatArray, IntArray
+from pose_graph_ros.core.geometry.se2 import BoolArray, FloatArray, IntArray
 
 KindArray = npt.NDArray[np.uint8]
 
@@ -74,7 +74,7 @@ class _Table:
         information, weight = getattr(self, 'information'), getattr(self, 'weight')  # noqa: B009
         return np.asarray(weight[:, None, None] * information)
 
-    def rows(self, index: IntArray | npt.NDArray[np.bool_] | slice) -> Self:
+    def rows(self, index: IntArray | BoolArray | slice) -> Self:
         """Return a table of some rows."""
         return type(self)(*(column[index] for column in self.columns))
 
@@ -223,7 +223,7 @@ _COLUMNS: dict[type, Any] = {
 _ROW_SHAPES = {'mean': (3,), 'offset': (3,), 'information': (3, 3), 'bias': (4,)}
 
 
-def check(table: Edges | ObservedNodes, is_bias: npt.NDArray[np.bool_]) -> None:
+def check(table: Edges | ObservedNodes, is_bias: BoolArray) -> None:
     """
     Raise GraphUpdateError for invalid constraints, with the row, what was expected and the value.
 
@@ -281,7 +281,7 @@ def _check_information(name: str, matrix: FloatArray) -> None:
 
 
 def _refuse_rows(
-    bad: npt.NDArray[np.bool_], reason: str, values: npt.NDArray[np.generic],
+    bad: BoolArray, reason: str, values: npt.NDArray[np.generic],
 ) -> None:
     """Raise GraphUpdateError with the first bad row, if there is one."""
     if np.any(bad):

@@ -13,13 +13,11 @@ import numpy.typing as npt
 from pose_graph_ros.core.compiled.jit import compile_only
 from pose_graph_ros.core.exceptions import GraphUpdateError
 from pose_graph_ros.core.geometry import se2
-from pose_graph_ros.core.geometry.se2 import FloatArray, IntArray
+from pose_graph_ros.core.geometry.se2 import BoolArray, FloatArray, IntArray
 from pose_graph_ros.core.graph import editing, tables as tb, transaction_log
 from pose_graph_ros.core.graph.constraints import check, EdgeKind, Edges, full, ObservedNodes
 from pose_graph_ros.core.graph.error_functions import edge_errors, energies, observed_errors
 from pose_graph_ros.core.graph.tables import Memory
-
-BoolArray = npt.NDArray[np.bool_]
 
 # Empty parts of updates.
 NO_POSES: Final[FloatArray] = np.empty((0, 3))

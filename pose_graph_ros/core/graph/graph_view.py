@@ -14,10 +14,10 @@ from typing import NamedTuple
 import numpy as np
 
 from pose_graph_ros.core.geometry import se2
-from pose_graph_ros.core.geometry.se2 import FloatArray, IntArray
+from pose_graph_ros.core.geometry.se2 import BoolArray, FloatArray, IntArray
 from pose_graph_ros.core.graph import factors, tables as tb
 from pose_graph_ros.core.graph.constraints import EdgeKind
-from pose_graph_ros.core.graph.graph import BoolArray, Graph
+from pose_graph_ros.core.graph.graph import Graph
 
 # Columns of the tables: diagonal of the information, offset or arm with the measured position.
 DIAGONAL = [tb.INFO, tb.INFO + 3, tb.INFO + 5]

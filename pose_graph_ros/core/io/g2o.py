@@ -31,11 +31,10 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-import numpy.typing as npt
 
 from pose_graph_ros.core.exceptions import FileFormatError, GraphUpdateError
 from pose_graph_ros.core.geometry import se2
-from pose_graph_ros.core.geometry.se2 import FloatArray, IntArray
+from pose_graph_ros.core.geometry.se2 import BoolArray, FloatArray, IntArray
 from pose_graph_ros.core.graph.constraints import (
     EdgeKind,
     Edges,
@@ -239,7 +238,7 @@ def _observed(rows: dict[str, _Rows], ids: IntArray) -> ObservedNodes:
     return ObservedNodes.joined(parts)
 
 
-def _compose_missing(poses: FloatArray, known: npt.NDArray[np.bool_], edges: Edges) -> None:
+def _compose_missing(poses: FloatArray, known: BoolArray, edges: Edges) -> None:
     """Set the poses of the nodes that are not known by composing edges, breadth-first."""
     neighbours: dict[int, list[tuple[int, FloatArray]]] = {}
     for i, j, mean in zip(edges.i.tolist(), edges.j.tolist(), edges.mean, strict=True):

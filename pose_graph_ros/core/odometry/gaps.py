@@ -18,11 +18,8 @@ SPEED_TIME_NS = 500_000_000
 RESUMED_WITHIN = 10.0
 # Standard deviations of the motion across a restart: the robot may have been moved [m, rad].
 RESTARTED = (1.0, 0.3)
-
-
-def restart_variance() -> Variances:
-    """Return the variances of (x, y, theta) of the motion across a restart [m^2, m^2, rad^2]."""
-    return RESTARTED[0]**2, RESTARTED[0]**2, RESTARTED[1]**2
+# The variances of (x, y, theta) by them [m^2, m^2, rad^2].
+RESTART_VARIANCE: Variances = (RESTARTED[0]**2, RESTARTED[0]**2, RESTARTED[1]**2)
 
 
 def gap_motion(
@@ -44,7 +41,7 @@ def gap_motion(
 
     """
     if last_ns <= saved_ns and until_ns - last_ns > RESUMED_WITHIN * 1e9:
-        return np.zeros(3), np.diag(restart_variance())
+        return np.zeros(3), np.diag(RESTART_VARIANCE)
     begin_ns = max(int(timeline.stamps_ns[0]), last_ns - SPEED_TIME_NS)
     motion, time = timeline.motion(begin_ns, last_ns), (last_ns - begin_ns) * 1e-9
     elapsed = (until_ns - last_ns) * 1e-9

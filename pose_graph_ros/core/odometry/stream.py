@@ -22,7 +22,7 @@ from pose_graph_ros.core.measurements import (
     rejected,
     value_defect,
 )
-from pose_graph_ros.core.odometry.gaps import JUMP_SIGMA, restart_variance, RESUMED_WITHIN
+from pose_graph_ros.core.odometry.gaps import JUMP_SIGMA, RESTART_VARIANCE, RESUMED_WITHIN
 from pose_graph_ros.core.odometry.jumps import is_jump, MEMORY_TIME, Speeds, SpeedWindow, UNKNOWN
 from pose_graph_ros.core.odometry.motion import Motion, odometry_covariance
 from pose_graph_ros.core.odometry.timeline import (
@@ -385,7 +385,7 @@ def _after_jump(before: _Instant, stamp_ns: int, raw: Pose, elapsed: float) -> _
 def _after_restart(before: _Instant, stamp_ns: int, raw: Pose) -> _Instant:
     """Return the state at a sample at which odometry restarts after a graph was loaded."""
     pose = before.row.pose
-    row = next_row(before.row, stamp_ns, pose, loose=restart_variance())
+    row = next_row(before.row, stamp_ns, pose, loose=RESTART_VARIANCE)
     offset = compose_one(pose, between_one(raw, (0.0, 0.0, 0.0)))
     return _Instant(
         raw, row, offset, SpeedWindow(UNKNOWN, stamp_ns, pose), jumped=True, restarted=True)

@@ -6,12 +6,11 @@ import math
 from typing import NamedTuple
 
 import numpy as np
-import numpy.typing as npt
 
 from pose_graph_ros.core.compiled.growing_array import GrowingArray
 from pose_graph_ros.core.geometry import se2
 from pose_graph_ros.core.geometry.scalar_se2 import Pose, wrap_one
-from pose_graph_ros.core.geometry.se2 import FloatArray, IntArray
+from pose_graph_ros.core.geometry.se2 import BoolArray, FloatArray, IntArray
 from pose_graph_ros.core.odometry.motion import Motion, NO_MOTION
 
 # Motions below both of these are not added to path length and turns: odometry jitters at rest,
@@ -173,7 +172,7 @@ class OdometryTimeline:
 
     def thinned(
         self, instants_ns: IntArray, since_ns: int,
-    ) -> tuple[IntArray, FloatArray, npt.NDArray[np.bool_]]:
+    ) -> tuple[IntArray, FloatArray, BoolArray]:
         """
         Return stamps, rows and `dense` of the samples for the motions between some instants.
 
@@ -200,7 +199,7 @@ class OdometryTimeline:
                 (self._dense.values & np.append(False, keep[:-1]))[keep])
 
     def restore(
-        self, stamps_ns: IntArray, rows: FloatArray, dense: npt.NDArray[np.bool_], last: Row, *,
+        self, stamps_ns: IntArray, rows: FloatArray, dense: BoolArray, last: Row, *,
         resting: bool,
     ) -> None:
         """
@@ -262,7 +261,7 @@ class OdometryTimeline:
         """
         return self._at(stamp_ns)[0][:3]
 
-    def _rows(self, which: int | slice | npt.NDArray[np.bool_]) -> FloatArray:
+    def _rows(self, which: int | slice | BoolArray) -> FloatArray:
         """Return some samples with their sums, shape (..., 8)."""
         samples = self._samples.values[which]
         rows = np.zeros((*samples.shape[:-1], 8))

@@ -7,8 +7,7 @@ from typing import Any, NamedTuple
 from numba import types
 import numpy as np
 
-from pose_graph_ros.core.batch import gauss_newton
-from pose_graph_ros.core.batch.optimizer import Status
+from pose_graph_ros.core.batch.optimizer import chi2_of, Status
 from pose_graph_ros.core.compiled.jit import compile_only
 from pose_graph_ros.core.config import SmootherConfig
 from pose_graph_ros.core.exceptions import GraphUpdateError
@@ -191,9 +190,8 @@ class IncrementalSmoother:
                 raise ValueError(f'covariances: expected {expected}, got {node}')
 
     def chi2(self) -> float:
-        """Return the energy of all constraints, in time proportional to the size of the graph."""
-        gradient = np.empty((self.graph.n_nodes, 3))
-        return float(gauss_newton.evaluate(self._memory.head, gradient)[0])
+        """Return the energy of all constraints; see `chi2_of`."""
+        return chi2_of(self.graph)
 
     def _solve_extended(self) -> UpdateResult:
         """Solve after a chain was extended by an observed node; a failure keeps the new node."""

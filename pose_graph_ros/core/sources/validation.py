@@ -12,11 +12,10 @@ from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
-import numpy.typing as npt
 
 from pose_graph_ros.core.config import CovariancePolicy, Heading
 from pose_graph_ros.core.geometry import covariance
-from pose_graph_ros.core.geometry.se2 import FloatArray
+from pose_graph_ros.core.geometry.se2 import BoolArray, FloatArray
 from pose_graph_ros.core.measurements import (
     Answer,
     GlobalPose,
@@ -201,7 +200,7 @@ def _is_known_heading(variance: float) -> bool:
     return bool(0.0 < variance < covariance.UNKNOWN_HEADING_VARIANCE)
 
 
-def _is_uninformative(cov: FloatArray) -> npt.NDArray[np.bool_]:
+def _is_uninformative(cov: FloatArray) -> BoolArray:
     return np.diagonal(cov) > covariance.LARGEST_VARIANCE
 
 

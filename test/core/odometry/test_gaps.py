@@ -8,7 +8,7 @@ import pytest
 from pose_graph_ros.core.odometry.gaps import (
     gap_motion,
     JUMP_SIGMA,
-    restart_variance,
+    RESTART_VARIANCE,
     RESTARTED,
     RESUMED_WITHIN,
 )
@@ -60,8 +60,8 @@ def test_a_long_gap_at_the_end_of_a_loaded_graph_is_a_restart(saved_ns: int) -> 
     limit_ns = END + round(RESUMED_WITHIN * 1e9)
     mean, noise = gap_motion(timeline(3.0), END, limit_ns + 1, saved_ns)
     np.testing.assert_array_equal(mean, 0.0)
-    np.testing.assert_array_equal(noise, np.diag(restart_variance()))
-    np.testing.assert_allclose(np.sqrt(restart_variance()), [*2 * RESTARTED[:1], RESTARTED[1]])
+    np.testing.assert_array_equal(noise, np.diag(RESTART_VARIANCE))
+    np.testing.assert_allclose(np.sqrt(RESTART_VARIANCE), [*2 * RESTARTED[:1], RESTARTED[1]])
     # neither a short one nor one of samples that came since
     for until_ns, saved in ((limit_ns, saved_ns), (limit_ns + 1, END - 1)):
         mean, _ = gap_motion(timeline(3.0), END, until_ns, saved)
