@@ -204,8 +204,8 @@ def polished(world: World, poses: FloatArray) -> float:
 
 def start_of_batch(world: World) -> FloatArray:
     """Return the start that both tools are given in the batch comparison, shape (N, 3)."""
-    head = world.graph(world.dead_reckoning()).memory.head
-    return chordal_start.chordal(head, symbolic.analyse(head).cliques)
+    graph = world.graph(world.dead_reckoning())
+    return chordal_start.chordal(graph, symbolic.analyse(graph.memory.head).cliques)
 
 
 def _jacobians(

@@ -201,5 +201,4 @@ def free_part(graph: Graph, H: FloatArray, b: FloatArray) -> tuple[FloatArray, F
 
 def chordal(graph: Graph) -> FloatArray:
     """Return the chordal start of a graph, shape (N, 3)."""
-    head = graph.memory.head
-    return chordal_start.chordal(head, symbolic.analyse(head).cliques)
+    return chordal_start.chordal(graph, symbolic.analyse(graph.memory.head).cliques)

@@ -26,18 +26,26 @@ from pose_graph_ros.core.exceptions import LinearSolveError
 from pose_graph_ros.core.geometry.se2 import FloatArray
 from pose_graph_ros.core.graph import tables as tb
 from pose_graph_ros.core.graph.factors import wrap
+from pose_graph_ros.core.graph.graph import Graph
 
 # Smallest |u| before normalisation; below it the measured headings cancel each other out.
 SMALLEST_ROTATION = 1e-9
 
 
-def chordal(head: tb.IntHead, cliques: symbolic.Cliques) -> FloatArray:
+def chordal(graph: Graph, cliques: symbolic.Cliques) -> FloatArray:
     """
     Return initial poses, shape (N, 3), from the constraints and the poses of fixed nodes alone.
 
-    The cliques are those of the whole graph. Raises LinearSolveError if headings or positions are
-    not determined, for example if only positions are observed, or if the graph has biases.
+    Raises LinearSolveError if headings or positions are not determined, for example if only
+    positions are observed, or if the graph has biases.
+
+    Parameters
+    ----------
+    graph : Graph
+    cliques : Cliques, cliques of the whole graph
+
     """
+    head = graph.memory.head
     if _n_biases(head) > 0:
         raise LinearSolveError('chordal start: a bias has no heading')
     u, bad = complex_system.solve(head, cliques, _rotation_terms(head))

@@ -149,7 +149,7 @@ def _linear_start(graph: Graph, cliques: symbolic.Cliques) -> FloatArray:
     which solves for headings and positions together, or raises LinearSolveError.
     """
     try:
-        return chordal_start.chordal(graph.memory.head, cliques)
+        return chordal_start.chordal(graph, cliques)
     except LinearSolveError:
         return _joint(graph)
 
