@@ -4,6 +4,7 @@
 
 import ast
 from collections.abc import Iterator
+from graphlib import TopologicalSorter
 from pathlib import Path
 import subprocess
 import sys
@@ -37,6 +38,10 @@ TOP = {'core.estimate', 'core.prediction', 'core.transaction', 'core.backend', '
 # Third-party libraries of `core`.
 LIBRARIES = {'numpy', 'scipy', 'numba', 'pyproj'}
 ROS = {'rclpy', 'rosidl_runtime_py', 'ament_index_python', 'launch', 'launch_ros'}
+
+# What the node decides without ROS, so that it can be tested without.
+LOGIC = ('input', 'liveness', 'memory', 'pose_continuity', 'set_pose_input', 'slew', 'time_jump',
+         'worker')
 
 MOST_LINES = 450
 
@@ -107,6 +112,18 @@ def test_the_arrows_between_packages_form_no_circle() -> None:
         below.add(package)
 
 
+def test_the_modules_of_core_import_each_other_in_no_circle() -> None:
+    names = {'.'.join(('pose_graph_ros', *path.with_suffix('').parts)): path
+             for path in modules('core')}
+    graph: dict[str, set[str]] = {}
+    for name, path in names.items():
+        # `from a import b` imports a module b of a, or something that a module a defines
+        graph[name] = {each for found in imports(path)
+                       for each in (found, found.rpartition('.')[0]) if each in names} - {name}
+    assert sum(map(len, graph.values())) > 200
+    TopologicalSorter(graph).prepare()
+
+
 @pytest.mark.parametrize('name', sorted(BASE))
 def test_the_base_of_core_imports_no_engine(name: str) -> None:
     path = Path(*name.split('.')).with_suffix('.py')
@@ -122,6 +139,14 @@ def test_adapters_import_no_rclpy_and_nothing_above_them(path: Path) -> None:
 @pytest.mark.parametrize('path', modules('ros'), ids=str)
 def test_ros_never_imports_cli(path: Path) -> None:
     assert 'cli' not in own_imports(path)
+
+
+@pytest.mark.parametrize('name', LOGIC)
+def test_the_logic_of_the_node_imports_no_ros(name: str) -> None:
+    found = set(imports(Path('ros', f'{name}.py')))
+    assert not {each for each in found if is_ros(each)}
+    own = {each.split('.')[2] for each in found if each.startswith('pose_graph_ros.ros.')}
+    assert own <= set(LOGIC)
 
 
 @pytest.mark.parametrize('path', modules('cli'), ids=str)

@@ -2,6 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Read the TUM files that the product writes."""
 
+import math
 from pathlib import Path
 
 import numpy as np
@@ -15,7 +16,9 @@ def read_tum(path: Path) -> Trajectory:
     for line in path.read_text(encoding='ascii').splitlines():
         if line.startswith('#'):
             continue
-        stamp, x, y, _, _, _, qz, qw = line.split()
+        stamp, x, y, z, qx, qy, qz, qw = line.split()
+        assert float(z) == float(qx) == float(qy) == 0.0
+        assert abs(math.hypot(float(qz), float(qw)) - 1.0) < 1e-12
         seconds, _, nanoseconds = stamp.removeprefix('-').partition('.')
         assert len(nanoseconds) == 9
         stamps.append(int(seconds + nanoseconds) * (-1 if stamp.startswith('-') else 1))

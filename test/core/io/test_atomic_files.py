@@ -77,14 +77,19 @@ def test_if_a_file_cannot_be_renamed_all_are_unchanged(
 
 
 @pytest.mark.parametrize('share', [0.0, 0.5, 0.9])
-def test_a_disk_that_is_full_leaves_the_old_files(tmp_path: Path, share: float) -> None:
+@pytest.mark.parametrize('name', NAMES)
+def test_a_disk_that_is_full_leaves_the_old_files(
+    tmp_path: Path, name: str, share: float,
+) -> None:
+    """Those before the largest one are whole by then."""
     write(tmp_path, OLD)
+    new = {**NEW, name: 3 * NEW[name]}
     limits = resource.getrlimit(resource.RLIMIT_FSIZE)
-    largest = max(map(len, NEW.values()))
+    largest = len(new[name])
     resource.setrlimit(resource.RLIMIT_FSIZE, (int(share * largest), limits[1]))
     try:
         with pytest.raises(FileWriteError, match='too large'):
-            write(tmp_path, NEW)
+            write(tmp_path, new)
     finally:
         resource.setrlimit(resource.RLIMIT_FSIZE, limits)
     assert contents(tmp_path) == OLD

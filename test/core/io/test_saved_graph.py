@@ -35,7 +35,7 @@ from pose_graph_ros.core.exceptions import NothingToSaveError
 from pose_graph_ros.core.geometry import covariance, se2
 from pose_graph_ros.core.geometry.geodesy import MapOrigin, TangentPlane
 from pose_graph_ros.core.io.graph_files import read_graph, write_graph
-from pose_graph_ros.core.io.saved_graph import SavedGraph, site_refusal
+from pose_graph_ros.core.io.saved_graph import SavedGraph, site_refusal, STATES
 from pose_graph_ros.core.measurements import (
     AnswerStatus,
     GlobalPose,
@@ -458,3 +458,7 @@ def test_a_first_fix_must_be_near_a_node() -> None:
     latitude, longitude, _ = plane.to_geodetic(np.array([end + 9_900.0, 0.0])).tolist()
     assert site_refusal(unaligned, fix=MapOrigin(latitude, longitude)) is not None
     assert site_refusal(unaligned, fix=north_of(HERE, 9_990.0)) is None
+
+
+def test_the_states_of_the_alignment_in_files_are_those_of_the_format() -> None:
+    assert STATES == ('local', 'unaligned', 'aligned')
