@@ -1,24 +1,13 @@
 # Copyright 2026 The pose_graph_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""
-Choose the topics of a bag that feed the sources of the node, and read their messages.
-
-The player and the offline replay both read bags with this module, so that the engine receives the
-same messages from both. No rclpy.
-"""
+"""Choose the topics of a bag that feed the sources, and read them, for player and replay alike."""
 
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 import logging
 from typing import NamedTuple
 
-from pose_graph_ros.adapters.bags import (
-    BagError,
-    BagMessage,
-    BagReader,
-    choose_topic,
-    MessageError,
-)
+from pose_graph_ros.adapters.bags import BagError, BagMessage, BagReader, MessageError
 from pose_graph_ros.adapters.sources import CLOSURES, Kind, KNOWN_SOURCES, Source
 
 logger = logging.getLogger(__name__)
@@ -31,15 +20,7 @@ STATIC_FRAMES = '/tf_static', 'tf2_msgs/msg/TFMessage'
 
 @dataclass(frozen=True, slots=True)
 class Inputs:
-    """
-    Topics of a bag that feed the sources of the node, and how many fixes are held out.
-
-    Raises
-    ------
-    BagError
-        If `hold_out` is negative or 1.
-
-    """
+    """Topics of a bag that feed the sources of the node, and how many fixes are held out."""
 
     topics: Mapping[str, str]
     """Topic in the bag by name of the source, such as `fix`."""
@@ -99,16 +80,16 @@ def choose_inputs(
     asked = 'global_pose' in chosen
     for name in sorted(set(chosen) - set(kinds)):
         raise BagError(f'--{_option(name)} {chosen[name]}: the parameter sources has no {name}')
-    for source in sources:
-        named = '/' + source.topic.removeprefix('/')
-        if source.name not in chosen and source.topic != _usual_topic(source):
-            if named in reader.topics:
-                chosen[source.name] = named
-            else:
-                logger.warning('%s: no topic %s for %s', reader.path, named, source.name)
+    named = {source.name: '/' + source.topic.removeprefix('/') for source in sources
+             if source.topic != KNOWN_SOURCES.get(source.name, (None, None))[1]}
+    for name, topic in named.items():
+        if name not in chosen and topic in reader.topics:
+            chosen[name] = topic
+        elif name not in chosen:
+            logger.warning('%s: no topic %s for %s', reader.path, topic, name)
     topics = {name: _checked(reader, name, kinds[name], topic) for name, topic in chosen.items()}
     for name in ('odom', 'fix', CLOSURES, 'global_pose', 'imu'):
-        if name in topics or name not in kinds or _is_named(name, sources):
+        if name in topics or name not in kinds or name in named:
             continue
         guess = _guess(reader, name, kinds, topics, asked=asked)
         if guess is not None:
@@ -125,19 +106,17 @@ def _option(name: str) -> str:
     return name.replace('_', '-')
 
 
-def _usual_topic(source: Source) -> str | None:
-    return KNOWN_SOURCES[source.name][1] if source.name in KNOWN_SOURCES else None
-
-
-def _is_named(name: str, sources: Sequence[Source]) -> bool:
-    return any(source.name == name and source.topic != _usual_topic(source) for source in sources)
-
-
 def _checked(reader: BagReader, name: str, kind: Kind, topic: str) -> str:
+    """Return a topic that was asked for, if the bag has it and it is of the type of the source."""
     option = f'--{_option(name)}' if name in OPTIONS else f'{name}.topic'
-    chosen = choose_topic(reader, topic, kind.message_type, option)
-    assert chosen is not None
-    return chosen
+    info = reader.topics.get(topic)
+    if info is None:
+        raise BagError(
+            f'{reader.path}: no topic {topic} ({option}); the bag has {reader.describe()}')
+    if info.type != kind.message_type:
+        raise BagError(f'{reader.path}: {option} {topic} is of type {info.type}, '
+                       f'expected {kind.message_type}')
+    return topic
 
 
 def _guess(
@@ -145,7 +124,7 @@ def _guess(
     *, asked: bool,
 ) -> str | None:
     """Return the topic of a source for which none was given; None if there is no candidate."""
-    kind = kinds[name]
+    kind, option = kinds[name], f'--{_option(name)}'
     free = [topic for topic, info in reader.topics.items()
             if info.type == kind.message_type and topic not in topics.values()]
     if kind is Kind.LOOP_CLOSURE:
@@ -154,9 +133,13 @@ def _guess(
     if kind is Kind.GLOBAL_POSE:
         fixes = any(kinds[source] is Kind.FIX for source in topics)
         return free[0] if len(free) == 1 and not fixes else None
-    if kind is Kind.FIX and asked:
+    if len(free) == 0 or (kind is Kind.FIX and asked):
         return None
-    return choose_topic(reader, None, kind.message_type, f'--{_option(name)}', among=free)
+    if len(free) > 1:
+        choices = ' or '.join(f'{option} {topic}' for topic in free)
+        raise BagError(
+            f'{reader.path}: {len(free)} topics of type {kind.message_type}, choose {choices}')
+    return free[0]
 
 
 def read_inputs(reader: BagReader, inputs: Inputs) -> Iterator[InputMessage]:
@@ -181,11 +164,9 @@ def read_inputs(reader: BagReader, inputs: Inputs) -> Iterator[InputMessage]:
     count = 0
     for message in reader.messages(list(sources)):
         for source in sources[message.topic]:
-            held_out = False
-            if source in held and inputs.hold_out > 0:
-                count += 1
-                held_out = count % inputs.hold_out == 0
-            yield InputMessage(source, message, held_out)
+            count += source in held
+            yield InputMessage(source, message, source in held and inputs.hold_out > 0
+                               and count % inputs.hold_out == 0)
 
 
 def read_static_frames(reader: BagReader) -> list[BagMessage]:

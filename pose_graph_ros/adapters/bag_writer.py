@@ -117,9 +117,8 @@ class BagWriter:
             If the type is unknown or the message does not fit it.
 
         """
-        connection = self._connections.get((topic, type_name))
-        if connection is None:
-            connection = self._connect(topic, type_name)
+        if (topic, type_name) not in self._connections:
+            self._connections[topic, type_name] = self._connect(topic, type_name)
         if not isinstance(message, bytes):
             try:
                 message = self._types.serialize_cdr(message, type_name)
@@ -127,21 +126,18 @@ class BagWriter:
                 raise BagError(
                     f'{self.folder}: {topic}: no valid {type_name}: {one_line(error)}',
                 ) from error
-        self._writer.write(connection, recorded_ns, message)
+        self._writer.write(self._connections[topic, type_name], recorded_ns, message)
 
     def _connect(self, topic: str, type_name: str) -> Connection:
         if type_name not in self._types.fielddefs:
             raise BagError(f'{self.folder}: {topic}: type {type_name} is unknown to ROS 2 Jazzy')
-        durability = (
-            QosDurability.TRANSIENT_LOCAL if topic in self._latched else QosDurability.VOLATILE)
-        depth = 1 if topic in self._latched else 10
+        depth, durability = ((1, QosDurability.TRANSIENT_LOCAL) if topic in self._latched
+                             else (10, QosDurability.VOLATILE))
         qos = Qos(
             QosHistory.KEEP_LAST, depth, QosReliability.RELIABLE, durability, FOREVER, FOREVER,
             QosLiveliness.AUTOMATIC, FOREVER, avoid_ros_namespace_conventions=False)
-        connection = self._writer.add_connection(
+        return self._writer.add_connection(
             topic, type_name, typestore=self._types, offered_qos_profiles=[qos])
-        self._connections[topic, type_name] = connection
-        return connection
 
 
 def message_types() -> dict[str, Any]:

@@ -16,10 +16,7 @@ import logging
 from pathlib import Path
 from typing import Any, Self
 
-from rosbags.interfaces import (
-    Connection,
-    MessageDefinitionFormat,
-)
+from rosbags.interfaces import Connection, MessageDefinitionFormat
 from rosbags.rosbag1 import Reader as Rosbag1Reader
 from rosbags.rosbag2 import Reader as Rosbag2Reader
 from rosbags.typesys import get_types_from_idl, get_types_from_msg, get_typestore, Stores
@@ -43,12 +40,10 @@ class MessageError(BagError):
 
 @dataclass(frozen=True, slots=True)
 class TopicInfo:
-    """Type and number of messages of one topic of a bag."""
+    """Type and number of messages of one topic of a bag; several types are joined with ` | `."""
 
     type: str
-    """Message type, such as `nav_msgs/msg/Odometry`; several types are joined with ` | `."""
     count: int
-    """Number of messages."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -64,15 +59,7 @@ class BagMessage:
     _decode: Callable[[bytes], Any] = field(repr=False, compare=False)
 
     def decode(self) -> Any:
-        """
-        Return the message as an object with the fields of its type.
-
-        Raises
-        ------
-        MessageError
-            If the bytes are not a message of the type, or the type is unknown.
-
-        """
+        """Return an object with the fields of the type, else raise a `MessageError`."""
         try:
             return self._decode(self.raw)
         except Exception as error:  # generated code can raise anything on invalid bytes
@@ -108,21 +95,13 @@ class BagReader:
         return self
 
     def __exit__(self, *exception: object) -> None:
-        self.close()
-
-    def close(self) -> None:
-        """Close the files; messages that were read before can still be decoded."""
-        self._reader.close()
+        self._reader.close()  # messages that were read before can still be decoded
 
     def messages(self, topics: Collection[str]) -> Iterator[BagMessage]:
         """
         Iterate over the messages of some topics in the order in which they were recorded.
 
-        Raises
-        ------
-        BagError
-            If a topic is not in the bag (at the call), or the file is damaged (on iteration).
-
+        A topic that is not in the bag is a `BagError` at the call, a damaged file on iteration.
         """
         unknown = sorted(set(topics) - set(self.topics))
         if unknown:
@@ -132,9 +111,8 @@ class BagReader:
 
     def describe(self) -> str:
         """Return the topics with their types on one line, for error messages."""
-        if len(self.topics) == 0:
-            return 'no topics'
-        return ', '.join(f'{name} ({info.type})' for name, info in self.topics.items())
+        return ', '.join(
+            f'{name} ({info.type})' for name, info in self.topics.items()) or 'no topics'
 
     def _messages(self, connections: list[Connection]) -> Iterator[BagMessage]:
         if len(connections) == 0:  # rosbags reads all topics if it is given none
@@ -160,23 +138,21 @@ class BagReader:
                                self.path, topic, self.topics[topic].count, seen[topic])
 
     def _decoder(self, connection: Connection) -> Callable[[bytes], Any]:
-        decoder = self._decoders.get(connection.msgtype)
-        if decoder is None:
-            is_ros1 = isinstance(self._reader, Rosbag1Reader)
-            decoder = _make_decoder(connection, is_ros1=is_ros1)
-            self._decoders[connection.msgtype] = decoder
-        return decoder
+        """Return the decoder of a type, by its definition in the bag, else by the standard one."""
+        name, is_ros1 = connection.msgtype, isinstance(self._reader, Rosbag1Reader)
+        if name not in self._decoders:
+            types = _own_types(connection) or get_typestore(
+                Stores.ROS1_NOETIC if is_ros1 else Stores.ROS2_JAZZY)
+            decode = types.deserialize_ros1 if is_ros1 else types.deserialize_cdr
+            self._decoders[name] = partial(decode, typename=name)
+        return self._decoders[name]
 
 
 def open_bag(path: str | Path) -> BagReader:
     """
     Open a rosbag2 folder (sqlite3 or mcap, also compressed), an .mcap, a .db3 or a .bag file.
 
-    Raises
-    ------
-    BagError
-        If the path does not exist, is no bag, or the bag is damaged or of an unsupported format.
-
+    What is no bag, damaged or not supported is a `BagError`.
     """
     path = Path(path)
     if not path.exists():
@@ -197,63 +173,6 @@ def open_bag(path: str | Path) -> BagReader:
         raise BagError(
             f'{path}: damaged, cut short or not supported: {one_line(error)}') from error
     return BagReader(path, reader)
-
-
-def choose_topic(
-    reader: BagReader, wanted: str | None, type_name: str, option: str,
-    *, among: Collection[str] | None = None,
-) -> str | None:
-    """
-    Return the topic to read: the wanted one, or else the only one of the type.
-
-    Parameters
-    ----------
-    reader : BagReader
-    wanted : str or None
-        Topic that the user asks for; None chooses the only one of the type.
-    type_name : str
-        Message type that the topic must have, such as `nav_msgs/msg/Odometry`.
-    option : str
-        Command line option for this topic, such as `--odom`, for error messages.
-    among : collection of str, optional
-        Topics to choose from; by default all.
-
-    Returns
-    -------
-    str or None
-        None if `wanted` is None and there is no topic of the type.
-
-    Raises
-    ------
-    BagError
-        If the wanted topic is missing or of another type, or if there are several to choose from.
-
-    """
-    if wanted is not None:
-        info = reader.topics.get(wanted)
-        if info is None:
-            raise BagError(
-                f'{reader.path}: no topic {wanted} ({option}); the bag has {reader.describe()}')
-        if info.type != type_name:
-            raise BagError(
-                f'{reader.path}: {option} {wanted} is of type {info.type}, expected {type_name}')
-        return wanted
-    candidates = [name for name, info in reader.topics.items()
-                  if info.type == type_name and (among is None or name in among)]
-    if len(candidates) > 1:
-        choices = ' or '.join(f'{option} {name}' for name in candidates)
-        raise BagError(
-            f'{reader.path}: {len(candidates)} topics of type {type_name}, choose {choices}')
-    return candidates[0] if candidates else None
-
-
-def _make_decoder(connection: Connection, *, is_ros1: bool) -> Callable[[bytes], Any]:
-    """Return the decoder of a type, by its definition in the bag, else by the standard one."""
-    types = _own_types(connection)
-    if types is None:
-        types = get_typestore(Stores.ROS1_NOETIC if is_ros1 else Stores.ROS2_JAZZY)
-    decode = types.deserialize_ros1 if is_ros1 else types.deserialize_cdr
-    return partial(decode, typename=connection.msgtype)
 
 
 def _own_types(connection: Connection) -> Typestore | None:

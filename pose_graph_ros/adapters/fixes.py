@@ -1,20 +1,17 @@
 # Copyright 2026 The pose_graph_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""
-Convert GNSS fixes to positions in the map, by the datum and the lever arms of the antennas.
+"""Convert GNSS fixes to positions in the map, by the datum and the lever arms of the antennas."""
 
-No rclpy.
-"""
-
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 import math
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from pose_graph_ros.adapters.conversions import frame, Message, stamp_ns
 from pose_graph_ros.adapters.sources import Source
 from pose_graph_ros.adapters.static_frames import StaticFrames
+from pose_graph_ros.core.exceptions import ConfigError
 from pose_graph_ros.core.geometry import covariance
 from pose_graph_ros.core.geometry.geodesy import MapOrigin, TangentPlane
 from pose_graph_ros.core.geometry.se2 import FloatArray
@@ -46,24 +43,19 @@ class Datum:
     """
 
     def __init__(self, given: Sequence[float] = (), *, wait: bool = False) -> None:
-        if len(given) not in (0, 2, 3):
-            raise ValueError(f'datum: expected [latitude, longitude] or [latitude, longitude, '
-                             f'yaw], got {list(given)}')
         self.yaw = float(given[2]) if len(given) == 3 else 0.0
         """Angle of the map's x axis from east [rad]."""
-        self.plane: TangentPlane | None = None
-        """Tangent plane of the map; None without a datum."""
         self.is_given = len(given) > 0
         """Whether the datum comes from the parameter."""
         self.is_of_graph = False
         """Whether the datum comes from a loaded graph."""
+        self.plane = TangentPlane(given[0], given[1], yaw=self.yaw) if self.is_given else None
+        """Tangent plane of the map; None without a datum."""
         self.altitude = 0.0
         """Altitude of the newest fix that has one [m]."""
-        if len(given) > 0:
-            self.plane = TangentPlane(given[0], given[1], yaw=self.yaw)
         self._waits = wait
         # a given datum takes its altitude from the first fix; east and north do not depend on it
-        self._to_lift = self.plane is not None
+        self._to_lift = self.is_given
 
     def keep(self, origin: MapOrigin) -> None:
         """Use the datum of a loaded graph from now on."""
@@ -105,6 +97,14 @@ class Datum:
         return self.plane
 
 
+def datum_of(values: Mapping[str, Any]) -> Datum:
+    """Return the datum by the checked parameters; a `ConfigError` if it is not on the Earth."""
+    try:
+        return Datum(values['datum'], wait=values['wait_for_datum'])
+    except ValueError as error:
+        raise ConfigError(f'parameter {error}') from error
+
+
 class Antenna(NamedTuple):
     """Position of the antenna of a receiver on the robot."""
 
@@ -128,37 +128,18 @@ class FixReader:
     base_frame : str
         Frame of the robot.
 
-    Raises
-    ------
-    ValueError
-        If the lever arm is not two finite numbers.
-
     """
 
     def __init__(
         self, source: Source, datum: Datum, frames: StaticFrames, base_frame: str,
     ) -> None:
-        self.configure(source)
+        self.source = source
+        """Gives the time offset and the lever arm; may be replaced at any time."""
         self._datum, self._frames, self._base_frame = datum, frames, base_frame
         self.antenna: Antenna | None = None
         """Antenna of the newest fix; None before the first."""
         self.without_lever_arm = 0
         """Number of fixes that were read while the antenna was unknown."""
-
-    def configure(self, source: Source) -> None:
-        """
-        Use the time offset and lever arm of a source from now on.
-
-        Raises
-        ------
-        ValueError
-            If the lever arm is not two finite numbers.
-
-        """
-        if len(source.lever_arm) != 2 or not np.all(np.isfinite(source.lever_arm)):
-            raise ValueError(f'{source.name}.lever_arm: expected [x, y] in metres, got '
-                             f'{list(source.lever_arm)}')
-        self._source = source
 
     def position(self, message: Message) -> Position | Answer:
         """
@@ -175,7 +156,7 @@ class FixReader:
         if abs(latitude) > 90.0 or abs(longitude) > 360.0 or abs(altitude) > LARGEST_ALTITUDE:
             return rejected('out_of_range', f'latitude {latitude}, longitude {longitude}, '
                                             f'altitude {altitude}')
-        stamp = stamp_ns(message, self._source.time_offset_ns)
+        stamp = stamp_ns(message, self.source.time_offset_ns)
         if stamp <= 0:
             return rejected('zero_stamp', 'a fix without a stamp')
         plane = self._datum.plane_for(latitude, longitude, altitude)
@@ -195,10 +176,8 @@ class FixReader:
                         self.antenna.lever_arm)
 
     def _find_antenna(self, frame_id: str) -> Antenna:
-        given = np.array(self._source.lever_arm, dtype=np.float64)
+        given = np.array(self.source.lever_arm, dtype=np.float64)
         if np.any(given):
             return Antenna(given, 'parameter')
         place = self._frames.position(frame_id, self._base_frame)
-        if place is None:
-            return Antenna(given, 'none')
-        return Antenna(place[:2], 'tf_static')
+        return Antenna(given, 'none') if place is None else Antenna(place[:2], 'tf_static')

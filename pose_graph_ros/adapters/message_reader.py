@@ -7,10 +7,9 @@ from typing import Any
 
 from pose_graph_ros.adapters import conversions
 from pose_graph_ros.adapters.conversions import frame, Message
-from pose_graph_ros.adapters.fixes import Datum, FixReader
+from pose_graph_ros.adapters.fixes import datum_of, FixReader
 from pose_graph_ros.adapters.sources import Kind, NANOSECONDS, Source, source_list
 from pose_graph_ros.adapters.static_frames import StaticFrames
-from pose_graph_ros.core.exceptions import ConfigError
 from pose_graph_ros.core.measurements import Answer, Measurement, OdometrySample, rejected
 from pose_graph_ros.core.odometry.stamp_guard import StampGuard
 
@@ -35,7 +34,7 @@ class MessageReader:
     Raises
     ------
     ConfigError
-        If the datum is not a point on the Earth or a lever arm is invalid.
+        If the datum is not a point on the Earth.
 
     """
 
@@ -47,13 +46,10 @@ class MessageReader:
         base_frame = frame(values['base_link_frame'])
         self.frames = StaticFrames() if frames is None else frames
         """Static transforms of the robot, as received on /tf_static."""
-        try:
-            self.datum = Datum(values['datum'], wait=values['wait_for_datum'])
-            self.fixes = {
-                source.name: FixReader(source, self.datum, self.frames, base_frame)
-                for source in self.sources.values() if source.kind is Kind.FIX}
-        except ValueError as error:
-            raise ConfigError(f'parameter {error}') from error
+        self.datum = datum_of(values)
+        self.fixes = {
+            source.name: FixReader(source, self.datum, self.frames, base_frame)
+            for source in self.sources.values() if source.kind is Kind.FIX}
 
     def renewed(self, values: Mapping[str, Any]) -> 'MessageReader':
         """Return a reader for a new graph; it shares the static transforms and nothing else."""
@@ -71,7 +67,7 @@ class MessageReader:
             self._guards[source.name].shift(source.time_offset_ns - before.time_offset_ns)
             self.sources[source.name] = source
             if source.kind is Kind.FIX:
-                self.fixes[source.name].configure(source)
+                self.fixes[source.name].source = source
 
     def read(self, name: str, message: Message) -> OdometrySample | Measurement | Answer:
         """

@@ -6,7 +6,7 @@ from collections.abc import Mapping
 from typing import Any
 
 from pose_graph_ros.adapters.conversions import frame
-from pose_graph_ros.adapters.fixes import Datum
+from pose_graph_ros.adapters.fixes import datum_of
 from pose_graph_ros.adapters.parameters import (
     all_parameters,
     Change,
@@ -72,21 +72,14 @@ def _require_changeable(parameter: Parameter, *, configured: bool) -> None:
 
 def require_together(values: Mapping[str, Any]) -> None:
     """
-    Check the conditions on more than one parameter.
+    Check the conditions on more than one parameter, and raise a `ConfigError` if one is broken.
 
-    Raises
-    ------
-    ConfigError
-        If the three frames are not different, the datum is not a point on the Earth, there is no
-        odometry, or settings of a source contradict each other.
-
+    The three frames must be different, the datum a point on the Earth, there must be odometry, and
+    settings of a source must not contradict each other.
     """
     frames = [frame(values[name]) for name in FRAMES]
     if '' in frames or len(set(frames)) < len(frames):
         raise ConfigError(f'parameters {", ".join(FRAMES)}: expected three different names, got '
                           f'{", ".join(map(repr, frames))}')
-    try:
-        Datum(values['datum'])
-    except ValueError as error:
-        raise ConfigError(f'parameter {error}') from error
+    datum_of(values)
     backend_config(values)

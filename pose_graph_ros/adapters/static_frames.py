@@ -6,6 +6,7 @@ import math
 from typing import NamedTuple
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 from pose_graph_ros.adapters.conversions import frame, Message
 from pose_graph_ros.core.geometry.se2 import FloatArray
@@ -40,8 +41,8 @@ class StaticFrames:
             if (parent in ('', child) or child == '' or not 1e-6 < norm < math.inf
                     or not np.all(np.abs(translation) < LARGEST_DISTANCE)):
                 continue
-            self._frames[child] = _Frame(
-                parent, _rotation(q.x / norm, q.y / norm, q.z / norm, q.w / norm), translation)
+            rotation = Rotation.from_quat((q.x, q.y, q.z, q.w)).as_matrix()
+            self._frames[child] = _Frame(parent, rotation, translation)
 
     def position(self, name: str, base: str) -> FloatArray | None:
         """
@@ -73,11 +74,3 @@ class StaticFrames:
                 break
             chain[name] = rotation, translation
         return chain
-
-
-def _rotation(x: float, y: float, z: float, w: float) -> FloatArray:
-    """Return the rotation matrix of a unit quaternion."""
-    return np.array([
-        [1.0 - 2.0 * (y * y + z * z), 2.0 * (x * y - w * z), 2.0 * (x * z + w * y)],
-        [2.0 * (x * y + w * z), 1.0 - 2.0 * (x * x + z * z), 2.0 * (y * z - w * x)],
-        [2.0 * (x * z - w * y), 2.0 * (y * z + w * x), 1.0 - 2.0 * (x * x + y * y)]])

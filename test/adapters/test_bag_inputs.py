@@ -57,10 +57,12 @@ def test_the_choice_of_topics(
 
 
 @pytest.mark.parametrize(('reader', 'wanted', 'said'), [
-    (bag(f='fix'), {}, 'odometry'), (bag(o='odom', p='odom'), {}, '--odom /o or --odom /p'),
+    (bag(f='fix'), {}, 'odometry'),
+    (bag(o='odom', p='odom'), {}, 'choose --odom /o or --odom /p'),
     (bag(o='odom', f='fix', g='fix'), {}, '--fix /f or --fix /g'),
-    (bag(o='odom', f='fix'), {'fix': '/x'}, '/x'),
-    (bag(o='odom', f='fix'), {'global_pose': '/f'}, POSE)])
+    (bag(o='odom', f='fix'), {'fix': '/x'}, r'no topic /x \(--fix\); the bag has /o, /f'),
+    (bag(o='odom', f='fix'), {'global_pose': '/f'},
+     f'--global-pose /f is of type {Kind.FIX.message_type}, expected {POSE}')])
 def test_a_choice_that_is_not_clear_names_the_candidates(
     reader: SimpleNamespace, wanted: dict[str, str], said: str,
 ) -> None:

@@ -16,7 +16,7 @@ from rosbags.typesys import get_types_from_msg, get_typestore, Stores
 from ruamel.yaml import YAML
 
 from pose_graph_ros.adapters.bag_writer import BagWriter, message_types
-from pose_graph_ros.adapters.bags import BagError, choose_topic, MessageError, open_bag
+from pose_graph_ros.adapters.bags import BagError, MessageError, open_bag
 
 POINT = 'geometry_msgs/msg/Point'
 STRING = 'std_msgs/msg/String'
@@ -205,23 +205,6 @@ def test_unknown_topics_are_refused_at_once_with_those_that_exist(tmp_path: Path
         BagError, match=r'no topic /c; the bag has /a \(geometry_msgs/msg/Point\), /b',
     ):
         bag.messages(['/a', '/c'])
-
-
-def test_choose_topic(tmp_path: Path) -> None:
-    with BagWriter(tmp_path / 'bag') as writer:
-        for topic in ('/a', '/b'):
-            writer.write(topic, POINT, 1, point(1))
-        writer.write('/c', STRING, 2, TYPES[STRING]('hello'))
-    with open_bag(tmp_path / 'bag') as bag:
-        assert choose_topic(bag, '/b', POINT, '--point') == '/b'
-        assert choose_topic(bag, None, STRING, '--text') == '/c'
-        assert choose_topic(bag, None, 'nav_msgs/msg/Odometry', '--odom') is None
-        with pytest.raises(BagError, match='choose --point /a or --point /b'):
-            choose_topic(bag, None, POINT, '--point')
-        with pytest.raises(BagError, match=f'--point /c is of type {STRING}, expected {POINT}'):
-            choose_topic(bag, '/c', POINT, '--point')
-        with pytest.raises(BagError, match='no topic /d'):
-            choose_topic(bag, '/d', POINT, '--point')
 
 
 def assert_clear(path: Path, words: str) -> None:
