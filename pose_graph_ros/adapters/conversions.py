@@ -3,10 +3,9 @@
 """
 Convert ROS messages to measurements.
 
-The functions accept any object with the fields of the message, from rclpy or from a bag reader, so
-this module imports no ROS and the offline tools share it. Invalid data never raises: the functions
-return an `Answer` with the reason. Covariances are passed on unchanged; `core.sources.validation`
-applies the covariance policy of the source.
+The functions accept any object with the fields of the message, from rclpy or from a bag reader.
+Invalid data never raises: they return an `Answer` with the reason. Covariances are passed on
+unchanged; `core.sources.validation` applies the covariance policy of the source.
 """
 
 import math

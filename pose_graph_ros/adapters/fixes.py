@@ -71,7 +71,7 @@ class Datum:
         self, latitude: float, longitude: float, altitude: float,
     ) -> TangentPlane | None:
         """
-        Return the plane for a valid fix, which becomes the datum if there is none.
+        Return the plane for a valid fix, which becomes the datum if there is none and none waits.
 
         Parameters
         ----------
@@ -79,11 +79,6 @@ class Datum:
             Of the fix [degrees].
         altitude : float
             Of the fix [m]; NaN if unknown.
-
-        Returns
-        -------
-        TangentPlane or None
-            None while the datum waits for `renew`.
 
         """
         if math.isfinite(altitude):

@@ -7,8 +7,6 @@ One message object for every point would take seconds instead of milliseconds. T
 constraint shows its error in sigmas: green up to 1, yellow at 2, red from 3. No rclpy.
 """
 
-import struct
-
 import numpy as np
 import numpy.typing as npt
 
@@ -48,25 +46,23 @@ def markers_cdr(view: GraphView, stamp_ns: int, frame_id: str) -> bytes:
         Frame of the map.
 
     """
-    measured = view.observed.ends[:, 1]
-    observed = colours(view.observed.sigmas)
+    plain = np.empty((0, 4), dtype='<f4')
     drawn = [
-        (POINTS, NODE_SIZE, view.nodes, np.empty((0, 4), dtype=np.float32)),
+        (POINTS, NODE_SIZE, view.nodes, plain),
         (LINE_LIST, EDGE_WIDTH, *_lines(view.odometry)),
         (LINE_LIST, CLOSURE_WIDTH, *_lines(view.loop_closures)),
         (LINE_LIST, EDGE_WIDTH, *_lines(view.observed)),
-        (POINTS, OBSERVED_SIZE, measured, observed)]
+        (POINTS, OBSERVED_SIZE, view.observed.ends[:, 1], colours(view.observed.sigmas))]
     shown = [number for number, (_, _, points, _) in enumerate(drawn) if len(points) > 0]
-    stream = _Stream()
-    stream.add('I', 1 + len(shown))
     header = (*divmod(stamp_ns, NANOSECONDS), frame_id)
-    nothing = np.empty((0, 2)), np.empty((0, 4), dtype=np.float32)
-    _add_marker(stream, header, '', (0, 0, DELETEALL), 0.0, *nothing)
+    stream = _Stream()
+    stream.add('<u4', 1 + len(shown))
+    _add_marker(stream, header, '', (0, 0, DELETEALL), 0.0, np.empty((0, 2)), plain)
     for number in shown:
         kind, size, points, point_colours = drawn[number]
         _add_marker(
             stream, header, NAMESPACES[number], (number, kind, ADD), size, points, point_colours)
-    return stream.bytes()
+    return b'\x00\x01\x00\x00' + bytes(stream.data)
 
 
 def colours(sigmas: FloatArray) -> _Colours:
@@ -87,68 +83,46 @@ def _add_marker(  # noqa: PLR0917  fields of a marker
 ) -> None:
     """Add a visualization_msgs/Marker field by field."""
     def add_header() -> None:
-        stream.add('i', header[0])
-        stream.add('I', header[1])
+        stream.add('<i4', header[0])
+        stream.add('<u4', header[1])
         stream.add_text(header[2])
 
     add_header()
     stream.add_text(namespace)
-    stream.add('i', *what)
-    stream.add('d', 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0)  # pose
-    stream.add('d', size, size, 0.0)                    # scale: lines use the first
-    stream.add('f', *NODE_COLOUR)                       # colour of points without their own
-    stream.add('i', 0, 0)                               # lifetime: forever
-    stream.add('B', 0)                                  # frame_locked
-    stream.add('I', len(points))
+    stream.add('<i4', *what)
+    stream.add('<f8', 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0)    # pose
+    stream.add('<f8', size, size, 0.0)                      # scale: lines use the first
+    stream.add('<f4', *NODE_COLOUR)                         # of points without their own
+    stream.add('<i4', 0, 0)                                 # lifetime: forever
+    stream.add('u1', 0)                                     # frame_locked
+    stream.add('<u4', len(points))
     if len(points) > 0:
-        flat = np.zeros((len(points), 3))
-        flat[:, :2] = points
-        stream.add_array(flat)
-    stream.add('I', len(point_colours))
-    stream.add_array(point_colours)
-    stream.add_text('')     # texture_resource
-    add_header()            # texture
+        stream.add('<f8', np.pad(points, ((0, 0), (0, 1))))
+    stream.add('<u4', len(point_colours))
+    stream.add('<f4', point_colours)
+    stream.add_text('')         # texture_resource
+    add_header()                # texture
     stream.add_text('')
-    stream.add('I', 0)
-    stream.add('I', 0)      # uv_coordinates
-    stream.add_text('')     # text
-    stream.add_text('')     # mesh_resource
-    stream.add_text('')     # mesh_file
-    stream.add('I', 0)
-    stream.add('B', 0)      # mesh_use_embedded_materials
+    stream.add('<u4', 0, 0)     # its data, and uv_coordinates
+    for _ in range(3):
+        stream.add_text('')     # text, mesh_resource and the name of mesh_file
+    stream.add('<u4', 0)
+    stream.add('u1', 0)         # mesh_use_embedded_materials
 
 
 class _Stream:
-    """
-    A stream of CDR.
-
-    The position of each number after the header of four bytes is a multiple of its size.
-    """
+    """A stream of CDR: the position of each number is a multiple of its size."""
 
     def __init__(self) -> None:
-        self._parts: list[bytes] = []
-        self._size = 0
+        self.data = bytearray()
 
-    def _append(self, part: bytes, alignment: int) -> None:
-        padding = -self._size % alignment
-        self._parts += (bytes(padding), part)
-        self._size += padding + len(part)
-
-    def add(self, code: str, *numbers: float) -> None:
-        """Add numbers with a format code of `struct`."""
-        self._append(struct.pack(f'<{len(numbers)}{code}', *numbers), struct.calcsize(code))
+    def add(self, code: str, *numbers: npt.ArrayLike) -> None:
+        """Add numbers, or an array, as a type of NumPy."""
+        array = np.asarray(numbers, dtype=code)
+        self.data += bytes(-len(self.data) % array.itemsize) + array.tobytes()
 
     def add_text(self, text: str) -> None:
         """Add a string."""
         name = text.encode() + b'\0'
-        self.add('I', len(name))
-        self._append(name, 1)
-
-    def add_array(self, array: npt.NDArray[np.generic]) -> None:
-        """Add the numbers of an array."""
-        little = array.astype(array.dtype.newbyteorder('<'), copy=False)
-        self._append(little.tobytes(), array.itemsize)
-
-    def bytes(self) -> bytes:
-        """Return the serialised message."""
-        return b''.join((b'\x00\x01\x00\x00', *self._parts))
+        self.add('<u4', len(name))
+        self.data += name

@@ -51,16 +51,11 @@ class MessageReader:
             source.name: FixReader(source, self.datum, self.frames, base_frame)
             for source in self.sources.values() if source.kind is Kind.FIX}
 
-    def renewed(self, values: Mapping[str, Any]) -> 'MessageReader':
-        """Return a reader for a new graph; it shares the static transforms and nothing else."""
-        return MessageReader(values, self.frames)
-
     def configure(self, values: Mapping[str, Any]) -> None:
         """
         Use other time offsets, lever arms and yaw offsets for messages from now on.
 
-        Sources, topics, frames and datum, which the node reads when it is configured, stay, and so
-        do static transforms and counts.
+        Sources, topics, frames, datum, static transforms and counts stay.
         """
         for source in source_list(values):
             before = self.sources[source.name]
@@ -104,7 +99,6 @@ class MessageReader:
             case Kind.FIX:
                 return self.fixes[source.name].position(message)
             case Kind.IMU:
-                return conversions.heading(
-                    message, self.datum.yaw, source.yaw_offset, offset_ns)
+                return conversions.heading(message, self.datum.yaw, source.yaw_offset, offset_ns)
             case Kind.LOOP_CLOSURE:
                 return conversions.loop_closure(message, offset_ns)

@@ -2,7 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Format the tables of parameters for docs/parameters.md and as a parameter file; no ROS."""
 
-from collections.abc import Iterable, Iterator
+from collections.abc import Collection, Iterator
 
 from pose_graph_ros.adapters.parameters import (
     listed_sources,
@@ -59,10 +59,7 @@ def as_markdown() -> str:
     """Return the table in docs/parameters.md of the parameters of the node."""
     lines = ['| parameter | default | unit | range | changes | description |',
              '|---|---|---|---|---|---|']
-    for parameter in PARAMETERS:
-        value = 'unset' if parameter.default == [] else _yaml(parameter.default)
-        lines.append(f'| `{parameter.name}` | {value} | {parameter.unit} | {_range(parameter)} | '
-                     f'{parameter.change.value} | {parameter.description} |')
+    lines += (f'| `{parameter.name}` | {_facts(parameter)}' for parameter in PARAMETERS)
     return '\n'.join(lines) + '\n'
 
 
@@ -70,17 +67,20 @@ def sources_as_markdown() -> str:
     """Return the table in docs/parameters.md of the parameters of a source."""
     lines = ['| parameter | types | default | unit | range | changes | description |',
              '|---|---|---|---|---|---|---|']
-    for parameter in SOURCE_PARAMETERS:
-        value = '' if parameter.name in ('type', 'topic') else (
-            'unset' if parameter.default == [] else _yaml(parameter.default))
-        lines.append(f'| `<source>.{parameter.name}` | {_kinds(parameter.kinds)} | {value} | '
-                     f'{parameter.unit} | {_range(parameter)} | {parameter.change.value} | '
-                     f'{parameter.description} |')
+    lines += (f'| `<source>.{parameter.name}` | {_kinds(parameter.kinds)} | {_facts(parameter)}'
+              for parameter in SOURCE_PARAMETERS)
     return '\n'.join(lines) + '\n'
 
 
-def _kinds(kinds: Iterable[Kind]) -> str:
-    kinds = set(kinds)
+def _facts(parameter: Parameter) -> str:
+    """Return the columns from the default on."""
+    value = '' if parameter.name in ('type', 'topic') else (
+        'unset' if parameter.default == [] else _yaml(parameter.default))
+    return (f'{value} | {parameter.unit} | {_range(parameter)} | {parameter.change.value} | '
+            f'{parameter.description} |')
+
+
+def _kinds(kinds: Collection[Kind]) -> str:
     missing = [kind.value for kind in Kind if kind not in kinds]
     if len(missing) == 0:
         return 'all'

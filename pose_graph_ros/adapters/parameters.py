@@ -15,21 +15,7 @@ import sys
 from typing import Any
 
 from pose_graph_ros.adapters.sources import DEFAULT_SOURCES, Kind, KNOWN_SOURCES, source_names
-from pose_graph_ros.core.config import (
-    AlignmentPolicy,
-    BackendConfig,
-    Correlation,
-    CovariancePolicy,
-    Heading,
-    HEADINGS,
-    LOOP_CLOSURES,
-    Loss,
-    MeasurementSource,
-    NodePolicy,
-    NoiseFrom,
-    OdometrySource,
-    POSITIONS,
-)
+from pose_graph_ros.core import config
 from pose_graph_ros.core.exceptions import ConfigError
 
 Value = bool | float | str | list[float] | list[str]
@@ -73,10 +59,9 @@ def _values(choices: type[Enum]) -> tuple[str, ...]:
     return tuple(str(choice.value) for choice in choices)
 
 
-_NODES, _ALIGNMENT, _BACKEND = NodePolicy(), AlignmentPolicy(), BackendConfig()
-_ODOMETRY, _MEASUREMENT, _COVARIANCE = OdometrySource(), MeasurementSource(), CovariancePolicy()
-_NOISE = _ODOMETRY.noise
-_POLICY = {True: 'repair', False: 'refuse'}
+_BACKEND, _ODOMETRY = config.BackendConfig(), config.OdometrySource()
+_MEASUREMENT, _COVARIANCE = config.MeasurementSource(), config.CovariancePolicy()
+_NODES, _ALIGNMENT, _NOISE = _BACKEND.nodes, _BACKEND.alignment, _ODOMETRY.noise
 
 PARAMETERS: tuple[Parameter, ...] = (
     Parameter('sources', list(DEFAULT_SOURCES), '', 'Names of the sources of measurements; the '
@@ -85,8 +70,7 @@ PARAMETERS: tuple[Parameter, ...] = (
               change=Change.START),
     Parameter('autostart', True, '', 'Whether the node configures and activates itself. If false, '
               'a lifecycle manager must do so.', change=Change.START),
-    Parameter('map_frame', 'map', '', 'Frame of the corrected path.',
-              change=Change.UNCONFIGURED),
+    Parameter('map_frame', 'map', '', 'Frame of the corrected path.', change=Change.UNCONFIGURED),
     Parameter('odom_frame', 'odom', '', 'Frame of the odometry, child of `map_frame` in TF.',
               change=Change.UNCONFIGURED),
     Parameter('base_link_frame', 'base_link', '', 'Frame of the robot base.',
@@ -127,9 +111,8 @@ PARAMETERS: tuple[Parameter, ...] = (
               'hidden nodes that are added because of distance or rotation.', 0.0, 60.0),
     Parameter('moving_node_interval', _NODES.moving_interval, 's',
               'Maximum time between two hidden nodes while the robot moves.', 0.05, 3600.0),
-    Parameter('node_heartbeat', _NODES.heartbeat, 's',
-              'Maximum time between two hidden nodes, also while the robot stands still.',
-              0.1, 86400.0),
+    Parameter('node_heartbeat', _NODES.heartbeat, 's', 'Maximum time between two hidden nodes, '
+              'also while the robot stands still.', 0.1, 86400.0),
     Parameter('odometry_patience', _BACKEND.odometry_patience, 's', 'Hidden nodes are added from '
               'another odometry source if the present one lags behind it by more than this time.',
               0.05, 3600.0),
@@ -147,6 +130,7 @@ _ALL = tuple(Kind)
 _WHEELS = (Kind.ODOMETRY,)
 _OTHERS = tuple(kind for kind in Kind if kind is not Kind.ODOMETRY)
 _POSITIONS = (Kind.GLOBAL_POSE, Kind.FIX)
+_NOT_POSITIONS = tuple(kind for kind in Kind if kind not in _POSITIONS)
 _NOT_CLOSURES = tuple(kind for kind in _OTHERS if kind is not Kind.LOOP_CLOSURE)
 
 SOURCE_PARAMETERS: tuple[Parameter, ...] = (
@@ -158,19 +142,15 @@ SOURCE_PARAMETERS: tuple[Parameter, ...] = (
               3600.0, kinds=_ALL),
     Parameter('noise', _ODOMETRY.noise_from.value, '', 'Origin of the odometry noise: `model` '
               'uses distance and rotation, `twist` the twist covariance times the time step.',
-              choices=_values(NoiseFrom), kinds=_WHEELS, change=Change.UNCONFIGURED),
-    Parameter('sigma_distance', _NOISE.sigma_distance, 'm/sqrt(m)',
-              'Odometry noise along the path, per square root of the distance.', 0.0, 10.0,
-              kinds=_WHEELS),
-    Parameter('sigma_lateral', _NOISE.sigma_lateral, 'm/sqrt(m)',
-              'Odometry noise across the path, per square root of the distance.', 0.0, 10.0,
-              kinds=_WHEELS),
-    Parameter('sigma_heading_distance', _NOISE.sigma_heading_distance, 'rad/sqrt(m)',
-              'Odometry noise of the heading, per square root of the distance.', 0.0, 10.0,
-              kinds=_WHEELS),
-    Parameter('sigma_heading_turn', _NOISE.sigma_heading_turn, 'rad/sqrt(rad)',
-              'Odometry noise of the heading, per square root of the rotation.', 0.0, 10.0,
-              kinds=_WHEELS),
+              choices=_values(config.NoiseFrom), kinds=_WHEELS, change=Change.UNCONFIGURED),
+    Parameter('sigma_distance', _NOISE.sigma_distance, 'm/sqrt(m)', 'Odometry noise along the '
+              'path, per square root of the distance.', 0.0, 10.0, kinds=_WHEELS),
+    Parameter('sigma_lateral', _NOISE.sigma_lateral, 'm/sqrt(m)', 'Odometry noise across the '
+              'path, per square root of the distance.', 0.0, 10.0, kinds=_WHEELS),
+    Parameter('sigma_heading_distance', _NOISE.sigma_heading_distance, 'rad/sqrt(m)', 'Odometry '
+              'noise of the heading, per square root of the distance.', 0.0, 10.0, kinds=_WHEELS),
+    Parameter('sigma_heading_turn', _NOISE.sigma_heading_turn, 'rad/sqrt(rad)', 'Odometry noise '
+              'of the heading, per square root of the rotation.', 0.0, 10.0, kinds=_WHEELS),
     Parameter('sigma_floor', [_NOISE.sigma_floor_position, _NOISE.sigma_floor_heading], 'm, rad',
               'Odometry noise of position and heading added once between two hidden nodes.', 1e-6,
               100.0, sizes=(2,), kinds=_WHEELS),
@@ -179,12 +159,10 @@ SOURCE_PARAMETERS: tuple[Parameter, ...] = (
               kinds=_WHEELS),
     Parameter('maximum_speed', _ODOMETRY.maximum_speed, 'm/s', 'Faster motion is treated as a '
               'jump of the odometry.', 0.01, 1e4, kinds=_WHEELS),
-    Parameter('covariance_policy', _POLICY[_COVARIANCE.repair], '',
-              'Whether to repair an invalid covariance or to refuse its measurement.',
-              choices=('repair', 'refuse'), kinds=_NOT_CLOSURES),
-    Parameter('covariance_policy', _POLICY[LOOP_CLOSURES.covariance.repair], '',
-              'Whether to repair an invalid covariance or to refuse its measurement.',
-              choices=('repair', 'refuse'), kinds=(Kind.LOOP_CLOSURE,)),
+    *(Parameter('covariance_policy', 'repair' if policy.repair else 'refuse', '',
+                'Whether to repair an invalid covariance or to refuse its measurement.',
+                choices=('repair', 'refuse'), kinds=kinds) for kinds, policy in (
+        (_NOT_CLOSURES, _COVARIANCE), ((Kind.LOOP_CLOSURE,), config.LOOP_CLOSURES.covariance))),
     Parameter('covariance_override', [], 'm, rad', 'Standard deviation of the position and, '
               'optionally, of the heading, used instead of the covariance in the messages.', 1e-6,
               1e6, sizes=(0, 1, 2), kinds=_OTHERS),
@@ -201,31 +179,29 @@ SOURCE_PARAMETERS: tuple[Parameter, ...] = (
               sizes=(2,), kinds=_OTHERS),
     Parameter('heading', _COVARIANCE.heading.value, '', 'Whether to use the heading of the pose. '
               'With `auto` it is used if its variance is positive and less than that of a uniform '
-              'distribution on the circle.', choices=_values(Heading), kinds=(Kind.GLOBAL_POSE,)),
+              'distribution on the circle.', choices=_values(config.Heading),
+              kinds=(Kind.GLOBAL_POSE,)),
     Parameter('lever_arm', [0.0, 0.0], 'm', 'Position of the antenna in the robot base frame, x '
               'and y. If zero, it is taken from /tf_static if available.', -1e3, 1e3, sizes=(2,),
               kinds=(Kind.FIX,)),
     Parameter('yaw_offset', 0.0, 'rad', 'Angle added to the yaw, such that zero is east.', -6.3,
               6.3, kinds=(Kind.IMU,)),
-    Parameter('robust_loss', POSITIONS.loss.value, '', 'Robust loss applied to the errors.',
-              choices=_values(Loss), kinds=_POSITIONS),
-    Parameter('robust_loss', _MEASUREMENT.loss.value, '', 'Robust loss applied to the errors.',
-              choices=_values(Loss), kinds=tuple(kind for kind in Kind if kind not in _POSITIONS)),
+    *(Parameter('robust_loss', loss.value, '', 'Robust loss applied to the errors.',
+                choices=_values(config.Loss), kinds=kinds) for kinds, loss in (
+        (_POSITIONS, config.POSITIONS.loss), (_NOT_POSITIONS, _MEASUREMENT.loss))),
     Parameter('rejection_threshold', _MEASUREMENT.rejection_threshold, '', 'Error in standard '
               'deviations above which the robust loss reduces the weight of a measurement.', 0.1,
               1e3, kinds=_ALL),
-    Parameter('minimum_period', _MEASUREMENT.minimum_period, 's', 'Minimum time between the '
-              'stamps of two measurements; of closer ones the first to arrive is used. If 0, all '
-              'are used.', 0.0, 3600.0, kinds=_POSITIONS),
-    Parameter('minimum_period', HEADINGS.minimum_period, 's', 'Minimum time between the stamps of '
-              'two measurements; of closer ones the first to arrive is used. If 0, all are used.',
-              0.0, 3600.0, kinds=(Kind.IMU,)),
+    *(Parameter('minimum_period', period, 's', 'Minimum time between the stamps of two '
+                'measurements; of closer ones the first to arrive is used. If 0, all are used.',
+                0.0, 3600.0, kinds=kinds) for kinds, period in (
+        (_POSITIONS, _MEASUREMENT.minimum_period), ((Kind.IMU,), config.HEADINGS.minimum_period))),
     Parameter('correlation_time', _MEASUREMENT.correlation_time, 's',
               'Time constant of time-correlated errors. If 0, errors are white noise.', 0.0, 1e5,
               kinds=_NOT_CLOSURES, change=Change.UNCONFIGURED),
     Parameter('correlation_model', _MEASUREMENT.correlation.value, '', 'Treatment of '
               'time-correlated errors: `bias` estimates them, `inflate` increases the '
-              'covariances.', choices=_values(Correlation), kinds=_NOT_CLOSURES,
+              'covariances.', choices=_values(config.Correlation), kinds=_NOT_CLOSURES,
               change=Change.UNCONFIGURED),
     Parameter('white_share', _MEASUREMENT.white_share, '', 'Fraction of the variance that is '
               'white noise, if time-correlated errors are estimated as a bias.', 0.0, 1.0,
@@ -268,26 +244,14 @@ def source_parameters(source: str, kind: str) -> tuple[Parameter, ...]:
 
 def _of_source(parameter: Parameter, source: str) -> Parameter:
     kind, topic = KNOWN_SOURCES.get(source, (None, source))
-    default = parameter.default
-    if parameter.name == 'type' and kind is not None:
-        default = kind.value
-    elif parameter.name == 'topic':
-        default = topic
-    return replace(parameter, name=f'{source}.{parameter.name}', default=default)
+    own = {'type': '' if kind is None else kind.value, 'topic': topic}
+    return replace(parameter, name=f'{source}.{parameter.name}',
+                   default=own.get(parameter.name, parameter.default))
 
 
 def listed_sources(given: Mapping[str, Any]) -> list[str]:
-    """
-    Return the names of all sources by the given parameters.
-
-    Raises
-    ------
-    ConfigError
-        If `sources` is not a list of different, valid names.
-
-    """
-    names = given.get('sources', list(DEFAULT_SOURCES))
-    names = checked_value(PARAMETERS[0], names)
+    """Return the names of all sources; a `ConfigError` if they are not different, valid names."""
+    names = checked_value(PARAMETERS[0], given.get('sources', list(DEFAULT_SOURCES)))
     for name in names:
         if _NAME.fullmatch(name) is None or name in _TAKEN:
             raise ConfigError(f'parameter sources: {name!r} cannot be the name of a source; '
@@ -301,11 +265,7 @@ def all_parameters(given: Mapping[str, Any]) -> tuple[Parameter, ...]:
     """
     Return the parameters of the node and of the sources in the given parameters.
 
-    Raises
-    ------
-    ConfigError
-        If the name or the kind of a source is invalid.
-
+    If the name or the kind of a source is invalid, that is a `ConfigError`.
     """
     parameters = list(PARAMETERS)
     for source in listed_sources(given):
@@ -318,11 +278,7 @@ def checked(given: Mapping[str, Any]) -> dict[str, Any]:
     """
     Return all parameters: the given values, after a check of types and ranges, else defaults.
 
-    Raises
-    ------
-    ConfigError
-        If a name is unknown, a type is wrong or a number is out of range.
-
+    An unknown name, a wrong type or a number out of range is a `ConfigError`.
     """
     parameters = all_parameters(given)
     known = {parameter.name for parameter in parameters}
@@ -353,45 +309,43 @@ def checked_value(parameter: Parameter, value: Any) -> Any:
         If the type is wrong or the value is out of range.
 
     """
-    name, default = parameter.name, parameter.default
-    if isinstance(default, bool | str):
-        if type(value) is not type(default):
-            raise ConfigError(f'parameter {name}: expected {type(default).__name__}, '
-                              f'got {value!r}')
-        if len(parameter.choices) > 0 and value not in parameter.choices:
-            raise ConfigError(f'parameter {name}: expected one of '
-                              f'{", ".join(parameter.choices)}, got {value!r}')
-        if name.endswith('.topic') and _TOPIC.fullmatch(str(value)) is None:
-            raise ConfigError(f'parameter {name}: expected the name of a topic, got {value!r}')
-        return value
+    default = parameter.default
     if isinstance(default, list):
         return _checked_list(parameter, value)
-    return _number(parameter, value)
+    if not isinstance(default, bool | str):
+        return _number(parameter, value)
+    if type(value) is not type(default):
+        raise _wrong(parameter, type(default).__name__, value)
+    if len(parameter.choices) > 0 and value not in parameter.choices:
+        raise _wrong(parameter, f'one of {", ".join(parameter.choices)}', value)
+    if parameter.name.endswith('.topic') and _TOPIC.fullmatch(str(value)) is None:
+        raise _wrong(parameter, 'the name of a topic', value)
+    return value
+
+
+def _wrong(parameter: Parameter, expected: str, value: object) -> ConfigError:
+    return ConfigError(f'parameter {parameter.name}: expected {expected}, got {value!r}')
 
 
 def _checked_list(parameter: Parameter, value: Any) -> Value:
-    name, sizes = parameter.name, parameter.sizes
-    of_names = name == 'sources'
+    sizes, of_names = parameter.sizes, parameter.name == 'sources'
     if not isinstance(value, Sequence) or isinstance(value, str | bytes) or (
             of_names and not all(isinstance(item, str) for item in value)):
-        raise ConfigError(f'parameter {name}: expected a list of '
-                          f'{"names" if of_names else "numbers"}, got {value!r}')
+        raise _wrong(parameter, f'a list of {"names" if of_names else "numbers"}', value)
     if of_names:
         return list(value)
     if len(sizes) > 0 and len(value) not in sizes:
-        raise ConfigError(f'parameter {name}: expected {" or ".join(map(str, sizes))} numbers '
-                          f'[{parameter.unit}], got {list(value)}')
+        expected = f'{" or ".join(map(str, sizes))} numbers [{parameter.unit}]'
+        raise _wrong(parameter, expected, list(value))
     return [_number(parameter, item) for item in value]
 
 
 def _number(parameter: Parameter, value: Any) -> float:
-    name = parameter.name
     if isinstance(value, bool) or not isinstance(value, (int, float)):
-        raise ConfigError(f'parameter {name}: expected a number, got {value!r}')
+        raise _wrong(parameter, 'a number', value)
     low = -sys.float_info.max if parameter.smallest is None else parameter.smallest
     high = sys.float_info.max if parameter.largest is None else parameter.largest
     if not low <= value <= high:
-        expected = ('a finite number' if parameter.smallest is None
-                    else f'a number in [{low:g}, {high:g}]')
-        raise ConfigError(f'parameter {name}: expected {expected}, got {value!r}')
+        raise _wrong(parameter, 'a finite number' if parameter.smallest is None
+                     else f'a number in [{low:g}, {high:g}]', value)
     return float(value)

@@ -1,30 +1,13 @@
 # Copyright 2026 The pose_graph_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""
-The sources of measurements by the ROS parameters, and the settings of the engine for them.
-
-No rclpy.
-"""
+"""The sources of measurements by the ROS parameters, and the settings of the engine for them."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass
 from enum import Enum
 from typing import Any
 
-from pose_graph_ros.core.config import (
-    AlignmentPolicy,
-    BackendConfig,
-    Correlation,
-    CovariancePolicy,
-    Heading,
-    Loss,
-    MeasurementSource,
-    NodePolicy,
-    NoiseFrom,
-    OdometryNoise,
-    OdometrySource,
-    SET_POSES,
-)
+from pose_graph_ros.core import config
 from pose_graph_ros.core.exceptions import ConfigError
 
 NANOSECONDS = 1_000_000_000
@@ -99,18 +82,14 @@ _SETTINGS = {'CovariancePolicy.position_ceiling': 'sigma_ceiling',
              'CovariancePolicy.heading_floor': 'sigma_floor'}
 
 
-def backend_config(values: Mapping[str, Any]) -> BackendConfig:
+def backend_config(values: Mapping[str, Any]) -> config.BackendConfig:
     """
     Return the settings of the engine by the checked parameters.
 
-    Raises
-    ------
-    ConfigError
-        If parameters contradict each other, or there is no source of odometry.
-
+    If these contradict each other, or have no source of odometry, that is a `ConfigError`.
     """
-    odometry: dict[str, OdometrySource] = {}
-    measurements = {SET_POSE: SET_POSES}
+    odometry: dict[str, config.OdometrySource] = {}
+    measurements = {SET_POSE: config.SET_POSES}
     for source in source_list(values):
         own = {name.removeprefix(f'{source.name}.'): value for name, value in values.items()
                if name.startswith(f'{source.name}.')}
@@ -126,14 +105,14 @@ def backend_config(values: Mapping[str, Any]) -> BackendConfig:
     if len(odometry) == 0:
         raise ConfigError('parameter sources: expected at least one of type odometry, got '
                           f'{values["sources"]}')
-    return BackendConfig(
-        nodes=NodePolicy(
+    return config.BackendConfig(
+        nodes=config.NodePolicy(
             minimum_travel_distance=values['minimum_travel_distance'],
             minimum_travel_heading=values['minimum_travel_heading'],
             minimum_interval=values['minimum_node_interval'],
             moving_interval=values['moving_node_interval'],
             heartbeat=values['node_heartbeat']),
-        alignment=AlignmentPolicy(
+        alignment=config.AlignmentPolicy(
             sigma_heading=values['alignment.sigma_heading'],
             minimum_baseline=values['alignment.minimum_baseline'],
             baseline_in_sigmas=values['alignment.baseline_in_sigmas']),
@@ -141,32 +120,32 @@ def backend_config(values: Mapping[str, Any]) -> BackendConfig:
         odometry_patience=values['odometry_patience'])
 
 
-def _odometry_source(own: Mapping[str, Any]) -> OdometrySource:
+def _odometry_source(own: Mapping[str, Any]) -> config.OdometrySource:
     position, heading = own['sigma_floor']
-    return OdometrySource(
-        noise=OdometryNoise(
+    return config.OdometrySource(
+        noise=config.OdometryNoise(
             sigma_distance=own['sigma_distance'], sigma_lateral=own['sigma_lateral'],
             sigma_heading_distance=own['sigma_heading_distance'],
             sigma_heading_turn=own['sigma_heading_turn'],
             sigma_floor_position=position, sigma_floor_heading=heading),
-        noise_from=NoiseFrom(own['noise']), covariance_scale=own['covariance_scale'],
+        noise_from=config.NoiseFrom(own['noise']), covariance_scale=own['covariance_scale'],
         reorder_window=own['reorder_window'], maximum_speed=own['maximum_speed'],
-        loss=Loss(own['robust_loss']), rejection_threshold=own['rejection_threshold'])
+        loss=config.Loss(own['robust_loss']), rejection_threshold=own['rejection_threshold'])
 
 
-def _measurement_source(own: Mapping[str, Any]) -> MeasurementSource:
+def _measurement_source(own: Mapping[str, Any]) -> config.MeasurementSource:
     position_floor, heading_floor = own['sigma_floor']
     default_position, default_heading = own['default_sigma']
-    return MeasurementSource(
-        covariance=CovariancePolicy(
+    return config.MeasurementSource(
+        covariance=config.CovariancePolicy(
             repair=own['covariance_policy'] == 'repair',
             override=tuple(own['covariance_override']), scale=own['covariance_scale'],
             position_floor=position_floor, heading_floor=heading_floor,
             position_ceiling=own['sigma_ceiling'], default_position=default_position,
-            default_heading=default_heading, heading=Heading(own.get('heading', 'auto'))),
-        loss=Loss(own['robust_loss']), rejection_threshold=own['rejection_threshold'],
+            default_heading=default_heading, heading=config.Heading(own.get('heading', 'auto'))),
+        loss=config.Loss(own['robust_loss']), rejection_threshold=own['rejection_threshold'],
         # sources of loop closures have neither a minimum period nor correlated errors
         **{} if 'correlation_time' not in own else {
             'minimum_period': own['minimum_period'], 'correlation_time': own['correlation_time'],
-            'correlation': Correlation(own['correlation_model']),
+            'correlation': config.Correlation(own['correlation_model']),
             'white_share': own['white_share']})

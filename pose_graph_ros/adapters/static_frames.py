@@ -3,7 +3,6 @@
 """Static transforms between the frames of the robot, as published on /tf_static; no rclpy."""
 
 import math
-from typing import NamedTuple
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -17,19 +16,12 @@ LONGEST_CHAIN = 100
 LARGEST_DISTANCE = 1e3
 
 
-class _Frame(NamedTuple):
-    """Pose of a frame in its parent."""
-
-    parent: str
-    rotation: FloatArray
-    translation: FloatArray
-
-
 class StaticFrames:
     """Static transforms; for each child frame the newest one is used."""
 
     def __init__(self) -> None:
-        self._frames: dict[str, _Frame] = {}
+        # parent, rotation and translation by child frame
+        self._frames: dict[str, tuple[str, FloatArray, FloatArray]] = {}
 
     def receive(self, message: Message) -> None:
         """Add the transforms of a tf2_msgs/TFMessage; invalid ones are ignored."""
@@ -42,7 +34,7 @@ class StaticFrames:
                     or not np.all(np.abs(translation) < LARGEST_DISTANCE)):
                 continue
             rotation = Rotation.from_quat((q.x, q.y, q.z, q.w)).as_matrix()
-            self._frames[child] = _Frame(parent, rotation, translation)
+            self._frames[child] = parent, rotation, translation
 
     def position(self, name: str, base: str) -> FloatArray | None:
         """

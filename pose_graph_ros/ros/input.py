@@ -73,7 +73,7 @@ class Input:
 
     def start_new_graph(self, values: Mapping[str, Any]) -> None:
         """Forget all messages but those of /tf_static; those that are held back stay so."""
-        self.reader = self.reader.renewed(values)
+        self.reader = MessageReader(values, self.reader.frames)
         self._clear()
 
     def receive(self, source: Source, message: Message, primary: str) -> Decision:

@@ -225,7 +225,7 @@ def test_another_lever_arm_is_taken_for_fixes_from_then_on_and_all_else_stays() 
     assert reader.read('fix', fix(3.0, 48.1, 11.6)).lever_arm.tolist() == [0.75, -0.25]
     assert reader.sources['fix'].time_offset_ns == 0
     # and those are all that stays where the graph begins anew
-    renewed = reader.renewed(values | {'fix.lever_arm': [0.0, 0.0]})
+    renewed = MessageReader(values | {'fix.lever_arm': [0.0, 0.0]}, reader.frames)
     assert renewed.datum.plane is None
     assert renewed.fixes['fix'].antenna is None
     assert renewed.read('fix', fix(4.0, 50.0, 9.0)).lever_arm.tolist() == [0.75, -0.25]
