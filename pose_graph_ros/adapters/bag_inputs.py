@@ -14,8 +14,7 @@ logger = logging.getLogger(__name__)
 
 OPTIONS = tuple(KNOWN_SOURCES)
 """Sources with a command line option for their topic; without it their topic is guessed."""
-STATIC_FRAMES = '/tf_static', 'tf2_msgs/msg/TFMessage'
-"""Topic and type of static transforms."""
+STATIC_FRAMES = '/tf_static', 'tf2_msgs/msg/TFMessage'  # topic and type of static transforms
 
 
 @dataclass(frozen=True, slots=True)

@@ -26,8 +26,7 @@ STORAGES = {'mcap': StoragePlugin.MCAP, 'sqlite3': StoragePlugin.SQLITE3}
 BAG_VERSION: Final = 9
 """Version of the metadata of ROS 2 Jazzy."""
 STATIC_TRANSFORMS = '/tf_static'
-FOREVER = QosTime(9223372036, 854775807)
-"""The "infinite" duration of rmw, 2^63 - 1 ns."""
+FOREVER = QosTime(9223372036, 854775807)  # the "infinite" duration of rmw, 2^63 - 1 ns
 
 
 class BagWriter:

@@ -34,10 +34,8 @@ MESSAGE_TYPES = {
     Kind.FIX: 'sensor_msgs/msg/NavSatFix', Kind.IMU: 'sensor_msgs/msg/Imu',
     Kind.LOOP_CLOSURE: _POSE}
 
-SET_POSE = 'set_pose'
-"""Name under which poses that a user sets are counted."""
-CLOSURES = 'loop_closure'
-"""Name of the source of loop closures that always exists."""
+SET_POSE = 'set_pose'  # name under which poses that a user sets are counted
+CLOSURES = 'loop_closure'  # name of the source of loop closures that always exists
 KNOWN_SOURCES = {
     'odom': (Kind.ODOMETRY, 'odom'), 'global_pose': (Kind.GLOBAL_POSE, 'global_pose'),
     'fix': (Kind.FIX, 'gps/fix'), 'imu': (Kind.IMU, 'imu/data'),

@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 
 from pose_graph_ros.adapters.bag_writer import BagWriter, message_types
+from pose_graph_ros.adapters.conversions import PLANAR
 from pose_graph_ros.core.geometry import se2
 from pose_graph_ros.core.geometry.se2 import FloatArray, IntArray
 from pose_graph_ros.core.geometry.trajectory import Trajectory
@@ -19,7 +20,6 @@ _TYPES = message_types()
 _ODOMETRY = 'nav_msgs/msg/Odometry'
 _FIX = 'sensor_msgs/msg/NavSatFix'
 _POSE = 'geometry_msgs/msg/PoseWithCovarianceStamped'
-_PLANAR = np.ix_([0, 1, 5], [0, 1, 5])
 
 
 def write_bag(
@@ -33,12 +33,7 @@ def write_bag(
     folder : str or Path
     messages : iterable of Message
     overwrite : bool
-        Whether to replace an existing bag.
-
-    Raises
-    ------
-    BagError
-        If the folder exists and is not to be overwritten, or is no bag.
+        Whether to replace an existing bag; without it, that is a `BagError`.
 
     """
     with BagWriter(folder, overwrite=overwrite) as bag:
@@ -125,7 +120,7 @@ def loop_closure_messages(
     """
     pose_with_covariance = _TYPES['geometry_msgs/msg/PoseWithCovariance']
     full = np.diag([0.0, 0.0, 0.01, 3e-4, 3e-4, 0.0])
-    full[_PLANAR] = covariance
+    full[PLANAR] = covariance
     for (old, new), pose in zip(stamps_ns.tolist(), poses.tolist(), strict=True):
         yield topic, _POSE, new + latency_ns, _TYPES[_POSE](
             _header(new, f'@{old // 10**9}.{old % 10**9:09d}'),

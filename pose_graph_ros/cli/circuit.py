@@ -19,23 +19,15 @@ from pose_graph_ros.core.geometry.se2 import FloatArray, IntArray
 
 CORNERS = ((310, 0), (310, 180), (105, 180), (105, 0), (200, 0), (200, 260), (0, 260), (0, 0))
 """Intersections at which the circuit turns by 90 degrees, in driving order [m]."""
-STOP_CORNERS = (1, 4, 6)
-"""Indices of the corners with a traffic light before them."""
-LANE_OFFSET = 1.8
-"""Offset of the lane to the right of the middle of the street [m]."""
-STREET_BEARING = 0.35
-"""Angle of the first street, from east to north [rad]."""
-TURN_LENGTH = 18.0
-"""Arc length of a turn [m]; its smallest radius is this divided by pi."""
-PATH_STEP = 0.1
-"""Distance of the points of the path [m]."""
-MAX_SPEED = 7.2
-"""Largest speed [m/s]."""
-MAX_ACCELERATION = 1.4
-MAX_LATERAL_ACCELERATION = 2.0
-"""Largest accelerations along and across the path [m/s^2]."""
-PERIOD_S = 0.01
-"""Sample period of the motion [s]."""
+STOP_CORNERS = (1, 4, 6)  # indices of the corners with a traffic light before them
+LANE_OFFSET = 1.8  # offset of the lane to the right of the middle of the street [m]
+STREET_BEARING = 0.35  # angle of the first street, from east to north [rad]
+TURN_LENGTH = 18.0  # arc length of a turn [m]; its smallest radius is this divided by pi
+PATH_STEP = 0.1  # distance of the points of the path [m]
+MAX_SPEED = 7.2  # largest speed [m/s]
+MAX_ACCELERATION = 1.4  # largest acceleration along the path [m/s^2]
+MAX_LATERAL_ACCELERATION = 2.0  # and across it [m/s^2]
+PERIOD_S = 0.01  # sample period of the motion [s]
 
 
 @dataclass(frozen=True, slots=True)

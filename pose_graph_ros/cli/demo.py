@@ -82,12 +82,16 @@ def execute(options: argparse.Namespace) -> int:
     signal.signal(signal.SIGTERM, signal.default_int_handler)  # also stop the processes on SIGTERM
     converged = _run(bag_path, inputs, source_list(values), options)
     seconds = time.monotonic() - start
-    corrected = _read_path(options.out / 'corrected')
+    path = _last(options.out / 'corrected', '/path')
+    poses = {stamp_ns(item): planar_pose(item.pose) for item in path.poses}
+    corrected = Trajectory(np.array(list(poses), dtype=np.int64),
+                           np.array([pose for pose in poses.values() if pose is not None]))
+    diagnostics = _last(options.out / 'corrected', '/diagnostics').status[0]
     with open_bag(bag_path) as bag:
         drive = collect_drive(bag, inputs, values, corrected, truth)
     table = write_results(drive, options.out, title, {
         'bag': bag_path.name, 'topics': dict(inputs.topics), 'rate': options.rate,
-        'seconds': seconds, 'node': _read_diagnostics(options.out / 'corrected')})
+        'seconds': seconds, 'node': {item.key: item.value for item in diagnostics.values}})
     print(f'\n{table}\n')
     print(f'written to {options.out}/: path.tum, corrected/ (rosbag2), drive.png, summary.json')
     return 0 if converged else 1
@@ -170,8 +174,7 @@ def _free_domain() -> int:
 
 def _stop(node: 'subprocess.Popen[bytes]') -> int:
     """Stop a process by SIGINT, as Ctrl-C does; return its exit code."""
-    if node.poll() is None:
-        node.send_signal(signal.SIGINT)
+    node.send_signal(signal.SIGINT)  # nothing happens if it has ended
     try:
         return node.wait(STOP_TIMEOUT)
     except subprocess.TimeoutExpired:
@@ -179,23 +182,8 @@ def _stop(node: 'subprocess.Popen[bytes]') -> int:
         return node.wait()
 
 
-def _read_path(folder: Path) -> Trajectory:
-    """Return the last path in the bag that the player has recorded."""
+def _last(folder: Path, topic: str) -> Any:
+    """Return the last message on a topic in the bag that the player has recorded."""
     with open_bag(folder) as bag:
-        path = None
-        for message in bag.messages(['/path']) if '/path' in bag.topics else ():
-            path = message.decode()
-    if path is None:
-        raise BagError(f'{folder}: the node published no path')
-    poses = {stamp_ns(item): planar_pose(item.pose) for item in path.poses}
-    return Trajectory(np.array(list(poses), dtype=np.int64),
-                      np.array([pose for pose in poses.values() if pose is not None]))
-
-
-def _read_diagnostics(folder: Path) -> dict[str, Any]:
-    """Return the last diagnostics in the bag that the player has recorded."""
-    with open_bag(folder) as bag:
-        last = None
-        for message in bag.messages(['/diagnostics']) if '/diagnostics' in bag.topics else ():
-            last = message.decode()
-    return {} if last is None else {item.key: item.value for item in last.status[0].values}
+        *_, message = bag.messages([topic])
+        return message.decode()

@@ -22,15 +22,7 @@ from pose_graph_ros.core.geometry.trajectory import Trajectory
 
 @dataclass(frozen=True, slots=True)
 class Drive:
-    """
-    Input and result of the pose graph, and the truth if it is known.
-
-    Raises
-    ------
-    ValueError
-        If shapes do not match or a pose is not finite.
-
-    """
+    """Input and result of the pose graph, and the truth if it is known; all finite."""
 
     odometry: Trajectory
     """Raw odometry, `T_odom_base`."""
@@ -51,13 +43,10 @@ class Drive:
 
     def __post_init__(self) -> None:
         count = len(self.fix_stamps_ns)
-        if self.fix_positions.shape != (count, 2) or self.fix_held_out.shape != (count,):
-            raise ValueError(
-                f'expected {count} positions (M, 2) and flags (M,) of fixes, got '
-                f'{self.fix_positions.shape} and {self.fix_held_out.shape}')
-        if self.loop_stamps_ns.ndim != 2 or self.loop_stamps_ns.shape[1] != 2:
-            raise ValueError(
-                f'expected stamps of loop closures (L, 2), got {self.loop_stamps_ns.shape}')
+        shapes = self.fix_positions.shape, self.fix_held_out.shape, self.loop_stamps_ns.shape[1:]
+        if shapes != ((count, 2), (count,), (2,)):
+            raise ValueError(f'expected {count} positions (M, 2) and flags (M,) of fixes, and '
+                             f'stamps of loop closures (L, 2), got {shapes}')
         paths = (self.odometry, self.corrected, *([] if self.truth is None else [self.truth]))
         values = (self.fix_positions, *(path.poses for path in paths))
         if not all(np.all(np.isfinite(array)) for array in values):
@@ -143,10 +132,8 @@ def distances(
 
     Returns
     -------
-    stamps_ns : ndarray, shape (K,)
-        Stamps that the path covers [ns].
-    distances : ndarray, shape (K,)
-        Distances at these stamps [m].
+    stamps_ns, distances : ndarray, shape (K,)
+        Stamps that the path covers [ns], and distances at these [m].
 
     """
     inside = path.covers(stamps_ns)
@@ -174,27 +161,22 @@ def error_rows(name: str, errors: FloatArray, unit: str = 'm') -> list[ErrorRow]
 
 
 def evaluate(drive: Drive) -> list[ErrorRow]:
-    """
-    Return the errors of odometry, fixes and corrected path to the truth and to the fixes.
-
-    Rows without any error are left out.
-    """
+    """Return the errors of odometry and result to truth and fixes; rows without any are left out."""
     rows: list[ErrorRow] = []
     paths = {'odometry alone': place_odometry(drive), 'corrected path': drive.corrected}
-    truth = drive.truth
+    truth, stamps, positions = drive.truth, drive.fix_stamps_ns, drive.fix_positions
     if truth is not None:
         for name, path in paths.items():
             _, errors = distances(path, truth.stamps_ns, truth.poses[:, :2])
             rows += error_rows(f'{name} to truth', errors)
-        _, errors = distances(truth, drive.fix_stamps_ns, drive.fix_positions)
-        rows[1:1] = error_rows('fixes to truth', errors)
+        rows[1:1] = error_rows('fixes to truth', distances(truth, stamps, positions)[1])
         inside = drive.corrected.covers(truth.stamps_ns)
         turns = se2.wrap(
             drive.corrected.at(truth.stamps_ns[inside])[:, 2] - truth.poses[inside, 2])
         rows += error_rows('corrected heading to truth', np.rad2deg(np.abs(turns)), 'deg')
     for kind, chosen in (('used', ~drive.fix_held_out), ('held out', drive.fix_held_out)):
         for name, path in paths.items():
-            _, errors = distances(path, drive.fix_stamps_ns[chosen], drive.fix_positions[chosen])
+            _, errors = distances(path, stamps[chosen], positions[chosen])
             rows += error_rows(f'{name} to fixes {kind}', errors)
     return rows
 
@@ -231,12 +213,8 @@ def summary(
     return {
         'duration_s': float(stamps[-1] - stamps[0]) * 1e-9 if len(stamps) else 0.0,
         'distance_m': float(np.sum(np.hypot(steps[:, 0], steps[:, 1]))),
-        'odometry': len(drive.odometry),
-        'poses': len(drive.corrected),
+        'odometry': len(drive.odometry), 'poses': len(drive.corrected),
         'fixes_used': int(np.sum(~drive.fix_held_out)),
         'fixes_held_out': int(np.sum(drive.fix_held_out)),
-        'loop_closures': len(drive.loop_stamps_ns),
-        'truth': drive.truth is not None,
-        'errors': [asdict(row) for row in rows],
-        **extra,
-    }
+        'loop_closures': len(drive.loop_stamps_ns), 'truth': drive.truth is not None,
+        'errors': [asdict(row) for row in rows], **extra}

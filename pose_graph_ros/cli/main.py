@@ -38,7 +38,7 @@ def main(args: list[str] | None = None) -> int:
     parameters.set_defaults(execute=_parameters)
 
     options = parser.parse_args(args)
-    return replay.guarded(options.execute, options)
+    return replay.guarded(options)
 
 
 def _simulate(options: argparse.Namespace) -> int:

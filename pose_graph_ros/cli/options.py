@@ -49,18 +49,8 @@ def wanted_topics(options: argparse.Namespace) -> dict[str, str | None]:
 
 
 def parameter_values(options: argparse.Namespace) -> dict[str, Any]:
-    """
-    Return all parameters of the node by the options, as the node would read them.
-
-    Raises
-    ------
-    ConfigError
-        If the file cannot be read, or a parameter is invalid.
-
-    """
-    given: dict[str, Any] = {}
-    if options.params_file is not None:
-        given |= _read_file(options.params_file)
+    """Return all parameters by the options, as the node would read them, or a `ConfigError`."""
+    given = {} if options.params_file is None else _read_file(options.params_file)
     for text in options.param:
         name, separator, value = text.partition(':=')
         if separator == '':

@@ -24,10 +24,8 @@ from pose_graph_ros.core.geometry.trajectory import Trajectory
 
 BLUE, ORANGE, VERMILION, GREEN, PURPLE = '#0072B2', '#E69F00', '#D55E00', '#009E73', '#B583A4'
 INK, GREY, GRID, SHADE = '#222222', '#666666', '#E2E2E2', '#F0F0F0'
-WIDTH, DPI = 16.0, 100
-"""Width of the picture [inch] and resolution [dots per inch]."""
-LEFT, RIGHT, TOP, BETWEEN, BOTTOM = 0.8, 0.3, 0.95, 1.05, 0.6
-"""Margins of the panels [inch]."""
+WIDTH, DPI = 16.0, 100  # width of the picture [inch] and resolution [dots per inch]
+LEFT, RIGHT, TOP, BETWEEN, BOTTOM = 0.8, 0.3, 0.95, 1.05, 0.6  # margins of the panels [inch]
 LEGEND_WIDTH, ERROR_HEIGHT = 2.9, 2.5
 """Width of the legend and height of the plot of errors [inch]."""
 MAP_HEIGHTS = (4.5, 9.0)
@@ -36,18 +34,13 @@ TALL, TALL_HEIGHT, TALL_WIDTHS = 1.15, 8.4, (4.5, 7.5)
 """Smallest ratio of height to width for a map beside the errors; its height and widths [inch]."""
 OUTAGE_S = 5.0
 """An outage is a time without fixes of more than this [s] and more than 10 median periods."""
-MIN_FIXES = 3
-"""With fewer fixes no outages are shown."""
-SECOND = 10**9
-"""One second [ns]."""
-TICK_SPACING = 1.6
-"""Largest spacing of the grid of the map [inch]."""
-TWO_DIGITS = 10.0
-"""Errors below this are shown with two digits after the point [m]."""
+MIN_FIXES = 3  # with fewer fixes no outages are shown
+SECOND = 10**9  # one second [ns]
+TICK_SPACING = 1.6  # largest spacing of the grid of the map [inch]
+TWO_DIGITS = 10.0  # errors below this are shown with two digits after the point [m]
 LOG_RATIO = 4.0
 """The error axis is logarithmic if the errors of odometry exceed the others by this factor."""
-LOG_FLOOR = 0.05
-"""Lower end of a logarithmic error axis [m]."""
+LOG_FLOOR = 0.05  # lower end of a logarithmic error axis [m]
 
 
 def draw_drive(drive: Drive, file: Path, title: str) -> None:

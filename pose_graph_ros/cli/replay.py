@@ -10,12 +10,11 @@ follows at the end. The path is the one of a node that receives the same message
 import argparse
 from collections import Counter
 from collections.abc import Mapping
-from dataclasses import dataclass
 import os
 from pathlib import Path
 import sys
 import time
-from typing import Any
+from typing import Any, NamedTuple
 
 from pose_graph_ros.adapters.bag_inputs import (
     choose_inputs,
@@ -39,8 +38,7 @@ from pose_graph_ros.core.measurements import Answer, OdometrySample
 UPDATE_EVERY = 10
 
 
-@dataclass(frozen=True, slots=True)
-class Replayed:
+class Replayed(NamedTuple):
     """Result of running a bag through the engine."""
 
     backend: PoseGraphBackend
@@ -106,33 +104,32 @@ def execute(options: argparse.Namespace) -> int:
         for source, topic in inputs.topics.items():
             print(f'{source}: {topic}')
         start = time.monotonic()
-        replayed = run(bag, inputs, values)
+        backend, report, refused = run(bag, inputs, values)
         seconds = time.monotonic() - start
-        backend, report = replayed.backend, replayed.report
         estimate = backend.estimate()
         if estimate is None:
             topics = ' or '.join(inputs.topics[name] for name in inputs.of(Kind.ODOMETRY))
             raise BagError(f'{options.bag}: no usable odometry on {topics}')
         drive = collect_drive(bag, inputs, values, estimate.path, options.truth)
     counts = {f'{source}.{answer}': count for (source, answer), count
-              in sorted((backend.counts + replayed.refused).items())}
+              in sorted((backend.counts + refused).items())}
     table = write_results(drive, options.out, options.bag.stem, {
         'seconds': seconds, 'alignment': estimate.alignment.value,
         'hidden_nodes': estimate.n_hidden, 'edges': estimate.n_edges,
         'observed_nodes': estimate.n_observed, 'biases': estimate.n_biases,
-        'chi2': estimate.chi2,
-        'status': report.status.value, 'counts': counts})
+        'chi2': estimate.chi2, 'status': report.status.value, 'counts': counts})
     write_g2o(backend.graph, options.out / 'graph.g2o')
     print(f'{estimate.n_hidden} hidden nodes, {estimate.n_edges} edges, {estimate.n_observed} '
           f'observed nodes in {seconds:.2f} s; {report.status.value}, chi2 {report.chi2:.6g}; '
           f'{estimate.alignment.value}')
     for source, fit in sorted(backend.reports().items()):
-        print(f'{source}: squared residual {fit.energy:.3g} sigma^2' + (
-            f'; errors of {fit.errors.sigma_correlated:.3g} m with a time constant of '
-            f'{fit.errors.tau:.3g} s'
-            if fit.errors.significant else '') + (
-            f', but are treated as white: see {source}.correlation_time'
-            if fit.wrongly_white else ''))
+        text = f'{source}: squared residual {fit.energy:.3g} sigma^2'
+        if fit.errors.significant:
+            text += (f'; errors of {fit.errors.sigma_correlated:.3g} m with a time constant of '
+                     f'{fit.errors.tau:.3g} s')
+        if fit.wrongly_white:
+            text += f', but are treated as white: see {source}.correlation_time'
+        print(text)
     print('counts: ' + ', '.join(f'{name} {count}' for name, count in counts.items()))
     print(f'\n{table}\n\nwritten: {options.out}/path.tum, drive.png, summary.json, graph.g2o')
     return 0 if report.status is Status.CONVERGED else 1
@@ -143,27 +140,18 @@ def main(args: list[str] | None = None) -> int:
     parser = argparse.ArgumentParser(
         prog='replay', description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     add_arguments(parser)
-    return guarded(execute, parser.parse_args(args))
+    parser.set_defaults(execute=execute)
+    return guarded(parser.parse_args(args))
 
 
-def guarded(execute: Any, options: argparse.Namespace) -> int:
+def guarded(options: argparse.Namespace) -> int:
     """
-    Run a tool and return its exit code; print errors that the user can correct on one line.
+    Run the tool `options.execute` and return its exit code.
 
-    Parameters
-    ----------
-    execute : callable
-        Tool that is called with `options` and returns the exit code.
-    options : argparse.Namespace
-
-    Returns
-    -------
-    int
-        2 after a `PoseGraphError` or `OSError`, 130 after Ctrl-C, else that of the tool.
-
+    Errors that the user can correct are printed on one line; the code is then 2.
     """
     try:
-        return int(execute(options))
+        return int(options.execute(options))
     except BrokenPipeError:  # the reader of the output, such as head, has ended
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return 1

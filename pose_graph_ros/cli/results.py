@@ -19,13 +19,7 @@ from pose_graph_ros.cli.picture import draw_drive
 from pose_graph_ros.core.geometry import se2
 from pose_graph_ros.core.geometry.trajectory import Trajectory
 from pose_graph_ros.core.io.tum import write_tum
-from pose_graph_ros.core.measurements import (
-    Answer,
-    GlobalPose,
-    HeadingOnly,
-    LoopClosure,
-    Position,
-)
+from pose_graph_ros.core.measurements import GlobalPose, LoopClosure, OdometrySample, Position
 
 TRUTH_TYPES = ('nav_msgs/msg/Odometry', 'geometry_msgs/msg/PoseStamped',
                'geometry_msgs/msg/PoseWithCovarianceStamped')
@@ -69,18 +63,14 @@ def collect_drive(
         except MessageError:
             continue
         match measurement:
-            case Answer() | HeadingOnly():
-                continue
             case Position(stamp, position, _, lever_arm):
                 observed.append((stamp, position, lever_arm, held_out))
             case GlobalPose(stamp, pose, _):
                 observed.append((stamp, pose[:2], np.zeros(2), held_out))
             case LoopClosure(stamp, _, _, int(reference)):
                 loops.append((reference, stamp))
-            case LoopClosure():
-                continue
-            case sample if source == preferred:
-                odometry.setdefault(sample.stamp_ns, sample.pose)
+            case OdometrySample(stamp, pose) if source == preferred:
+                odometry.setdefault(stamp, pose)
     stamps = np.array([row[0] for row in observed], dtype=np.int64)
     positions = np.array([row[1] for row in observed]).reshape(-1, 2)
     arms = np.array([row[2] for row in observed]).reshape(-1, 2)

@@ -23,12 +23,7 @@ import numpy as np
 from scipy.ndimage import gaussian_filter1d
 from scipy.spatial import KDTree
 
-from pose_graph_ros.cli.bag_messages import (
-    fix_messages,
-    loop_closure_messages,
-    odometry_messages,
-    write_bag,
-)
+from pose_graph_ros.cli import bag_messages
 from pose_graph_ros.cli.circuit import drive_circuit, gauss_markov, PERIOD_S
 from pose_graph_ros.core.geometry import se2
 from pose_graph_ros.core.geometry.geodesy import TangentPlane
@@ -36,46 +31,35 @@ from pose_graph_ros.core.geometry.se2 import FloatArray, IntArray
 from pose_graph_ros.core.geometry.trajectory import Trajectory
 
 MIN_DURATION_S = 10.0
-START_NS = 1_746_518_400_250_000_000
-"""Stamp of the start [ns]."""
+START_NS = 1_746_518_400_250_000_000  # stamp of the start [ns]
 CITY = TangentPlane(50.7271, 7.0866, 61.0)
 """Plane of the circuit, which begins at the point where the plane touches the ellipsoid."""
 ODOMETRY_PERIOD_S = 0.05
-TRACK_WIDTH = 1.5
-"""Distance of the wheels [m]."""
+TRACK_WIDTH = 1.5  # distance of the wheels [m]
 WHEEL_SCALE = (1.0068, 1.0070)
 """Ratio of measured to true distance of the left and the right wheel."""
-TRACK_SCALE = 1.012
-"""Ratio of assumed to true track width."""
+TRACK_SCALE = 1.012  # ratio of assumed to true track width
 SLIP_EVENTS_PER_S = 1.0 / 60.0
-SLIP_S = 0.012
-"""Relative excess of the speed of a wheel in a slip event, integrated over the event [s]."""
-HEADING_WANDER = 1.2e-3
-"""Standard deviation of the time-correlated error of the yaw rate [rad/s]."""
-WANDER_TIME_S = 40.0
-"""Time constant of this error [s]."""
+SLIP_S = 0.012  # relative excess of a wheel's speed in a slip event, integrated over it [s]
+HEADING_WANDER = 1.2e-3  # standard deviation of the time-correlated error of the yaw rate [rad/s]
+WANDER_TIME_S = 40.0  # time constant of this error [s]
 ODOMETRY_VARIANCES = (1e-3, 1e-3, 1e6, 1e6, 1e6, 3e-2)
 """Constant variances of pose and twist, as many drivers set them."""
 FIX_PERIOD_S = 0.5
-FIX_SIGMA_SLOW = 1.2
-FIX_SIGMA_WHITE = 0.4
-"""Standard deviations of the time-correlated and the white error of fixes [m]."""
-FIX_CORRELATION_S = 60.0
-"""Time constant of the time-correlated error [s]."""
+FIX_SIGMA_SLOW = 1.2  # standard deviation of the time-correlated error of fixes [m]
+FIX_SIGMA_WHITE = 0.4  # and of their white error [m]
+FIX_SIGMA = float(np.hypot(FIX_SIGMA_SLOW, FIX_SIGMA_WHITE))
+FIX_CORRELATION_S = 60.0  # time constant of the time-correlated error [s]
 OUTAGE_S = (-40.0, 30.0)
 """Start and end of the outage of the fixes relative to the start of the second lap [s]."""
 ODOMETRY_LATENCY_NS, FIX_LATENCY_NS, LOOP_LATENCY_NS = 4_000_000, 130_000_000, 800_000_000
 """Time from the stamp of a measurement to its recording [ns]."""
-LOOP_SIGMAS = (0.1, 0.1, np.deg2rad(1.0))
-"""Standard deviations of loop closures [m, m, rad]."""
-LOOP_SPACING = 25.0
-"""Length of the stretches of the path with at most one loop closure each [m]."""
-LOOP_RADIUS = 2.0
-LOOP_ANGLE = np.deg2rad(20.0)
-"""Largest distance [m] and angle [rad] between the true poses of a loop closure."""
-LOOP_MIN_TIME_S = 15.0
-LOOP_MIN_DISTANCE = 50.0
-"""Smallest time [s] and driven distance [m] between the poses of a loop closure."""
+LOOP_SIGMAS = (0.1, 0.1, np.deg2rad(1.0))  # standard deviations of loop closures [m, m, rad]
+LOOP_SPACING = 25.0  # length of the stretches of the path with at most one loop closure each [m]
+# Largest distance [m] and angle [rad] between the true poses of a loop closure, and smallest time
+# [s] and driven distance [m] between them.
+LOOP_RADIUS, LOOP_ANGLE = 2.0, np.deg2rad(20.0)
+LOOP_MIN_TIME_S, LOOP_MIN_DISTANCE = 15.0, 50.0
 
 
 @dataclass(frozen=True, slots=True)
@@ -90,14 +74,10 @@ class SimulatedDrive:
     """Stamps of the fixes, shape (M,) [ns]."""
     fixes: FloatArray
     """Latitude, longitude and ellipsoidal height, shape (M, 3) [deg, deg, m]."""
-    fix_sigma: float
-    """Standard deviation of a fix along each of east and north [m]."""
     loop_stamps_ns: IntArray
     """Stamps of the earlier and of the later pose of the loop closures, shape (L, 2) [ns]."""
     loop_poses: FloatArray
     """Measured later pose in the frame of the earlier one, shape (L, 3) [m, m, rad]."""
-    loop_covariance: FloatArray
-    """Covariance of each measured pose, shape (3, 3)."""
 
 
 def simulate_drive(seed: int = 1, duration_s: float = 440.0) -> SimulatedDrive:
@@ -134,10 +114,7 @@ def simulate_drive(seed: int = 1, duration_s: float = 440.0) -> SimulatedDrive:
     poses[:, :2] = plane.to_map(*CITY.to_geodetic(poses[:, :2]).T)
     return SimulatedDrive(
         truth=Trajectory(truth_stamps, poses), odometry=odometry,
-        fix_stamps_ns=fix_stamps, fixes=fixes,
-        fix_sigma=float(np.hypot(FIX_SIGMA_SLOW, FIX_SIGMA_WHITE)),
-        loop_stamps_ns=loop_stamps, loop_poses=loop_poses,
-        loop_covariance=np.diag(np.square(LOOP_SIGMAS)))
+        fix_stamps_ns=fix_stamps, fixes=fixes, loop_stamps_ns=loop_stamps, loop_poses=loop_poses)
 
 
 def write_drive(drive: SimulatedDrive, folder: str | Path, *, overwrite: bool = False) -> None:
@@ -149,24 +126,17 @@ def write_drive(drive: SimulatedDrive, folder: str | Path, *, overwrite: bool = 
     drive : SimulatedDrive
     folder : str or Path
     overwrite : bool
-        Whether to replace an existing bag.
-
-    Raises
-    ------
-    BagError
-        If the folder exists and is not to be overwritten, or is no bag.
+        Whether to replace an existing bag; without it, that is a `BagError`.
 
     """
-    write_bag(folder, (
-        *odometry_messages(
-            '/odom', 'odom', drive.odometry, ODOMETRY_VARIANCES, ODOMETRY_LATENCY_NS),
-        *odometry_messages(
-            '/ground_truth', 'map', drive.truth, (0.0,) * 6, ODOMETRY_LATENCY_NS),
-        *fix_messages(
-            '/gps/fix', drive.fix_stamps_ns, drive.fixes, drive.fix_sigma, FIX_LATENCY_NS),
-        *loop_closure_messages(
-            '/loop_closure', drive.loop_stamps_ns, drive.loop_poses, drive.loop_covariance,
-            LOOP_LATENCY_NS)), overwrite=overwrite)
+    odometry, fixes = bag_messages.odometry_messages, bag_messages.fix_messages
+    bag_messages.write_bag(folder, (
+        *odometry('/odom', 'odom', drive.odometry, ODOMETRY_VARIANCES, ODOMETRY_LATENCY_NS),
+        *odometry('/ground_truth', 'map', drive.truth, (0.0,) * 6, ODOMETRY_LATENCY_NS),
+        *fixes('/gps/fix', drive.fix_stamps_ns, drive.fixes, FIX_SIGMA, FIX_LATENCY_NS),
+        *bag_messages.loop_closure_messages(
+            '/loop_closure', drive.loop_stamps_ns, drive.loop_poses,
+            np.diag(np.square(LOOP_SIGMAS)), LOOP_LATENCY_NS)), overwrite=overwrite)
 
 
 def _jittered_stamps(
@@ -196,8 +166,7 @@ def _odometry(generator: np.random.Generator, truth: Trajectory) -> Trajectory:
     left *= 1.0 + SLIP_S * spin[0]
     right *= 1.0 + SLIP_S * spin[1]
 
-    wander = gauss_markov(
-        generator, len(steps), HEADING_WANDER, PERIOD_S / WANDER_TIME_S)
+    wander = gauss_markov(generator, len(steps), HEADING_WANDER, PERIOD_S / WANDER_TIME_S)
     forward = 0.5 * (left + right) + generator.normal(0.0, 3e-4, len(steps)) * (forward > 1e-4)
     turn = (right - left) / (TRACK_SCALE * TRACK_WIDTH) + np.where(
         forward > 1e-4, wander * PERIOD_S, 0.0)

@@ -286,7 +286,7 @@ def test_errors_of_the_user_are_one_line_and_an_exit_code(
     def execute(_: argparse.Namespace) -> int:
         raise error
 
-    assert replay.guarded(execute, argparse.Namespace()) == code
+    assert replay.guarded(argparse.Namespace(execute=execute)) == code
     assert capsys.readouterr() == ('', said)
 
 
@@ -295,7 +295,7 @@ def test_an_error_of_the_program_is_not_hidden() -> None:
         raise ZeroDivisionError
 
     with pytest.raises(ZeroDivisionError):
-        replay.guarded(execute, argparse.Namespace())
+        replay.guarded(argparse.Namespace(execute=execute))
 
 
 def test_a_pipe_whose_reader_has_ended_is_no_traceback(
@@ -306,6 +306,6 @@ def test_a_pipe_whose_reader_has_ended_is_no_traceback(
 
     with (tmp_path / 'out').open('w', encoding='utf-8') as stream:
         monkeypatch.setattr(sys, 'stdout', stream)
-        assert replay.guarded(execute, argparse.Namespace()) == 1
+        assert replay.guarded(argparse.Namespace(execute=execute)) == 1
         # what is still in the buffer goes nowhere
         assert os.path.samestat(os.fstat(stream.fileno()), os.stat(os.devnull))

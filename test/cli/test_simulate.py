@@ -9,6 +9,8 @@ import pytest
 
 from pose_graph_ros.adapters.bags import open_bag
 from pose_graph_ros.cli.simulate import (
+    FIX_SIGMA,
+    LOOP_SIGMAS,
     simulate_drive,
     SimulatedDrive,
     write_drive,
@@ -65,7 +67,7 @@ def test_fixes_err_by_their_sigma_and_pause_once(drive: SimulatedDrive) -> None:
         errors.append(positions[inside]
                        - other.truth.at(other.fix_stamps_ns[inside])[:, :2])
     rms = np.sqrt(np.mean(np.concatenate(errors) ** 2))
-    assert rms == pytest.approx(drive.fix_sigma, rel=0.25)
+    assert rms == pytest.approx(FIX_SIGMA, rel=0.25)
 
     gaps = np.diff(drive.fix_stamps_ns) * 1e-9
     assert 68.0 < gaps.max() < 72.0
@@ -79,7 +81,7 @@ def test_loop_closures_are_true_up_to_their_noise(drive: SimulatedDrive) -> None
     truth = se2.between(drive.truth.at(old), drive.truth.at(new))
     assert np.linalg.norm(truth[:, :2], axis=1).max() < 2.2
     error = se2.between(truth, drive.loop_poses)
-    sigmas = np.sqrt(np.diag(drive.loop_covariance))
+    sigmas = np.array(LOOP_SIGMAS)
     assert np.std(error / sigmas) == pytest.approx(1.0, rel=0.25)
 
     gap = np.argmax(np.diff(drive.fix_stamps_ns))
@@ -108,7 +110,7 @@ def test_the_bag_says_what_the_drive_says(tmp_path: Path) -> None:
             if record.topic == '/gps/fix':
                 value = (message.latitude, message.longitude, message.altitude)
                 assert message.status.status == 0
-                assert message.position_covariance[0] == pytest.approx(drive.fix_sigma**2)
+                assert message.position_covariance[0] == pytest.approx(FIX_SIGMA**2)
             else:
                 pose = message.pose.pose
                 theta = 2.0 * np.arctan2(pose.orientation.z, pose.orientation.w)
