@@ -161,7 +161,7 @@ def error_rows(name: str, errors: FloatArray, unit: str = 'm') -> list[ErrorRow]
 
 
 def evaluate(drive: Drive) -> list[ErrorRow]:
-    """Return the errors of odometry and result to truth and fixes; rows without any are left out."""
+    """Return the errors of odometry, fixes and path; a row without any is left out."""
     rows: list[ErrorRow] = []
     paths = {'odometry alone': place_odometry(drive), 'corrected path': drive.corrected}
     truth, stamps, positions = drive.truth, drive.fix_stamps_ns, drive.fix_positions

@@ -3,8 +3,7 @@
 """
 From messages to measurements, with a count for everything; imports no rclpy.
 
-Each message is counted, held back while it is in doubt whether time has jumped back, and read. A
-message that cannot be used is counted by source and reason; the first of each is logged.
+Each message is counted, held back while it is in doubt whether time has jumped back, and read.
 """
 
 from collections import Counter
@@ -31,14 +30,9 @@ class Input:
     Parameters
     ----------
     values : mapping
-        All checked parameters.
+        All checked parameters; a `ConfigError` if they do not go together.
     warn : callable
         Logs a sentence.
-
-    Raises
-    ------
-    ConfigError
-        If the parameters do not go together.
 
     """
 
@@ -129,7 +123,7 @@ class Input:
         source : str
         measurement : OdometrySample or Measurement
         post : callable
-            Called with both; returns False if the engine's inbox is full.
+            `Worker.post`.
 
         """
         if self.paused:

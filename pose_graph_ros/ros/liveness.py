@@ -27,15 +27,7 @@ class _Arrivals:
 
 
 class Liveness:
-    """
-    Times of the messages of each source, by a monotonic clock.
-
-    Parameters
-    ----------
-    rare : collection of str
-        Sources without a period: their silence means nothing.
-
-    """
+    """Times of the messages of each source; the silence of those that are rare means nothing."""
 
     def __init__(self, rare: Collection[str] = ()) -> None:
         self._rare = frozenset(rare)
@@ -49,7 +41,7 @@ class Liveness:
         ----------
         source : str
         now : float
-            Time of its arrival [s].
+            By a monotonic clock, here and below [s].
 
         """
         arrivals = self._arrivals.get(source)
@@ -70,7 +62,6 @@ class Liveness:
         ----------
         source : str
         now : float
-            The present time [s].
 
         """
         arrivals = self._arrivals.get(source)

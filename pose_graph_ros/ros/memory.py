@@ -3,8 +3,7 @@
 """
 Return memory to the system that only the start of the process needs; imports no rclpy.
 
-Loading compiled kernels reads much of LLVM and of other libraries: more than 100 MB of pages of
-their files stay in memory and are not used again.
+Loading compiled kernels leaves more than 100 MB of pages of LLVM and other libraries in memory.
 """
 
 import ctypes
@@ -23,11 +22,7 @@ SMAPS = Path('/proc/self/smaps')
 
 
 def give_back_large_arrays() -> None:
-    """
-    Make glibc return the pages of every large array when it is freed.
-
-    By default it raises its threshold after the first ones and keeps later ones in its heap.
-    """
+    """Make glibc return the pages of every large array: by default it keeps most in its heap."""
     mallopt = getattr(ctypes.CDLL(None), 'mallopt', None)
     if mallopt is not None:
         mallopt(M_MMAP_THRESHOLD, LARGE)
@@ -35,12 +30,7 @@ def give_back_large_arrays() -> None:
 
 
 def release_memory() -> None:
-    """
-    Return pages of mapped files and of the free heap to the system, where it supports that.
-
-    Only pages that the system can read again from their file: those of read-only mappings in
-    which nothing was changed when they were loaded.
-    """
+    """Return pages of the free heap, and of files that can be read again, to the system."""
     libc = ctypes.CDLL(None)
     trim, madvise = getattr(libc, 'malloc_trim', None), getattr(libc, 'madvise', None)
     if trim is not None:

@@ -15,18 +15,23 @@ import struct
 
 from builtin_interfaces.msg import Time
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
+from geometry_msgs.msg import PoseWithCovarianceStamped
 from nav_msgs.msg import Odometry
 import numpy as np
-from sensor_msgs.msg import NavSatFix, NavSatStatus
+from sensor_msgs.msg import Imu, NavSatFix, NavSatStatus
 from std_msgs.msg import Header
 
-from pose_graph_ros.adapters.sources import NANOSECONDS
+from pose_graph_ros.adapters.sources import Kind, NANOSECONDS
 from pose_graph_ros.core.geometry import covariance as cov
 from pose_graph_ros.core.geometry.geodesy import TangentPlane
 from pose_graph_ros.core.geometry.se2 import FloatArray
 from pose_graph_ros.core.geometry.trajectory import Trajectory
 from pose_graph_ros.core.prediction import Prediction
 
+CLASSES = {Kind.ODOMETRY: Odometry, Kind.FIX: NavSatFix, Kind.IMU: Imu,
+           Kind.GLOBAL_POSE: PoseWithCovarianceStamped,
+           Kind.LOOP_CLOSURE: PoseWithCovarianceStamped}
+"""Class of the messages by kind of source."""
 # Variance of height, roll and pitch in messages for filters: they are not estimated [m^2, rad^2].
 UNKNOWN_VARIANCE = 1e6
 # The same in poses for viewers, which would draw an ellipsoid of a kilometre [m^2, rad^2].

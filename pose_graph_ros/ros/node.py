@@ -33,12 +33,7 @@ class PoseGraphNode(LifecycleNode):
     The online back end of pose-graph SLAM as a managed node.
 
     This class has the parameters and the lifecycle; `Session` does the work of a configured node.
-
-    Raises
-    ------
-    ConfigError
-        If `sources` is not valid, which determines the other parameters.
-
+    If `sources` is not valid, which determines the other parameters, that is a `ConfigError`.
     """
 
     def __init__(self, **node_options: Any) -> None:
@@ -63,46 +58,36 @@ class PoseGraphNode(LifecycleNode):
     # ---- lifecycle
 
     def start(self) -> None:
-        """
-        Configure and activate.
-
-        Raises
-        ------
-        ConfigError
-            If a transition failed: the reason.
-
-        """
+        """Configure and activate; a `ConfigError` says why a transition failed."""
         for trigger in (self.trigger_configure, self.trigger_activate):
             if trigger() is not TransitionCallbackReturn.SUCCESS:
                 raise ConfigError(self.failure)
 
     def on_configure(self, state: LifecycleState) -> TransitionCallbackReturn:
         """Check the parameters; start worker, services and diagnostics."""
-        return self._transition(self._configure, state)
+        return self._transition(self._configure)
 
     def on_activate(self, state: LifecycleState) -> TransitionCallbackReturn:
         """Start receiving and publishing."""
-        return self._transition(self._configured.activate, state)
+        return self._transition(self._configured.activate)
 
     def on_deactivate(self, state: LifecycleState) -> TransitionCallbackReturn:
         """Stop receiving and publishing; keep the graph."""
-        return self._transition(self._configured.deactivate, state)
+        return self._transition(self._configured.deactivate)
 
     def on_cleanup(self, state: LifecycleState) -> TransitionCallbackReturn:
         """Discard the graph."""
-        return self._transition(self.close, state)
+        return self._transition(self.close)
 
     def on_shutdown(self, state: LifecycleState) -> TransitionCallbackReturn:
         """Discard everything before the end of the node."""
-        return self._transition(self.close, state)
+        return self._transition(self.close)
 
     def on_error(self, state: LifecycleState) -> TransitionCallbackReturn:
         """Discard everything after a transition that raised, to be unconfigured again."""
-        return self._transition(self.close, state)
+        return self._transition(self.close)
 
-    def _transition(
-        self, change: Callable[[], None], _: LifecycleState,
-    ) -> TransitionCallbackReturn:
+    def _transition(self, change: Callable[[], None]) -> TransitionCallbackReturn:
         """Change the state; if that fails, keep the reason, which rclpy does not."""
         try:
             change()
@@ -128,12 +113,11 @@ class PoseGraphNode(LifecycleNode):
 
     def close(self) -> None:
         """Stop the worker and destroy all that was configured."""
-        offer, self._offered = self._offered, None
-        session, self._session = self._session, None
-        if offer is not None:
-            offer.close()
-        if session is not None:
-            session.close()
+        closing = self._offered, self._session
+        self._offered = self._session = None
+        for each in closing:
+            if each is not None:
+                each.close()
 
     def _answer_every_change_of_state(self) -> None:
         """
@@ -177,8 +161,7 @@ class PoseGraphNode(LifecycleNode):
             value = self.get_parameter(parameter.name).value
             # files of `ros2 param dump` have null for values that are not set, read as a text
             if value is not None and not (value == 'null' and isinstance(parameter.default, list)):
-                given[parameter.name] = (
-                    list(value) if isinstance(value, array | tuple) else value)
+                given[parameter.name] = list(value) if isinstance(value, array | tuple) else value
         return given
 
     def _warn_of_unknown(self) -> None:

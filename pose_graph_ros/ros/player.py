@@ -11,7 +11,6 @@ optimisation, and its last path is recorded.
 import argparse
 from collections import Counter
 from collections.abc import Callable, Mapping
-from functools import partial
 from pathlib import Path
 import sys
 import time
@@ -22,9 +21,8 @@ from nav_msgs.msg import Odometry, Path as PathMessage
 import rclpy
 from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
 from rclpy.node import Node
-from rclpy.qos import QoSDurabilityPolicy, QoSProfile, QoSReliabilityPolicy
+from rclpy.qos import QoSDurabilityPolicy, QoSProfile
 from rclpy.serialization import deserialize_message
-from sensor_msgs.msg import Imu, NavSatFix
 from std_srvs.srv import Trigger
 
 from pose_graph_ros.adapters.bag_inputs import (
@@ -35,21 +33,16 @@ from pose_graph_ros.adapters.bag_inputs import (
 )
 from pose_graph_ros.adapters.bag_writer import BagWriter
 from pose_graph_ros.adapters.bags import BagError, MessageError, open_bag
-from pose_graph_ros.adapters.sources import Kind, MESSAGE_TYPES
+from pose_graph_ros.adapters.sources import Kind
+from pose_graph_ros.ros.messages import CLASSES
+from pose_graph_ros.ros.transforms import TFMessage
 
-try:
-    from tf2_msgs.msg import TFMessage
-except ImportError:  # ROS 2 from PyPI lacks tf2_msgs until it is built
-    TFMessage = None
-
-CLASSES = {Kind.ODOMETRY: Odometry, Kind.FIX: NavSatFix, Kind.IMU: Imu,
-           Kind.GLOBAL_POSE: PoseWithCovarianceStamped,
-           Kind.LOOP_CLOSURE: PoseWithCovarianceStamped}
-RELIABLE = QoSProfile(depth=1000, reliability=QoSReliabilityPolicy.RELIABLE)
-LATCHED = QoSProfile(depth=1, reliability=QoSReliabilityPolicy.RELIABLE,
-                     durability=QoSDurabilityPolicy.TRANSIENT_LOCAL)
-STATIC = QoSProfile(depth=100, reliability=QoSReliabilityPolicy.RELIABLE,
-                    durability=QoSDurabilityPolicy.TRANSIENT_LOCAL)
+# Name of the node, for its service and its diagnostics.
+NODE_NAME = 'pose_graph'
+# Profiles are reliable if they do not say otherwise.
+RELIABLE = QoSProfile(depth=1000)
+LATCHED = QoSProfile(depth=1, durability=QoSDurabilityPolicy.TRANSIENT_LOCAL)
+STATIC = QoSProfile(depth=100, durability=QoSDurabilityPolicy.TRANSIENT_LOCAL)
 # Greatest number of unprocessed messages, well below the depth of the node's queues.
 WINDOW = 400
 # Longest waits for the node: to appear, to compile at its first start, to process another message,
@@ -76,42 +69,36 @@ class Player(Node):
     ----------
     inputs : Inputs
     topics : mapping
-        Topic of the node for each source.
-    node_name : str
-        Name of the node, for its service and its diagnostics.
+        Of the node, by source.
 
     """
 
-    def __init__(
-        self, inputs: Inputs, topics: Mapping[str, str], node_name: str = 'pose_graph',
-    ) -> None:
+    def __init__(self, inputs: Inputs, topics: Mapping[str, str]) -> None:
         super().__init__('pose_graph_player')
         self._inputs = inputs
-        self._node_name = node_name
         self._executor = SingleThreadedExecutor()
         self._executor.add_node(self)
         self._writers = {
-            source: self.create_publisher(
-                CLASSES[inputs.kinds[source]], topics[source], RELIABLE)
+            source: self.create_publisher(CLASSES[inputs.kinds[source]], topics[source], RELIABLE)
             for source in inputs.topics}
         self._static = None if TFMessage is None else self.create_publisher(
             TFMessage, STATIC_FRAMES[0], STATIC)
         self.recorded: list[tuple[str, str, int, bytes]] = []
         """Topic, type, time of arrival [ns] and bytes of the node's messages."""
-        self.path: bytes | None = None
+        self.path = b''
         """The newest path."""
         self._path_at = -float('inf')
         self.diagnostics: dict[str, str] = {}
         """The newest values of the node's diagnostics."""
         self._diagnostics_raw = b''
-        self._record('pose', PoseWithCovarianceStamped, MESSAGE_TYPES[Kind.GLOBAL_POSE])
-        self._record('odometry/filtered', Odometry, MESSAGE_TYPES[Kind.ODOMETRY])
+        self._record('pose', PoseWithCovarianceStamped, Kind.GLOBAL_POSE.message_type)
+        self._record('odometry/filtered', Odometry, Kind.ODOMETRY.message_type)
         if TFMessage is not None:
             self._record('/tf', TFMessage, 'tf2_msgs/msg/TFMessage')
         self.create_subscription(PathMessage, 'path', self._on_path, LATCHED, raw=True)
         self.create_subscription(
             DiagnosticArray, '/diagnostics', self._on_diagnostics, RELIABLE, raw=True)
-        self._optimize = self.create_client(Trigger, f'{node_name}/optimize')
+        self._optimize = self.create_client(Trigger, f'{NODE_NAME}/optimize')
 
     def _record(self, topic: str, message_type: type, type_name: str) -> None:
         name = self.resolve_topic_name(topic)
@@ -126,7 +113,7 @@ class Player(Node):
 
     def _on_diagnostics(self, raw: bytes) -> None:
         for status in deserialize_message(raw, DiagnosticArray).status:
-            if status.name.partition(':')[0].rpartition('/')[2] == self._node_name:
+            if status.name.partition(':')[0].rpartition('/')[2] == NODE_NAME:
                 self.diagnostics = {value.key: value.value for value in status.values}
                 self._diagnostics_raw = raw
 
@@ -135,25 +122,8 @@ class Player(Node):
         """Number of messages that the node has processed, by its diagnostics."""
         return int(self.diagnostics.get('processed', 0))
 
-    def spin_until(self, done: Callable[[], bool], timeout: float, failure: str) -> None:
-        """
-        Receive messages until a condition holds.
-
-        Parameters
-        ----------
-        done : callable
-            Returns whether it holds.
-        timeout : float
-            Longest wait [s].
-        failure : str
-            Message of the error.
-
-        Raises
-        ------
-        PlayError
-            If the condition does not hold in time.
-
-        """
+    def _spin_until(self, done: Callable[[], bool], timeout: float, failure: str) -> None:
+        """Receive messages until a condition holds, at most for a time [s]."""
         end = time.monotonic() + timeout
         while not done():
             if time.monotonic() > end:
@@ -176,17 +146,12 @@ class Player(Node):
             Number of published messages by input, of those held out under `held_out`, and of those
             that cannot be decoded under `malformed`.
 
-        Raises
-        ------
-        PlayError
-            If the node does not appear, or stops processing.
-
         """
-        self.spin_until(
+        self._spin_until(
             lambda: all(writer.get_subscription_count() > 0 for writer in self._writers.values())
             and len(self.diagnostics) > 0 and self._optimize.service_is_ready(), APPEAR_TIMEOUT,
             'the node does not subscribe')
-        self.spin_until(lambda: self.diagnostics.get('prepared') != '0', PREPARE_TIMEOUT,
+        self._spin_until(lambda: self.diagnostics.get('prepared') != '0', PREPARE_TIMEOUT,
                         'the node is still compiling')
         if self._static is not None:
             with open_bag(bag) as reader:
@@ -194,8 +159,8 @@ class Player(Node):
                     self._static.publish(frames.raw)
         # the other side of a match may learn of it a little later
         settled = time.monotonic() + 0.5
-        self.spin_until(lambda: time.monotonic() > settled, 2.0, '')
-        already = self.processed
+        self._spin_until(lambda: time.monotonic() > settled, 2.0, '')
+        sent = self.processed
         published: Counter[str] = Counter()
         with open_bag(bag) as reader:
             total = sum(reader.topics[topic].count for topic in self._inputs.topics.values())
@@ -214,10 +179,12 @@ class Player(Node):
                 if start is None or first_ns is None:
                     start, first_ns = time.monotonic(), message.recorded_ns
                 if rate > 0.0:
-                    self._sleep_until(start + (message.recorded_ns - first_ns) * 1e-9 / rate)
+                    instant = start + (message.recorded_ns - first_ns) * 1e-9 / rate
+                    while (left := instant - time.monotonic()) > 0.0:
+                        self._executor.spin_once(timeout_sec=min(left, 0.05))
                 self._writers[source].publish(message.raw)
                 published[source] += 1
-                sent = already + _sent(published)
+                sent += 1
                 if sent - self.processed > WINDOW:
                     self._wait_for(sent - WINDOW // 2)
                 self._executor.spin_once(timeout_sec=0.0)
@@ -226,32 +193,25 @@ class Player(Node):
                     _progress(published.total(), total)
         _progress(published.total(), total)
         print(file=sys.stderr)
-        self._wait_for(already + _sent(published))
+        self._wait_for(sent)
         return published
-
-    def _sleep_until(self, instant: float) -> None:
-        while (left := instant - time.monotonic()) > 0.0:
-            self._executor.spin_once(timeout_sec=min(left, 0.05))
 
     def _wait_for(self, count: int) -> None:
         """Wait until the node has processed a number of messages, as long as it makes progress."""
         while (before := self.processed) < count:
-            self.spin_until(
-                partial(self._more_than, before), STALL_TIMEOUT,
+            self._spin_until(
+                lambda before=before: self.processed > before, STALL_TIMEOUT,  # type: ignore[misc]
                 f'the node has processed {before} of {count} messages and makes no progress')
-
-    def _more_than(self, count: int) -> bool:
-        return self.processed > count
 
     def request_final_optimization(self) -> tuple[bool, str]:
         """Call ~/optimize, and wait for the path after it; return success and message."""
         answer = self._optimize.call_async(Trigger.Request())
         asked_at = time.monotonic()
-        self.spin_until(answer.done, ANSWER_TIMEOUT, 'no answer from ~/optimize')
+        self._spin_until(answer.done, ANSWER_TIMEOUT, 'no answer from ~/optimize')
         answered_at = time.monotonic()
         response = answer.result()
         # an earlier path may still come first: wait until no other one comes
-        self.spin_until(
+        self._spin_until(
             lambda: asked_at < self._path_at
             and max(answered_at, self._path_at) < time.monotonic() - PATH_SILENCE,
             ANSWER_TIMEOUT, 'no path came after the optimisation')
@@ -263,18 +223,9 @@ class Player(Node):
         with BagWriter(folder, overwrite=True, latched=[path_topic]) as writer:
             for topic, type_name, arrived_ns, raw in self.recorded:
                 writer.write(topic, type_name, arrived_ns, raw)
-            if self.path is not None:
-                writer.write(path_topic, 'nav_msgs/msg/Path', time.time_ns(), self.path)
+            writer.write(path_topic, 'nav_msgs/msg/Path', time.time_ns(), self.path)
             writer.write('/diagnostics', 'diagnostic_msgs/msg/DiagnosticArray', time.time_ns(),
                          self._diagnostics_raw)
-
-    def n_path_poses(self) -> int:
-        """Return the number of poses of the newest path."""
-        return 0 if self.path is None else len(deserialize_message(self.path, PathMessage).poses)
-
-
-def _sent(published: Counter[str]) -> int:
-    return published.total() - published['held_out'] - published['malformed']
 
 
 def _progress(done: int, total: int) -> None:
@@ -304,8 +255,9 @@ def main(args: list[str] | None = None) -> int:
         success, answer = player.request_final_optimization()
         player.write(options.out)
         print('published: ' + ', '.join(f'{key} {count}' for key, count in published.items()))
+        n_poses = len(deserialize_message(player.path, PathMessage).poses)
         print(f'the node: processed {player.processed}; optimisation {answer}; '
-              f'path of {player.n_path_poses()} poses')
+              f'path of {n_poses} poses')
         if not success:
             print(f'player: ~/optimize: {answer}', file=sys.stderr)
             return NOT_CONVERGED

@@ -19,7 +19,7 @@ from geometry_msgs.msg import PoseWithCovarianceStamped
 from nav_msgs.msg import Odometry, Path
 from rclpy.node import Node
 from rclpy.publisher import Publisher
-from rclpy.qos import QoSDurabilityPolicy, QoSProfile, QoSReliabilityPolicy
+from rclpy.qos import QoSDurabilityPolicy, QoSProfile
 from rclpy.qos_overriding_options import QoSOverridingOptions
 from sensor_msgs.msg import NavSatFix
 from std_msgs.msg import Header
@@ -39,10 +39,9 @@ from pose_graph_ros.ros import messages
 from pose_graph_ros.ros.slew import Slew
 from pose_graph_ros.ros.transforms import TF_QOS, TFMessage, TOPIC, TransformPublisher
 
-OUTPUT_QOS = QoSProfile(depth=10, reliability=QoSReliabilityPolicy.RELIABLE)
+OUTPUT_QOS = QoSProfile(depth=10)  # reliable, as profiles are by default
 # Late subscribers receive the newest path and graph at once.
-LATCHED_QOS = QoSProfile(depth=1, reliability=QoSReliabilityPolicy.RELIABLE,
-                      durability=QoSDurabilityPolicy.TRANSIENT_LOCAL)
+LATCHED_QOS = QoSProfile(depth=1, durability=QoSDurabilityPolicy.TRANSIENT_LOCAL)
 
 
 class Publishers:
@@ -178,7 +177,6 @@ class Publishers:
         ----------
         estimate : Estimate
         path : Trajectory
-            In the map.
         graph : int
             Number of its graph.
 

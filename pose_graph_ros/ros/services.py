@@ -4,6 +4,7 @@
 
 from collections.abc import Awaitable, Callable
 from concurrent.futures import CancelledError, Future as DoneFuture, ThreadPoolExecutor
+from functools import partial
 import logging
 from pathlib import Path
 from typing import Any
@@ -27,6 +28,9 @@ logger = logging.getLogger(__name__)
 # Answer if a new graph was started before the service was done.
 REPLACED = 'the graph was replaced meanwhile'
 
+Answer = tuple[bool, str]
+"""Whether what was asked for was done, and a sentence on it."""
+
 
 class Services:
     """
@@ -44,14 +48,15 @@ class Services:
         self._offered: list[Service] = []
         # files of a large graph take seconds: neither worker nor executor should wait for them
         self._files = ThreadPoolExecutor(1, 'graph files')
-        for name, kind, answer in (
+        for name, kind, act in (
                 ('optimize', Trigger, self._optimize), ('reset', Trigger, self._reset),
                 ('pause', SetBool, self._pause), ('set_datum', Trigger, self._set_datum),
-                ('save_graph', Trigger, self._save_graph),
-                ('load_graph', Trigger, self._load_graph)):
+                ('save_graph', Trigger, partial(self._with_file, self._save)),
+                ('load_graph', Trigger, partial(self._with_file, self._load))):
             # each in its own group: a service that awaits blocks all others in its group
             self._offered.append(node.create_service(
-                kind, f'~/{name}', answer, callback_group=MutuallyExclusiveCallbackGroup()))
+                kind, f'~/{name}', partial(_answer, act),
+                callback_group=MutuallyExclusiveCallbackGroup()))
 
     def close(self) -> None:
         """Destroy the services and the thread for files."""
@@ -66,93 +71,92 @@ class Services:
         await done
         return future.result()
 
-    async def _optimize(
-        self, _: Trigger.Request, response: Trigger.Response,
-    ) -> Trigger.Response:
+    async def _optimize(self, _: Trigger.Request) -> Answer:
         try:
             report = await self._done(self._session.optimize())
         except CancelledError:
-            response.message = REPLACED
-            return response
+            raise
         except Exception as error:
-            response.message = f'failed: {error}'
-            return response
+            return False, f'failed: {error}'
         if self._session.worker.estimate is None:
-            response.message = 'there is no odometry yet'
-            return response
-        response.success = report.status is Status.CONVERGED
-        response.message = (
+            return False, 'there is no odometry yet'
+        return report.status is Status.CONVERGED, (
             f'{report.status.value} after {report.iterations} iterations, chi2 {report.chi2:.6g}'
             + (f': {report.reason}' if report.reason != '' else ''))
-        return response
 
-    def _reset(self, _: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
+    async def _reset(self, _: Trigger.Request) -> Answer:
         estimate = self._session.worker.estimate
         self._session.reset()
-        response.success = True
         plane = self._session.input.reader.datum.plane
-        response.message = (
+        return True, (
             f'{0 if estimate is None else estimate.n_hidden} hidden nodes are gone; '
             + ('the next good fix will be the datum' if plane is None else
                f'the datum is still [{plane.latitude:.9f}, {plane.longitude:.9f}]'))
-        return response
 
-    def _pause(self, request: SetBool.Request, response: SetBool.Response) -> SetBool.Response:
-        session, response.success = self._session, True
-        if session.input.paused == request.data:
-            response.message = 'paused already' if request.data else 'was not paused'
-            return response
-        session.input.paused = request.data
-        response.message = (
+    async def _pause(self, request: SetBool.Request) -> Answer:
+        received = self._session.input
+        if received.paused == request.data:
+            return True, 'paused already' if request.data else 'was not paused'
+        received.paused = request.data
+        return True, (
             'paused: measurements are counted but not used; poses still follow the odometry'
             if request.data else 'resumed')
-        return response
 
-    def _set_datum(self, _: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
+    async def _set_datum(self, _: Trigger.Request) -> Answer:
         """Let the next good fix be the datum, unless the graph refers to the present one."""
         session = self._session
         status, datum = session.worker.status, session.input.reader.datum
         used = sum(status.counts[name, 'accepted'] for name in session.input.reader.fixes)
         if datum.is_of_graph:
-            response.message = 'refused: the graph that was loaded refers to the present datum'
-        elif datum.plane is not None and used > 0:
-            response.message = (f'refused: {used} fixes in the graph refer to the datum '
-                                f'[{datum.plane.latitude:.9f}, {datum.plane.longitude:.9f}]')
-        elif datum.plane is not None and (
+            return False, 'refused: the graph that was loaded refers to the present datum'
+        if datum.plane is not None and used > 0:
+            return False, (f'refused: {used} fixes in the graph refer to the datum '
+                           f'[{datum.plane.latitude:.9f}, {datum.plane.longitude:.9f}]')
+        if datum.plane is not None and (
                 status.pending > 0 or status.processed < session.input.posted):
-            response.message = ('refused: measurements that wait for odometry may refer to the '
-                                'present datum')
-        else:
-            datum.renew()
-            response.success, response.message = True, 'the next good fix will be the datum'
-        return response
+            return False, ('refused: measurements that wait for odometry may refer to the '
+                           'present datum')
+        datum.renew()
+        return True, 'the next good fix will be the datum'
 
-    async def _save_graph(
-        self, _: Trigger.Request, response: Trigger.Response,
-    ) -> Trigger.Response:
-        """Write the graph to `graph_file`, all or nothing."""
+    async def _with_file(
+        self, act: Callable[[Path], Awaitable[str]], _: Trigger.Request,
+    ) -> Answer:
+        """Return the answer of an action on the file of the graph."""
+        name = self._session.values['graph_file']
+        if name == '':
+            return False, (
+                'refused: set the parameter graph_file first, for example to ~/map.g2o')
+        try:
+            return True, await act(Path(name).expanduser())
+        except CancelledError:
+            raise
+        except PoseGraphError as error:
+            return False, f'refused: {error}'
+        except Exception as error:
+            logger.exception('the file of the graph failed')
+            return False, f'failed: {type(error).__name__}: {error}'
+
+    async def _save(self, path: Path) -> str:
+        """Write the graph, all or nothing."""
         plane = self._session.input.reader.datum.plane
 
         def capture(backend: PoseGraphBackend) -> SavedGraph:
             backend.update()
             return backend.saved(None if plane is None else plane.origin)
 
-        async def save(path: Path) -> str:
-            saved = await self._done(self._session.worker.call(capture))
-            files = await self._done(self._files.submit(write_graph, saved, path))
-            left_out = '' if saved.n_left_out == 0 else (
-                f'; {saved.n_left_out} waiting measurements are left out')
-            return (f'{len(saved.nodes.rows)} hidden nodes in {files[0]}, with '
-                    f'{files[1].name} and {files[2].name}{left_out}')
-        return await self._file_answer(save, response)
+        saved = await self._done(self._session.worker.call(capture))
+        files = await self._done(self._files.submit(write_graph, saved, path))
+        left_out = '' if saved.n_left_out == 0 else (
+            f'; {saved.n_left_out} waiting measurements are left out')
+        return (f'{len(saved.nodes.rows)} hidden nodes in {files[0]}, with '
+                f'{files[1].name} and {files[2].name}{left_out}')
 
-    async def _load_graph(
-        self, _: Trigger.Request, response: Trigger.Response,
-    ) -> Trigger.Response:
-        """Replace the graph by the one in `graph_file`, if it is of the present site."""
+    async def _load(self, path: Path) -> str:
+        """Replace the graph by the one in a file, if it is of the present site."""
         session = self._session
 
-        def restore(path: Path) -> tuple[SavedGraph, PoseGraphBackend]:
+        def restore() -> tuple[SavedGraph, PoseGraphBackend]:
             saved, datum = read_graph(path), session.input.reader.datum
             origin = None if datum.plane is None else datum.plane.origin
             refusal = site_refusal(
@@ -163,32 +167,18 @@ class Services:
             backend.update()
             return saved, backend
 
-        async def load(path: Path) -> str:
-            # wait until the worker has prepared the kernels, which reading needs
-            await self._done(session.worker.call(lambda _: None))
-            saved, backend = await self._done(self._files.submit(restore, path))
-            session.load(saved, backend, str(path))
-            return (f'{len(saved.nodes.rows)} hidden nodes from {path}, datum '
-                    f'{"none" if saved.datum is None else saved.datum}')
-        return await self._file_answer(load, response)
+        # wait until the worker has prepared the kernels, which reading needs
+        await self._done(session.worker.call(lambda _: None))
+        saved, backend = await self._done(self._files.submit(restore))
+        session.load(saved, backend, str(path))
+        return (f'{len(saved.nodes.rows)} hidden nodes from {path}, datum '
+                f'{"none" if saved.datum is None else saved.datum}')
 
-    async def _file_answer(
-        self, act: Callable[[Path], Awaitable[str]], response: Trigger.Response,
-    ) -> Trigger.Response:
-        """Answer a request with the result of an action on the graph's file."""
-        name = self._session.values['graph_file']
-        if name == '':
-            response.message = (
-                'refused: set the parameter graph_file first, for example to ~/map.g2o')
-            return response
-        try:
-            response.message = await act(Path(name).expanduser())
-            response.success = True
-        except CancelledError:
-            response.message = REPLACED
-        except PoseGraphError as error:
-            response.message = f'refused: {error}'
-        except Exception as error:
-            logger.exception('the file of the graph failed')
-            response.message = f'failed: {type(error).__name__}: {error}'
-        return response
+
+async def _answer(act: Callable[[Any], Awaitable[Answer]], request: Any, response: Any) -> Any:
+    """Fill in a response with what an action answers."""
+    try:
+        response.success, response.message = await act(request)
+    except CancelledError:
+        response.message = REPLACED
+    return response

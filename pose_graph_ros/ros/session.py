@@ -4,8 +4,7 @@
 Everything that a configured node owns: inputs, the worker with its graph, outputs and timers.
 
 Callbacks read messages, post measurements and return. With each message of the primary odometry
-the newest estimate, propagated by that odometry, is published; path and markers are published
-after updates.
+the newest estimate, propagated by it, is published; path and markers are after updates.
 """
 
 from collections.abc import Callable, Mapping, Sequence
@@ -21,16 +20,10 @@ from nav_msgs.msg import Odometry
 from rclpy.clock import Clock, ClockType, JumpHandle, JumpThreshold, TimeJump
 from rclpy.duration import Duration
 from rclpy.node import Node
-from rclpy.qos import (
-    QoSDurabilityPolicy,
-    QoSHistoryPolicy,
-    QoSProfile,
-    QoSReliabilityPolicy,
-)
+from rclpy.qos import QoSDurabilityPolicy, QoSProfile, QoSReliabilityPolicy
 from rclpy.qos_overriding_options import QoSOverridingOptions
 from rclpy.subscription import Subscription
 from rclpy.timer import Timer
-from sensor_msgs.msg import Imu, NavSatFix
 
 from pose_graph_ros.adapters.conversions import frame, Message
 from pose_graph_ros.adapters.sources import backend_config, Kind, SET_POSE, Source
@@ -41,6 +34,7 @@ from pose_graph_ros.core.measurements import OdometrySample
 from pose_graph_ros.core.sources.constraint_names import ConstraintEnergy
 from pose_graph_ros.ros import diagnostics, memory
 from pose_graph_ros.ros.input import Input, PAUSED
+from pose_graph_ros.ros.messages import CLASSES
 from pose_graph_ros.ros.pose_continuity import PoseContinuity
 from pose_graph_ros.ros.publishers import Publishers
 from pose_graph_ros.ros.set_pose_input import SetPoseInput
@@ -48,21 +42,15 @@ from pose_graph_ros.ros.time_jump import ReceivedMessage
 from pose_graph_ros.ros.transforms import TFMessage
 from pose_graph_ros.ros.worker import Worker
 
+# Profiles are reliable if they do not say otherwise.
 # The queue is deep since no odometry may be lost. A best-effort reader matches reliable and
 # best-effort writers.
-SENSOR_QOS = QoSProfile(depth=1000, history=QoSHistoryPolicy.KEEP_LAST,
-                        reliability=QoSReliabilityPolicy.BEST_EFFORT)
+SENSOR_QOS = QoSProfile(depth=1000, reliability=QoSReliabilityPolicy.BEST_EFFORT)
 # A loop closure is rare and must not get lost.
-LOOP_CLOSURE_QOS = QoSProfile(depth=100, reliability=QoSReliabilityPolicy.RELIABLE)
+LOOP_CLOSURE_QOS = QoSProfile(depth=100)
 # Late subscribers receive the newest message of every broadcaster.
-STATIC_QOS = QoSProfile(depth=100, reliability=QoSReliabilityPolicy.RELIABLE,
-                        durability=QoSDurabilityPolicy.TRANSIENT_LOCAL)
-SET_POSE_QOS = QoSProfile(depth=1, reliability=QoSReliabilityPolicy.RELIABLE)
-
-CLASSES: dict[Kind, tuple[type, QoSProfile]] = {
-    Kind.ODOMETRY: (Odometry, SENSOR_QOS), Kind.FIX: (NavSatFix, SENSOR_QOS),
-    Kind.GLOBAL_POSE: (PoseWithCovarianceStamped, SENSOR_QOS), Kind.IMU: (Imu, SENSOR_QOS),
-    Kind.LOOP_CLOSURE: (PoseWithCovarianceStamped, LOOP_CLOSURE_QOS)}
+STATIC_QOS = QoSProfile(depth=100, durability=QoSDurabilityPolicy.TRANSIENT_LOCAL)
+SET_POSE_QOS = QoSProfile(depth=1)
 
 # Longest wait for a running solve when the node ends; launch kills a node after 5 s [s].
 STOP_TIMEOUT = 4.0
@@ -81,12 +69,7 @@ class Session:
     ----------
     node : rclpy.node.Node
     values : mapping
-        All checked parameters.
-
-    Raises
-    ------
-    ConfigError
-        If the parameters do not go together.
+        All checked parameters; a `ConfigError` if they do not go together.
 
     """
 
@@ -105,7 +88,7 @@ class Session:
         # a clock that is set back, or a bag that starts again, must not stall a timer
         self._steady = Clock(clock_type=ClockType.STEADY_TIME)
         self._clear()
-        self.worker = self._start_worker(PoseGraphBackend(self._config), self._warm_up)
+        self._start_worker(PoseGraphBackend(self._config))
         self._set_timer('diagnostics', values['diagnostics_period'], self.publish_diagnostics)
 
     def _clear(self, *, resumes: bool = False) -> None:
@@ -118,14 +101,11 @@ class Session:
         """The constraints with the largest energies."""
         self._energies_at = -math.inf
 
-    def _start_worker(
-        self, backend: PoseGraphBackend,
-        prepare: Callable[[Callable[[], bool]], None] | None = None,
-    ) -> Worker:
+    def _start_worker(self, backend: PoseGraphBackend, *, prepared: bool = False) -> None:
         """Start the thread that owns a graph."""
-        worker = Worker(backend, partial(self._publish_views, self.out.graph), prepare)
-        worker.start()
-        return worker
+        self.worker = Worker(backend, partial(self._publish_views, self.out.graph),
+                             None if prepared else self._warm_up)
+        self.worker.start()
 
     def _warm_up(self, stopped: Callable[[], bool]) -> None:
         """Compile or load all kernels before the first measurement; for the worker's thread."""
@@ -152,8 +132,9 @@ class Session:
         for topic in ('initialpose', 'set_pose'):
             self._subscribe(topic, PoseWithCovarianceStamped, self._on_set_pose, SET_POSE_QOS)
         for source in sources:
-            message_type, qos = CLASSES[source.kind]
-            self._subscribe(source.topic, message_type, partial(self._on_message, source), qos)
+            qos = LOOP_CLOSURE_QOS if source.kind is Kind.LOOP_CLOSURE else SENSOR_QOS
+            self._subscribe(
+                source.topic, CLASSES[source.kind], partial(self._on_message, source), qos)
         self._watch_time()
         self.active = True
         topics = ', '.join(self.node.resolve_topic_name(source.topic) for source in sources)
@@ -214,7 +195,7 @@ class Session:
         primary = '' if estimate is None else estimate.primary
         decision = self.input.receive(source, message, primary)
         if decision.jump_ns > 0:
-            self.start_new_graph(f'the stamps of {source.name} jumped back by '
+            self._start_new_graph(f'the stamps of {source.name} jumped back by '
                                  f'{decision.jump_ns * 1e-9:.3f} s', decision.released)
         else:
             for received in decision.released:
@@ -290,26 +271,16 @@ class Session:
     def _on_clock_jump(self, jump: TimeJump) -> None:
         back_ns = -jump.delta.nanoseconds
         self.input.time_jumps.clock_jumped(back_ns)
-        self.start_new_graph(f'the clock jumped back by {back_ns * 1e-9:.3f} s',
+        self._start_new_graph(f'the clock jumped back by {back_ns * 1e-9:.3f} s',
                              self.input.time_jumps.release())
 
     def reset(self) -> None:
         """Start a new graph on request; the next messages may have any stamps."""
         self.input.time_jumps.forget()
-        self.start_new_graph('a call of ~/reset')
+        self._start_new_graph('a call of ~/reset')
 
-    def start_new_graph(self, reason: str, messages: Sequence[ReceivedMessage] = ()) -> None:
-        """
-        Start a new graph; the datum by parameter and the transforms of /tf_static are kept.
-
-        Parameters
-        ----------
-        reason : str
-            For the log and the diagnostics.
-        messages : sequence of ReceivedMessage
-            Messages that belong to the new graph.
-
-        """
+    def _start_new_graph(self, reason: str, messages: Sequence[ReceivedMessage] = ()) -> None:
+        """Start a new graph with some messages; keep the datum by parameter and /tf_static."""
         self._replace(PoseGraphBackend(self._config), f'a new graph was started: {reason}')
         for received in messages:
             self.input.received[received.source] += 1
@@ -323,9 +294,9 @@ class Session:
         ----------
         saved : SavedGraph
         backend : PoseGraphBackend
-            The engine that was restored from it.
+            Restored from it.
         name : str
-            Name of the file, for the log.
+            For the log.
 
         """
         self.input.time_jumps.forget()
@@ -338,14 +309,14 @@ class Session:
         self, backend: PoseGraphBackend, reason: str, *, resumes: bool = False,
     ) -> None:
         self.node.get_logger().warning(reason)
-        prepare = None if self.worker.prepared else self._warm_up
+        prepared = self.worker.prepared
         self.worker.stop(0.0)  # the result of a running solve is discarded
         self.out.start_new_graph()
         self.input.start_new_graph(self.values)
         self._set_pose_input.forget()
         self._clear(resumes=resumes)
         self.n_resets, self.reset_reason = self.n_resets + 1, reason
-        self.worker = self._start_worker(backend, prepare)
+        self._start_worker(backend, prepared=prepared)
 
     # ---- timers
 
@@ -397,9 +368,8 @@ class Session:
     @property
     def odometry_topics(self) -> list[str]:
         """Resolved topics of all odometry sources."""
-        return [self.node.resolve_topic_name(source.topic)
-                for source in self.input.reader.sources.values()
-                if source.kind is Kind.ODOMETRY]
+        return [self.node.resolve_topic_name(self.input.reader.sources[name].topic)
+                for name in self._config.odometry]
 
     def publish_diagnostics(self) -> None:
         """Publish the state of the node."""

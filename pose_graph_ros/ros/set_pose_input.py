@@ -34,18 +34,13 @@ class SetPoseInput:
 
     def receive(self, message: Message, *, early: bool = False) -> Answer | None:
         """
-        Keep a message for `pop`; return why it cannot be used.
+        Return why a message cannot be used; None if it can and is kept for `pop`.
 
         Parameters
         ----------
         message : geometry_msgs/PoseWithCovarianceStamped
         early : bool
             Whether there is no odometry yet: the pose then applies to the first odometry.
-
-        Returns
-        -------
-        answer : Answer or None
-            Why the message cannot be used; None if it can.
 
         """
         named = frame(message.header.frame_id)

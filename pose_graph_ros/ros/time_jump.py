@@ -45,11 +45,7 @@ class TimeJumpDetector:
     """
     Watches the stamps of the primary odometry for jumps back in time.
 
-    Parameters
-    ----------
-    threshold_ns : int
-        A stamp that is behind the newest one by less than this is late, and no jump [ns].
-
+    A stamp that is behind the newest one by less than the threshold [ns] is late, and no jump.
     """
 
     def __init__(self, threshold_ns: int) -> None:

@@ -9,7 +9,7 @@ import time
 
 from rclpy.node import Node
 from rclpy.publisher import Publisher
-from rclpy.qos import QoSProfile, QoSReliabilityPolicy
+from rclpy.qos import QoSProfile
 from rclpy.serialization import deserialize_message
 from rclpy.subscription import Subscription
 
@@ -22,8 +22,8 @@ try:
 except ImportError:  # ROS 2 from PyPI lacks tf2_msgs until it is built
     TFMessage = None
 
-# The profile of tf2_ros.
-TF_QOS = QoSProfile(depth=100, reliability=QoSReliabilityPolicy.RELIABLE)
+# The profile of tf2_ros, which is reliable.
+TF_QOS = QoSProfile(depth=100)
 TOPIC = '/tf'
 # Reading all of /tf costs as much as reading odometry, so it is read for this time only [s].
 LISTENING = 2.0
@@ -69,7 +69,6 @@ class TransformPublisher:
         Parameters
         ----------
         at_ns : int
-            Stamp [ns].
         T_map_odom : ndarray, shape (3,)
 
         """
@@ -117,8 +116,9 @@ class TransformPublisher:
             return
         for transform in deserialize_message(data, TFMessage).transforms:
             parent = frame(transform.header.frame_id)
+            t = transform.transform
             if frame(transform.child_frame_id) != self._odom_frame or (
-                    _key(transform) in self._own):
+                    stamp_ns(transform), t.translation.x, t.rotation.z) in self._own:
                 continue
             wrong = '' if parent == self._map_frame else ', so that it has two parents'
             self.other = (
@@ -126,8 +126,3 @@ class TransformPublisher:
                 'set publish_tf of one of the two to false')
             self._on_other(self.other)
             return
-
-
-def _key(transform: object) -> tuple[int, float, float]:
-    t = transform.transform  # type: ignore[attr-defined]
-    return stamp_ns(transform), t.translation.x, t.rotation.z

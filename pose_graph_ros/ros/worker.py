@@ -9,8 +9,9 @@ gets a new worker. Imports no ROS.
 """
 
 from collections import Counter, deque
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from concurrent.futures import Future
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field
 import logging
 import threading
@@ -111,16 +112,12 @@ class Worker:
 
     def post(self, source: str, measurement: OdometrySample | Measurement) -> bool:
         """
-        Hand a measurement over; return False if the inbox is full.
+        Return whether a measurement was handed over: not if the inbox is full.
 
         Parameters
         ----------
         source : str
         measurement : OdometrySample or Measurement
-
-        Returns
-        -------
-        posted : bool
 
         """
         with self._condition:
@@ -152,7 +149,13 @@ class Worker:
         return future
 
     def _run(self) -> None:
-        self._run_preparation()
+        try:
+            if self._prepare is not None:
+                self._prepare(lambda: self._stopping)
+        except Exception:
+            # kernels are then compiled when they are first needed
+            logger.exception('the preparation of the worker failed')
+        self.prepared = True
         while True:
             with self._condition:
                 self._condition.wait_for(lambda: (
@@ -165,7 +168,8 @@ class Worker:
                 batch, self._inbox = self._inbox, deque()
                 wanted, self._update_wanted = self._update_wanted, False
                 jobs, self._jobs = self._jobs, []
-            try:
+            # no error may end the thread, which is the only one that adds measurements
+            with suppress(Exception), self._count_errors():
                 for source, measurement in batch:
                     self._add(source, measurement)
                 report = self._update(self._backend.update) if wanted else None
@@ -174,43 +178,30 @@ class Worker:
                 if report is not None or self.estimate is None or stale:
                     self._publish()
                 self._report(report, len(batch))
-            except Exception:
-                # no error may end the thread, which is the only one that adds measurements
-                logger.exception('the worker failed')
-                self._backend.counts['worker', 'internal_error'] += 1
             for job, future in jobs:
-                self._do(job, future)
-
-    def _do(self, job: Job[object], future: 'Future[object]') -> None:
-        if not future.set_running_or_notify_cancel():
-            return
-        try:
-            result = job(self._backend)
-        except Exception as error:
-            future.set_exception(error)
-        else:
-            future.set_result(result)
+                if not future.set_running_or_notify_cancel():
+                    continue
+                try:
+                    future.set_result(job(self._backend))
+                except Exception as error:
+                    future.set_exception(error)
 
     def optimize_fully(self, backend: PoseGraphBackend) -> UpdateReport:
         """Optimise the whole graph; a job for `call`."""
-        try:
+        with self._count_errors():
             report = self._update(backend.optimize)
             self._publish()
             self._report(report, 0)
-        except Exception:
-            logger.exception('the worker failed')
-            backend.counts['worker', 'internal_error'] += 1
-            raise
         return report
 
-    def _run_preparation(self) -> None:
+    @contextmanager
+    def _count_errors(self) -> Iterator[None]:
         try:
-            if self._prepare is not None:
-                self._prepare(lambda: self._stopping)
+            yield
         except Exception:
-            # kernels are then compiled when they are first needed
-            logger.exception('the preparation of the worker failed')
-        self.prepared = True
+            logger.exception('the worker failed')
+            self._backend.counts['worker', 'internal_error'] += 1
+            raise
 
     def _add(self, source: str, measurement: OdometrySample | Measurement) -> None:
         try:
