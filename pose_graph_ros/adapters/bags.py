@@ -84,8 +84,7 @@ class BagReader:
         self.path = path
         self._reader = reader
         self._decoders: dict[str, Callable[[bytes], Any]] = {}
-        self.topics: dict[str, TopicInfo] = {}
-        """Topics of the bag by name."""
+        self.topics: dict[str, TopicInfo] = {}  # topics of the bag by name
         for name in sorted({connection.topic for connection in reader.connections}):
             connections = [c for c in reader.connections if c.topic == name]
             types = ' | '.join(sorted({c.msgtype for c in connections}))

@@ -28,8 +28,7 @@ from pose_graph_ros.core.measurements import (
     rejected,
 )
 
-# Rows and columns of x, y and yaw in a 6x6 covariance.
-PLANAR = np.ix_((0, 1, 5), (0, 1, 5))
+PLANAR = np.ix_((0, 1, 5), (0, 1, 5))  # rows and columns of x, y and yaw in a 6x6 covariance
 # First element of the orientation covariance of an Imu without an orientation.
 NO_ORIENTATION = -1.0
 

@@ -19,8 +19,7 @@ from pose_graph_ros.core.measurements import Answer, Position, rejected
 
 STATUS_NO_FIX = -1
 COVARIANCE_TYPE_UNKNOWN = 0
-# Largest valid distance from the ellipsoid [m].
-LARGEST_ALTITUDE = 1e5
+LARGEST_ALTITUDE = 1e5  # largest valid distance from the ellipsoid [m]
 
 
 class Datum:
@@ -45,14 +44,11 @@ class Datum:
     def __init__(self, given: Sequence[float] = (), *, wait: bool = False) -> None:
         self.yaw = float(given[2]) if len(given) == 3 else 0.0
         """Angle of the map's x axis from east [rad]."""
-        self.is_given = len(given) > 0
-        """Whether the datum comes from the parameter."""
-        self.is_of_graph = False
-        """Whether the datum comes from a loaded graph."""
+        self.is_given = len(given) > 0  # whether the datum comes from the parameter
+        self.is_of_graph = False  # whether the datum comes from a loaded graph
         self.plane = TangentPlane(given[0], given[1], yaw=self.yaw) if self.is_given else None
         """Tangent plane of the map; None without a datum."""
-        self.altitude = 0.0
-        """Altitude of the newest fix that has one [m]."""
+        self.altitude = 0.0  # altitude of the newest fix that has one [m]
         self._waits = wait
         # a given datum takes its altitude from the first fix; east and north do not depend on it
         self._to_lift = self.is_given
@@ -131,10 +127,8 @@ class FixReader:
         self.source = source
         """Gives the time offset and the lever arm; may be replaced at any time."""
         self._datum, self._frames, self._base_frame = datum, frames, base_frame
-        self.antenna: Antenna | None = None
-        """Antenna of the newest fix; None before the first."""
-        self.without_lever_arm = 0
-        """Number of fixes that were read while the antenna was unknown."""
+        self.antenna: Antenna | None = None  # antenna of the newest fix; None before the first
+        self.without_lever_arm = 0  # number of fixes that were read while the antenna was unknown
 
     def position(self, message: Message) -> Position | Answer:
         """

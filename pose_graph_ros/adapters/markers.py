@@ -20,8 +20,7 @@ LINE_LIST, POINTS, ADD, DELETEALL = 5, 8, 0, 3
 # Colours (red, green, blue, alpha) of constraints at these errors [sigma]; interpolated between.
 SIGMAS = (1.0, 2.0, 3.0)
 COLOURS = ((0.15, 0.7, 0.3, 1.0), (0.95, 0.8, 0.1, 1.0), (0.9, 0.1, 0.1, 1.0))
-# Colour of hidden nodes.
-NODE_COLOUR = (0.4, 0.6, 0.85, 1.0)
+NODE_COLOUR = (0.4, 0.6, 0.85, 1.0)  # colour of hidden nodes
 # Sizes of points, and widths of lines [m].
 NODE_SIZE, OBSERVED_SIZE, EDGE_WIDTH, CLOSURE_WIDTH = 0.2, 0.25, 0.06, 0.1
 

@@ -39,8 +39,7 @@ class MessageReader:
     """
 
     def __init__(self, values: Mapping[str, Any], frames: StaticFrames | None = None) -> None:
-        self.sources = {source.name: source for source in source_list(values)}
-        """Sources by name."""
+        self.sources = {source.name: source for source in source_list(values)}  # sources by name
         self._guards = {name: StampGuard(LEAP_NS, behind=True) for name in self.sources}
         self._map_frame = frame(values['map_frame'])
         base_frame = frame(values['base_link_frame'])

@@ -10,10 +10,8 @@ from scipy.spatial.transform import Rotation
 from pose_graph_ros.adapters.conversions import frame, Message
 from pose_graph_ros.core.geometry.se2 import FloatArray
 
-# Largest number of frames from one to its root; protects against cycles.
-LONGEST_CHAIN = 100
-# Largest valid coordinate of a translation [m].
-LARGEST_DISTANCE = 1e3
+LONGEST_CHAIN = 100  # largest number of frames from one to its root; protects against cycles
+LARGEST_DISTANCE = 1e3  # largest valid coordinate of a translation [m]
 
 
 class StaticFrames:

@@ -3,9 +3,9 @@
 """
 Simulate the motion of a car that drives laps around some city blocks.
 
-The circuit is a list of intersections. The car keeps to the right lane of the streets, which are
-slightly curved. The curvature of a turn begins and ends at zero. The speed obeys limits of speed,
-lateral and longitudinal acceleration, and is zero at traffic lights.
+The car keeps to the right lane of the streets, which are slightly curved. The curvature of a turn
+begins and ends at zero. The speed obeys limits of speed, lateral and longitudinal acceleration,
+and is zero at traffic lights.
 """
 
 from dataclasses import dataclass

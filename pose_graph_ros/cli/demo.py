@@ -9,7 +9,8 @@ machine. Without a bag, a drive with known ground truth is simulated first.
 
 import argparse
 from collections import deque
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
+from contextlib import suppress
 import fcntl
 import os
 from pathlib import Path
@@ -26,7 +27,7 @@ import numpy as np
 from pose_graph_ros.adapters.bag_inputs import choose_inputs, Inputs
 from pose_graph_ros.adapters.bags import BagError, open_bag
 from pose_graph_ros.adapters.conversions import planar_pose, stamp_ns
-from pose_graph_ros.adapters.sources import Source, source_list
+from pose_graph_ros.adapters.sources import source_list
 from pose_graph_ros.cli import options as shared
 from pose_graph_ros.cli.results import collect_drive, write_results
 from pose_graph_ros.cli.simulate import simulate_drive, write_drive
@@ -36,7 +37,7 @@ from pose_graph_ros.core.geometry.trajectory import Trajectory
 SIMULATED_TOPICS = {'odom': '/odom', 'fix': '/gps/fix', 'loop_closure': '/loop_closure'}
 SIMULATED_TRUTH = '/ground_truth'
 # Short periods [s]: the player reads from the diagnostics which messages the node has processed.
-DEMO_PARAMETERS = ('diagnostics_period:=0.05', 'path_period:=0.5')
+DEMO_PARAMETERS = ('-p', 'diagnostics_period:=0.05', '-p', 'path_period:=0.5')
 # Time for a process to end after SIGINT, and period of checking on the processes [s].
 STOP_TIMEOUT, POLL_PERIOD = 15.0, 0.1
 # Exit code of the player, whose module cannot be imported without ROS.
@@ -77,10 +78,9 @@ def execute(options: argparse.Namespace) -> int:
     print(f'bag: {bag_path}')
     for source, topic in inputs.topics.items():
         print(f'  {source:<13} {topic}')
-
     start = time.monotonic()
     signal.signal(signal.SIGTERM, signal.default_int_handler)  # also stop the processes on SIGTERM
-    converged = _run(bag_path, inputs, source_list(values), options)
+    converged = _run(bag_path, inputs, values, options)
     seconds = time.monotonic() - start
     path = _last(options.out / 'corrected', '/path')
     poses = {stamp_ns(item): planar_pose(item.pose) for item in path.poses}
@@ -112,24 +112,20 @@ def _bag(
 
 
 def _run(
-    bag: Path, inputs: Inputs, sources: Sequence[Source], options: argparse.Namespace,
+    bag: Path, inputs: Inputs, values: Mapping[str, Any], options: argparse.Namespace,
 ) -> bool:
     """Tell whether the optimisation converged after playing the bag to the node."""
-    ros_args = shared.ros_arguments(options)
+    node_command = [sys.executable, '-m', 'pose_graph_ros.ros.main',
+                    *shared.ros_arguments(options), *DEMO_PARAMETERS]
+    player = [sys.executable, '-m', 'pose_graph_ros.ros.player', str(bag.resolve()),
+              str((options.out / 'corrected').resolve()), '--rate', str(options.rate),
+              '--hold-out', str(inputs.hold_out)]
+    for name, topic in inputs.topics.items():
+        player += ['--input', name, inputs.kinds[name].value, values[f'{name}.topic'], topic]
     with tempfile.TemporaryDirectory(prefix='pose_graph_') as log:
         env = isolated_environment(Path(log))
-        for parameter in DEMO_PARAMETERS:
-            ros_args += ['-p', parameter]
-        processes = [node := subprocess.Popen(
-            [sys.executable, '-m', 'pose_graph_ros.ros.main', *ros_args], env=env)]
+        processes = [node := subprocess.Popen(node_command, env=env)]
         try:
-            player = [sys.executable, '-m', 'pose_graph_ros.ros.player', str(bag.resolve()),
-                      str((options.out / 'corrected').resolve()), '--rate', str(options.rate),
-                      '--hold-out', str(inputs.hold_out)]
-            for source in sources:
-                if source.name in inputs.topics:
-                    player += ['--input', source.name, source.kind.value, source.topic,
-                               inputs.topics[source.name]]
             processes.append(subprocess.Popen(player, env=env))
             while processes[1].poll() is None:
                 if node.poll() is not None:
@@ -162,13 +158,11 @@ def _free_domain() -> int:
     domains = random.SystemRandom().sample(range(1, 101), 100)
     for domain in domains:
         name = Path(tempfile.gettempdir()) / f'pose_graph_ros_domain_{domain}'
-        try:
+        with suppress(OSError):
             lock = name.open('a', encoding='utf-8')
             fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except OSError:
-            continue
-        _DOMAINS.append(lock)
-        return domain
+            _DOMAINS.append(lock)
+            return domain
     return domains[0]
 
 

@@ -19,18 +19,16 @@ def add_inputs(parser: argparse.ArgumentParser) -> None:
     """Add the options that choose topics and the fixes to hold out."""
     group = parser.add_argument_group(
         'topics in the bag', 'by default, the only topic of the type is used')
-    group.add_argument('--odom', metavar='TOPIC', help='nav_msgs/Odometry')
-    group.add_argument('--fix', metavar='TOPIC', help='sensor_msgs/NavSatFix')
-    group.add_argument('--global-pose', metavar='TOPIC',
-                       help='geometry_msgs/PoseWithCovarianceStamped in the map')
-    group.add_argument('--loop-closure', metavar='TOPIC',
-                       help='geometry_msgs/PoseWithCovarianceStamped relative to another pose')
-    group.add_argument('--imu', metavar='TOPIC',
-                       help='sensor_msgs/Imu with an absolute heading, if the parameter sources '
-                            'lists imu')
-    group.add_argument('--truth', metavar='TOPIC',
-                       help='Odometry, PoseStamped or PoseWithCovarianceStamped in the map, '
-                            'only used for comparison')
+    pose = 'geometry_msgs/PoseWithCovarianceStamped'
+    for option, text in (
+            ('--odom', 'nav_msgs/Odometry'), ('--fix', 'sensor_msgs/NavSatFix'),
+            ('--global-pose', f'{pose} in the map'),
+            ('--loop-closure', f'{pose} relative to another pose'),
+            ('--imu', 'sensor_msgs/Imu with an absolute heading, if the parameter sources lists '
+                      'imu'),
+            ('--truth', 'Odometry, PoseStamped or PoseWithCovarianceStamped in the map, only used '
+                        'for comparison')):
+        group.add_argument(option, metavar='TOPIC', help=text)
     parser.add_argument('--hold-out', metavar='N', type=int, default=0,
                         help='keep every N-th fix out of the graph and use it for comparison')
 

@@ -32,14 +32,12 @@ MAP_HEIGHTS = (4.5, 9.0)
 """Smallest and largest height of the map [inch]; in between it depends on the drive."""
 TALL, TALL_HEIGHT, TALL_WIDTHS = 1.15, 8.4, (4.5, 7.5)
 """Smallest ratio of height to width for a map beside the errors; its height and widths [inch]."""
-OUTAGE_S = 5.0
-"""An outage is a time without fixes of more than this [s] and more than 10 median periods."""
+OUTAGE_S = 5.0  # an outage is a time without fixes above this [s] and above 10 median periods
 MIN_FIXES = 3  # with fewer fixes no outages are shown
 SECOND = 10**9  # one second [ns]
 TICK_SPACING = 1.6  # largest spacing of the grid of the map [inch]
 TWO_DIGITS = 10.0  # errors below this are shown with two digits after the point [m]
-LOG_RATIO = 4.0
-"""The error axis is logarithmic if the errors of odometry exceed the others by this factor."""
+LOG_RATIO = 4.0  # if errors of odometry exceed others by this factor, the axis is logarithmic
 LOG_FLOOR = 0.05  # lower end of a logarithmic error axis [m]
 
 
@@ -58,22 +56,19 @@ def draw_drive(drive: Drive, file: Path, title: str) -> None:
     odometry = place_odometry(drive)
     low, high = _limits(drive, odometry)
     ratio = float((high - low)[1] / (high - low)[0])
-    wide = WIDTH - LEFT - RIGHT
     if ratio > TALL:
         size = np.array([np.clip(TALL_HEIGHT / ratio, *TALL_WIDTHS), TALL_HEIGHT])
         height = TOP + TALL_HEIGHT + BOTTOM
-        left = LEFT + size[0] + BETWEEN
-        error_box = (left, BOTTOM, WIDTH - RIGHT - left, 0.6 * TALL_HEIGHT)
+        left, error_height = LEFT + size[0] + BETWEEN, 0.6 * TALL_HEIGHT
     else:
-        width = wide - LEGEND_WIDTH
+        width = WIDTH - LEFT - RIGHT - LEGEND_WIDTH
         size = np.array([width, np.clip(width * ratio, *MAP_HEIGHTS)])
         height = TOP + size[1] + BETWEEN + ERROR_HEIGHT + BOTTOM
-        error_box = (LEFT, BOTTOM, wide, ERROR_HEIGHT)
+        left, error_height = LEFT, ERROR_HEIGHT
     figure = Figure(figsize=(WIDTH, height), dpi=DPI, facecolor='white')
     FigureCanvasAgg(figure)
     plan = _add_axes(figure, (LEFT, height - TOP - size[1], *size))
-    errors = _add_axes(figure, error_box)
-
+    errors = _add_axes(figure, (left, BOTTOM, WIDTH - RIGHT - left, error_height))
     _draw_map(plan, drive, odometry)
     metres_per_inch = float(np.max((high - low) / size))
     middle, half = 0.5 * (low + high), 0.5 * metres_per_inch * size
@@ -84,8 +79,8 @@ def draw_drive(drive: Drive, file: Path, title: str) -> None:
     _draw_errors(errors, drive, odometry)
     figure.text(LEFT / WIDTH, 1.0 - 0.2 / height, title, fontsize=18, fontweight='bold',
                 color=INK, va='top', parse_math=False)
-    figure.text(LEFT / WIDTH, 1.0 - 0.57 / height, _facts(drive), fontsize=12, color=GREY,
-                va='top')
+    figure.text(
+        LEFT / WIDTH, 1.0 - 0.57 / height, _facts(drive), fontsize=12, color=GREY, va='top')
     figure.savefig(file)
 
 
@@ -93,8 +88,7 @@ def _add_axes(figure: Figure, box: tuple[float, float, float, float]) -> Axes:
     """Add a panel with a box (left, bottom, width, height) in inches."""
     width, height = figure.get_size_inches()
     left, bottom, box_width, box_height = box
-    axes = figure.add_axes(
-        (left / width, bottom / height, box_width / width, box_height / height))
+    axes = figure.add_axes((left / width, bottom / height, box_width / width, box_height / height))
     axes.spines[['top', 'right']].set_visible(False)
     axes.spines[['left', 'bottom']].set_color(GREY)
     axes.tick_params(which='both', colors=GREY, labelsize=11)
@@ -197,30 +191,28 @@ def _draw_errors(axes: Axes, drive: Drive, odometry: Trajectory) -> None:
     paths = [path for path in (odometry, drive.corrected) if len(path)]
     begin = min((int(path.stamps_ns[0]) for path in paths), default=0)
     end = max((int(path.stamps_ns[-1]) for path in paths), default=SECOND)
-    lines: list[tuple[Trajectory, IntArray, FloatArray, dict[str, Any]]]
     odometry_style = {'color': PURPLE, 'linewidth': 1.2, 'zorder': 2}
     fixes_style = {'color': ORANGE, 'marker': 'o', 'markersize': 3, 'markeredgewidth': 0,
                   'linestyle': 'none', 'alpha': 0.6, 'zorder': 1}
     corrected_style = {'color': BLUE, 'linewidth': 2.2, 'zorder': 3}
+    held_out_style = {'color': 'none', 'marker': 'D', 'markeredgecolor': VERMILION,
+                     'markersize': 4, 'linestyle': 'none', 'zorder': 4}
+    truth, result, held_out = drive.truth, drive.corrected, drive.fix_held_out
     stamps, positions = drive.fix_stamps_ns, drive.fix_positions
-    if drive.truth is not None:
+    lines: list[tuple[Trajectory, IntArray, FloatArray, dict[str, Any]]]
+    if truth is not None:
         target = 'the truth'
-        true_stamps, true_positions = drive.truth.stamps_ns, drive.truth.poses[:, :2]
-        lines = [(odometry, true_stamps, true_positions, odometry_style),
-                 (drive.truth, stamps, positions, fixes_style),
-                 (drive.corrected, true_stamps, true_positions, corrected_style)]
+        lines = [(odometry, truth.stamps_ns, truth.poses[:, :2], odometry_style),
+                 (truth, stamps, positions, fixes_style),
+                 (result, truth.stamps_ns, truth.poses[:, :2], corrected_style)]
     elif len(stamps) == 0:
         target = 'the corrected path'
-        lines = [(odometry, drive.corrected.stamps_ns, drive.corrected.poses[:, :2],
-                  odometry_style)]
+        lines = [(odometry, result.stamps_ns, result.poses[:, :2], odometry_style)]
     else:
         target = 'the fixes'
-        held_out = drive.fix_held_out
-        held_out_style = {'color': 'none', 'marker': 'D', 'markeredgecolor': VERMILION,
-                         'markersize': 4, 'linestyle': 'none', 'zorder': 4}
         lines = [(odometry, stamps, positions, odometry_style),
-                 (drive.corrected, stamps, positions, corrected_style),
-                 (drive.corrected, stamps[held_out], positions[held_out], held_out_style)]
+                 (result, stamps, positions, corrected_style),
+                 (result, stamps[held_out], positions[held_out], held_out_style)]
 
     highest = []
     for path, line_stamps, line_positions, style in lines:
@@ -237,10 +229,8 @@ def _draw_errors(axes: Axes, drive: Drive, odometry: Trajectory) -> None:
     axes.set_xlabel('time [s]', fontsize=12, color=INK)
     axes.set_ylabel('distance [m]', fontsize=12, color=INK)
     axes.set_title(f'distance to {target}', loc='left', fontsize=13, fontweight='bold', color=INK)
-    outages = _outages(drive, begin, end)
-    for outage in outages:
+    for outage in _outages(drive, begin, end):
         axes.axvspan(*outage, color=SHADE, zorder=0)
-    if outages:
         axes.set_title('shaded: no fixes used', loc='right', fontsize=12, color=GREY)
 
 

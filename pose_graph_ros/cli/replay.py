@@ -97,10 +97,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def execute(options: argparse.Namespace) -> int:
     """Run the tool; return the exit code."""
-    values = shared.parameter_values(options)
+    values, wanted = shared.parameter_values(options), shared.wanted_topics(options)
     with open_bag(options.bag) as bag:
-        inputs = choose_inputs(
-            bag, source_list(values), shared.wanted_topics(options), options.hold_out)
+        inputs = choose_inputs(bag, source_list(values), wanted, options.hold_out)
         for source, topic in inputs.topics.items():
             print(f'{source}: {topic}')
         start = time.monotonic()

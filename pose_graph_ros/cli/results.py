@@ -3,6 +3,7 @@
 """Write the results of a run: corrected path, picture, summary and table of errors."""
 
 from collections.abc import Mapping
+from contextlib import suppress
 import json
 from pathlib import Path
 from typing import Any
@@ -109,13 +110,11 @@ def read_truth(bag: BagReader, topic: str) -> Trajectory:
                        f'{", ".join(TRUTH_TYPES)}; the bag has {bag.describe()}')
     poses: dict[int, np.ndarray] = {}
     for bag_message in bag.messages([topic]):
-        try:
+        with suppress(MessageError):
             message = bag_message.decode()
-        except MessageError:
-            continue
-        pose = planar_pose(message.pose if info.type == TRUTH_TYPES[1] else message.pose.pose)
-        if pose is not None:
-            poses.setdefault(stamp_ns(message), pose)
+            pose = planar_pose(message.pose if info.type == TRUTH_TYPES[1] else message.pose.pose)
+            if pose is not None:
+                poses.setdefault(stamp_ns(message), pose)
     return _trajectory(poses)
 
 
@@ -126,7 +125,7 @@ def _trajectory(poses: Mapping[int, np.ndarray]) -> Trajectory:
 
 def write_results(drive: Drive, folder: Path, title: str, facts: Mapping[str, Any]) -> str:
     """
-    Write `path.tum`, `drive.png` and `summary.json` to a folder.
+    Return a table of errors, after writing `path.tum`, `drive.png` and `summary.json`.
 
     Parameters
     ----------
@@ -134,20 +133,15 @@ def write_results(drive: Drive, folder: Path, title: str, facts: Mapping[str, An
     folder : Path
         Created if it does not exist.
     title : str
-        Title of the picture.
+        Of the picture.
     facts : mapping
         Further entries of the summary.
-
-    Returns
-    -------
-    str
-        Table of errors.
 
     """
     folder.mkdir(parents=True, exist_ok=True)
     rows = evaluate(drive)
     write_tum(drive.corrected, folder / 'path.tum')
     draw_drive(drive, folder / 'drive.png', title)
-    content = summary(drive, rows, dict(facts))
-    (folder / 'summary.json').write_text(json.dumps(content, indent=2) + '\n', encoding='utf-8')
+    text = json.dumps(summary(drive, rows, facts), indent=2)
+    (folder / 'summary.json').write_text(text + '\n', encoding='utf-8')
     return format_table(rows)

@@ -3,8 +3,7 @@
 """
 Simulate a drive through some city blocks with known ground truth, and write it as a rosbag2.
 
-The car keeps to the right lane of slightly curved streets, slows down for corners, stops at
-traffic lights, and drives along some streets twice, on the second lap along all of them. It has
+The car of `circuit` drives along some streets twice, on the second lap along all of them. It has
 
 - wheel odometry: two wheels with wrong radii, a wrong track width, slip in turns and in a few
   events, and a drifting heading; the odometry frame is rotated by about 2 rad against the map;
@@ -32,26 +31,22 @@ from pose_graph_ros.core.geometry.trajectory import Trajectory
 
 MIN_DURATION_S = 10.0
 START_NS = 1_746_518_400_250_000_000  # stamp of the start [ns]
-CITY = TangentPlane(50.7271, 7.0866, 61.0)
-"""Plane of the circuit, which begins at the point where the plane touches the ellipsoid."""
+CITY = TangentPlane(50.7271, 7.0866, 61.0)  # the circuit begins where it touches the ellipsoid
 ODOMETRY_PERIOD_S = 0.05
 TRACK_WIDTH = 1.5  # distance of the wheels [m]
-WHEEL_SCALE = (1.0068, 1.0070)
-"""Ratio of measured to true distance of the left and the right wheel."""
+WHEEL_SCALE = (1.0068, 1.0070)  # ratio of measured to true distance, left and right
 TRACK_SCALE = 1.012  # ratio of assumed to true track width
 SLIP_EVENTS_PER_S = 1.0 / 60.0
 SLIP_S = 0.012  # relative excess of a wheel's speed in a slip event, integrated over it [s]
 HEADING_WANDER = 1.2e-3  # standard deviation of the time-correlated error of the yaw rate [rad/s]
 WANDER_TIME_S = 40.0  # time constant of this error [s]
-ODOMETRY_VARIANCES = (1e-3, 1e-3, 1e6, 1e6, 1e6, 3e-2)
-"""Constant variances of pose and twist, as many drivers set them."""
+ODOMETRY_VARIANCES = (1e-3, 1e-3, 1e6, 1e6, 1e6, 3e-2)  # constant, as many drivers set them
 FIX_PERIOD_S = 0.5
 FIX_SIGMA_SLOW = 1.2  # standard deviation of the time-correlated error of fixes [m]
 FIX_SIGMA_WHITE = 0.4  # and of their white error [m]
 FIX_SIGMA = float(np.hypot(FIX_SIGMA_SLOW, FIX_SIGMA_WHITE))
 FIX_CORRELATION_S = 60.0  # time constant of the time-correlated error [s]
-OUTAGE_S = (-40.0, 30.0)
-"""Start and end of the outage of the fixes relative to the start of the second lap [s]."""
+OUTAGE_S = (-40.0, 30.0)  # start and end of the outage of fixes from the second lap on [s]
 ODOMETRY_LATENCY_NS, FIX_LATENCY_NS, LOOP_LATENCY_NS = 4_000_000, 130_000_000, 800_000_000
 """Time from the stamp of a measurement to its recording [ns]."""
 LOOP_SIGMAS = (0.1, 0.1, np.deg2rad(1.0))  # standard deviations of loop closures [m, m, rad]

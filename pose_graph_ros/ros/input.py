@@ -42,17 +42,14 @@ class Input:
         self._warn = warn
         self._warned: set[tuple[str, str]] = set()
         self._received_at = 0.0
-        self.paused = False
-        """Whether all measurements are rejected."""
+        self.paused = False  # whether all measurements are rejected
         self._clear()
 
     def _clear(self) -> None:
-        self.received: Counter[str] = Counter()
-        """Number of messages by source."""
+        self.received: Counter[str] = Counter()  # number of messages by source
         self.rejected: Counter[tuple[str, str]] = Counter()
         """Number of messages that did not reach the engine, by source and reason."""
-        self.posted = 0
-        """Number of measurements that were handed to the engine."""
+        self.posted = 0  # number of measurements that were handed to the engine
         self.liveness = Liveness([source.name for source in self.reader.sources.values()
                                   if source.kind is Kind.LOOP_CLOSURE])
         self.posted_at = time.monotonic()

@@ -8,8 +8,7 @@ from dataclasses import dataclass
 # A source is silent after this time [s], or after this many of its own periods if that is longer.
 LEAST_SILENCE = 2.0
 PERIODS = 5.0
-# Weight of the newest gap between two messages in the mean period.
-NEWEST = 0.1
+NEWEST = 0.1  # weight of the newest gap between two messages in the mean period
 
 
 @dataclass(slots=True)

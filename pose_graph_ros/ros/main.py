@@ -3,33 +3,22 @@
 """
 The process of the node: from the command line to a clean end.
 
-SIGINT and SIGTERM set a flag that the loop checks, so a second signal, or one while the node
+SIGINT and SIGTERM are kept for the loop to check, so a second signal, or one while the node
 starts or ends, has no further effect.
 """
 
 import signal
 import sys
-from types import FrameType
 
 # Time for which a thread may run Python while another one waits for the interpreter [s].
 SWITCH_INTERVAL = 0.0005
 
 
-class StopSignals:
-    """Handles SIGINT and SIGTERM from its construction on."""
-
-    def __init__(self) -> None:
-        self.received = False
-        for number in (signal.SIGINT, signal.SIGTERM):
-            signal.signal(number, self._on_signal)
-
-    def _on_signal(self, _signal: int, _frame: FrameType | None) -> None:
-        self.received = True
-
-
 def main(args: list[str] | None = None) -> int:
     """Run the node until SIGINT or SIGTERM; return the exit code."""
-    stop = StopSignals()
+    received: list[int] = []
+    for each in (signal.SIGINT, signal.SIGTERM):
+        signal.signal(each, lambda number, _: received.append(number))
     # ruff: noqa: PLC0415  the imports take most of the start; signals must be handled before
     import logging
     import traceback
@@ -50,7 +39,7 @@ def main(args: list[str] | None = None) -> int:
     try:
         rclpy.init(args=args, signal_handler_options=SignalHandlerOptions.NO)
         node = PoseGraphNode()
-        if node.autostarts:
+        if node.get_parameter('autostart').value:
             node.start()
     except (ConfigError, InvalidParameterTypeException, InvalidParameterValueException,
             RuntimeError) as error:  # RuntimeError: by rcl, such as for bad arguments
@@ -59,7 +48,7 @@ def main(args: list[str] | None = None) -> int:
         return 2
     executor = SingleThreadedExecutor()
     executor.add_node(node)
-    while not stop.received and rclpy.ok():
+    while len(received) == 0 and rclpy.ok():
         try:
             executor.spin_once(timeout_sec=0.1)
         except Exception:

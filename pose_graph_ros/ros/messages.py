@@ -8,19 +8,18 @@ little endian): filling in message objects would take ten times as long. In CDR 
 aligned to its size, counted from the end of the four bytes at the start of the stream.
 """
 
-from collections.abc import Mapping
 import functools
 import math
 import struct
 
 from builtin_interfaces.msg import Time
-from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
 from geometry_msgs.msg import PoseWithCovarianceStamped
 from nav_msgs.msg import Odometry
 import numpy as np
 from sensor_msgs.msg import Imu, NavSatFix, NavSatStatus
 from std_msgs.msg import Header
 
+from pose_graph_ros.adapters.conversions import PLANAR
 from pose_graph_ros.adapters.sources import Kind, NANOSECONDS
 from pose_graph_ros.core.geometry import covariance as cov
 from pose_graph_ros.core.geometry.geodesy import TangentPlane
@@ -37,13 +36,11 @@ UNKNOWN_VARIANCE = 1e6
 # The same in poses for viewers, which would draw an ellipsoid of a kilometre [m^2, rad^2].
 PLANAR_VARIANCE = 1e-6
 
-# Number of poses of a path that are written at a time.
-PATH_CHUNK = 2048
+PATH_CHUNK = 2048  # number of poses of a path that are written at a time
 
 CDR = b'\x00\x01\x00\x00'
 _STAMP, _LENGTH = struct.Struct('<iI'), struct.Struct('<I')
-_POSE_WITH_COVARIANCE, _TRANSFORM = struct.Struct('<43d'), struct.Struct('<7d')
-_TWIST = struct.Struct('<6d')
+_POSE, _TWIST = struct.Struct('<7d'), struct.Struct('<6d')
 _UNKNOWN_TWIST = bytes(48) + (UNKNOWN_VARIANCE * np.eye(6)).tobytes()
 
 
@@ -134,18 +131,17 @@ def stamped_pose_cdr(stamp_ns: int, prediction: Prediction, map_frame: str) -> b
                      _pose_with_covariance_cdr(prediction, PLANAR_VARIANCE)))
 
 
-def _pose_with_covariance_cdr(prediction: Prediction, u: float) -> bytes:
-    """Serialise a planar pose; height, roll and pitch have the variance u."""
-    x, y, theta = prediction.T_map_base.tolist()
-    (xx, xy, xt), (yx, yy, yt), (tx, ty, tt) = prediction.covariance.tolist()
-    return _POSE_WITH_COVARIANCE.pack(
-        x, y, 0.0, 0.0, 0.0, math.sin(theta / 2.0), math.cos(theta / 2.0),
-        xx, xy, 0.0, 0.0, 0.0, xt,
-        yx, yy, 0.0, 0.0, 0.0, yt,
-        0.0, 0.0, u, 0.0, 0.0, 0.0,
-        0.0, 0.0, 0.0, u, 0.0, 0.0,
-        0.0, 0.0, 0.0, 0.0, u, 0.0,
-        tx, ty, 0.0, 0.0, 0.0, tt)
+def _pose_with_covariance_cdr(prediction: Prediction, unknown: float) -> bytes:
+    """Serialise a planar pose; height, roll and pitch have the unknown variance."""
+    covariance = np.diag(np.full(6, unknown))
+    covariance[PLANAR] = prediction.covariance
+    return _pose_cdr(prediction.T_map_base) + covariance.astype('<f8').tobytes()
+
+
+def _pose_cdr(pose: FloatArray) -> bytes:
+    """Serialise a planar pose, as position and quaternion."""
+    x, y, theta = pose.tolist()
+    return _POSE.pack(x, y, 0.0, 0.0, 0.0, math.sin(theta / 2.0), math.cos(theta / 2.0))
 
 
 def transform_cdr(
@@ -161,11 +157,8 @@ def transform_cdr(
     map_frame, odom_frame : str
 
     """
-    x, y, theta = T_map_odom.tolist()
-    return b''.join((
-        CDR, _LENGTH.pack(1), _STAMP.pack(*divmod(stamp_ns, NANOSECONDS)),
-        _names(12, map_frame, odom_frame),
-        _TRANSFORM.pack(x, y, 0.0, 0.0, 0.0, math.sin(theta / 2.0), math.cos(theta / 2.0))))
+    return b''.join((CDR, _LENGTH.pack(1), _STAMP.pack(*divmod(stamp_ns, NANOSECONDS)),
+                     _names(12, map_frame, odom_frame), _pose_cdr(T_map_odom)))
 
 
 def path_cdr(path: Trajectory, stamp_ns: int, frame_id: str) -> bytes:
@@ -208,28 +201,3 @@ def path_cdr(path: Trajectory, stamp_ns: int, frame_id: str) -> bytes:
             parts += (first[:names_end], bytes(-(len(head) + names_end) % 8), first[-56:])
         parts.append(numbers[begin == 0:n].tobytes())
     return b''.join(parts)
-
-
-def diagnostics_message(
-    stamp: Time, name: str, level: bytes, text: str, values: Mapping[str, object],
-) -> DiagnosticArray:
-    """
-    Return a message with one status.
-
-    Parameters
-    ----------
-    stamp : builtin_interfaces.msg.Time
-    name : str
-        Name of the status.
-    level : bytes
-        One of the levels of DiagnosticStatus.
-    text : str
-        The status in a sentence.
-    values : mapping
-        Written as texts.
-
-    """
-    status = DiagnosticStatus(
-        level=level, name=name, message=text, hardware_id='pose_graph',
-        values=[KeyValue(key=key, value=str(value)) for key, value in values.items()])
-    return DiagnosticArray(header=Header(stamp=stamp), status=[status])

@@ -38,22 +38,15 @@ class PoseGraphNode(LifecycleNode):
 
     def __init__(self, **node_options: Any) -> None:
         super().__init__('pose_graph', **node_options)
-        self.failure = ''
-        """Why the last configuration failed."""
+        self.failure = ''  # why the last configuration failed
         self._session: Session | None = None
         self._offered: Services | None = None
-        self._given = self._declared()
-        """The node's own parameters that have a value."""
+        self._given = self._declared()  # the node's own parameters that have a value
         self._own = frozenset(parameter.name for parameter in all_parameters(self._given))
         self._warn_of_unknown()
         self.add_on_set_parameters_callback(self._on_set_parameters)
         self.add_post_set_parameters_callback(self._on_parameters_set)
         self._answer_every_change_of_state()
-
-    @property
-    def autostarts(self) -> bool:
-        """Whether the node is to configure and activate itself."""
-        return bool(self._given['autostart'])
 
     # ---- lifecycle
 

@@ -37,14 +37,12 @@ from pose_graph_ros.adapters.sources import Kind
 from pose_graph_ros.ros.messages import CLASSES
 from pose_graph_ros.ros.transforms import TFMessage
 
-# Name of the node, for its service and its diagnostics.
-NODE_NAME = 'pose_graph'
+NODE_NAME = 'pose_graph'  # name of the node, for its service and its diagnostics
 # Profiles are reliable if they do not say otherwise.
 RELIABLE = QoSProfile(depth=1000)
 LATCHED = QoSProfile(depth=1, durability=QoSDurabilityPolicy.TRANSIENT_LOCAL)
 STATIC = QoSProfile(depth=100, durability=QoSDurabilityPolicy.TRANSIENT_LOCAL)
-# Greatest number of unprocessed messages, well below the depth of the node's queues.
-WINDOW = 400
+WINDOW = 400  # greatest number of unprocessed messages, well below the depth of the node's queues
 # Longest waits for the node: to appear, to compile at its first start, to process another message,
 # and to answer [s].
 APPEAR_TIMEOUT = 30.0
@@ -85,11 +83,9 @@ class Player(Node):
             TFMessage, STATIC_FRAMES[0], STATIC)
         self.recorded: list[tuple[str, str, int, bytes]] = []
         """Topic, type, time of arrival [ns] and bytes of the node's messages."""
-        self.path = b''
-        """The newest path."""
+        self.path = b''  # the newest path
         self._path_at = -float('inf')
-        self.diagnostics: dict[str, str] = {}
-        """The newest values of the node's diagnostics."""
+        self.diagnostics: dict[str, str] = {}  # the newest values of the node's diagnostics
         self._diagnostics_raw = b''
         self._record('pose', PoseWithCovarianceStamped, Kind.GLOBAL_POSE.message_type)
         self._record('odometry/filtered', Odometry, Kind.ODOMETRY.message_type)

@@ -31,8 +31,7 @@ class PoseContinuity:
     """
 
     def __init__(self, maximum_speed: float, *, resumes: bool = False) -> None:
-        self.maximum_speed = maximum_speed
-        """Greatest possible speed of the robot [m/s]; may be changed at any time."""
+        self.maximum_speed = maximum_speed  # may be changed at any time
         self._resumes = resumes
         self._stamp_ns = 0
         self._pose = (0.0, 0.0, 0.0)

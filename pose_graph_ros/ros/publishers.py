@@ -14,7 +14,7 @@ import threading
 import time
 from typing import Any
 
-from diagnostic_msgs.msg import DiagnosticArray
+from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
 from geometry_msgs.msg import PoseWithCovarianceStamped
 from nav_msgs.msg import Odometry, Path
 from rclpy.node import Node
@@ -46,7 +46,7 @@ LATCHED_QOS = QoSProfile(depth=1, durability=QoSDurabilityPolicy.TRANSIENT_LOCAL
 
 class Publishers:
     """
-    Publishes all outputs of the node.
+    The outputs of the node.
 
     Parameters
     ----------
@@ -79,8 +79,7 @@ class Publishers:
         self._slew = Slew()
         self._aligned = False
         self._newest_ns = 0
-        self.graph = 0
-        """Number of the present graph: how many were started after the first."""
+        self.graph = 0  # number of the present graph: how many were started after the first
         # shared by the two threads
         self._lock = threading.Lock()
         self._path_shown: Estimate | None = None
@@ -95,25 +94,21 @@ class Publishers:
 
     def configure(self, values: Mapping[str, Any]) -> None:
         """Set the parameters that can change while the node runs."""
-        if values['publish_tf'] and self.transforms is None:
-            self._create_transforms()
+        if values['publish_tf'] and TFMessage is None:
+            self._node.get_logger().warning(
+                'tf2_msgs is not installed: the transform from map to odom is not published',
+                once=True)
+        elif values['publish_tf'] and self.transforms is None:
+            self.transforms = TransformPublisher(
+                self._node, self._publisher(TFMessage, TOPIC, TF_QOS), self.map_frame,
+                self.odom_frame, self._on_other)
+            self._slew.forget()
         elif not values['publish_tf'] and self.transforms is not None:
             self.transforms.close()
             self.transforms = None
         self._tf_offset_ns = round(values['transform_time_offset'] * NANOSECONDS)
         self._slew_limits = values['transform_slew_linear'], values['transform_slew_angular']
         self._path_period, self._graph_period = values['path_period'], values['graph_period']
-
-    def _create_transforms(self) -> None:
-        if TFMessage is None:
-            self._node.get_logger().warning(
-                'tf2_msgs is not installed: the transform from map to odom is not published',
-                once=True)
-            return
-        self.transforms = TransformPublisher(
-            self._node, self._publisher(TFMessage, TOPIC, TF_QOS), self.map_frame,
-            self.odom_frame, self._on_other)
-        self._slew.forget()
 
     def publish_pose(
         self, estimate: Estimate, odometry: Odometry, sample: OdometrySample, datum: Datum,
@@ -246,9 +241,12 @@ class Publishers:
         values : mapping
 
         """
-        name = f'{self._node.get_fully_qualified_name()}: pose graph'
-        self._diagnostics.publish(messages.diagnostics_message(
-            self._node.get_clock().now().to_msg(), name, level, text, values))
+        status = DiagnosticStatus(
+            level=level, name=f'{self._node.get_fully_qualified_name()}: pose graph', message=text,
+            hardware_id='pose_graph',
+            values=[KeyValue(key=key, value=str(value)) for key, value in values.items()])
+        self._diagnostics.publish(DiagnosticArray(
+            header=Header(stamp=self._node.get_clock().now().to_msg()), status=[status]))
 
     def close(self) -> None:
         """Destroy all publishers."""

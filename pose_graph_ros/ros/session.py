@@ -46,16 +46,14 @@ from pose_graph_ros.ros.worker import Worker
 # The queue is deep since no odometry may be lost. A best-effort reader matches reliable and
 # best-effort writers.
 SENSOR_QOS = QoSProfile(depth=1000, reliability=QoSReliabilityPolicy.BEST_EFFORT)
-# A loop closure is rare and must not get lost.
-LOOP_CLOSURE_QOS = QoSProfile(depth=100)
+LOOP_CLOSURE_QOS = QoSProfile(depth=100)  # a loop closure is rare and must not get lost
 # Late subscribers receive the newest message of every broadcaster.
 STATIC_QOS = QoSProfile(depth=100, durability=QoSDurabilityPolicy.TRANSIENT_LOCAL)
 SET_POSE_QOS = QoSProfile(depth=1)
 
 # Longest wait for a running solve when the node ends; launch kills a node after 5 s [s].
 STOP_TIMEOUT = 4.0
-# Period of the check whether all sources are silent [s].
-SILENCE_PERIOD = 0.2
+SILENCE_PERIOD = 0.2  # period of the check whether all sources are silent [s]
 # Period of the search for the constraints with the largest energies [s], and their number.
 ENERGY_PERIOD = 5.0
 N_ENERGIES = 3
@@ -95,8 +93,7 @@ class Session:
         self._continuity = {
             name: PoseContinuity(source.maximum_speed, resumes=resumes)
             for name, source in self._config.odometry.items()}
-        self.silent: list[str] = []
-        """Sources that are silent while others are not."""
+        self.silent: list[str] = []  # sources that are silent while others are not
         self.largest_energies: Sequence[ConstraintEnergy] = []
         """The constraints with the largest energies."""
         self._energies_at = -math.inf

@@ -23,7 +23,7 @@ class SetPoseInput:
     Parameters
     ----------
     map_frame, odom_frame, base_frame : str
-        The frames in which a pose may be given.
+        Those in which a pose may be given.
 
     """
 

@@ -3,10 +3,9 @@
 """
 Detection of time that starts again: a bag that is played in a loop, a simulation that is reset.
 
-A single stamp in the past is no evidence: messages come late, and drivers make mistakes. If
-several consecutive odometry stamps increase behind the newest one, time has started again.
-Messages that come in the meantime are held back, so that no measurement of the new time reaches
-the old graph. Imports no rclpy.
+Messages come late, and drivers make mistakes, so that time has started again only if several
+consecutive odometry stamps increase behind the newest one. Messages that come in the meantime are
+held back, so that no measurement of the new time reaches the old graph. Imports no rclpy.
 """
 
 from typing import NamedTuple
@@ -14,8 +13,7 @@ from typing import NamedTuple
 from pose_graph_ros.adapters.conversions import Message
 from pose_graph_ros.core.odometry.stamp_guard import EVIDENCE, StampGuard
 
-# Greatest number of messages that are held back at a time.
-MOST_HELD = 200
+MOST_HELD = 200  # greatest number of messages that are held back at a time
 # Number of odometry messages of the new time after which those of the old time have drained.
 MOST_OLD = 20
 

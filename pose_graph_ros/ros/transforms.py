@@ -27,10 +27,8 @@ TF_QOS = QoSProfile(depth=100)
 TOPIC = '/tf'
 # Reading all of /tf costs as much as reading odometry, so it is read for this time only [s].
 LISTENING = 2.0
-# Period of the listening; a new publisher on /tf starts it at once [s].
-PAUSE = 30.0
-# Number of the newest transforms of this node that are kept, to recognise them on /tf.
-OWN = 2000
+PAUSE = 30.0  # period of the listening; a new publisher on /tf starts it at once [s]
+OWN = 2000  # number of the newest transforms of this node that are kept, to recognise them on /tf
 
 
 class TransformPublisher:
@@ -51,16 +49,14 @@ class TransformPublisher:
         self, node: Node, publisher: Publisher, map_frame: str, odom_frame: str,
         on_other: Callable[[str], None],
     ) -> None:
-        self._node, self._publisher = node, publisher
+        self._node, self._publisher, self._on_other = node, publisher, on_other
         self._map_frame, self._odom_frame = map_frame, odom_frame
-        self._on_other = on_other
         self._newest_ns = 0
         self._own: deque[tuple[int, float, float]] = deque(maxlen=OWN)
         self._subscription: Subscription | None = None
         self._known: set[bytes] = set()
         self._since = -float('inf')
-        self.other = ''
-        """Warning about another publisher of the transform; empty if there is none."""
+        self.other = ''  # warning about another publisher of the transform; empty if there is none
 
     def publish(self, at_ns: int, T_map_odom: FloatArray) -> None:
         """

@@ -1,11 +1,10 @@
 # Copyright 2026 The pose_graph_ros authors
 # SPDX-License-Identifier: Apache-2.0
 """
-The thread that owns the engine: the single writer of the graph.
+The thread that owns the engine: the single writer of the graph. Imports no ROS.
 
 Callbacks post measurements and request updates or jobs; they never wait for a solver. They read
-an immutable estimate that the thread replaces as a whole. A worker serves one graph: a new graph
-gets a new worker. Imports no ROS.
+an immutable estimate that the thread replaces as a whole.
 """
 
 from collections import Counter, deque
@@ -57,16 +56,15 @@ class WorkerStatus:
 
 class Worker:
     """
-    Runs a backend in a thread of its own.
+    Runs a backend in a thread of its own; a new graph gets a new worker.
 
     Parameters
     ----------
     backend : PoseGraphBackend
     on_estimate : callable
-        Called in the worker's thread after each new estimate, with the backend.
+        Called in the thread after each new estimate, with the backend.
     prepare : callable
-        Called in the worker's thread before its first work, while posted measurements wait; gets
-        a function that returns whether the worker is to end.
+        Called in the thread before its first work, with a function that returns whether to end.
 
     """
 
@@ -74,11 +72,8 @@ class Worker:
         self, backend: PoseGraphBackend, on_estimate: Callable[[PoseGraphBackend], None],
         prepare: Callable[[Callable[[], bool]], None] | None = None,
     ) -> None:
-        self._backend = backend
-        self._on_estimate = on_estimate
-        self._prepare = prepare
-        self.prepared = False
-        """Whether the preparation has ended."""
+        self._backend, self._on_estimate, self._prepare = backend, on_estimate, prepare
+        self.prepared = False  # whether the preparation has ended
         self._inbox: deque[tuple[str, OdometrySample | Measurement]] = deque()
         self._update_wanted = False
         self._jobs: list[tuple[Job[object], Future[object]]] = []
@@ -89,8 +84,7 @@ class Worker:
         self._warned: set[tuple[str, str]] = set()
         self.estimate: Estimate | None = None
         """The newest estimate, without its path; replaced as a whole."""
-        self.status = WorkerStatus()
-        """The newest status; replaced as a whole."""
+        self.status = WorkerStatus()  # the newest status; replaced as a whole
         self._thread = threading.Thread(target=self._run, name='pose graph', daemon=True)
 
     def start(self) -> None:
@@ -205,10 +199,9 @@ class Worker:
 
     def _add(self, source: str, measurement: OdometrySample | Measurement) -> None:
         try:
-            if isinstance(measurement, OdometrySample):
-                answer = self._backend.add_odometry(measurement, source)
-            else:
-                answer = self._backend.add_measurement(measurement, source)
+            answer = (self._backend.add_odometry(measurement, source)
+                      if isinstance(measurement, OdometrySample)
+                      else self._backend.add_measurement(measurement, source))
             key = (source, answer.reason)
             if answer.status is AnswerStatus.REJECTED and key not in self._warned:
                 self._warned.add(key)

@@ -79,7 +79,7 @@ def managed(tmp_path: Path, request: pytest.FixtureRequest) -> Iterator[Managed]
 
 def test_it_goes_through_all_its_states_and_back(managed: Managed) -> None:
     node = managed.local.node
-    assert node.autostarts
+    assert node.get_parameter('autostart').value
     managed.start()
     managed.drive(2.0)
     worker = managed.session.worker

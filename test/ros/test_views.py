@@ -263,4 +263,4 @@ def test_foxglove_plots_what_is_in_the_diagnostics() -> None:
     hardware |= {panel['selectedHardwareId'] for panel in PANELS.values()
                  if 'selectedHardwareId' in panel}
     assert hardware == {'pose_graph'}
-    assert hardware <= strings(SOURCES / 'messages.py')
+    assert hardware <= strings(SOURCES / 'publishers.py')
