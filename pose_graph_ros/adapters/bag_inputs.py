@@ -21,10 +21,8 @@ STATIC_FRAMES = '/tf_static', 'tf2_msgs/msg/TFMessage'  # topic and type of stat
 class Inputs:
     """Topics of a bag that feed the sources of the node, and how many fixes are held out."""
 
-    topics: Mapping[str, str]
-    """Topic in the bag by name of the source, such as `fix`."""
-    kinds: Mapping[str, Kind] = field(default_factory=dict)
-    """Kind by name of the source."""
+    topics: Mapping[str, str]  # topic in the bag by name of the source, such as `fix`
+    kinds: Mapping[str, Kind] = field(default_factory=dict)  # kind by name of the source
     hold_out: int = 0
     """Every n-th fix (global pose, if there are no fixes) is held out; 0 holds out none."""
 
@@ -42,8 +40,7 @@ class InputMessage(NamedTuple):
 
     source: str
     message: BagMessage
-    held_out: bool
-    """Whether it is kept out of the graph."""
+    held_out: bool  # whether it is kept out of the graph
 
 
 def choose_inputs(

@@ -52,10 +52,8 @@ class BagMessage:
 
     topic: str
     type: str
-    recorded_ns: int
-    """When the recorder received the message [ns]; not the stamp in its header."""
-    raw: bytes
-    """The message as stored: in CDR in a rosbag2, in the ROS 1 format in a .bag file."""
+    recorded_ns: int  # when the recorder received the message [ns]; not the stamp in its header
+    raw: bytes  # the message as stored: in CDR in a rosbag2, in the ROS 1 format in a .bag file
     _decode: Callable[[bytes], Any] = field(repr=False, compare=False)
 
     def decode(self) -> Any:

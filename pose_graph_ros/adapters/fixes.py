@@ -99,10 +99,8 @@ def datum_of(values: Mapping[str, Any]) -> Datum:
 class Antenna(NamedTuple):
     """Position of the antenna of a receiver on the robot."""
 
-    lever_arm: FloatArray
-    """Antenna in the frame of the robot, shape (2,) [m]."""
-    origin: str
-    """`parameter`, `tf_static`, or `none` if unknown (the lever arm is then zero)."""
+    lever_arm: FloatArray  # antenna in the frame of the robot, shape (2,) [m]
+    origin: str  # `parameter`, `tf_static`, or `none` if unknown (the lever arm is then zero)
 
 
 class FixReader:

@@ -36,22 +36,16 @@ class Change(Enum):
 class Parameter:
     """One parameter of the node, or of its sources if `kinds` is not empty."""
 
-    name: str
-    """For a parameter of a source, without the name of the source."""
-    default: Value
-    """An empty list of numbers means that the parameter is unset."""
+    name: str  # for a parameter of a source, without the name of the source
+    default: Value  # an empty list of numbers means that the parameter is unset
     unit: str
     description: str
     smallest: float | None = None
     """Lower bound of a number, or of each number in a list, inclusive."""
-    largest: float | None = None
-    """Upper bound, inclusive."""
-    choices: tuple[str, ...] = ()
-    """Allowed texts; empty if all are allowed."""
-    sizes: tuple[int, ...] = ()
-    """Allowed sizes of a list; empty if all are allowed."""
-    kinds: tuple[Kind, ...] = ()
-    """Kinds of sources with this parameter."""
+    largest: float | None = None  # upper bound, inclusive
+    choices: tuple[str, ...] = ()  # allowed texts; empty if all are allowed
+    sizes: tuple[int, ...] = ()  # allowed sizes of a list; empty if all are allowed
+    kinds: tuple[Kind, ...] = ()  # kinds of sources with this parameter
     change: Change = Change.ALWAYS
 
 

@@ -50,14 +50,11 @@ class Source:
 
     name: str
     kind: Kind
-    topic: str
-    """Topic to which the node subscribes."""
-    time_offset_ns: int = 0
-    """Added to the stamps of its messages [ns]."""
+    topic: str  # topic to which the node subscribes
+    time_offset_ns: int = 0  # added to the stamps of its messages [ns]
     lever_arm: tuple[float, ...] = (0.0, 0.0)
     """Antenna of fixes in the frame of the robot (x, y) [m]; zero if not given."""
-    yaw_offset: float = 0.0
-    """Added to the yaw of an IMU [rad]."""
+    yaw_offset: float = 0.0  # added to the yaw of an IMU [rad]
 
 
 def source_list(values: Mapping[str, Any]) -> tuple[Source, ...]:

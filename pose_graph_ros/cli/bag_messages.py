@@ -15,7 +15,7 @@ from pose_graph_ros.core.geometry.se2 import FloatArray, IntArray
 from pose_graph_ros.core.geometry.trajectory import Trajectory
 
 Message = tuple[str, str, int, Any]
-"""Topic, type, time of recording [ns] and message."""
+"""Topic, type, time of recording [ns] and message; recorded at its stamp, if made here."""
 _TYPES = message_types()
 _ODOMETRY = 'nav_msgs/msg/Odometry'
 _FIX = 'sensor_msgs/msg/NavSatFix'
@@ -42,7 +42,7 @@ def write_bag(
 
 
 def odometry_messages(
-    topic: str, frame: str, path: Trajectory, variances: Sequence[float], latency_ns: int = 0,
+    topic: str, frame: str, path: Trajectory, variances: Sequence[float],
 ) -> Iterator[Message]:
     """
     Return nav_msgs/Odometry messages with the twists between consecutive poses.
@@ -54,8 +54,6 @@ def odometry_messages(
         Poses of base_link in the frame.
     variances : sequence of float, length 6
         Of the pose and of the twist.
-    latency_ns : int
-        Time from the stamp to the recording [ns].
 
     """
     pose_with_covariance, twist_with_covariance, make_twist, vector = (
@@ -67,13 +65,13 @@ def odometry_messages(
     rates = np.concatenate((steps[:1], steps)).tolist()
     for stamp, pose, (vx, _, yaw_rate) in zip(stamps.tolist(), poses.tolist(), rates, strict=True):
         twist = make_twist(vector(vx, 0.0, 0.0), vector(0.0, 0.0, yaw_rate))
-        yield topic, _ODOMETRY, stamp + latency_ns, _TYPES[_ODOMETRY](
+        yield topic, _ODOMETRY, stamp, _TYPES[_ODOMETRY](
             _header(stamp, frame), 'base_link', pose_with_covariance(_pose(pose), covariance),
             twist_with_covariance(twist, covariance))
 
 
 def fix_messages(
-    topic: str, stamps_ns: IntArray, geodetic: FloatArray, sigma: float, latency_ns: int = 0,
+    topic: str, stamps_ns: IntArray, geodetic: FloatArray, sigma: float,
 ) -> Iterator[Message]:
     """
     Return sensor_msgs/NavSatFix messages.
@@ -86,21 +84,18 @@ def fix_messages(
         Latitude, longitude and ellipsoidal height [deg, deg, m].
     sigma : float
         Standard deviation along each of east and north [m]; that of the height is twice as large.
-    latency_ns : int
-        Time from the stamp to the recording [ns].
 
     """
     status = _TYPES['sensor_msgs/msg/NavSatStatus']
     covariance = sigma**2 * np.diag([1.0, 1.0, 4.0]).ravel()
     for stamp, fix in zip(stamps_ns.tolist(), geodetic.tolist(), strict=True):
-        yield topic, _FIX, stamp + latency_ns, _TYPES[_FIX](
+        yield topic, _FIX, stamp, _TYPES[_FIX](
             _header(stamp, 'gps'), status(status.STATUS_FIX, status.SERVICE_GPS), *fix,
             covariance, _TYPES[_FIX].COVARIANCE_TYPE_DIAGONAL_KNOWN)
 
 
 def loop_closure_messages(
     topic: str, stamps_ns: IntArray, poses: FloatArray, covariance: FloatArray,
-    latency_ns: int = 0,
 ) -> Iterator[Message]:
     """
     Return loop closures as geometry_msgs/PoseWithCovarianceStamped messages.
@@ -114,15 +109,13 @@ def loop_closure_messages(
         Later pose of the robot in the frame of the earlier one [m, m, rad].
     covariance : ndarray, shape (3, 3)
         Of each of the poses.
-    latency_ns : int
-        Time from the later stamp to the recording [ns].
 
     """
     pose_with_covariance = _TYPES['geometry_msgs/msg/PoseWithCovariance']
     full = np.diag([0.0, 0.0, 0.01, 3e-4, 3e-4, 0.0])
     full[PLANAR] = covariance
     for (old, new), pose in zip(stamps_ns.tolist(), poses.tolist(), strict=True):
-        yield topic, _POSE, new + latency_ns, _TYPES[_POSE](
+        yield topic, _POSE, new, _TYPES[_POSE](
             _header(new, f'@{old // 10**9}.{old % 10**9:09d}'),
             pose_with_covariance(_pose(pose), full.ravel()))
 

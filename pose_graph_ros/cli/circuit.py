@@ -34,14 +34,10 @@ PERIOD_S = 0.01  # sample period of the motion [s]
 class Motion:
     """Poses of the car, every 10 ms."""
 
-    time: FloatArray
-    """Time since the start, shape (N,) [s]."""
-    distance: FloatArray
-    """Distance driven since the start, shape (N,) [m]."""
-    poses: FloatArray
-    """Poses in the frame of the city, shape (N, 3) [m, m, rad]; headings are not wrapped."""
-    lap_time: float
-    """Time at which the second lap begins [s]; after the end, or infinite, if there is none."""
+    time: FloatArray  # time since the start, shape (N,) [s]
+    distance: FloatArray  # distance driven since the start, shape (N,) [m]
+    poses: FloatArray  # in the frame of the city, shape (N, 3) [m, m, rad]; not wrapped
+    lap_time: float  # when the second lap begins [s]; after the end, or infinite, if there is none
 
 
 def drive_circuit(generator: np.random.Generator, duration_s: float) -> Motion:

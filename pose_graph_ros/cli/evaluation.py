@@ -24,22 +24,14 @@ from pose_graph_ros.core.geometry.trajectory import Trajectory
 class Drive:
     """Input and result of the pose graph, and the truth if it is known; all finite."""
 
-    odometry: Trajectory
-    """Raw odometry, `T_odom_base`."""
-    fix_stamps_ns: IntArray
-    """Stamps of the fixes, shape (M,) [ns]."""
-    fix_positions: FloatArray
-    """Positions of the fixes in the map, shape (M, 2) [m]."""
-    fix_held_out: npt.NDArray[np.bool_]
-    """Whether a fix was kept out of the pose graph, shape (M,)."""
-    corrected: Trajectory
-    """Result, `T_map_base`."""
-    truth: Trajectory | None
-    """True poses, `T_map_base`; None if unknown."""
-    loop_stamps_ns: IntArray
-    """Stamps of both ends of the loop closures, shape (L, 2) [ns]."""
-    map_axes: tuple[str, str] = ('x', 'y')
-    """Names of the axes of the map."""
+    odometry: Trajectory  # raw odometry, `T_odom_base`
+    fix_stamps_ns: IntArray  # stamps of the fixes, shape (M,) [ns]
+    fix_positions: FloatArray  # positions of the fixes in the map, shape (M, 2) [m]
+    fix_held_out: npt.NDArray[np.bool_]  # whether a fix was kept out of the pose graph, shape (M,)
+    corrected: Trajectory  # result, `T_map_base`
+    truth: Trajectory | None  # true poses, `T_map_base`; None if unknown
+    loop_stamps_ns: IntArray  # stamps of both ends of the loop closures, shape (L, 2) [ns]
+    map_axes: tuple[str, str] = ('x', 'y')  # names of the axes of the map
 
     def __post_init__(self) -> None:
         count = len(self.fix_stamps_ns)

@@ -42,10 +42,8 @@ class Replayed(NamedTuple):
     """Result of running a bag through the engine."""
 
     backend: PoseGraphBackend
-    report: UpdateReport
-    """Report of the final optimisation."""
-    refused: Counter[tuple[str, str]]
-    """Number of messages without a valid measurement, by source and reason."""
+    report: UpdateReport  # report of the final optimisation
+    refused: Counter[tuple[str, str]]  # messages without a valid measurement, by source and reason
 
 
 def run(bag: BagReader, inputs: Inputs, values: Mapping[str, Any]) -> Replayed:

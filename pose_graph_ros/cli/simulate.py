@@ -22,7 +22,12 @@ import numpy as np
 from scipy.ndimage import gaussian_filter1d
 from scipy.spatial import KDTree
 
-from pose_graph_ros.cli import bag_messages
+from pose_graph_ros.cli.bag_messages import (
+    fix_messages,
+    loop_closure_messages,
+    odometry_messages,
+    write_bag,
+)
 from pose_graph_ros.cli.circuit import drive_circuit, gauss_markov, PERIOD_S
 from pose_graph_ros.core.geometry import se2
 from pose_graph_ros.core.geometry.geodesy import TangentPlane
@@ -47,8 +52,9 @@ FIX_SIGMA_WHITE = 0.4  # and of their white error [m]
 FIX_SIGMA = float(np.hypot(FIX_SIGMA_SLOW, FIX_SIGMA_WHITE))
 FIX_CORRELATION_S = 60.0  # time constant of the time-correlated error [s]
 OUTAGE_S = (-40.0, 30.0)  # start and end of the outage of fixes from the second lap on [s]
-ODOMETRY_LATENCY_NS, FIX_LATENCY_NS, LOOP_LATENCY_NS = 4_000_000, 130_000_000, 800_000_000
-"""Time from the stamp of a measurement to its recording [ns]."""
+LATENCIES_NS = {'/odom': 4_000_000, '/ground_truth': 4_000_000, '/gps/fix': 130_000_000,
+                '/loop_closure': 800_000_000}
+"""Time from the stamp of a measurement to its recording, by topic [ns]."""
 LOOP_SIGMAS = (0.1, 0.1, np.deg2rad(1.0))  # standard deviations of loop closures [m, m, rad]
 LOOP_SPACING = 25.0  # length of the stretches of the path with at most one loop closure each [m]
 # Largest distance [m] and angle [rad] between the true poses of a loop closure, and smallest time
@@ -61,18 +67,12 @@ LOOP_MIN_TIME_S, LOOP_MIN_DISTANCE = 15.0, 50.0
 class SimulatedDrive:
     """Measurements and true poses of a simulated drive."""
 
-    truth: Trajectory
-    """True poses, `T_map_base`."""
-    odometry: Trajectory
-    """Measured poses, `T_odom_base`."""
-    fix_stamps_ns: IntArray
-    """Stamps of the fixes, shape (M,) [ns]."""
-    fixes: FloatArray
-    """Latitude, longitude and ellipsoidal height, shape (M, 3) [deg, deg, m]."""
-    loop_stamps_ns: IntArray
-    """Stamps of the earlier and of the later pose of the loop closures, shape (L, 2) [ns]."""
-    loop_poses: FloatArray
-    """Measured later pose in the frame of the earlier one, shape (L, 3) [m, m, rad]."""
+    truth: Trajectory  # true poses, `T_map_base`
+    odometry: Trajectory  # measured poses, `T_odom_base`
+    fix_stamps_ns: IntArray  # stamps of the fixes, shape (M,) [ns]
+    fixes: FloatArray  # latitude, longitude and ellipsoidal height, shape (M, 3) [deg, deg, m]
+    loop_stamps_ns: IntArray  # of the earlier and later pose of loop closures, shape (L, 2) [ns]
+    loop_poses: FloatArray  # measured later pose in the earlier one, shape (L, 3) [m, m, rad]
 
 
 def simulate_drive(seed: int = 1, duration_s: float = 440.0) -> SimulatedDrive:
@@ -124,14 +124,14 @@ def write_drive(drive: SimulatedDrive, folder: str | Path, *, overwrite: bool = 
         Whether to replace an existing bag; without it, that is a `BagError`.
 
     """
-    odometry, fixes = bag_messages.odometry_messages, bag_messages.fix_messages
-    bag_messages.write_bag(folder, (
-        *odometry('/odom', 'odom', drive.odometry, ODOMETRY_VARIANCES, ODOMETRY_LATENCY_NS),
-        *odometry('/ground_truth', 'map', drive.truth, (0.0,) * 6, ODOMETRY_LATENCY_NS),
-        *fixes('/gps/fix', drive.fix_stamps_ns, drive.fixes, FIX_SIGMA, FIX_LATENCY_NS),
-        *bag_messages.loop_closure_messages(
-            '/loop_closure', drive.loop_stamps_ns, drive.loop_poses,
-            np.diag(np.square(LOOP_SIGMAS)), LOOP_LATENCY_NS)), overwrite=overwrite)
+    messages = (
+        *odometry_messages('/odom', 'odom', drive.odometry, ODOMETRY_VARIANCES),
+        *odometry_messages('/ground_truth', 'map', drive.truth, (0.0,) * 6),
+        *fix_messages('/gps/fix', drive.fix_stamps_ns, drive.fixes, FIX_SIGMA),
+        *loop_closure_messages('/loop_closure', drive.loop_stamps_ns, drive.loop_poses,
+                               np.diag(np.square(LOOP_SIGMAS))))
+    write_bag(folder, ((topic, type_name, stamp_ns + LATENCIES_NS[topic], message)
+                       for topic, type_name, stamp_ns, message in messages), overwrite=overwrite)
 
 
 def _jittered_stamps(

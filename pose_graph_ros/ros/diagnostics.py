@@ -40,14 +40,12 @@ def _state(session: 'Session') -> dict[str, object]:
         'memory_mb': f'{memory() / 1e6:.0f}'}
     if session.reset_reason != '':
         found['reset_reason'] = session.reset_reason
-    for source, count in sorted(received.items()):
-        found[f'received.{source}'] = count
-    for (source, answer), count in sorted((status.counts + rejected).items()):
-        found[f'{source}.{answer}'] = count
+    found |= {f'received.{source}': count for source, count in sorted(received.items())}
+    found |= {f'{source}.{answer}': count
+              for (source, answer), count in sorted((status.counts + rejected).items())}
     if estimate is not None:
         found.update({
-            'odometry': estimate.primary,
-            'alignment': estimate.alignment.value,
+            'odometry': estimate.primary, 'alignment': estimate.alignment.value,
             'alignment_yaw_deg': f'{math.degrees(estimate.T_map_odom[2]):.3f}',
             'alignment_sigma_deg': f'{math.degrees(estimate.alignment_sigma):.3f}',
             'hidden_nodes': estimate.n_hidden, 'edges': estimate.n_edges,

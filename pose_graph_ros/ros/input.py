@@ -1,10 +1,6 @@
 # Copyright 2026 The pose_graph_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""
-From messages to measurements, with a count for everything; imports no rclpy.
-
-Each message is counted, held back while it is in doubt whether time has jumped back, and read.
-"""
+"""From messages to measurements, with a count for everything; imports no rclpy."""
 
 from collections import Counter
 from collections.abc import Callable, Mapping
@@ -19,13 +15,14 @@ from pose_graph_ros.ros.liveness import Liveness
 from pose_graph_ros.ros.time_jump import Decision, ReceivedMessage, TimeJumpDetector
 
 PAUSED = rejected('paused', 'call ~/pause with false to resume')
+BEFORE_JUMP = rejected('before_clock_jump', 'a message from before the clock was set back')
 # Messages that are held back are released if no other one comes within this time [s].
 LONGEST_DOUBT = 1.0
 
 
 class Input:
     """
-    Receives the messages of all sources.
+    Counts all messages, holds them back while time may have jumped back, and reads them.
 
     Parameters
     ----------
@@ -52,8 +49,7 @@ class Input:
         self.posted = 0  # number of measurements that were handed to the engine
         self.liveness = Liveness([source.name for source in self.reader.sources.values()
                                   if source.kind is Kind.LOOP_CLOSURE])
-        self.posted_at = time.monotonic()
-        """Time of the last measurement that was handed to the engine, by a monotonic clock [s]."""
+        self.posted_at = time.monotonic()  # time of the last of them, by a monotonic clock [s]
         self.is_streaming = False
         """Whether measurements were posted since the final optimisation after a silence."""
 
@@ -83,13 +79,12 @@ class Input:
         self.received[name] += 1
         self.liveness.receive(name, time.monotonic())
         # the stamp is without `time_offset`: a change of that must not look like a jump of time
-        decision = self.time_jumps.receive(ReceivedMessage(
-            name, message, stamp_ns(message),
-            source.kind is Kind.ODOMETRY and primary in ('', name)))
+        is_primary = source.kind is Kind.ODOMETRY and primary in ('', name)
+        decision = self.time_jumps.receive(
+            ReceivedMessage(name, message, stamp_ns(message), is_primary))
         self._received_at = time.monotonic()
         if decision.is_old:
-            self.reject(name, rejected(
-                'before_clock_jump', 'a message from before the clock was set back'))
+            self.reject(name, BEFORE_JUMP)
         return decision
 
     def release_overdue(self) -> list[ReceivedMessage]:
@@ -139,7 +134,6 @@ class Input:
         ----------
         source : str
         answer : Answer
-            Why it cannot be used.
 
         """
         self.rejected[source, answer.reason] += 1
@@ -152,9 +146,8 @@ class Input:
 
         Parameters
         ----------
-        about, what : str
-            A source and a reason, or a parameter and a value.
-        sentence : str
+        about, what, sentence : str
+            The first two: a source and a reason, or a parameter and a value.
 
         """
         if (about, what) not in self._warned:

@@ -13,10 +13,8 @@ NEWEST = 0.1  # weight of the newest gap between two messages in the mean period
 
 @dataclass(slots=True)
 class _Arrivals:
-    at: float
-    """Time of the newest message [s]."""
-    period: float = 0.0
-    """Mean gap between messages [s]."""
+    at: float  # time of the newest message [s]
+    period: float = 0.0  # mean gap between messages [s]
     count: int = 1
 
     @property

@@ -3,9 +3,9 @@
 """
 From estimates to messages.
 
-Messages that are sent with each odometry message are written as the bytes of the middleware (CDR,
-little endian): filling in message objects would take ten times as long. In CDR every number is
-aligned to its size, counted from the end of the four bytes at the start of the stream.
+What is sent with each odometry message is written as the bytes of the middleware (CDR, little
+endian): filling in message objects would take ten times as long. In CDR every number is aligned to
+its size, counted from the end of the four bytes at the start of the stream.
 """
 
 import functools
@@ -61,7 +61,6 @@ def fix_message(
     stamp_ns : int
     prediction : Prediction
     plane : TangentPlane
-        Of the map.
     altitude : float
         Above the ellipsoid [m].
     base_frame : str

@@ -148,9 +148,8 @@ class PoseGraphNode(LifecycleNode):
         for parameter in parameters:
             if not self.has_parameter(parameter.name):
                 # an array without a value has no type yet; numbers may be given as 5 for 5.0
-                unset = parameter.default == []
-                self.declare_parameter(
-                    parameter.name, None if unset else parameter.default, _descriptor(parameter))
+                default = None if parameter.default == [] else parameter.default
+                self.declare_parameter(parameter.name, default, _descriptor(parameter))
             value = self.get_parameter(parameter.name).value
             # files of `ros2 param dump` have null for values that are not set, read as a text
             if value is not None and not (value == 'null' and isinstance(parameter.default, list)):

@@ -98,11 +98,10 @@ class Player(Node):
 
     def _record(self, topic: str, message_type: type, type_name: str) -> None:
         name = self.resolve_topic_name(topic)
-
-        def record(raw: bytes) -> None:
-            self.recorded.append((name, type_name, time.time_ns(), raw))
-
-        self.create_subscription(message_type, topic, record, RELIABLE, raw=True)
+        self.create_subscription(
+            message_type, topic,
+            lambda raw: self.recorded.append((name, type_name, time.time_ns(), raw)),
+            RELIABLE, raw=True)
 
     def _on_path(self, raw: bytes) -> None:
         self.path, self._path_at = raw, time.monotonic()

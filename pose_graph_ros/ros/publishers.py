@@ -82,10 +82,13 @@ class Publishers:
         self.graph = 0  # number of the present graph: how many were started after the first
         # shared by the two threads
         self._lock = threading.Lock()
+        self._forget_views()
+        self.configure(values)
+
+    def _forget_views(self) -> None:
         self._path_shown: Estimate | None = None
         self._path_stamp_ns = self._graph_stamp_ns = 0
         self._path_at = self._graph_at = -float('inf')
-        self.configure(values)
 
     def _publisher(self, message_type: type, topic: str, qos: QoSProfile) -> Publisher:
         return self._node.create_publisher(
@@ -196,10 +199,8 @@ class Publishers:
         Parameters
         ----------
         view : GraphView
-        stamp_ns : int
-            Stamp of the newest odometry in it [ns].
-        graph : int
-            Number of the graph.
+        stamp_ns, graph : int
+            Stamp of the newest odometry in it [ns], and number of the graph.
 
         """
         with self._lock:
@@ -211,33 +212,27 @@ class Publishers:
 
     def start_new_graph(self) -> None:
         """Forget all stamps; publish an empty path and the deletion of all markers."""
-        self._newest_ns = 0
-        self._aligned = False
+        self._newest_ns, self._aligned = 0, False
         self._slew.forget()
         if self.transforms is not None:
             self.transforms.forget()
         with self._lock:
             self.graph += 1
-            self._path_shown, self._path_at = None, -float('inf')
-            self._graph_at = -float('inf')
-            self._path_stamp_ns = self._graph_stamp_ns = 0
+            self._forget_views()
             header = Header(frame_id=self.map_frame)
             self._path.publish(Path(header=header))
             self._graph.publish(MarkerArray(
                 markers=[Marker(header=header, action=Marker.DELETEALL)]))
 
-    def publish_diagnostics(
-        self, level: bytes, text: str, values: Mapping[str, object],
-    ) -> None:
+    def publish_diagnostics(self, level: bytes, text: str, values: Mapping[str, object]) -> None:
         """
         Publish the state of the node; the only output that is stamped by the node's clock.
 
         Parameters
         ----------
         level : bytes
-            One of the levels of DiagnosticStatus.
+            As in DiagnosticStatus.
         text : str
-            The state in a sentence.
         values : mapping
 
         """

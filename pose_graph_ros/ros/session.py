@@ -55,8 +55,7 @@ SET_POSE_QOS = QoSProfile(depth=1)
 STOP_TIMEOUT = 4.0
 SILENCE_PERIOD = 0.2  # period of the check whether all sources are silent [s]
 # Period of the search for the constraints with the largest energies [s], and their number.
-ENERGY_PERIOD = 5.0
-N_ENERGIES = 3
+ENERGY_PERIOD, N_ENERGIES = 5.0, 3
 
 
 class Session:
@@ -95,7 +94,6 @@ class Session:
             for name, source in self._config.odometry.items()}
         self.silent: list[str] = []  # sources that are silent while others are not
         self.largest_energies: Sequence[ConstraintEnergy] = []
-        """The constraints with the largest energies."""
         self._energies_at = -math.inf
 
     def _start_worker(self, backend: PoseGraphBackend, *, prepared: bool = False) -> None:
@@ -302,9 +300,7 @@ class Session:
             self.input.reader.datum.keep(saved.datum)
         self.worker.request_update()
 
-    def _replace(
-        self, backend: PoseGraphBackend, reason: str, *, resumes: bool = False,
-    ) -> None:
+    def _replace(self, backend: PoseGraphBackend, reason: str, *, resumes: bool = False) -> None:
         self.node.get_logger().warning(reason)
         prepared = self.worker.prepared
         self.worker.stop(0.0)  # the result of a running solve is discarded
@@ -371,8 +367,7 @@ class Session:
     def publish_diagnostics(self) -> None:
         """Publish the state of the node."""
         now = time.monotonic()
-        before, self.silent = self.silent, (
-            self.input.liveness.silent(now) if self.active else [])
+        before, self.silent = self.silent, self.input.liveness.silent(now) if self.active else []
         for name in sorted(set(self.silent) - set(before)):
             self.node.get_logger().warning(f'{name} is silent while other sources are not')
         if self.out.transforms is not None and self.active:

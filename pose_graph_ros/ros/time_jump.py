@@ -24,8 +24,7 @@ class ReceivedMessage(NamedTuple):
     source: str
     message: Message
     stamp_ns: int
-    is_primary: bool
-    """Whether it is of the primary odometry; before there is one, of any odometry."""
+    is_primary: bool  # whether it is of the primary odometry; before there is one, of any odometry
 
 
 class Decision(NamedTuple):
@@ -33,10 +32,8 @@ class Decision(NamedTuple):
 
     released: list[ReceivedMessage]
     """Messages that can be used now, in the order in which they came."""
-    jump_ns: int = 0
-    """Length of the jump back in time before these messages [ns]; 0 for none."""
-    is_old: bool = False
-    """Whether the message is from before the clock was set back."""
+    jump_ns: int = 0  # length of the jump back in time before these messages [ns]; 0 for none
+    is_old: bool = False  # whether the message is from before the clock was set back
 
 
 class TimeJumpDetector:

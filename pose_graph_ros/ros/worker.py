@@ -36,20 +36,15 @@ INBOX_LIMIT = 100_000
 class WorkerStatus:
     """A snapshot for the diagnostics."""
 
-    processed: int = 0
-    """Number of measurements that the engine has accepted or rejected."""
+    processed: int = 0  # number of measurements that the engine has accepted or rejected
     counts: Counter[tuple[str, str]] = field(default_factory=Counter)
     """Number of measurements by source and 'accepted' or a reason."""
     pending: int = 0
     quarantined: int = 0
-    updates: int = 0
-    """Number of updates that ran the solver."""
-    solve_mean: float = 0.0
-    """Mean duration of such an update [s]."""
-    solve_max: float = 0.0
-    """Longest such duration [s]."""
-    report: UpdateReport | None = None
-    """Of the newest update."""
+    updates: int = 0  # number of updates that ran the solver
+    solve_mean: float = 0.0  # mean duration of such an update [s]
+    solve_max: float = 0.0  # longest such duration [s]
+    report: UpdateReport | None = None  # of the newest update
     sources: Mapping[str, SourceReport] = field(default_factory=dict)
     """How well the measurements of each source fit."""
 
@@ -216,8 +211,7 @@ class Worker:
         report = update()
         if report.iterations > 0:
             seconds = time.monotonic() - start
-            self._solves += 1
-            self._solve_total += seconds
+            self._solves, self._solve_total = self._solves + 1, self._solve_total + seconds
             self._solve_max = max(self._solve_max, seconds)
         if report.reason != '':
             logger.warning('the solver failed, the last good estimate is kept: %s', report.reason)
