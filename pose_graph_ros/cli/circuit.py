@@ -17,8 +17,8 @@ from scipy.signal import lfilter
 from pose_graph_ros.core.geometry import se2
 from pose_graph_ros.core.geometry.se2 import FloatArray, IntArray
 
+# Intersections at which the circuit turns by 90 degrees, in driving order [m].
 CORNERS = ((310, 0), (310, 180), (105, 180), (105, 0), (200, 0), (200, 260), (0, 260), (0, 0))
-"""Intersections at which the circuit turns by 90 degrees, in driving order [m]."""
 STOP_CORNERS = (1, 4, 6)  # indices of the corners with a traffic light before them
 LANE_OFFSET = 1.8  # offset of the lane to the right of the middle of the street [m]
 STREET_BEARING = 0.35  # angle of the first street, from east to north [rad]
@@ -92,10 +92,8 @@ def gauss_markov(
     ----------
     generator : numpy.random.Generator
     count : int
-    sigma : float
-        Standard deviation of each sample.
-    step : float
-        Sample period divided by the time constant.
+    sigma, step : float
+        Standard deviation of each sample, and sample period divided by the time constant.
 
     """
     decay = np.exp(-step)

@@ -40,10 +40,8 @@ SIMULATED_TRUTH = '/ground_truth'
 DEMO_PARAMETERS = ('-p', 'diagnostics_period:=0.05', '-p', 'path_period:=0.5')
 # Time for a process to end after SIGINT, and period of checking on the processes [s].
 STOP_TIMEOUT, POLL_PERIOD = 15.0, 0.1
-# Exit code of the player, whose module cannot be imported without ROS.
-NOT_CONVERGED = 3
-# Lock files of the domains in use; older ones are released.
-_DOMAINS: deque[IO[str]] = deque(maxlen=8)
+NOT_CONVERGED = 3  # exit code of the player, whose module cannot be imported without ROS
+_DOMAINS: deque[IO[str]] = deque(maxlen=8)  # lock files of domains in use; older are released
 
 
 class DemoError(PoseGraphError):

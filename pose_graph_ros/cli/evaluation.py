@@ -91,11 +91,7 @@ def fit_rigid(source: FloatArray, target: FloatArray) -> FloatArray:
 
 
 def place_odometry(drive: Drive) -> Trajectory:
-    """
-    Return the odometry aligned with the truth if known, else with the fixes, else the result.
-
-    Odometry that does not overlap with any of them in time is returned unchanged.
-    """
+    """Return the odometry laid over truth, else fixes, else result; as it is if none overlaps."""
     anchors = [(drive.fix_stamps_ns, drive.fix_positions),
                (drive.corrected.stamps_ns, drive.corrected.poses[:, :2])]
     if drive.truth is not None:
@@ -145,9 +141,7 @@ def error_rows(name: str, errors: FloatArray, unit: str = 'm') -> list[ErrorRow]
     unit : str
 
     """
-    if len(errors) == 0:
-        return []
-    return [ErrorRow(
+    return [] if len(errors) == 0 else [ErrorRow(
         name, len(errors), float(np.median(errors)), float(np.sqrt(np.mean(np.square(errors)))),
         float(np.percentile(errors, 95.0)), float(np.max(errors)), unit)]
 

@@ -1,11 +1,6 @@
 # Copyright 2026 The pose_graph_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""
-Draw a drive: a map of all paths, and below it (beside it, if it is tall) their errors over time.
-
-The colours follow Okabe and Ito, so that people with any kind of colour vision can distinguish
-them.
-"""
+"""Draw a drive: a map of all paths, and below it (or beside a tall one) their errors over time."""
 
 from pathlib import Path
 from typing import Any
@@ -22,14 +17,13 @@ from pose_graph_ros.cli.evaluation import distances, Drive, evaluate, place_odom
 from pose_graph_ros.core.geometry.se2 import FloatArray, IntArray
 from pose_graph_ros.core.geometry.trajectory import Trajectory
 
+# After Okabe and Ito, so that people with any kind of colour vision can distinguish them.
 BLUE, ORANGE, VERMILION, GREEN, PURPLE = '#0072B2', '#E69F00', '#D55E00', '#009E73', '#B583A4'
 INK, GREY, GRID, SHADE = '#222222', '#666666', '#E2E2E2', '#F0F0F0'
 WIDTH, DPI = 16.0, 100  # width of the picture [inch] and resolution [dots per inch]
 LEFT, RIGHT, TOP, BETWEEN, BOTTOM = 0.8, 0.3, 0.95, 1.05, 0.6  # margins of the panels [inch]
-LEGEND_WIDTH, ERROR_HEIGHT = 2.9, 2.5
-"""Width of the legend and height of the plot of errors [inch]."""
-MAP_HEIGHTS = (4.5, 9.0)
-"""Smallest and largest height of the map [inch]; in between it depends on the drive."""
+LEGEND_WIDTH, ERROR_HEIGHT = 2.9, 2.5  # of the legend and of the plot of errors [inch]
+MAP_HEIGHTS = (4.5, 9.0)  # smallest and largest height of the map [inch]
 TALL, TALL_HEIGHT, TALL_WIDTHS = 1.15, 8.4, (4.5, 7.5)
 """Smallest ratio of height to width for a map beside the errors; its height and widths [inch]."""
 OUTAGE_S = 5.0  # an outage is a time without fixes above this [s] and above 10 median periods
@@ -121,14 +115,13 @@ def _nice_step(step: float) -> float:
 def _facts(drive: Drive) -> str:
     """Return the subtitle: duration, length and numbers of measurements."""
     path = max(drive.corrected, drive.odometry, key=len)
-    parts = []
-    if len(path) > 1:
-        steps = np.diff(path.poses[:, :2], axis=0)
-        parts = [f'{(path.stamps_ns[-1] - path.stamps_ns[0]) / SECOND:.0f} s',
-                 f'{np.sum(np.hypot(steps[:, 0], steps[:, 1])):.0f} m']
+    steps = np.diff(path.poses[:, :2], axis=0)
     used, held_out = int(np.sum(~drive.fix_held_out)), int(np.sum(drive.fix_held_out))
-    parts.append(f'{used} fixes used' + (f', {held_out} held out' if held_out else ''))
-    parts.append(f'{len(drive.loop_stamps_ns)} loop closures')
+    parts = [f'{used} fixes used' + (f', {held_out} held out' if held_out else ''),
+             f'{len(drive.loop_stamps_ns)} loop closures']
+    if len(path) > 1:
+        parts[:0] = (f'{(path.stamps_ns[-1] - path.stamps_ns[0]) / SECOND:.0f} s',
+                     f'{np.sum(np.hypot(steps[:, 0], steps[:, 1])):.0f} m')
     return '   ·   '.join(parts)
 
 

@@ -34,8 +34,7 @@ from pose_graph_ros.core.exceptions import PoseGraphError
 from pose_graph_ros.core.io.g2o import write_g2o
 from pose_graph_ros.core.measurements import Answer, OdometrySample
 
-# Number of new hidden nodes after which the graph is updated, to keep it near the optimum.
-UPDATE_EVERY = 10
+UPDATE_EVERY = 10  # new hidden nodes after which the graph is updated, to stay near the optimum
 
 
 class Replayed(NamedTuple):

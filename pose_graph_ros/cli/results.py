@@ -24,7 +24,6 @@ from pose_graph_ros.core.measurements import GlobalPose, LoopClosure, OdometrySa
 
 TRUTH_TYPES = ('nav_msgs/msg/Odometry', 'geometry_msgs/msg/PoseStamped',
                'geometry_msgs/msg/PoseWithCovarianceStamped')
-"""Message types of which a topic of the truth can be."""
 
 
 def collect_drive(

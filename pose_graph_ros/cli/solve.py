@@ -12,8 +12,7 @@ from pose_graph_ros.core.batch import optimizer
 from pose_graph_ros.core.config import SolverConfig
 from pose_graph_ros.core.io.g2o import EDGE2_ORDERS, read_g2o, write_g2o
 
-# Number of edges, and of observed nodes, that are printed.
-N_LARGEST = 5
+N_LARGEST = 5  # number of edges, and of observed nodes, that are printed
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:

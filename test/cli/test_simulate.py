@@ -93,9 +93,6 @@ def test_a_short_drive_needs_no_second_lap() -> None:
     short = simulate_drive(duration_s=20.0)
     assert short.loop_poses.shape == (0, 3)
     assert short.truth.stamps_ns[-1] - short.truth.stamps_ns[0] > 19e9
-    for duration in (0.0, 9.9, float('nan')):
-        with pytest.raises(ValueError, match=r'duration of 10\.0 s or more'):
-            simulate_drive(duration_s=duration)
 
 
 def test_the_bag_says_what_the_drive_says(tmp_path: Path) -> None:
