@@ -16,8 +16,7 @@ from pose_graph_ros.ros.time_jump import Decision, ReceivedMessage, TimeJumpDete
 
 PAUSED = rejected('paused', 'call ~/pause with false to resume')
 BEFORE_JUMP = rejected('before_clock_jump', 'a message from before the clock was set back')
-# Messages that are held back are released if no other one comes within this time [s].
-LONGEST_DOUBT = 1.0
+LONGEST_DOUBT = 1.0  # messages that are held back are released if no other comes for so long [s]
 
 
 class Input:
@@ -44,14 +43,12 @@ class Input:
 
     def _clear(self) -> None:
         self.received: Counter[str] = Counter()  # number of messages by source
-        self.rejected: Counter[tuple[str, str]] = Counter()
-        """Number of messages that did not reach the engine, by source and reason."""
+        self.rejected: Counter[tuple[str, str]] = Counter()  # number by source and reason
         self.posted = 0  # number of measurements that were handed to the engine
         self.liveness = Liveness([source.name for source in self.reader.sources.values()
                                   if source.kind is Kind.LOOP_CLOSURE])
         self.posted_at = time.monotonic()  # time of the last of them, by a monotonic clock [s]
-        self.is_streaming = False
-        """Whether measurements were posted since the final optimisation after a silence."""
+        self.is_streaming = False  # whether any were posted since the final optimisation
 
     def configure(self, values: Mapping[str, Any]) -> None:
         """Set the parameters that can change while the node runs."""

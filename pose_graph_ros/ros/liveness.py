@@ -6,8 +6,7 @@ from collections.abc import Collection
 from dataclasses import dataclass
 
 # A source is silent after this time [s], or after this many of its own periods if that is longer.
-LEAST_SILENCE = 2.0
-PERIODS = 5.0
+LEAST_SILENCE, PERIODS = 2.0, 5.0
 NEWEST = 0.1  # weight of the newest gap between two messages in the mean period
 
 

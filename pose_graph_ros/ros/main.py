@@ -10,8 +10,7 @@ starts or ends, has no further effect.
 import signal
 import sys
 
-# Time for which a thread may run Python while another one waits for the interpreter [s].
-SWITCH_INTERVAL = 0.0005
+SWITCH_INTERVAL = 0.0005  # for which a thread may run Python while another one waits [s]
 
 
 def main(args: list[str] | None = None) -> int:

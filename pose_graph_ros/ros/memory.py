@@ -10,11 +10,8 @@ import ctypes
 from pathlib import Path
 
 # Constants of <sys/mman.h> and <malloc.h> of Linux.
-MADV_DONTNEED = 4
-M_MMAP_THRESHOLD = -3
-M_ARENA_MAX = -8
-# Size from which an array gets pages of its own, which are returned when it is freed [bytes].
-LARGE = 256 * 1024
+MADV_DONTNEED, M_MMAP_THRESHOLD, M_ARENA_MAX = 4, -3, -8
+LARGE = 256 * 1024  # from this size an array has its own pages, returned when it is freed [bytes]
 # Number of heaps: each of the dozen threads of the middleware would have its own, mostly empty.
 ARENAS = 2
 

@@ -69,16 +69,10 @@ class PoseGraphNode(LifecycleNode):
         return self._transition(self._configured.deactivate)
 
     def on_cleanup(self, state: LifecycleState) -> TransitionCallbackReturn:
-        """Discard the graph."""
+        """Discard everything: before the end, or to be unconfigured again, also after an error."""
         return self._transition(self.close)
 
-    def on_shutdown(self, state: LifecycleState) -> TransitionCallbackReturn:
-        """Discard everything before the end of the node."""
-        return self._transition(self.close)
-
-    def on_error(self, state: LifecycleState) -> TransitionCallbackReturn:
-        """Discard everything after a transition that raised, to be unconfigured again."""
-        return self._transition(self.close)
+    on_shutdown = on_error = on_cleanup
 
     def _transition(self, change: Callable[[], None]) -> TransitionCallbackReturn:
         """Change the state; if that fails, keep the reason, which rclpy does not."""

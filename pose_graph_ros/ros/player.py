@@ -4,8 +4,7 @@
 Play a bag to the node over DDS, from a separate process, and record the node's outputs.
 
 No message is lost: the writers are reliable, and the node's queues hold all messages that it has
-not processed yet, by its own count in the diagnostics. At the end the node is asked for the final
-optimisation, and its last path is recorded.
+not processed yet, by its own count. At the end it is asked for the final optimisation and path.
 """
 
 import argparse
@@ -45,12 +44,8 @@ STATIC = QoSProfile(depth=100, durability=QoSDurabilityPolicy.TRANSIENT_LOCAL)
 WINDOW = 400  # greatest number of unprocessed messages, well below the depth of the node's queues
 # Longest waits for the node: to appear, to compile at its first start, to process another message,
 # and to answer [s].
-APPEAR_TIMEOUT = 30.0
-PREPARE_TIMEOUT = 600.0
-STALL_TIMEOUT = 20.0
-ANSWER_TIMEOUT = 90.0
-# Exit code if everything was played and recorded, but the optimisation did not converge.
-NOT_CONVERGED = 3
+APPEAR_TIMEOUT, PREPARE_TIMEOUT, STALL_TIMEOUT, ANSWER_TIMEOUT = 30.0, 600.0, 20.0, 90.0
+NOT_CONVERGED = 3  # exit code if all was played and recorded, without convergence at the end
 # Time without a path after which the last one has come; longer than the node's `path_period` [s].
 PATH_SILENCE = 1.0
 

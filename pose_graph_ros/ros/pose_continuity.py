@@ -17,16 +17,15 @@ class PoseContinuity:
     """
     Watches the raw poses of the primary odometry for jumps, as the engine does.
 
-    The engine's next estimate accounts for a jump; until then the old estimate must not be
-    propagated over it.
+    Its next estimate accounts for a jump; until then the old one must not be propagated over it.
 
     Parameters
     ----------
     maximum_speed : float
         Greatest possible speed of the robot [m/s].
     resumes : bool
-        Whether there is an estimate from before the first sample: only the engine can decide
-        whether the odometry continues from there.
+        Whether there is an estimate from before the first sample: the engine then decides whether
+        the odometry continues from there.
 
     """
 

@@ -25,9 +25,7 @@ from pose_graph_ros.ros.session import Session
 
 logger = logging.getLogger(__name__)
 
-# Answer if a new graph was started before the service was done.
 REPLACED = 'the graph was replaced meanwhile'
-
 Answer = tuple[bool, str]
 """Whether what was asked for was done, and a sentence on it."""
 

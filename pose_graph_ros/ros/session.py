@@ -51,8 +51,7 @@ LOOP_CLOSURE_QOS = QoSProfile(depth=100)  # a loop closure is rare and must not 
 STATIC_QOS = QoSProfile(depth=100, durability=QoSDurabilityPolicy.TRANSIENT_LOCAL)
 SET_POSE_QOS = QoSProfile(depth=1)
 
-# Longest wait for a running solve when the node ends; launch kills a node after 5 s [s].
-STOP_TIMEOUT = 4.0
+STOP_TIMEOUT = 4.0  # longest wait for a solve at the end; launch kills a node after 5 s [s]
 SILENCE_PERIOD = 0.2  # period of the check whether all sources are silent [s]
 # Period of the search for the constraints with the largest energies [s], and their number.
 ENERGY_PERIOD, N_ENERGIES = 5.0, 3

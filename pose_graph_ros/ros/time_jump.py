@@ -14,8 +14,7 @@ from pose_graph_ros.adapters.conversions import Message
 from pose_graph_ros.core.odometry.stamp_guard import EVIDENCE, StampGuard
 
 MOST_HELD = 200  # greatest number of messages that are held back at a time
-# Number of odometry messages of the new time after which those of the old time have drained.
-MOST_OLD = 20
+MOST_OLD = 20  # after this many odometry messages of the new time the old ones have drained
 
 
 class ReceivedMessage(NamedTuple):
@@ -93,9 +92,8 @@ class TimeJumpDetector:
         """
         Start again because the clock was set back by an amount [ns].
 
-        Messages of the old time may still be in the queues. A message is old if its stamp is less
-        than half of the jump behind the newest one and its source has sent none of the new time
-        before.
+        Messages of the old time may still be in the queues: those less than half of the jump
+        behind the newest one, of sources that have sent none of the new time before.
         """
         newest_ns = self.guard.newest_ns
         self.forget()

@@ -28,8 +28,7 @@ Result = TypeVar('Result')
 Job = Callable[[PoseGraphBackend], Result]
 """A function that is called in the worker's thread with the engine."""
 
-# Greatest number of measurements that wait for the thread; further ones are rejected.
-INBOX_LIMIT = 100_000
+INBOX_LIMIT = 100_000  # measurements that wait for the thread; further ones are rejected
 
 
 @dataclass(frozen=True, slots=True)
@@ -77,8 +76,7 @@ class Worker:
         self._revision = backend.revision
         self._solves, self._solve_total, self._solve_max = 0, 0.0, 0.0
         self._warned: set[tuple[str, str]] = set()
-        self.estimate: Estimate | None = None
-        """The newest estimate, without its path; replaced as a whole."""
+        self.estimate: Estimate | None = None  # the newest, without its path; replaced as a whole
         self.status = WorkerStatus()  # the newest status; replaced as a whole
         self._thread = threading.Thread(target=self._run, name='pose graph', daemon=True)
 
