@@ -2,6 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """The node over DDS and the offline replay give the same path from the same bag."""
 
+from collections.abc import Iterable, Iterator
 import json
 from pathlib import Path
 import shutil
@@ -15,7 +16,12 @@ from tum_files import read_tum
 
 from pose_graph_ros.adapters.bag_writer import BagWriter
 from pose_graph_ros.adapters.bags import open_bag
-from pose_graph_ros.cli.bag_messages import fix_messages, odometry_messages, write_bag
+from pose_graph_ros.cli.bag_messages import (
+    fix_messages,
+    Message,
+    odometry_messages,
+    write_bag,
+)
 from pose_graph_ros.cli.main import main
 from pose_graph_ros.cli.simulate import simulate_drive, write_drive
 from pose_graph_ros.core.geometry import se2
@@ -92,6 +98,12 @@ SOURCES = """
 ANTENNA = np.array([0.75, -0.25])
 
 
+def delayed(messages: Iterable[Message], latency_ns: int) -> Iterator[Message]:
+    """Let messages be recorded so long after their stamps."""
+    for topic, type_name, stamp_ns, message in messages:
+        yield topic, type_name, stamp_ns + latency_ns, message
+
+
 def write_rich_drive(folder: Path) -> None:
     """A drive with two odometries, two receivers, one of them lifted by /tf_static, and an imu."""
     generator = np.random.default_rng(8)
@@ -128,9 +140,10 @@ def write_rich_drive(folder: Path) -> None:
     variances = (1e-3, 1e-3, 1e6, 1e6, 1e6, 1e-3)
     write_bag(folder, (
         *odometry_messages('/odom', 'odom', drifted(1.01), variances),
-        *odometry_messages('/vo', 'vo', drifted(0.99), variances, 30_000_000),
-        *fix_messages('/gps/fix', stamps[::5], geodetic(ANTENNA), 0.5, 10**8),
-        *fix_messages('/rear/fix', stamps[::5], geodetic(np.array([-0.5, 0.25])), 0.5, 2 * 10**8),
+        *delayed(odometry_messages('/vo', 'vo', drifted(0.99), variances), 30_000_000),
+        *delayed(fix_messages('/gps/fix', stamps[::5], geodetic(ANTENNA), 0.5), 10**8),
+        *delayed(fix_messages('/rear/fix', stamps[::5], geodetic(np.array([-0.5, 0.25])), 0.5),
+                 2 * 10**8),
         ('/tf_static', 'tf2_msgs/msg/TFMessage', int(stamps[300]), frames), *headings))
 
 
