@@ -13,6 +13,8 @@ shift
 CORE_COVERAGE=95
 OTHER_COVERAGE=88
 failed=()
+# The tests start a hundred interpreters, which need not compile the same modules each.
+unset PYTHONDONTWRITEBYTECODE
 
 run() { # name, command...
     local name=$1

@@ -5,7 +5,6 @@
 import math
 
 import numpy as np
-from scipy.spatial.transform import Rotation
 
 from pose_graph_ros.adapters.conversions import frame, Message
 from pose_graph_ros.core.geometry.se2 import FloatArray
@@ -31,7 +30,7 @@ class StaticFrames:
             if (parent in ('', child) or child == '' or not 1e-6 < norm < math.inf
                     or not np.all(np.abs(translation) < LARGEST_DISTANCE)):
                 continue
-            rotation = Rotation.from_quat((q.x, q.y, q.z, q.w)).as_matrix()
+            rotation = _rotation(q.x / norm, q.y / norm, q.z / norm, q.w / norm)
             self._frames[child] = parent, rotation, translation
 
     def position(self, name: str, base: str) -> FloatArray | None:
@@ -64,3 +63,11 @@ class StaticFrames:
                 break
             chain[name] = rotation, translation
         return chain
+
+
+def _rotation(x: float, y: float, z: float, w: float) -> FloatArray:
+    """Return the matrix of a unit quaternion; SciPy's would make each start 0.3 s longer."""
+    return np.array([
+        [1.0 - 2.0 * (y * y + z * z), 2.0 * (x * y - w * z), 2.0 * (x * z + w * y)],
+        [2.0 * (x * y + w * z), 1.0 - 2.0 * (x * x + z * z), 2.0 * (y * z - w * x)],
+        [2.0 * (x * z - w * y), 2.0 * (y * z + w * x), 1.0 - 2.0 * (x * x + y * y)]])

@@ -48,7 +48,7 @@ def client(request: pytest.FixtureRequest) -> Iterator[Any]:
         assert 'Traceback' not in process.stderr()
 
 
-@pytest.fixture(scope='session')
+@pytest.fixture(scope='package')
 def _shared_node(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Any]:
     """Start a node with the default parameters, for all tests that leave them as they are."""
     from harness import NodeProcess  # noqa: PLC0415
