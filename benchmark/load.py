@@ -102,14 +102,14 @@ def started(
     module: str, parameters: Sequence[str] = (), *, path: bool = False,
 ) -> Iterator[tuple[Process, Feeder]]:
     """Start a process and a feeder that talk to each other alone."""
-    with tempfile.TemporaryDirectory(prefix='pose_graph_') as log:
-        environment = isolated_environment(Path(log))
-        with Feeder(environment, listens_to_path=path) as feeder:
-            process = Process(module, environment, parameters)
-            try:
-                yield process, feeder
-            finally:
-                process.stop()
+    with tempfile.TemporaryDirectory(prefix='pose_graph_') as log, \
+            isolated_environment(Path(log)) as environment, \
+            Feeder(environment, listens_to_path=path) as feeder:
+        process = Process(module, environment, parameters)
+        try:
+            yield process, feeder
+        finally:
+            process.stop()
 
 
 def measured(process: Process, feeder: Feeder, rate: float, seconds: float) -> Phase:

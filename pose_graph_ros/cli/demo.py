@@ -8,9 +8,8 @@ machine. Without a bag, a drive with known ground truth is simulated first.
 """
 
 import argparse
-from collections import deque
-from collections.abc import Mapping
-from contextlib import suppress
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager, ExitStack
 import fcntl
 import os
 from pathlib import Path
@@ -20,7 +19,7 @@ import subprocess
 import sys
 import tempfile
 import time
-from typing import Any, IO
+from typing import Any
 
 import numpy as np
 
@@ -41,7 +40,6 @@ DEMO_PARAMETERS = ('-p', 'diagnostics_period:=0.05', '-p', 'path_period:=0.5')
 # Time for a process to end after SIGINT, and period of checking on the processes [s].
 STOP_TIMEOUT, POLL_PERIOD = 15.0, 0.1
 NOT_CONVERGED = 3  # exit code of the player, whose module cannot be imported without ROS
-_DOMAINS: deque[IO[str]] = deque(maxlen=8)  # lock files of domains in use; older are released
 
 
 class DemoError(PoseGraphError):
@@ -120,8 +118,8 @@ def _run(
               '--hold-out', str(inputs.hold_out)]
     for name, topic in inputs.topics.items():
         player += ['--input', name, inputs.kinds[name].value, values[f'{name}.topic'], topic]
-    with tempfile.TemporaryDirectory(prefix='pose_graph_') as log:
-        env = isolated_environment(Path(log))
+    with tempfile.TemporaryDirectory(prefix='pose_graph_') as log, \
+            isolated_environment(Path(log)) as env:
         processes = [node := subprocess.Popen(node_command, env=env)]
         try:
             processes.append(subprocess.Popen(player, env=env))
@@ -139,29 +137,42 @@ def _run(
         return codes[0] == 0
 
 
-def isolated_environment(log: Path) -> dict[str, str]:
-    """Return environment variables for ROS processes that only communicate with each other."""
-    env = dict(os.environ)
-    # set by a sourced ROS, but not by the wheels from PyPI
-    env.setdefault('AMENT_PREFIX_PATH', sys.prefix)
-    env['ROS_AUTOMATIC_DISCOVERY_RANGE'] = 'LOCALHOST'
-    env['ROS_DOMAIN_ID'] = str(_free_domain())
-    env['ROS_LOG_DIR'] = str(log)
-    env.pop('ROS_LOCALHOST_ONLY', None)
-    return env
+@contextmanager
+def isolated_environment(log: Path) -> Iterator[dict[str, str]]:
+    """
+    Yield environment variables for ROS processes that only communicate with each other.
+
+    No other program of this package uses their domain until the context is left.
+    """
+    with _free_domain() as domain:
+        env = dict(os.environ)
+        # set by a sourced ROS, but not by the wheels from PyPI
+        env.setdefault('AMENT_PREFIX_PATH', sys.prefix)
+        env['ROS_AUTOMATIC_DISCOVERY_RANGE'] = 'LOCALHOST'
+        env['ROS_DOMAIN_ID'] = str(domain)
+        env['ROS_LOG_DIR'] = str(log)
+        env.pop('ROS_LOCALHOST_ONLY', None)
+        yield env
 
 
-def _free_domain() -> int:
-    """Return a ROS domain that no other program of this package on this machine uses."""
+@contextmanager
+def _free_domain() -> Iterator[int]:
+    """Yield a ROS domain whose lock file this process holds; any domain if all are held."""
     domains = random.SystemRandom().sample(range(1, 101), 100)
-    for domain in domains:
-        name = Path(tempfile.gettempdir()) / f'pose_graph_ros_domain_{domain}'
-        with suppress(OSError):
-            lock = name.open('a', encoding='utf-8')
-            fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
-            _DOMAINS.append(lock)
-            return domain
-    return domains[0]
+    with ExitStack() as locks:
+        yield next((domain for domain in domains if _is_locked(domain, locks)), domains[0])
+
+
+def _is_locked(domain: int, locks: ExitStack) -> bool:
+    """Tell whether the lock file of a domain could be locked, until the locks are released."""
+    name = Path(tempfile.gettempdir()) / f'pose_graph_ros_domain_{domain}'
+    try:
+        lock = name.open('a', encoding='utf-8')
+        locks.callback(lock.close)
+        fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except OSError:
+        return False
+    return True
 
 
 def _stop(node: 'subprocess.Popen[bytes]') -> int:

@@ -3,6 +3,7 @@
 """A real node in a process of its own, and an independent client that talks to it over DDS."""
 
 from collections.abc import Callable, Mapping, Sequence
+from contextlib import ExitStack
 import math
 from pathlib import Path
 import shutil
@@ -73,7 +74,8 @@ class NodeProcess:
         self, log: Path, arguments: Sequence[str] = (), domain: int | None = None,
         program: Sequence[str] = ('-m', 'pose_graph_ros.ros.main'),
     ) -> None:
-        self.env = isolated_environment(log)
+        self._stack = ExitStack()
+        self.env = self._stack.enter_context(isolated_environment(log))
         if domain is not None:
             self.env['ROS_DOMAIN_ID'] = str(domain)
         self._stderr = (log / 'stderr').open('w+')
@@ -100,6 +102,7 @@ class NodeProcess:
             self.process.kill()
             self.process.wait()
         self._stderr.close()
+        self._stack.close()
 
 
 class Client:

@@ -3,6 +3,7 @@
 """A node in the test's own process and a client that talks to it over DDS, in one executor."""
 
 from collections.abc import Callable
+from contextlib import ExitStack
 from pathlib import Path
 import time
 from typing import Any
@@ -40,8 +41,9 @@ class LocalNode:
         self, log: Path, make_node: Callable[[Context], Node] | None = None,
     ) -> None:
         self.context = Context()
-        domain = int(isolated_environment(log)['ROS_DOMAIN_ID'])
-        rclpy.init(context=self.context, domain_id=domain)
+        self._stack = ExitStack()
+        env = self._stack.enter_context(isolated_environment(log))
+        rclpy.init(context=self.context, domain_id=int(env['ROS_DOMAIN_ID']))
         self.node = (Node('pose_graph', context=self.context) if make_node is None
                      else make_node(self.context))
         self.client = Node('client', context=self.context)
@@ -57,6 +59,7 @@ class LocalNode:
         self.client.destroy_node()
         self.node.destroy_node()
         rclpy.shutdown(context=self.context)
+        self._stack.close()
 
     def spin_until(
         self, done: Callable[[], bool], what: str, patience: float = PATIENCE,

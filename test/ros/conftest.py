@@ -5,6 +5,7 @@
 from collections.abc import Iterator
 import os
 from pathlib import Path
+import signal
 from typing import Any
 
 import pytest
@@ -39,6 +40,8 @@ def client(request: pytest.FixtureRequest) -> Iterator[Any]:
 
     is_own = 'node' in request.fixturenames
     process = request.getfixturevalue('node' if is_own else '_shared_node')
+    if not is_own:
+        process.process.send_signal(signal.SIGCONT)
     with Client(int(process.env['ROS_DOMAIN_ID'])) as connected:
         if not is_own:
             connected.start_new_graph()
@@ -46,6 +49,8 @@ def client(request: pytest.FixtureRequest) -> Iterator[Any]:
     if not is_own:
         assert process.process.poll() is None
         assert 'Traceback' not in process.stderr()
+        # until the next test that needs it, which may be minutes away
+        process.process.send_signal(signal.SIGSTOP)
 
 
 @pytest.fixture(scope='package')

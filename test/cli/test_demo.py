@@ -1,0 +1,37 @@
+# Copyright 2026 The pose_graph_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""The environment of the demo's processes; the demo itself runs in test/ros/test_replay_is_node."""
+
+from contextlib import ExitStack
+from pathlib import Path
+
+import pytest
+
+from pose_graph_ros.cli.demo import isolated_environment
+
+
+def test_two_at_the_same_time_have_different_domains(tmp_path: Path) -> None:
+    with ExitStack() as stack:
+        domains = [stack.enter_context(isolated_environment(tmp_path))['ROS_DOMAIN_ID']
+                   for _ in range(40)]
+    assert len(set(domains)) == 40
+    assert all(0 < int(domain) <= 100 for domain in domains)
+
+
+def test_domains_are_free_again_after_an_error(tmp_path: Path) -> None:
+    """There are a hundred, and programs that share one receive each other's messages."""
+    for _ in range(120):
+        with pytest.raises(OSError, match='of the body'), isolated_environment(tmp_path):
+            raise OSError('of the body')
+    with isolated_environment(tmp_path) as first, isolated_environment(tmp_path) as second:
+        assert first['ROS_DOMAIN_ID'] != second['ROS_DOMAIN_ID']
+
+
+def test_nothing_is_heard_from_other_machines(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setenv('ROS_LOCALHOST_ONLY', '0')
+    with isolated_environment(tmp_path) as env:
+        assert env['ROS_AUTOMATIC_DISCOVERY_RANGE'] == 'LOCALHOST'
+        assert 'ROS_LOCALHOST_ONLY' not in env
+        assert env['ROS_LOG_DIR'] == str(tmp_path)
