@@ -1,6 +1,6 @@
 # Copyright 2026 The pose_graph_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""The environment of the demo's processes; the demo itself runs in test/ros/test_replay_is_node."""
+"""The environment of the processes of the demo, which itself runs in test_replay_is_node."""
 
 from contextlib import ExitStack
 from pathlib import Path
