@@ -8,6 +8,7 @@ machine. Without a bag, a drive with known ground truth is simulated first.
 """
 
 import argparse
+from collections import deque
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager, ExitStack
 import fcntl
@@ -188,5 +189,5 @@ def _stop(node: 'subprocess.Popen[bytes]') -> int:
 def _last(folder: Path, topic: str) -> Any:
     """Return the last message on a topic in the bag that the player has recorded."""
     with open_bag(folder) as bag:
-        *_, message = bag.messages([topic])
+        (message,) = deque(bag.messages([topic]), maxlen=1)
         return message.decode()

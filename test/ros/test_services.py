@@ -195,6 +195,7 @@ def test_a_graph_that_cannot_be_loaded_is_refused_and_the_present_one_stays(
     with NodeProcess(tmp_path, arguments) as node, \
             Client(int(node.env['ROS_DOMAIN_ID'])) as client:
         drive(client, 10.0)
+        assert client.optimize().success
         assert client.trigger('save_graph').success
         nodes = client.values['hidden_nodes']
         side = file.with_suffix('.json')
