@@ -45,8 +45,15 @@ def fix_at(
     return fix(START + seconds, latitude, longitude, sigma)
 
 
-def drive(client: Client, end: float, *, begin: float = 0.0, fixes: bool = True) -> None:
-    """Publish a drive, or a part of it: odometry at 10 Hz, exact fixes at 2 Hz."""
+def drive(
+    client: Client, end: float, *, begin: float = 0.0, fixes: bool = True, paced: bool = False,
+) -> None:
+    """
+    Publish a drive, or a part of it: odometry at 10 Hz, exact fixes at 2 Hz.
+
+    Only a paced drive waits for each answer. The node keeps ten for a client that is late, so
+    that others may miss some on a busy machine.
+    """
     already = int(client.values['processed'])
     count = 0
     for step in range(round(begin * 10), round(end * 10)):
@@ -60,6 +67,8 @@ def drive(client: Client, end: float, *, begin: float = 0.0, fixes: bool = True)
             # from the first estimate on every odometry message is answered; it comes when the
             # reorder window of 0.25 s is over
             client.wait_processed(already + count)
+        elif paced:
+            client.wait_answered(START + seconds)
         client.spin_for(0.002)
     client.wait_processed(already + count)
 

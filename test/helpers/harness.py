@@ -194,9 +194,10 @@ class Client:
                         f'{count} messages are processed')
 
     def wait_answered(self, seconds: float) -> None:
-        """Wait until the pose and the transform for the odometry at a stamp [s] have come."""
+        """Wait until pose, odometry and transform at the stamp of an odometry [s] have come."""
         last = round(seconds * NANOSECONDS)
-        for messages in (self.poses, self.transforms)[:1 if TFMessage is None else 2]:
+        outputs = (self.poses, self.filtered, self.transforms)
+        for messages in outputs[:2 if TFMessage is None else 3]:
             self.spin_until(lambda sent=messages: len(sent) > 0 and stamp_ns(sent[-1]) >= last,
                             f'the outputs at {seconds} s come')
 

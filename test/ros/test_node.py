@@ -39,7 +39,7 @@ from pose_graph_ros.core.geometry import se2
 
 
 def test_every_message_of_a_drive_is_sound(client: Client) -> None:
-    drive(client, 30.0)
+    drive(client, 30.0, paced=True)
     answer = client.optimize()
     assert answer.success, answer.message
 

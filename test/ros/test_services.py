@@ -60,7 +60,7 @@ def test_a_pause_lets_nothing_in_and_the_outputs_go_on(client: Client) -> None:
     assert client.call(pause, SetBool.Request(data=True)).message == 'paused already'
     nodes, accepted = client.values['hidden_nodes'], client.values['odom.accepted']
     count = len(client.poses)
-    drive(client, 13.0, begin=10.0)
+    drive(client, 13.0, begin=10.0, paced=True)
     client.spin_until(lambda: len(client.poses) - count >= 30, 'every message is answered')
     np.testing.assert_allclose(newest(client), true_pose(12.9), atol=1e-2)
     assert client.values['hidden_nodes'] == nodes
