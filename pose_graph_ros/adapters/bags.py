@@ -98,7 +98,7 @@ class BagReader:
         """
         Iterate over the messages of some topics in the order in which they were recorded.
 
-        A topic that is not in the bag is a `BagError` at the call, a damaged file on iteration.
+        Raises `BagError`: at the call for an unknown topic, on iteration for a damaged file.
         """
         unknown = sorted(set(topics) - set(self.topics))
         if unknown:
@@ -149,7 +149,7 @@ def open_bag(path: str | Path) -> BagReader:
     """
     Open a rosbag2 folder (sqlite3 or mcap, also compressed), an .mcap, a .db3 or a .bag file.
 
-    What is no bag, damaged or not supported is a `BagError`.
+    Raises `BagError` for a path that is no bag, or a bag that is damaged or not supported.
     """
     path = Path(path)
     if not path.exists():

@@ -89,7 +89,7 @@ class Datum:
 
 
 def datum_of(values: Mapping[str, Any]) -> Datum:
-    """Return the datum by the checked parameters; a `ConfigError` if it is not on the Earth."""
+    """Return the datum by the checked parameters; raises `ConfigError` if it is not on Earth."""
     try:
         return Datum(values['datum'], wait=values['wait_for_datum'])
     except ValueError as error:

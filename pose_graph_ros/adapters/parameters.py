@@ -244,7 +244,7 @@ def _of_source(parameter: Parameter, source: str) -> Parameter:
 
 
 def listed_sources(given: Mapping[str, Any]) -> list[str]:
-    """Return the names of all sources; a `ConfigError` if they are not different, valid names."""
+    """Return the names of all sources; raises `ConfigError` for equal or bad names."""
     names = checked_value(PARAMETERS[0], given.get('sources', list(DEFAULT_SOURCES)))
     for name in names:
         if _NAME.fullmatch(name) is None or name in _TAKEN:
@@ -259,7 +259,7 @@ def all_parameters(given: Mapping[str, Any]) -> tuple[Parameter, ...]:
     """
     Return the parameters of the node and of the sources in the given parameters.
 
-    If the name or the kind of a source is invalid, that is a `ConfigError`.
+    Raises `ConfigError` if the name or the kind of a source is invalid.
     """
     parameters = list(PARAMETERS)
     for source in listed_sources(given):
@@ -272,7 +272,7 @@ def checked(given: Mapping[str, Any]) -> dict[str, Any]:
     """
     Return all parameters: the given values, after a check of types and ranges, else defaults.
 
-    An unknown name, a wrong type or a number out of range is a `ConfigError`.
+    Raises `ConfigError` for an unknown name, a wrong type or a number out of range.
     """
     parameters = all_parameters(given)
     known = {parameter.name for parameter in parameters}

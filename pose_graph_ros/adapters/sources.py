@@ -81,7 +81,7 @@ def backend_config(values: Mapping[str, Any]) -> config.BackendConfig:
     """
     Return the settings of the engine by the checked parameters.
 
-    If these contradict each other, or have no source of odometry, that is a `ConfigError`.
+    Raises `ConfigError` if these contradict each other, or have no source of odometry.
     """
     odometry: dict[str, config.OdometrySource] = {}
     measurements = {SET_POSE: config.SET_POSES}

@@ -33,7 +33,7 @@ def write_bag(
     folder : str or Path
     messages : iterable of Message
     overwrite : bool
-        Whether to replace an existing bag; without it, that is a `BagError`.
+        Whether to replace an existing bag; otherwise one raises `BagError`.
 
     """
     with BagWriter(folder, overwrite=overwrite) as bag:

@@ -169,10 +169,14 @@ def _is_locked(domain: int, locks: ExitStack) -> bool:
     name = Path(tempfile.gettempdir()) / f'pose_graph_ros_domain_{domain}'
     try:
         lock = name.open('a', encoding='utf-8')
-        locks.callback(lock.close)
-        fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
     except OSError:
         return False
+    try:
+        fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except OSError:
+        lock.close()
+        return False
+    locks.callback(lock.close)
     return True
 
 

@@ -47,7 +47,7 @@ def wanted_topics(options: argparse.Namespace) -> dict[str, str | None]:
 
 
 def parameter_values(options: argparse.Namespace) -> dict[str, Any]:
-    """Return all parameters by the options, as the node would read them, or a `ConfigError`."""
+    """Return all parameters by the options, as the node reads them; raises `ConfigError`."""
     given = {} if options.params_file is None else _read_file(options.params_file)
     for text in options.param:
         name, separator, value = text.partition(':=')

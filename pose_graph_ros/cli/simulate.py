@@ -113,7 +113,7 @@ def write_drive(drive: SimulatedDrive, folder: str | Path, *, overwrite: bool = 
     drive : SimulatedDrive
     folder : str or Path
     overwrite : bool
-        Whether to replace an existing bag; without it, that is a `BagError`.
+        Whether to replace an existing bag; otherwise one raises `BagError`.
 
     """
     messages = (

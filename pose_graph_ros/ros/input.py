@@ -26,7 +26,7 @@ class Input:
     Parameters
     ----------
     values : mapping
-        All checked parameters; a `ConfigError` if they do not go together.
+        All checked parameters; raises `ConfigError` if they contradict each other.
     warn : callable
         Logs a sentence.
 

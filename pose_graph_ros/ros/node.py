@@ -33,7 +33,7 @@ class PoseGraphNode(LifecycleNode):
     The online back end of pose-graph SLAM as a managed node.
 
     This class has the parameters and the lifecycle; `Session` does the work of a configured node.
-    If `sources` is not valid, which determines the other parameters, that is a `ConfigError`.
+    Raises `ConfigError` if `sources`, which determines the other parameters, is not valid.
     """
 
     def __init__(self, **node_options: Any) -> None:
@@ -51,7 +51,7 @@ class PoseGraphNode(LifecycleNode):
     # ---- lifecycle
 
     def start(self) -> None:
-        """Configure and activate; a `ConfigError` says why a transition failed."""
+        """Configure and activate; raises `ConfigError` with the reason if a transition fails."""
         for trigger in (self.trigger_configure, self.trigger_activate):
             if trigger() is not TransitionCallbackReturn.SUCCESS:
                 raise ConfigError(self.failure)

@@ -65,7 +65,7 @@ class Session:
     ----------
     node : rclpy.node.Node
     values : mapping
-        All checked parameters; a `ConfigError` if they do not go together.
+        All checked parameters; raises `ConfigError` if they contradict each other.
 
     """
 
@@ -190,7 +190,7 @@ class Session:
         decision = self.input.receive(source, message, primary)
         if decision.jump_ns > 0:
             self._start_new_graph(f'the stamps of {source.name} jumped back by '
-                                 f'{decision.jump_ns * 1e-9:.3f} s', decision.released)
+                                  f'{decision.jump_ns * 1e-9:.3f} s', decision.released)
         else:
             for received in decision.released:
                 self._use(received)
@@ -266,7 +266,7 @@ class Session:
         back_ns = -jump.delta.nanoseconds
         self.input.time_jumps.clock_jumped(back_ns)
         self._start_new_graph(f'the clock jumped back by {back_ns * 1e-9:.3f} s',
-                             self.input.time_jumps.release())
+                              self.input.time_jumps.release())
 
     def reset(self) -> None:
         """Start a new graph on request; the next messages may have any stamps."""
