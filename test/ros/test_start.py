@@ -46,15 +46,16 @@ def test_nothing_is_lost_while_kernels_are_compiled(
         assert 'Traceback' not in node.stderr()
 
 
+@pytest.mark.timeout(PREPARE_PATIENCE)
 def test_a_signal_while_kernels_are_compiled_ends_the_node(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    # what the elimination needs is compiled: some eight seconds
-    copy_kernels(tmp_path / 'kernels', without='elimination')
+    # all is compiled, as after an installation
     monkeypatch.setenv('NUMBA_CACHE_DIR', str(tmp_path / 'kernels'))
     with NodeProcess(tmp_path) as node:
         client = Client(int(node.env['ROS_DOMAIN_ID']))
-        client.spin_until(lambda: len(client.diagnostics) > 0, 'it runs')
+        client.spin_until(lambda: len(client.diagnostics) > 0, 'it runs', PREPARE_PATIENCE)
+        assert client.values['prepared'] == '0'
         client.close()
         assert node.signal_and_wait(signal.SIGINT, signal.SIGINT) == 0
         assert 'Traceback' not in node.stderr()
