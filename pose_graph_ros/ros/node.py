@@ -4,6 +4,7 @@
 
 from array import array
 from collections.abc import Callable, Mapping, Sequence
+import logging
 import traceback
 from typing import Any
 
@@ -26,6 +27,8 @@ from pose_graph_ros.adapters.parameters import (
 from pose_graph_ros.core.exceptions import ConfigError
 from pose_graph_ros.ros.services import Services
 from pose_graph_ros.ros.session import Session
+
+logger = logging.getLogger(__name__)
 
 
 class PoseGraphNode(LifecycleNode):
@@ -175,7 +178,11 @@ class PoseGraphNode(LifecycleNode):
         if any(parameter.name in self._own for parameter in parameters):
             self._given = self._changed(parameters)
             if self._session is not None:
-                self._session.configure(checked(self._given))
+                try:
+                    self._session.configure(checked(self._given))
+                except Exception:
+                    # raised from here, the client would get no answer
+                    logger.exception('a change of parameters failed')
 
     def _changed(self, parameters: list[RosParameter]) -> dict[str, Any]:
         wanted = {parameter.name: parameter.value for parameter in parameters

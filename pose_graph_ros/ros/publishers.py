@@ -248,5 +248,6 @@ class Publishers:
         if self.transforms is not None:
             self.transforms.close()
         with self._lock:
+            self.graph += 1     # nothing more is published of the graph so far
             for publisher in self._publishers:
                 self._node.destroy_publisher(publisher)

@@ -11,6 +11,7 @@ from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import Future
 from copy import copy
 from functools import partial
+import logging
 import math
 import time
 from typing import Any
@@ -30,7 +31,7 @@ from pose_graph_ros.adapters.sources import backend_config, Kind, SET_POSE, Sour
 from pose_graph_ros.core.backend import PoseGraphBackend
 from pose_graph_ros.core.estimate import UpdateReport
 from pose_graph_ros.core.io.saved_graph import SavedGraph
-from pose_graph_ros.core.measurements import OdometrySample
+from pose_graph_ros.core.measurements import AnswerStatus, GlobalPose, OdometrySample
 from pose_graph_ros.core.sources.constraint_names import ConstraintEnergy
 from pose_graph_ros.ros import diagnostics, memory
 from pose_graph_ros.ros.input import Input, PAUSED
@@ -41,6 +42,8 @@ from pose_graph_ros.ros.set_pose_input import SetPoseInput
 from pose_graph_ros.ros.time_jump import ReceivedMessage
 from pose_graph_ros.ros.transforms import TFMessage
 from pose_graph_ros.ros.worker import Worker
+
+logger = logging.getLogger(__name__)
 
 # Profiles are reliable if they do not say otherwise.
 # The queue is deep since no odometry may be lost. A best-effort reader matches reliable and
@@ -93,12 +96,16 @@ class Session:
             for name, source in self._config.odometry.items()}
         self.silent: list[str] = []  # sources that are silent while others are not
         self.largest_energies: Sequence[ConstraintEnergy] = []
+        # of this graph, so that the answer of an earlier worker is nobody's
+        self._energies: Future[list[ConstraintEnergy]] | None = None
         self._energies_at = -math.inf
 
     def _start_worker(self, backend: PoseGraphBackend, *, prepared: bool = False) -> None:
         """Start the thread that owns a graph."""
-        self.worker = Worker(backend, partial(self._publish_views, self.out.graph),
-                             None if prepared else self._warm_up)
+        graph = self.out.graph
+        self.worker = worker = Worker(
+            backend, lambda backend: self._publish_views(worker, graph, backend),
+            None if prepared else self._warm_up)
         self.worker.start()
 
     def _warm_up(self, stopped: Callable[[], bool]) -> None:
@@ -164,7 +171,7 @@ class Session:
         self.out.configure(values)
         for name, source in config.odometry.items():
             self._continuity[name].maximum_speed = source.maximum_speed
-        self.worker.call(lambda backend: backend.configure(config))
+        self.worker.call(lambda backend: backend.configure(config), 'a change of parameters')
         self._set_timer('diagnostics', values['diagnostics_period'], self.publish_diagnostics)
         if self.active:
             self._watch_time()
@@ -239,12 +246,19 @@ class Session:
         estimate = self.worker.estimate
         if estimate is None or (pose := self._set_pose_input.pop(estimate)) is None:
             return
-        x, y, yaw = pose.pose
-        self.node.get_logger().info(
-            f'the pose is set to ({x:.3f}, {y:.3f}, {yaw:.3f}) in {self.out.map_frame}')
         self.out.jump()
-        self.worker.call(lambda backend: backend.set_pose(pose, SET_POSE))
+        self.worker.call(partial(self._hand_over, pose), 'a pose that is set')
         self.worker.request_update()
+
+    def _hand_over(self, pose: GlobalPose, backend: PoseGraphBackend) -> None:
+        """Set the pose in the engine and log what it answers; for the worker's thread."""
+        answer = backend.set_pose(pose, SET_POSE)
+        x, y, yaw = pose.pose
+        what = f'({x:.3f}, {y:.3f}, {yaw:.3f}) in {self.out.map_frame}'
+        if answer.status is AnswerStatus.REJECTED:
+            logger.warning('the pose is not set to %s: %s: %s', what, answer.reason, answer.detail)
+        else:
+            logger.info('the pose is set to %s', what)
 
     # ---- time
 
@@ -330,14 +344,19 @@ class Session:
     def _on_views_timer(self) -> None:
         """Make the worker's thread publish path and markers that are due."""
         if self.worker.estimate is not None and self.worker.prepared:
-            self.worker.call(partial(self._publish_views, self.out.graph))
+            self.worker.call(partial(self._publish_views, self.worker, self.out.graph),
+                             'the path or the markers')
 
     def _publish_views(
-        self, graph: int, backend: PoseGraphBackend, *, at_once: bool = False,
+        self, worker: Worker, graph: int, backend: PoseGraphBackend, *, at_once: bool = False,
     ) -> None:
-        """Publish path and markers that are due, the path also `at_once`; for the worker."""
-        estimate = self.worker.estimate
-        if estimate is None:
+        """
+        Publish path and markers that are due, the path also `at_once`.
+
+        For the thread of the worker, which may no longer be the one of the present graph.
+        """
+        estimate = worker.estimate
+        if estimate is None or graph != self.out.graph:
             return
         if self.out.path_is_due(estimate) or at_once:
             newest = backend.estimate()
@@ -353,9 +372,9 @@ class Session:
         def job(backend: PoseGraphBackend) -> UpdateReport:
             report = worker.optimize_fully(backend)
             # so that the next path after the answer is the optimised one
-            self._publish_views(graph, backend, at_once=True)
+            self._publish_views(worker, graph, backend, at_once=True)
             return report
-        return worker.call(job)
+        return worker.call(job, 'the full optimisation')
 
     @property
     def odometry_topics(self) -> list[str]:
@@ -371,11 +390,19 @@ class Session:
             self.node.get_logger().warning(f'{name} is silent while other sources are not')
         if self.out.transforms is not None and self.active:
             self.out.transforms.check_for_others()
-        if now - self._energies_at > ENERGY_PERIOD and self.worker.prepared:
-            self._energies_at = now
-            self.worker.call(self._find_largest_energies)
+        self._update_largest_energies(now)
         level, text = diagnostics.health(self)
         self.out.publish_diagnostics(level, text, diagnostics.values(self))
 
-    def _find_largest_energies(self, backend: PoseGraphBackend) -> None:
-        self.largest_energies = backend.largest_energies(N_ENERGIES)
+    def _update_largest_energies(self, now: float) -> None:
+        """Take the newest answer of the worker, and ask again after a while."""
+        asked = self._energies
+        if asked is not None and asked.done():
+            self._energies = None
+            if not asked.cancelled() and asked.exception() is None:
+                self.largest_energies = asked.result()
+        if self._energies is None and self.worker.prepared and (
+                now - self._energies_at > ENERGY_PERIOD):
+            self._energies_at = now
+            self._energies = self.worker.call(
+                lambda backend: backend.largest_energies(N_ENERGIES), 'the largest energies')

@@ -8,9 +8,8 @@ an immutable estimate that the thread replaces as a whole.
 """
 
 from collections import Counter, deque
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Collection, Mapping
 from concurrent.futures import Future
-from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field
 import logging
 import threading
@@ -19,6 +18,7 @@ from typing import TypeVar
 
 from pose_graph_ros.core.backend import PoseGraphBackend
 from pose_graph_ros.core.estimate import Estimate, UpdateReport
+from pose_graph_ros.core.exceptions import PoseGraphError
 from pose_graph_ros.core.measurements import AnswerStatus, Measurement, OdometrySample
 from pose_graph_ros.core.sources.source_report import SourceReport
 
@@ -70,7 +70,7 @@ class Worker:
         self.prepared = False  # whether the preparation has ended
         self._inbox: deque[tuple[str, OdometrySample | Measurement]] = deque()
         self._update_wanted = False
-        self._jobs: list[tuple[Job[object], Future[object]]] = []
+        self._jobs: list[tuple[str, Job[object], Future[object]]] = []
         self._stopping = False
         self._condition = threading.Condition()
         self._revision = backend.revision
@@ -122,16 +122,27 @@ class Worker:
 
     def request_final_optimization(self) -> 'Future[UpdateReport]':
         """Request a full optimisation with all posted measurements."""
-        return self.call(self.optimize_fully)
+        return self.call(self.optimize_fully, 'the full optimisation')
 
-    def call(self, job: Job[Result]) -> 'Future[Result]':
-        """Request a call in the thread, after all posted measurements were added."""
+    def call(self, job: Job[Result], what: str = 'a job') -> 'Future[Result]':
+        """
+        Return the future answer of a job, done in the thread after all posted measurements.
+
+        If it fails, that is logged and counted whether or not anybody reads the answer.
+
+        Parameters
+        ----------
+        job : callable
+        what : str
+            For the log.
+
+        """
         future: Future[Result] = Future()
         with self._condition:
             if self._stopping:
                 future.cancel()
             else:
-                self._jobs.append((job, future))  # type: ignore[arg-type]
+                self._jobs.append((what, job, future))  # type: ignore[arg-type]
                 self._condition.notify()
         return future
 
@@ -149,46 +160,65 @@ class Worker:
                     self._stopping or self._update_wanted
                     or len(self._inbox) + len(self._jobs) > 0))
                 if self._stopping:
-                    for _, future in self._jobs:
+                    for *_, future in self._jobs:
                         future.cancel()
                     return
                 batch, self._inbox = self._inbox, deque()
                 wanted, self._update_wanted = self._update_wanted, False
                 jobs, self._jobs = self._jobs, []
             # no error may end the thread, which is the only one that adds measurements
-            with suppress(Exception), self._count_errors():
-                for source, measurement in batch:
-                    self._add(source, measurement)
-                report = self._update(self._backend.update) if wanted else None
-                # after a jump of the odometry the old estimate cannot be propagated
-                stale = self._revision != self._backend.revision
-                if report is not None or self.estimate is None or stale:
-                    self._publish()
-                self._report(report, len(batch))
-            for job, future in jobs:
-                if not future.set_running_or_notify_cancel():
-                    continue
-                try:
-                    future.set_result(job(self._backend))
-                except Exception as error:
-                    future.set_exception(error)
+            try:
+                self._process(batch, wanted=wanted)
+            except Exception as error:
+                self._count_failure('an update', error, len(batch))
+            for what, job, future in jobs:
+                self._do(what, job, future)
+
+    def _process(
+        self, batch: Collection[tuple[str, OdometrySample | Measurement]], *, wanted: bool,
+    ) -> None:
+        """Add measurements, and update the graph if that is wanted."""
+        for source, measurement in batch:
+            if self._stopping:
+                return
+            self._add(source, measurement)
+        report = self._update(self._backend.update) if wanted else None
+        # after a jump of the odometry the old estimate cannot be propagated
+        stale = self._revision != self._backend.revision
+        if report is not None or self.estimate is None or stale:
+            self._publish()
+        self._report(report, len(batch))
+
+    def _do(self, what: str, job: Job[object], future: Future[object]) -> None:
+        """Do a job and answer it, unless the thread is to end."""
+        if self._stopping:
+            future.cancel()
+        if not future.set_running_or_notify_cancel():
+            return
+        try:
+            result = job(self._backend)
+        except Exception as error:
+            self._count_failure(what, error)
+            future.set_exception(error)
+        else:
+            future.set_result(result)
 
     def optimize_fully(self, backend: PoseGraphBackend) -> UpdateReport:
         """Optimise the whole graph; a job for `call`."""
-        with self._count_errors():
-            report = self._update(backend.optimize)
-            self._publish()
-            self._report(report, 0)
+        report = self._update(backend.optimize)
+        self._publish()
+        self._report(report, 0)
         return report
 
-    @contextmanager
-    def _count_errors(self) -> Iterator[None]:
-        try:
-            yield
-        except Exception:
-            logger.exception('the worker failed')
-            self._backend.counts['worker', 'internal_error'] += 1
-            raise
+    def _count_failure(self, what: str, error: Exception, processed: int = 0) -> None:
+        """Log and count an error; one of this project tells users why, and needs no traceback."""
+        if isinstance(error, PoseGraphError):
+            logger.warning('%s: %s', what, error)
+        else:
+            logger.error('%s failed', what, exc_info=error)
+        reason = 'refused_job' if isinstance(error, PoseGraphError) else 'internal_error'
+        self._backend.counts['worker', reason] += 1
+        self._report(None, processed)
 
     def _add(self, source: str, measurement: OdometrySample | Measurement) -> None:
         try:

@@ -16,6 +16,7 @@ from harness import PREPARE_PATIENCE
 from lifecycle_msgs.msg import Transition
 from lifecycle_msgs.srv import ChangeState
 from local_node import Driver, LocalNode
+from rcl_interfaces.srv import SetParameters
 from rclpy.context import Context
 from rclpy.lifecycle import TransitionCallbackReturn
 from rclpy.parameter import Parameter
@@ -208,6 +209,26 @@ def test_an_error_of_the_engine_is_answered(
     answer = managed.call('optimize')
     assert (answer.success, answer.message) == (False, 'failed: no memory')
     assert managed.session.worker.alive
+
+
+def test_a_change_of_parameters_that_fails_is_answered_and_logged(
+    managed: Managed, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture,
+) -> None:
+    managed.start()
+    engine = managed.session.worker._backend
+
+    def fail(*_: object) -> None:
+        raise MemoryError('no memory')
+    monkeypatch.setattr(engine, 'configure', fail)
+    wanted = SetParameters.Request(
+        parameters=[Parameter('odom.maximum_speed', value=4.0).to_parameter_msg()])
+    assert managed.call('set_parameters', wanted, SetParameters).results[0].successful
+    worker = managed.session.worker
+    managed.wait(lambda: worker.status.counts['worker', 'internal_error'] == 1, 'it is counted')
+    assert caplog.messages == ['a change of parameters failed']
+    monkeypatch.setattr(managed.session.out, 'configure', fail)
+    assert managed.call('set_parameters', wanted, SetParameters).results[0].successful
+    assert caplog.messages == 2 * ['a change of parameters failed']
 
 
 def test_pause_answers_whether_it_changed_something(managed: Managed) -> None:

@@ -29,6 +29,7 @@ from pose_graph_ros.core.alignment.monitor import AlignmentState
 from pose_graph_ros.core.backend import PoseGraphBackend
 from pose_graph_ros.core.batch.optimizer import Status
 from pose_graph_ros.core.estimate import UpdateReport
+from pose_graph_ros.core.measurements import Answer, rejected
 from pose_graph_ros.core.warm_up import warm_up
 from pose_graph_ros.ros import diagnostics, memory, session as session_module
 from pose_graph_ros.ros.session import Session
@@ -325,6 +326,57 @@ def test_a_pose_that_is_set_puts_the_robot_there(
     active.wait(lambda: np.hypot(*(worker.estimate.T_map_base - [30.0, -20.0, 0.0])[:2])
                 == pytest.approx(np.hypot(*(now - begin)[:2]), abs=0.2), 'the robot is there')
     assert worker.status.counts['set_pose', 'accepted'] == len(jumps) == 1
+
+
+def test_a_pose_is_said_to_be_set_only_when_the_engine_has_taken_it(
+    active: Robot, caplog: pytest.LogCaptureFixture,
+) -> None:
+    caplog.set_level('INFO')
+    setting = active.local.advertise(PoseWithCovarianceStamped, 'initialpose')
+    active.drive(4.0)
+    engine = active.session.worker._backend
+    set_pose = engine.set_pose
+    for answer, said in ((rejected('failed', 'the solver failed'),
+                          'the pose is not set to (1.000, 2.000, 0.000) in map: failed: the '
+                          'solver failed'),
+                         (None, 'the pose is set to (1.000, 2.000, 0.000) in map')):
+        running, release = threading.Event(), threading.Event()
+
+        def answered(*given: object, answer=answer, running=running, release=release) -> Answer:
+            running.set()
+            assert release.wait(10.0)
+            return set_pose(*given) if answer is None else answer
+        engine.set_pose = answered
+        caplog.clear()
+        setting.publish(pose(START + 3.9, 1.0, 2.0, 0.0))
+        active.wait(running.is_set, 'the engine has it')
+        assert caplog.messages == []
+        release.set()
+        active.wait(lambda said=said: caplog.messages == [said], said)
+
+
+def test_an_earlier_worker_writes_nothing_into_a_new_graph(active: Robot) -> None:
+    active.drive(4.0)
+    session = active.session
+    paths = active.local.subscribe(PathMessage, 'path', LATCHED)
+    active.wait(lambda: len(paths) > 0, 'a path comes')
+    old, graph = session.worker, session.out.graph
+    running, release = threading.Event(), threading.Event()
+    old.call(lambda _: (running.set(), release.wait(10.0)))
+    assert running.wait(10.0)
+    session._energies, session._energies_at = None, -np.inf
+    session.publish_diagnostics()
+    asked, optimisation = session._energies, session.optimize()
+    session.reset()
+    active.drive(2.0, fixes=False)
+    release.set()
+    active.wait(lambda: not old.alive, 'the old worker ends')
+    assert asked.cancelled()
+    assert optimisation.cancelled()
+    # a job that had begun before the reset
+    shown = session.out._path_shown
+    session._publish_views(old, graph, old._backend, at_once=True)
+    assert session.out._path_shown is shown
 
 
 def test_frames_that_differ_from_the_parameters_are_warned_of_once(

@@ -7,12 +7,14 @@ import threading
 import time
 
 import numpy as np
+import pytest
 
 from pose_graph_ros.core.backend import PoseGraphBackend
 from pose_graph_ros.core.batch import optimizer
 from pose_graph_ros.core.batch.optimizer import Status
 from pose_graph_ros.core.estimate import Estimate
-from pose_graph_ros.core.measurements import GlobalPose, OdometrySample
+from pose_graph_ros.core.exceptions import FileFormatError
+from pose_graph_ros.core.measurements import Answer, GlobalPose, OdometrySample
 from pose_graph_ros.ros.worker import Worker
 
 PATIENCE = 10.0
@@ -183,3 +185,54 @@ def test_a_preparation_that_fails_or_is_stopped_does_not_hold_the_worker() -> No
     worker = Worker(PoseGraphBackend(), lambda _: None, wait_until)
     worker.start()
     assert worker.stop(PATIENCE)
+
+
+def test_a_job_that_fails_is_answered_logged_and_counted(
+    caplog: pytest.LogCaptureFixture,
+) -> None:
+    def fail(error: Exception) -> Callable[[PoseGraphBackend], None]:
+        def job(_: PoseGraphBackend) -> None:
+            raise error
+        return job
+
+    worker = Worker(PoseGraphBackend(), lambda _: None)
+    worker.start()
+    broken = worker.call(fail(ZeroDivisionError('broken')), 'the markers')
+    refused = worker.call(fail(FileFormatError('no graph')), 'a copy of the graph')
+    assert isinstance(broken.exception(PATIENCE), ZeroDivisionError)
+    assert isinstance(refused.exception(PATIENCE), FileFormatError)
+    wait_until(lambda: len(worker.status.counts) == 2)
+    assert worker.status.counts == {
+        ('worker', 'internal_error'): 1, ('worker', 'refused_job'): 1}
+    first, second = caplog.records
+    assert first.getMessage() == 'the markers failed'
+    assert first.exc_info is not None
+    assert second.getMessage() == 'a copy of the graph: no graph'
+    assert second.exc_info is None
+    assert worker.call(lambda _: 3).result(PATIENCE) == 3
+    assert worker.stop(PATIENCE)
+
+
+def test_nothing_is_begun_after_the_worker_was_stopped() -> None:
+    running, release, begun = threading.Event(), threading.Event(), []
+
+    class Slow(PoseGraphBackend):
+        def add_odometry(self, added: OdometrySample, source: str = 'odom') -> Answer:
+            begun.append(added)
+            running.set()
+            assert release.wait(PATIENCE)
+            return super().add_odometry(added, source)
+
+    worker = Worker(Slow(), lambda _: begun.append('an estimate'))
+    # before the thread starts, so that it takes all of them at once
+    for step in range(1, 50):
+        worker.post('odom', sample(step))
+    worker.request_update()
+    job = worker.call(begun.append)
+    worker.start()
+    assert running.wait(PATIENCE)
+    assert not worker.stop(0.0)
+    release.set()
+    assert worker.stop(PATIENCE)
+    assert len(begun) == 1
+    assert job.cancelled()
