@@ -2,27 +2,12 @@
 # SPDX-License-Identifier: Apache-2.0
 """Memory that is returned to the system; in separate processes, as all of a process counts."""
 
-import subprocess
 import sys
 
 import pytest
+from separate_process import run
 
 pytestmark = pytest.mark.skipif(sys.platform != 'linux', reason='what Linux says of a process')
-
-_RESIDENT = '''
-from pathlib import Path
-def resident(name):
-    lines = Path('/proc/self/status').read_text().splitlines()
-    values = dict(line.split(':', 1) for line in lines if ':' in line)
-    return int(values[name].split()[0]) / 1000.0
-'''
-
-
-def run(program: str) -> list[float]:
-    done = subprocess.run([sys.executable, '-c', _RESIDENT + program], check=True,
-                          stdout=subprocess.PIPE, text=True, timeout=120)
-    return [float(word) for word in done.stdout.split()]
-
 
 def test_pages_of_files_go_and_the_process_goes_on() -> None:
     before, after, same = run('''

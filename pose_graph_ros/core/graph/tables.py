@@ -20,6 +20,7 @@ each group is the number of columns. Units: sigma^2 is the unit of energies.
 """
 
 from collections.abc import Callable
+import contextlib
 import mmap
 from typing import Any, Final
 
@@ -260,12 +261,16 @@ def _pages(shape: int | tuple[int, int], dtype: type[np.generic]) -> npt.NDArray
     Return an array of zeros; a large one has pages of its own, which take memory when written to.
 
     NumPy would allocate huge pages and keep them in the process after a table has grown out of
-    them, which would double the memory of the tables.
+    them, which would double the memory of the tables. The pages are private: a process that is
+    forked from this one gets copies of those that it writes to.
     """
     size = int(np.prod(shape)) * np.dtype(dtype).itemsize
     if size < OWN_PAGES:
         return np.zeros(shape, dtype)
-    return np.frombuffer(mmap.mmap(-1, size), dtype).reshape(shape)
+    pages = mmap.mmap(-1, size, mmap.MAP_PRIVATE | mmap.MAP_ANONYMOUS)
+    with contextlib.suppress(OSError):  # a kernel without huge pages
+        pages.madvise(mmap.MADV_NOHUGEPAGE)
+    return np.frombuffer(pages, dtype).reshape(shape)
 
 
 class Memory:
