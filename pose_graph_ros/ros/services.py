@@ -2,7 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """The services of the node; each answers what was done, or why it was not."""
 
-from collections.abc import Awaitable, Callable
+from collections.abc import Awaitable, Callable, Mapping
 from concurrent.futures import CancelledError, Future as DoneFuture, ThreadPoolExecutor
 from functools import partial
 import logging
@@ -22,10 +22,13 @@ from pose_graph_ros.core.exceptions import FileFormatError, PoseGraphError
 from pose_graph_ros.core.io.graph_files import read_graph, write_graph
 from pose_graph_ros.core.io.saved_graph import SavedGraph, site_refusal
 from pose_graph_ros.ros.session import Session
+from pose_graph_ros.ros.worker import Worker
 
 logger = logging.getLogger(__name__)
 
 REPLACED = 'the graph was replaced meanwhile'
+CLOSED = 'the node was cleaned up meanwhile'
+ANSWER_TIME = 0.2  # for which a service outlives its last answer, so that it is sent [s]
 Answer = tuple[bool, str]
 """Whether what was asked for was done, and a sentence on it."""
 
@@ -43,7 +46,9 @@ class Services:
 
     def __init__(self, node: Node, session: Session) -> None:
         self._node, self._session = node, session
-        self._offered: list[Service] = []
+        self._offered: dict[str, Service] = {}
+        self._answering: set[str] = set()  # services that have a request
+        self._closed = False
         # files of a large graph take seconds: neither worker nor executor should wait for them
         self._files = ThreadPoolExecutor(1, 'graph files')
         for name, kind, act in (
@@ -52,15 +57,45 @@ class Services:
                 ('save_graph', Trigger, partial(self._with_file, self._save)),
                 ('load_graph', Trigger, partial(self._with_file, self._load))):
             # each in its own group: a service that awaits blocks all others in its group
-            self._offered.append(node.create_service(
-                kind, f'~/{name}', partial(_answer, act),
-                callback_group=MutuallyExclusiveCallbackGroup()))
+            self._offered[name] = node.create_service(
+                kind, f'~/{name}', partial(self._answer, name, act),
+                callback_group=MutuallyExclusiveCallbackGroup())
 
     def close(self) -> None:
-        """Destroy the services and the thread for files."""
-        for service in self._offered:
-            self._node.destroy_service(service)
-        self._files.shutdown(cancel_futures=True)
+        """
+        Destroy the services, each after the request that it still has to answer.
+
+        A file that is being written is completed in its thread, for which nobody waits here.
+        """
+        self._closed = True
+        if 'save_graph' in self._answering:
+            self._node.get_logger().warning('the graph is still being saved')
+        self._files.shutdown(wait=False, cancel_futures=True)
+        for name in self._offered.keys() - self._answering:
+            self._node.destroy_service(self._offered.pop(name))
+
+    async def _answer(
+        self, name: str, act: Callable[[Any], Awaitable[Answer]], request: Any, response: Any,
+    ) -> Any:
+        """Fill in a response with what an action answers."""
+        self._answering.add(name)
+        try:
+            if self._closed:
+                raise CancelledError
+            response.success, response.message = await act(request)
+        except CancelledError:
+            response.message = CLOSED if self._closed else REPLACED
+        self._answering.discard(name)
+        if self._closed:
+            self._destroy_soon(name)
+        return response
+
+    def _destroy_soon(self, name: str) -> None:
+        def destroy() -> None:
+            self._node.destroy_timer(timer)
+            if name in self._offered:
+                self._node.destroy_service(self._offered.pop(name))
+        timer = self._node.create_timer(ANSWER_TIME, destroy, clock=self._session.steady)
 
     async def _done(self, future: 'DoneFuture[Any]') -> Any:
         """Await a result of another thread, while other callbacks are served."""
@@ -69,14 +104,27 @@ class Services:
         await done
         return future.result()
 
+    async def _in_file_thread(self, job: Callable[..., Any], *arguments: Any) -> Any:
+        """Await what a function returns that reads or writes files."""
+        if self._closed:
+            raise CancelledError
+        return await self._done(self._files.submit(job, *arguments))
+
+    def _require_present(self, worker: Worker) -> None:
+        """Raise `CancelledError` if a worker's graph is no longer that of the node."""
+        if self._closed or self._session.worker is not worker:
+            raise CancelledError
+
     async def _optimize(self, _: Trigger.Request) -> Answer:
+        worker = self._session.worker
         try:
             report = await self._done(self._session.optimize())
         except CancelledError:
             raise
         except Exception as error:
             return False, f'failed: {error}'
-        if self._session.worker.estimate is None:
+        self._require_present(worker)
+        if worker.estimate is None:
             return False, 'there is no odometry yet'
         return report.status is Status.CONVERGED, (
             f'{report.status.value} after {report.iterations} iterations, chi2 {report.chi2:.6g}'
@@ -143,8 +191,8 @@ class Services:
             backend.update()
             return backend.saved(None if plane is None else plane.origin)
 
-        saved = await self._done(self._session.worker.call(capture))
-        files = await self._done(self._files.submit(write_graph, saved, path))
+        saved = await self._done(self._session.worker.call(capture, 'a copy of the graph'))
+        files = await self._in_file_thread(write_graph, saved, path)
         left_out = '' if saved.n_left_out == 0 else (
             f'; {saved.n_left_out} waiting measurements are left out')
         return (f'{len(saved.nodes.rows)} hidden nodes in {files[0]}, with '
@@ -152,31 +200,25 @@ class Services:
 
     async def _load(self, path: Path) -> str:
         """Replace the graph by the one in a file, if it is of the present site."""
-        session = self._session
-
-        def restore() -> tuple[SavedGraph, PoseGraphBackend]:
-            saved, datum = read_graph(path), session.input.reader.datum
-            origin = None if datum.plane is None else datum.plane.origin
-            refusal = site_refusal(
-                saved, *((origin, None) if datum.is_given else (None, origin)))
-            if refusal is not None:
-                raise FileFormatError(refusal)
-            backend = PoseGraphBackend.restored(backend_config(session.values), saved)
-            backend.update()
-            return saved, backend
-
+        session, worker = self._session, self._session.worker
         # wait until the worker has prepared the kernels, which reading needs
-        await self._done(session.worker.call(lambda _: None))
-        saved, backend = await self._done(self._files.submit(restore))
+        await self._done(worker.call(lambda _: None))
+        saved, backend = await self._in_file_thread(_restored, path, session.values)
+        # all that follows is about now: in the meantime a datum or parameters may have been set
+        self._require_present(worker)
+        datum = session.input.reader.datum
+        origin = None if datum.plane is None else datum.plane.origin
+        refusal = site_refusal(saved, *((origin, None) if datum.is_given else (None, origin)))
+        if refusal is not None:
+            raise FileFormatError(refusal)
+        backend.configure(backend_config(session.values))
         session.load(saved, backend, str(path))
         return (f'{len(saved.nodes.rows)} hidden nodes from {path}, datum '
                 f'{"none" if saved.datum is None else saved.datum}')
 
 
-async def _answer(act: Callable[[Any], Awaitable[Answer]], request: Any, response: Any) -> Any:
-    """Fill in a response with what an action answers."""
-    try:
-        response.success, response.message = await act(request)
-    except CancelledError:
-        response.message = REPLACED
-    return response
+def _restored(path: Path, values: Mapping[str, Any]) -> tuple[SavedGraph, PoseGraphBackend]:
+    saved = read_graph(path)
+    backend = PoseGraphBackend.restored(backend_config(values), saved)
+    backend.update()
+    return saved, backend

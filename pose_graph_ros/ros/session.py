@@ -85,7 +85,7 @@ class Session:
         self._timers: dict[str, Timer] = {}
         self._jump_handle: JumpHandle | None = None
         # a clock that is set back, or a bag that starts again, must not stall a timer
-        self._steady = Clock(clock_type=ClockType.STEADY_TIME)
+        self.steady = Clock(clock_type=ClockType.STEADY_TIME)
         self._clear()
         self._start_worker(PoseGraphBackend(self._config))
         self._set_timer('diagnostics', values['diagnostics_period'], self.publish_diagnostics)
@@ -186,7 +186,7 @@ class Session:
     def _set_timer(self, name: str, period: float, tick: Callable[[], None]) -> None:
         if name in self._timers:
             self.node.destroy_timer(self._timers.pop(name))
-        self._timers[name] = self.node.create_timer(period, tick, clock=self._steady)
+        self._timers[name] = self.node.create_timer(period, tick, clock=self.steady)
 
     # ---- messages
 

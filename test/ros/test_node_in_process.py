@@ -3,6 +3,7 @@
 """The managed node in the test's own process: its lifecycle, parameters and services."""
 
 from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 import threading
 from typing import Any
@@ -20,13 +21,14 @@ from rcl_interfaces.srv import SetParameters
 from rclpy.context import Context
 from rclpy.lifecycle import TransitionCallbackReturn
 from rclpy.parameter import Parameter
+from rclpy.task import Future
 from std_srvs.srv import SetBool, Trigger
 
 from pose_graph_ros.core.exceptions import ConfigError
 from pose_graph_ros.core.warm_up import warm_up
-from pose_graph_ros.ros import memory
+from pose_graph_ros.ros import memory, services
 from pose_graph_ros.ros.node import PoseGraphNode
-from pose_graph_ros.ros.services import REPLACED
+from pose_graph_ros.ros.services import CLOSED, REPLACED
 from pose_graph_ros.ros.session import Session
 
 pytestmark = pytest.mark.timeout(PREPARE_PATIENCE)
@@ -47,12 +49,20 @@ class Managed(Driver):
     """The node with parameters, and a client that calls its services."""
 
     def call(self, name: str, request: Any = None, kind: type = Trigger) -> Any:
+        future = self.request(name, request, kind)
+        self.wait(future.done, f'{name} answers')
+        return future.result()
+
+    def request(self, name: str, request: Any = None, kind: type = Trigger) -> Future:
+        """Call a service; return its future answer."""
         client = self.local.client.create_client(kind, f'/pose_graph/{name}')
         self.wait(client.service_is_ready, f'{name} is there')
-        future = client.call_async(kind.Request() if request is None else request)
-        self.wait(future.done, f'{name} answers')
-        self.local.client.destroy_client(client)
-        return future.result()
+        return client.call_async(kind.Request() if request is None else request)
+
+    @property
+    def offered(self) -> list[str]:
+        """Names of the services of the node."""
+        return [service.service_name for service in self.local.node.services]
 
     def pause(self, *, data: bool) -> SetBool.Response:
         return self.call('pause', SetBool.Request(data=data), SetBool)
@@ -186,9 +196,7 @@ def test_a_new_graph_while_it_is_optimised_is_answered(managed: Managed) -> None
     running, release = threading.Event(), threading.Event()
     managed.session.worker.call(lambda _: (running.set(), release.wait(10.0)))
     assert running.wait(10.0)
-    client = managed.local.client.create_client(Trigger, '/pose_graph/optimize')
-    managed.wait(client.service_is_ready, 'the service is there')
-    answer = client.call_async(Trigger.Request())
+    answer = managed.request('optimize')
     worker = managed.session.worker
     managed.wait(lambda: len(worker._jobs) > 0, 'the optimisation waits')
     managed.session.reset()
@@ -282,6 +290,79 @@ def test_a_graph_is_saved_and_loaded(managed: Managed, tmp_path: Path) -> None:
     answer = managed.call('load_graph')
     assert not answer.success
     assert 'another site' in answer.message
+
+
+@contextmanager
+def held(monkeypatch: pytest.MonkeyPatch, name: str) -> Iterator[threading.Event]:
+    """Let a function of the services wait; yield an event that is set while it does."""
+    function = getattr(services, name)
+    running, release = threading.Event(), threading.Event()
+
+    def wait(*given: object) -> object:
+        running.set()
+        assert release.wait(10.0)
+        return function(*given)
+    with monkeypatch.context() as patch:
+        patch.setattr(services, name, wait)
+        yield running
+        release.set()
+
+
+def test_a_cleanup_waits_for_no_file_and_each_request_is_answered(
+    managed: Managed, tmp_path: Path, monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    managed.start()
+    managed.set('graph_file', str(tmp_path / 'map.g2o'))
+    node = managed.local.node
+
+    def clean_up() -> None:
+        assert node.trigger_deactivate() is SUCCESS
+        assert node.trigger_cleanup() is SUCCESS
+
+    managed.drive(4.0)
+    with held(monkeypatch, 'write_graph') as writing:
+        answer = managed.request('save_graph')
+        managed.wait(writing.is_set, 'the file is written')
+        clean_up()
+        assert not (tmp_path / 'map.g2o').exists()
+    managed.wait(answer.done, 'it answers')
+    assert answer.result().success
+    assert (tmp_path / 'map.g2o').exists()
+    managed.wait(lambda: not any(name.endswith('save_graph')
+                                 for name in managed.offered), 'the service ends')
+
+    node.start()
+    session = managed.session
+    with held(monkeypatch, 'read_graph') as reading:
+        answer = managed.request('load_graph')
+        managed.wait(reading.is_set, 'the file is read')
+        clean_up()
+    managed.wait(answer.done, 'it answers')
+    assert (answer.result().success, answer.result().message) == (False, CLOSED)
+    assert not session.worker.alive
+
+
+def test_a_graph_is_not_replaced_by_one_that_was_asked_for_before(
+    managed: Managed, tmp_path: Path, monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    managed.start()
+    managed.set('graph_file', str(tmp_path / 'map.g2o'))
+    managed.drive(4.0)
+    assert managed.call('save_graph').success
+    with held(monkeypatch, 'read_graph') as reading:
+        answer = managed.request('load_graph')
+        managed.wait(reading.is_set, 'the file is read')
+        managed.session.reset()
+    managed.wait(answer.done, 'it answers')
+    assert (answer.result().success, answer.result().message) == (False, REPLACED)
+    assert managed.session.worker.estimate is None
+    # a datum that came while the file was read, of another site
+    with held(monkeypatch, 'read_graph') as reading:
+        answer = managed.request('load_graph')
+        managed.wait(reading.is_set, 'the file is read')
+        managed.session.input.reader.datum.plane_for(50.0, 8.0, 0.0)
+    managed.wait(answer.done, 'it answers')
+    assert 'another site' in answer.result().message
 
 
 def test_an_error_of_a_file_is_answered(
