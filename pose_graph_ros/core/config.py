@@ -41,8 +41,25 @@ def require(settings: object, *names: str, positive: bool = False) -> None:
                 f'{type(settings).__name__}.{name}: expected {expected}, got {value!r}')
 
 
+def require_member(settings: object, name: str, kind: type[Enum]) -> None:
+    """
+    Raise ConfigError unless the named setting is a member of an enumeration.
+
+    Parameters
+    ----------
+    settings : object
+    name : str, attribute of `settings`
+    kind : type, the enumeration
+
+    """
+    value = getattr(settings, name)
+    if not isinstance(value, kind):
+        raise ConfigError(f'{type(settings).__name__}.{name}: expected one of '
+                          f'{", ".join(map(str, kind))}, got {value!r}')
+
+
 class Loss(Enum):
-    """Loss of a constraint as a function of its energy; see `graph.reweighting`."""
+    """Loss of a constraint as a function of its energy; see `graph.losses`."""
 
     NONE = 'none'
     HUBER = 'huber'
@@ -124,6 +141,8 @@ class OdometrySource:
     def __post_init__(self) -> None:
         require(self, 'covariance_scale', 'maximum_speed', 'rejection_threshold', positive=True)
         require(self, 'reorder_window')
+        require_member(self, 'noise_from', NoiseFrom)
+        require_member(self, 'loss', Loss)
 
 
 @dataclass(frozen=True, slots=True)
@@ -151,6 +170,7 @@ class CovariancePolicy:
     def __post_init__(self) -> None:
         require(self, 'scale', 'position_floor', 'heading_floor', 'position_ceiling',
                 'default_position', 'default_heading', positive=True)
+        require_member(self, 'heading', Heading)
         if len(self.override) not in (0, 1, 2) or not all(
                 0.0 < sigma < math.inf for sigma in self.override):
             raise ConfigError('CovariancePolicy.override: expected no, one or two positive '
@@ -183,6 +203,8 @@ class MeasurementSource:
     def __post_init__(self) -> None:
         require(self, 'rejection_threshold', positive=True)
         require(self, 'minimum_period', 'correlation_time', 'white_share')
+        require_member(self, 'loss', Loss)
+        require_member(self, 'correlation', Correlation)
         if self.white_share > 1.0:
             raise ConfigError('MeasurementSource.white_share: expected a number in [0, 1], '
                               f'got {self.white_share!r}')

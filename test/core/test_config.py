@@ -11,6 +11,7 @@ from pose_graph_ros.core.config import (
     AlignmentPolicy,
     BackendConfig,
     CovariancePolicy,
+    Loss,
     MeasurementSource,
     NodePolicy,
     OdometryNoise,
@@ -45,6 +46,15 @@ def test_zero_is_taken_where_it_means_something(kind: type, name: str) -> None:
     else:
         with pytest.raises(ConfigError, match=f'{name}: expected a positive number, got 0.0'):
             replace(kind(), **{name: 0.0})
+
+
+@pytest.mark.parametrize(('kind', 'name', 'value'), [
+    (MeasurementSource, 'loss', 'huber'), (OdometrySource, 'loss', 1),
+    (MeasurementSource, 'correlation', 'inflate'), (OdometrySource, 'noise_from', 'twist'),
+    (CovariancePolicy, 'heading', Loss.NONE)])
+def test_a_choice_is_a_member_of_its_enumeration(kind: type, name: str, value: object) -> None:
+    with pytest.raises(ConfigError, match=f'{kind.__name__}.{name}: expected one of .*, got'):
+        kind(**{name: value})
 
 
 @pytest.mark.parametrize('kind', [SolverConfig, SmootherConfig])

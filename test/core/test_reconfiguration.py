@@ -28,7 +28,7 @@ from pose_graph_ros.core.config import (
 from pose_graph_ros.core.exceptions import ConfigError
 from pose_graph_ros.core.geometry import se2
 from pose_graph_ros.core.geometry.se2 import FloatArray
-from pose_graph_ros.core.graph import reweighting
+from pose_graph_ros.core.graph.losses import costs_and_weights
 from pose_graph_ros.core.measurements import (
     AnswerStatus,
     GlobalPose,
@@ -318,7 +318,7 @@ def test_a_loss_counts_for_what_joins_from_then_on() -> None:
     positions = table.information[:, 2, 2] == 0.0
     np.testing.assert_allclose(
         weights[made:][positions],
-        reweighting._weights(Loss.CAUCHY, energies[positions], 2.0), rtol=1e-6)
+        costs_and_weights(Loss.CAUCHY, energies[positions], 2.0)[1], rtol=1e-6)
     assert np.all(weights[made:][~positions] == 1.0)
     # and back: what has one keeps it
     backend.configure(CONFIG)

@@ -43,8 +43,12 @@ class EdgeKind(IntEnum):
     """
 
 
+KNOWN_EDGES = (EdgeKind.ODOMETRY, EdgeKind.LOOP_CLOSURE, EdgeKind.BIAS)
+"""Kinds of edges whose error is in `error_functions` and in the kernels; others are refused."""
+
+
 class ObservedKind(IntEnum):
-    """What was measured of an observed node."""
+    """What was measured of an observed node; the error is the same for all kinds."""
 
     GLOBAL_POSE = 0
     POSITION = 1
@@ -250,8 +254,9 @@ def check(table: Edges | ObservedNodes, is_bias: BoolArray) -> None:
     for end in ends:
         _refuse_rows((end < 0) | (end >= n_nodes),
                      f'{name}: expected a hidden node in 0..{n_nodes - 1}', end)
-    kinds = EdgeKind if isinstance(table, Edges) else ObservedKind
-    _refuse_rows(table.kind >= len(kinds), f'{name}.kind is no {kinds.__name__}', table.kind)
+    known = KNOWN_EDGES if isinstance(table, Edges) else tuple(ObservedKind)
+    _refuse_rows(~np.isin(table.kind, known),
+                 f'{name}.kind is none of {", ".join(kind.name for kind in known)}', table.kind)
     _refuse_rows(table.weight < 0.0, f'{name}.weight is negative', table.weight)
     if isinstance(table, Edges):
         _refuse_rows(table.i == table.j, f'{name}: an edge leads from a node to itself', table.i)

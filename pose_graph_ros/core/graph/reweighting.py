@@ -10,14 +10,8 @@ repeatedly, starting from weights that do not depend on earlier updates.
 The *base weight* of a constraint is its weight without the loss: 1, or less where the errors of
 several measurements are correlated.
 
-With s the square root of the energy e^T information e and k the threshold of a loss [sigma], the
-cost of a constraint is rho(s) instead of s^2, and its weight in H and b is w(s) = rho'(s) / (2 s):
-
-    none     rho = s^2                          w = 1
-    Huber    rho = s^2 up to k, 2 k s - k^2     w = 1, then k / s
-    Cauchy   rho = k^2 log(1 + s^2 / k^2)       w = 1 / (1 + s^2 / k^2)
-
-The weights depend on the estimate and the estimate on the weights, so both are computed in turn.
+The weights (see `losses`) depend on the estimate and the estimate on the weights, so both are
+computed in turn.
 """
 
 from collections.abc import Mapping
@@ -31,6 +25,7 @@ from pose_graph_ros.core.geometry.se2 import FloatArray, IntArray
 from pose_graph_ros.core.graph.constraints import Edges, ObservedNodes
 from pose_graph_ros.core.graph.error_functions import edge_errors, energies, observed_errors
 from pose_graph_ros.core.graph.graph import Graph
+from pose_graph_ros.core.graph.losses import costs_and_weights
 from pose_graph_ros.core.saved_columns import Integers, Numbers
 
 # Number of the newest constraints that are reweighted at each update; as many older ones are, too.
@@ -39,27 +34,6 @@ WINDOW = 200
 LEAST_CHANGE = 0.005
 
 _LOSSES = tuple(Loss)
-
-
-def _weights(loss: Loss, energy: FloatArray, threshold: float) -> FloatArray:
-    """Return the weights of constraints with these unweighted energies, shape (M,), in (0, 1]."""
-    ratio = np.maximum(energy, 0.0) / threshold**2
-    if loss is Loss.HUBER:
-        return np.asarray(1.0 / np.sqrt(np.maximum(ratio, 1.0)))
-    if loss is Loss.CAUCHY:
-        return np.asarray(1.0 / (1.0 + ratio))
-    return np.ones_like(ratio)
-
-
-def _costs(loss: Loss, energy: FloatArray, threshold: float) -> FloatArray:
-    """Return the costs rho of constraints with these unweighted energies, shape (M,) [sigma^2]."""
-    square = threshold**2
-    ratio = np.maximum(energy, 0.0) / square
-    if loss is Loss.HUBER:
-        return np.where(ratio > 1.0, square * (2.0 * np.sqrt(ratio) - 1.0), square * ratio)
-    if loss is Loss.CAUCHY:
-        return np.asarray(square * np.log1p(ratio))
-    return np.asarray(energy)
 
 
 @dataclass(frozen=True, slots=True)
@@ -128,7 +102,7 @@ class _Rows:
         energy, weight = self.energies(graph, rows)
         wanted = np.empty(len(index))
         for loss, threshold, chosen in self.groups(index):
-            wanted[chosen] = _weights(loss, energy[chosen], widened * threshold)
+            _, wanted[chosen] = costs_and_weights(loss, energy[chosen], widened * threshold)
         wanted *= self.base_weights.values[index]
         changed = np.abs(wanted - weight) > least * np.minimum(wanted, weight)
         return dict(zip(rows[changed].tolist(), wanted[changed].tolist(), strict=True))
@@ -250,7 +224,7 @@ class Reweighting:
         for table in (self._edges, self._observed):
             energy, weight = table.energies(graph, table.rows.values)
             for loss, threshold, chosen in table.groups(np.arange(len(table.rows))):
-                costs = _costs(loss, energy[chosen], threshold)
+                costs, _ = costs_and_weights(loss, energy[chosen], threshold)
                 total += float(np.sum(table.base_weights.values[chosen] * costs
                                       - weight[chosen] * energy[chosen]))
         return total

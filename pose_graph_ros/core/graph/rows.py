@@ -11,10 +11,13 @@ import math
 
 from pose_graph_ros.core.compiled.jit import kernel
 from pose_graph_ros.core.graph import factors, tables as tb
+from pose_graph_ros.core.graph.constraints import KNOWN_EDGES, ObservedKind
 
 # Tolerance of the symmetry and the eigenvalues of an information matrix whose diagonal is scaled
 # to 1; a tenth of that in `constraints.check`.
 _TOLERANCE = 1e-6
+_EDGE_KINDS = tuple(map(int, KNOWN_EDGES))
+_OBSERVED_KINDS = tuple(map(int, ObservedKind))
 
 
 @kernel
@@ -149,7 +152,7 @@ def write_edges(  # type: ignore[no-untyped-def]
     valid = True
     for k in range(len(i)):
         e = head[tb.N_EDGES] + k
-        inside = 0 <= i[k] < n_nodes and 0 <= j[k] < n_nodes and kind[k] <= factors.BIAS
+        inside = 0 <= i[k] < n_nodes and 0 <= j[k] < n_nodes and kind[k] in _EDGE_KINDS
         valid = write_edge(
             head, e, i[k], j[k], mean[k], information[k], kind[k], weight[k]) and inside and valid
         if kind[k] == factors.BIAS:
@@ -179,7 +182,7 @@ def write_all_observed(  # type: ignore[no-untyped-def]
     """
     valid = True
     for k in range(len(node)):
-        inside = 0 <= node[k] < n_nodes and kind[k] <= 2
+        inside = 0 <= node[k] < n_nodes and kind[k] in _OBSERVED_KINDS
         if not (write_observed(head, head[tb.N_OBSERVED] + k, node[k], offset[k], mean[k],
                                information[k], kind[k], weight[k]) and inside):
             valid = False

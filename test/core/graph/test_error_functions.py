@@ -11,20 +11,22 @@ import pytest
 from random_graphs import (
     matrix,
     random_edges,
+    random_edges_to_biases,
     random_information,
     random_observed,
     random_poses,
     slow_edge,
     slow_observed,
+    slow_to_bias,
     vector,
 )
 from sparse_system import LinearSystem
 
 from pose_graph_ros.core.geometry import se2
 from pose_graph_ros.core.geometry.se2 import FloatArray
-from pose_graph_ros.core.graph import error_functions
+from pose_graph_ros.core.graph import error_functions, factors, tables as tb
 from pose_graph_ros.core.graph.constraints import EdgeKind, Edges, ObservedKind, ObservedNodes
-from pose_graph_ros.core.graph.graph import Graph, GraphUpdate
+from pose_graph_ros.core.graph.graph import Graph, GraphUpdate, NO_POSES
 
 # Tolerance for coordinates of about 10 m after three or four rotations, each rounded to 2e-15.
 ROUNDING = 1e-13
@@ -143,6 +145,23 @@ def test_angles_are_wrapped_once_and_at_the_end() -> None:
                              [ObservedKind.GLOBAL_POSE])
     assert error_functions.observed_errors(poses, observed)[0, 2] == pytest.approx(
         -0.1, abs=ROUNDING)
+
+
+@pytest.mark.parametrize('kind', EdgeKind)
+def test_an_edge_of_any_kind_has_the_same_error_in_arrays_and_kernels(kind: EdgeKind) -> None:
+    rng, graph = np.random.default_rng(4), Graph()
+    poses, to_bias = random_poses(rng, 2), kind is EdgeKind.BIAS
+    one = (random_edges_to_biases if to_bias else random_edges)(rng, [0], [1])
+    one = Edges(one.i, one.j, one.mean, one.information, [kind], bias=one.bias)
+    graph.apply(GraphUpdate(hidden=poses[:1 if to_bias else 2], biases=poses[1:] if to_bias
+                            else NO_POSES, edges=one))
+    error, *_ = (slow_to_bias(*poses, one.mean[0], one.bias[0]) if to_bias
+                 else slow_edge(*poses, one.mean[0]))
+    energy = np.empty(1)
+    factors.energies(graph.memory.head, energy, np.empty(0))
+    assert energy[0] == pytest.approx(error @ one.information[0] @ error)
+    assert graph.memory['edge_f'][0, tb.ENERGY] == pytest.approx(energy[0])
+    assert graph.energies().chi2 == pytest.approx(energy[0])
 
 
 @given(seeds)

@@ -92,6 +92,10 @@ BAD_UPDATES = {
     'edge_information_zero': (
         lambda: edge(information=[np.zeros((3, 3))]), r'Edges\.information.*row 0'),
     'edge_kind_missing': (lambda: edge(kind=()), r'Edges\.kind.*\(1,\).*\(0,\)'),
+    'edge_kind_unknown': (
+        lambda: edge(kind=[len(EdgeKind)]), 'kind is none of ODOMETRY, LOOP_CLOSURE, BIAS; row 0'),
+    'observed_kind_unknown': (
+        lambda: observed(kind=[255]), 'kind is none of GLOBAL_POSE, .*; row 0: 255'),
     'edge_to_a_pose_as_a_bias': (
         lambda: edge(kind=[EdgeKind.BIAS]), r'kind BIAS to lead to a bias; row 0: 1'),
     'edge_to_a_bias_of_another_kind': (

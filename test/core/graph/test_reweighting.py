@@ -1,6 +1,6 @@
 # Copyright 2026 The pose_graph_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""Robust losses, and reweighting by them, in time independent of the graph."""
+"""Reweighting by robust losses, in time independent of the graph."""
 
 from hypothesis import given, settings, strategies as st
 import numpy as np
@@ -11,11 +11,10 @@ from saved_graphs import assert_same_value
 from pose_graph_ros.core.config import Loss
 from pose_graph_ros.core.graph import error_functions, reweighting
 from pose_graph_ros.core.graph.graph import Graph, GraphUpdate
+from pose_graph_ros.core.graph.losses import costs_and_weights
 from pose_graph_ros.core.graph.reweighting import Reweighting
 
 seeds = st.integers(0, 2**32 - 1)
-LOSSES = (Loss.NONE, Loss.HUBER, Loss.CAUCHY)
-ROBUST = (Loss.HUBER, Loss.CAUCHY)
 some_losses = st.lists(
     st.tuples(st.sampled_from(Loss), st.floats(0.1, 10.0), st.floats(0.05, 1.0)),
     min_size=9, max_size=9)
@@ -51,8 +50,8 @@ def test_every_weight_is_that_of_the_loss_times_the_base_weight(
     found = some.all_changes(graph, widened)
     for changed, energy, with_base in zip(found, energies(graph), (False, True), strict=True):
         expected = {
-            row: (base if with_base else 1.0) * float(reweighting._weights(
-                loss, energy[row:row + 1], widened * threshold)[0])
+            row: (base if with_base else 1.0) * float(costs_and_weights(
+                loss, energy[row:row + 1], widened * threshold)[1][0])
             for row, (loss, threshold, base) in enumerate(chosen[:len(energy)])
             if loss is not Loss.NONE}
         # all others have that weight already
@@ -76,7 +75,7 @@ def test_with_the_cost_chi2_is_the_sum_of_the_robust_costs(
             loss, threshold, base = (
                 chosen[row] if row < len(chosen) else (Loss.NONE, 1.0, 1.0))
             base = base if with_base and loss is not Loss.NONE else 1.0
-            expected += base * float(reweighting._costs(loss, np.array([each]), threshold)[0])
+            expected += base * float(costs_and_weights(loss, np.array([each]), threshold)[0][0])
     assert graph.energies().chi2 + some.cost(graph) == pytest.approx(expected)
 
 
@@ -158,39 +157,3 @@ def test_a_saved_state_goes_on_with_the_constraint_that_is_next(
     for each in (one, other):
         each.add(4, Loss.CAUCHY, 1.0, edge=False)
     assert_same_value(other.saved(), one.saved())
-
-
-@pytest.mark.parametrize('loss', LOSSES)
-@given(st.floats(1e-3, 1e4), st.floats(0.1, 10.0))
-def test_weights_are_the_derivatives_of_the_costs(
-    loss: Loss, energy: float, threshold: float,
-) -> None:
-    step = 1e-4 * energy
-    low, high = reweighting._costs(loss, np.array([energy - step, energy + step]), threshold)
-    weight = reweighting._weights(loss, np.array([energy]), threshold)[0]
-    assert weight == pytest.approx((high - low) / (2.0 * step), rel=1e-3)
-    assert 0.0 < weight <= 1.0
-
-
-@pytest.mark.parametrize('loss', ROBUST)
-def test_small_errors_count_in_full_and_large_ones_less_and_less(loss: Loss) -> None:
-    energy = np.geomspace(1e-12, 1e12, 200)
-    weight, cost = reweighting._weights(loss, energy, 3.0), reweighting._costs(loss, energy, 3.0)
-    assert weight[0] == pytest.approx(1.0)
-    assert cost[0] == pytest.approx(energy[0], rel=1e-6)
-    assert np.all(np.diff(weight) <= 0.0)
-    assert np.all(np.diff(cost) > 0.0)
-    # no jump at the threshold
-    around = np.array([8.999999, 9.000001])
-    assert np.ptp(reweighting._weights(loss, around, 3.0)) < 1e-6
-    assert np.ptp(reweighting._costs(loss, around, 3.0)) < 3e-6
-
-
-@pytest.mark.parametrize('loss', LOSSES)
-def test_no_energy_gives_a_weight_that_is_no_number(loss: Loss) -> None:
-    energy = np.array([0.0, -1e-20, 1e-300, 1e300])
-    with np.errstate(all='raise', under='ignore'):
-        weight = reweighting._weights(loss, energy, 1e-3)
-    assert np.all(np.isfinite(weight))
-    assert np.all(weight > 0.0)
-    assert np.all(np.isfinite(reweighting._costs(loss, energy, 1e-3)))
