@@ -2,6 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Check changes of parameters: whether they are allowed now and consistent; no ROS."""
 
+from array import array
 from collections.abc import Mapping
 from typing import Any
 
@@ -13,11 +14,31 @@ from pose_graph_ros.adapters.parameters import (
     checked,
     checked_value,
     Parameter,
+    unknown,
 )
 from pose_graph_ros.adapters.sources import backend_config
 from pose_graph_ros.core.exceptions import ConfigError
 
 FRAMES = ('map_frame', 'odom_frame', 'base_link_frame')
+NOTHING = (None, 'null', 'None')
+"""What is not set, as rcl and `ros2 param load` read what `ros2 param dump` has written."""
+
+
+def plain(value: Any) -> Any:
+    """Return the value of a ROS parameter with an array as a list."""
+    return list(value) if isinstance(value, array | tuple) else value
+
+
+def is_same(one: Any, other: Any) -> bool:
+    """
+    Tell whether two plain values are equal as parameters: 5 and 5.0 are, 1 and True are not.
+
+    Parameters
+    ----------
+    one, other : object
+
+    """
+    return bool(one == other) and isinstance(one, bool) == isinstance(other, bool)
 
 
 def changed(
@@ -47,7 +68,7 @@ def changed(
     new = {name: values.get(name, parameter.default) for name, parameter in parameters.items()}
     for name, value in wanted.items():
         if name not in parameters:
-            raise ConfigError(f'parameter {name!r} is not known')
+            raise unknown(name, parameters)
         parameter = parameters[name]
         good = checked_value(
             parameter, [] if value is None and parameter.default == [] else value)

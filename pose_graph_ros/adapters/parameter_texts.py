@@ -5,6 +5,7 @@
 from collections.abc import Collection, Iterator
 
 from pose_graph_ros.adapters.parameters import (
+    Change,
     listed_sources,
     Parameter,
     PARAMETERS,
@@ -94,6 +95,17 @@ def _range(parameter: Parameter) -> str:
         return ', '.join(parameter.choices)
     return '' if parameter.smallest is None else (
         f'{parameter.smallest:g} to {parameter.largest:g}')
+
+
+def constraints(parameter: Parameter) -> str:
+    """Return what `ros2 param describe` tells of the values that a parameter can have."""
+    sizes = ' or '.join(str(size) for size in parameter.sizes if size > 0)
+    facts = (
+        f'one of: {", ".join(parameter.choices)}' if len(parameter.choices) > 0 else '',
+        f'{sizes} numbers' + (', or unset' if 0 in parameter.sizes else '') if sizes else '',
+        f'unit: {parameter.unit}' if parameter.unit != '' else '',
+        'only while the node is not configured' if parameter.change is Change.UNCONFIGURED else '')
+    return '; '.join(fact for fact in facts if fact != '')
 
 
 def _yaml(value: Value) -> str:

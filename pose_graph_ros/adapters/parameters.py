@@ -7,13 +7,14 @@ The node declares its parameters from the tables, and the parameter file and doc
 generated from them. Defaults come from `core.config`. This module imports no ROS.
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
 from enum import Enum
 import re
 import sys
 from typing import Any
 
+from pose_graph_ros.adapters.parameter_names import explanation
 from pose_graph_ros.adapters.sources import DEFAULT_SOURCES, Kind, KNOWN_SOURCES, source_names
 from pose_graph_ros.core import config
 from pose_graph_ros.core.exceptions import ConfigError
@@ -202,6 +203,8 @@ SOURCE_PARAMETERS: tuple[Parameter, ...] = (
               kinds=_NOT_CLOSURES, change=Change.UNCONFIGURED),
 )
 
+OF_SOURCES = frozenset(parameter.name for parameter in SOURCE_PARAMETERS)
+
 # Names of sources are prefixes of parameters and of counts in the diagnostics.
 _NAME = re.compile(r'[A-Za-z][A-Za-z0-9_]*')
 _TOPIC = re.compile(r'(~?/)?[A-Za-z_][A-Za-z0-9_]*(/[A-Za-z_][A-Za-z0-9_]*)*')
@@ -277,14 +280,24 @@ def checked(given: Mapping[str, Any]) -> dict[str, Any]:
     parameters = all_parameters(given)
     known = {parameter.name for parameter in parameters}
     for name in sorted(set(given) - known):
-        source, dot, own = name.partition('.')
-        hint = ''
-        if dot and own in {parameter.name for parameter in SOURCE_PARAMETERS}:
-            hint = (f': a source of type {given.get(f"{source}.type", "") or "its kind"} has none'
-                    if f'{source}.type' in known else f': {source} is not in sources')
-        raise ConfigError(f'parameter {name!r} is not known{hint}')
+        raise unknown(name, known)
     return {parameter.name: checked_value(parameter, given[parameter.name])
             if parameter.name in given else parameter.default for parameter in parameters}
+
+
+def unknown(name: str, known: Collection[str]) -> ConfigError:
+    """
+    Return the error for a parameter that is not known, with what may have been meant.
+
+    Parameters
+    ----------
+    name : str
+    known : collection of str
+        Names of all parameters.
+
+    """
+    hint = explanation(name, known, OF_SOURCES)
+    return ConfigError(f'parameter {name} is not known' + (hint and f': {hint}'))
 
 
 def checked_value(parameter: Parameter, value: Any) -> Any:

@@ -2,7 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """The managed node: its parameters and the transitions of its lifecycle."""
 
-from array import array
 from collections.abc import Callable, Mapping, Sequence
 import logging
 import traceback
@@ -12,17 +11,26 @@ from rcl_interfaces.msg import FloatingPointRange, ParameterDescriptor, SetParam
 from rclpy.lifecycle import LifecycleNode, LifecycleState, TransitionCallbackReturn
 from rclpy.parameter import Parameter as RosParameter
 
-from pose_graph_ros.adapters.parameter_changes import changed, require_together
+from pose_graph_ros.adapters.parameter_changes import (
+    changed,
+    is_same,
+    NOTHING,
+    plain,
+    require_together,
+)
+from pose_graph_ros.adapters.parameter_names import is_own
+from pose_graph_ros.adapters.parameter_texts import constraints
 from pose_graph_ros.adapters.parameters import (
     all_parameters,
     Change,
     checked,
     listed_sources,
+    OF_SOURCES,
     Parameter,
     PARAMETERS,
-    SOURCE_PARAMETERS,
     source_parameters,
     type_parameter,
+    unknown,
 )
 from pose_graph_ros.core.exceptions import ConfigError
 from pose_graph_ros.ros.services import Services
@@ -45,7 +53,7 @@ class PoseGraphNode(LifecycleNode):
         self._session: Session | None = None
         self._offered: Services | None = None
         self._given = self._declared()  # the node's own parameters that have a value
-        self._own = frozenset(parameter.name for parameter in all_parameters(self._given))
+        self._own = {parameter.name: parameter for parameter in all_parameters(self._given)}
         self._warn_of_unknown()
         self.add_on_set_parameters_callback(self._on_set_parameters)
         self.add_post_set_parameters_callback(self._on_parameters_set)
@@ -148,21 +156,51 @@ class PoseGraphNode(LifecycleNode):
                 default = None if parameter.default == [] else parameter.default
                 self.declare_parameter(parameter.name, default, _descriptor(parameter))
             value = self.get_parameter(parameter.name).value
-            # files of `ros2 param dump` have null for values that are not set, read as a text
-            if value is not None and not (value == 'null' and isinstance(parameter.default, list)):
-                given[parameter.name] = list(value) if isinstance(value, array | tuple) else value
+            if value is not None and (
+                    value not in NOTHING or not isinstance(parameter.default, list)):
+                given[parameter.name] = plain(value)
         return given
 
     def _warn_of_unknown(self) -> None:
         """Warn of unknown parameters: rclpy does not, as a file may be for several nodes."""
         overrides: Mapping[str, object] = getattr(self, '_parameter_overrides', {})
-        own = {parameter.name for parameter in SOURCE_PARAMETERS}
-        for name in sorted(set(overrides) - self._own):
-            source, _, leaf = name.rpartition('.')
-            if leaf in own:
-                self.get_logger().warning(
-                    f'parameter {name} is not known: {source} is not in sources, or is of a type '
-                    'without this parameter')
+        for name in sorted(overrides):
+            # those of rclpy are declared, or will be with the publishers and subscriptions
+            if not self.has_parameter(name) and not name.startswith('qos_overrides.') and (
+                    is_own(name, self._own, OF_SOURCES)):
+                self.get_logger().warning(str(unknown(name, self._own)))
+
+    def set_parameters_atomically(
+        self, parameter_list: list[RosParameter],
+    ) -> SetParametersResult:
+        """
+        Set several parameters, all or none, as the services for parameters do.
+
+        A parameter, also a read-only one, can be set to the value that it has, and one that is
+        not set to nothing, so that a node takes what `ros2 param dump` has written of it.
+
+        Parameters
+        ----------
+        parameter_list : list of rclpy.parameter.Parameter
+
+        """
+        changes = []
+        for parameter in parameter_list:
+            name = parameter.name
+            if not self.has_parameter(name):
+                return SetParametersResult(successful=False, reason=str(unknown(name, self._own)))
+            value = self._plain(name, parameter.value)
+            if not is_same(value, self._plain(name, self.get_parameter(name).value)):
+                changes.append(parameter if value != [] else RosParameter(
+                    name, RosParameter.Type.DOUBLE_ARRAY, []))  # rclpy would undeclare it
+        if len(changes) == 0:
+            return SetParametersResult(successful=True)
+        return super().set_parameters_atomically(changes)
+
+    def _plain(self, name: str, value: Any) -> Any:
+        """Return a value of a parameter with its arrays as lists, also where it is unset."""
+        can_be_unset = name in self._own and self._own[name].default == []
+        return [] if can_be_unset and value in NOTHING else plain(value)
 
     def _on_set_parameters(self, parameters: list[RosParameter]) -> SetParametersResult:
         """Return whether all of some changes can be made now, and why not."""
@@ -193,6 +231,7 @@ class PoseGraphNode(LifecycleNode):
 def _descriptor(parameter: Parameter) -> ParameterDescriptor:
     descriptor = ParameterDescriptor(
         description=f'{parameter.description} [{parameter.unit}]'.removesuffix(' []'),
+        additional_constraints=constraints(parameter),
         read_only=parameter.change is Change.START,
         dynamic_typing=not isinstance(parameter.default, bool | str))
     if parameter.smallest is not None and parameter.largest is not None:

@@ -15,7 +15,12 @@ import pytest
 import yaml
 
 from pose_graph_ros.adapters.parameter_changes import changed, require_together
-from pose_graph_ros.adapters.parameter_texts import as_markdown, as_yaml, sources_as_markdown
+from pose_graph_ros.adapters.parameter_texts import (
+    as_markdown,
+    as_yaml,
+    constraints,
+    sources_as_markdown,
+)
 from pose_graph_ros.adapters.parameters import (
     all_parameters,
     Change,
@@ -174,9 +179,9 @@ def test_a_wrong_name_or_type_is_refused(values: dict[str, object]) -> None:
 def test_a_name_that_is_not_known_has_to_have_a_type() -> None:
     with pytest.raises(ConfigError, match=r'wheels\.type: expected one of odometry, global_pose'):
         checked({'sources': ['wheels']})
-    with pytest.raises(ConfigError, match=r"wheels\.topic' is not known: wheels is not in"):
+    with pytest.raises(ConfigError, match=r'wheels\.topic is not known: wheels is not in'):
         checked({'wheels.topic': 'wheels'})
-    with pytest.raises(ConfigError, match=r'a source of type odometry has none'):
+    with pytest.raises(ConfigError, match='a source of the type of wheels has none'):
         checked({'sources': ['wheels'], 'wheels.type': 'odometry', 'wheels.lever_arm': [0.0, 0.0]})
 
 
@@ -252,6 +257,15 @@ def test_every_parameter_says_what_it_does() -> None:
     assert all(len(parameter.kinds) > 0 for parameter in SOURCE_PARAMETERS)
 
 
+@pytest.mark.parametrize(('name', 'text'), [
+    ('fix.robust_loss', 'one of: none, huber, cauchy'),
+    ('datum', '2 or 3 numbers, or unset; unit: deg, deg, rad; only while the node is not '
+              'configured'),
+    ('fix.sigma_floor', '2 numbers; unit: m, rad'), ('frequency', 'unit: Hz'), ('publish_tf', '')])
+def test_a_parameter_says_which_values_it_can_have(name: str, text: str) -> None:
+    assert constraints(next(each for each in all_parameters({}) if each.name == name)) == text
+
+
 # --- Changes while the node runs -----------------------------------------------------------------
 
 PRESENT = checked({'sources': ['odom', 'global_pose', 'fix', 'imu']})
@@ -294,7 +308,8 @@ def test_what_can_be_unset_is_unset(nothing: object) -> None:
     ({'fix.lever_arm': array('d', [math.nan, 0.0])}, r'fix\.lever_arm: .* got nan'),
     ({'fix.lever_arm': b'ab'}, r'fix\.lever_arm: expected a list of numbers'),
     ({'fix.robust_loss': 'l1'}, r'fix\.robust_loss: expected one of none, huber, cauchy'),
-    ({'no_such': 1.0}, r"'no_such' is not known"),
+    ({'no_such': 1.0}, 'no_such is not known'),
+    ({'frequncy': 1.0}, r'frequncy is not known: did you mean frequency\?'),
     ({'sources': ['odom']}, r'sources is read at the start: .*start the node again'),
     ({'fix.type': 'imu'}, r'fix\.type is read at the start'),
     ({'fix.sigma_ceiling': 0.001}, r'fix\.sigma_ceiling: expected at least the floor 0\.01'),

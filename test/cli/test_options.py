@@ -76,7 +76,7 @@ def test_a_file_without_a_section_for_the_node_sets_nothing(tmp_path: Path) -> N
 
 @pytest.mark.parametrize(('text', 'said'), [
     ('/**: {ros__parameters: {frequency: 0.0}}', r'frequency: expected a number in'),
-    ('/**: {ros__parameters: {no_such: 0.0}}', r"'no_such' is not known"),
+    ('/**: {ros__parameters: {no_such: 0.0}}', 'no_such is not known'),
     ('/**: {frequency: 1.0}', r'params\.yaml: /\*\*: expected ros__parameters'),
     ('pose_graph: 5', r'params\.yaml: pose_graph: expected ros__parameters'),
     ('/**: [', r'params\.yaml: cannot be read as yaml'),

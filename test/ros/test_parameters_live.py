@@ -3,16 +3,19 @@
 """`ros2 param`, quality of service, and two robots on one machine: the real node over DDS."""
 
 from array import array
+from collections.abc import Mapping
 from pathlib import Path
 
 from circle import drive, fix_at, odometry_at, path_error
 from harness import Client, NodeProcess
 import pytest
-from rcl_interfaces.srv import DescribeParameters, GetParameters, ListParameters
-from rclpy.parameter import parameter_value_to_python
+from rcl_interfaces.msg import Parameter
+from rcl_interfaces.srv import DescribeParameters, GetParameters, ListParameters, SetParameters
+from rclpy.parameter import get_parameter_value, parameter_value_to_python
 from rclpy.qos import QoSHistoryPolicy, QoSReliabilityPolicy
 import yaml
 
+from pose_graph_ros.adapters.parameter_texts import constraints
 from pose_graph_ros.adapters.parameters import all_parameters, Change
 
 
@@ -28,6 +31,7 @@ def test_every_parameter_is_described(client: Client) -> None:
         parameter = own[descriptor.name]
         assert parameter.description in descriptor.description
         assert descriptor.read_only == (parameter.change is Change.START)
+        assert descriptor.additional_constraints == constraints(parameter)
         if parameter.smallest is not None:
             (interval,) = descriptor.floating_point_range
             assert (interval.from_value, interval.to_value) == (
@@ -55,7 +59,9 @@ def test_a_change_takes_effect_or_is_refused_with_the_reason(
             ('sources', ['odom'], 'read-only'), ('fix.robust_loss', 'l1', 'none, huber, cauchy'),
             ('frequency', -1.0, 'range'), ('frequency', 'often', ''),
             ('datum', [48.0, 11.0], 'datum'), ('fix.lever_arm', [1.0], '2 numbers'),
-            ('no_such_parameter', 1.0, ''), ('fix.sigma_ceiling', 0.001, 'ceiling')):
+            ('no_such_parameter', 1.0, 'is not known'),
+            ('fix.sigma_celing', 1.0, 'did you mean fix.sigma_ceiling?'),
+            ('fix.sigma_ceiling', 0.001, 'ceiling')):
         successful, reason = client.set_parameter(name, value)
         assert not successful, name
         assert expected in reason, (name, reason)
@@ -122,6 +128,49 @@ def test_two_robots_on_one_machine(tmp_path: Path) -> None:
 def test_it_can_have_another_name(node: NodeProcess) -> None:
     with Client(int(node.env['ROS_DOMAIN_ID']), name='back_end') as client:
         assert client.trigger('reset').success
+
+
+def parameter_texts(client: Client) -> dict[str, str]:
+    """Return what `ros2 param dump` writes of all parameters, by name."""
+    create = client.node.create_client
+    names = client.call(create(ListParameters, 'pose_graph/list_parameters'),
+                        ListParameters.Request()).result.names
+    values = client.call(create(GetParameters, 'pose_graph/get_parameters'),
+                         GetParameters.Request(names=names)).values
+    plain = [parameter_value_to_python(value) for value in values]
+    return {name: str(list(value) if isinstance(value, array) else value)
+            for name, value in zip(names, plain, strict=True)}
+
+
+def load(client: Client, texts: Mapping[str, str]) -> dict[str, str]:
+    """Set parameters as `ros2 param load` does; return the reasons of those that were refused."""
+    parameters = [Parameter(name=name, value=get_parameter_value(text))
+                  for name, text in texts.items()]
+    results = client.call(client.node.create_client(SetParameters, 'pose_graph/set_parameters'),
+                          SetParameters.Request(parameters=parameters)).results
+    return {name: result.reason for name, result in zip(texts, results, strict=True)
+            if not result.successful}
+
+
+def test_what_param_dump_wrote_can_be_loaded_again(node: NodeProcess, client: Client) -> None:
+    texts = parameter_texts(client)
+    assert texts['datum'] == texts['fix.covariance_override'] == 'None'
+    assert texts['qos_overrides./odom.subscription.depth'] == '1000'
+    assert load(client, texts) == {}
+    assert parameter_texts(client) == texts
+
+    # what is unset there is unset again, and can be set again
+    for _ in range(2):
+        assert client.set_parameter('fix.covariance_override', [2.0]) == (True, '')
+        assert load(client, texts) == {}
+        assert parameter_texts(client)['fix.covariance_override'] == '[]'
+    assert client.set_parameter('fix.covariance_override', [2.0]) == (True, '')
+    assert load(client, {'fix.covariance_override': '[]'}) == {}
+
+    # a read-only parameter with another value is refused as ever
+    refused = load(client, {**texts, 'autostart': 'False', 'sources': '[odom]', 'frequncy': '1.0'})
+    assert refused.keys() == {'autostart', 'sources', 'frequncy'}
+    assert 'read-only' in refused['autostart']
 
 
 def test_a_file_that_param_dump_wrote_can_be_given_again(tmp_path: Path) -> None:

@@ -25,6 +25,7 @@ import numpy as np
 import pytest
 from rclpy.qos import QoSDurabilityPolicy, QoSProfile, QoSReliabilityPolicy
 from sensor_msgs.msg import Imu, NavSatFix
+import yaml
 
 from pose_graph_ros.core.geometry import se2
 
@@ -127,13 +128,22 @@ def test_two_of_each_from_a_file_and_one_falls_silent(tmp_path: Path) -> None:
 
 def test_the_file_of_defaults_is_taken_and_what_is_not_known_is_said(tmp_path: Path) -> None:
     file = Path(__file__).resolve().parents[2] / 'config' / 'pose_graph_full.yaml'
+    (tmp_path / 'misspelt.yaml').write_text(yaml.safe_dump({
+        '/**': {'ros__parameters': {
+            'odom': {'sigma_distnce': 0.1}, 'fine': 1, 'use_sim_time': False}},
+        '/other': {'ros__parameters': {'map_frme': 'world'}}}))
     arguments = ('--params-file', str(file), '-p', 'wheels.type:=odometry',
-                 '-p', 'odom.lever_arm:=[1.0, 0.0]', '-p', 'other_node.gain:=1.0')
+                 '--params-file', str(tmp_path / 'misspelt.yaml'), '-p', 'frequncy:=3.0',
+                 '-p', 'odom.lever_arm:=[1.0, 0.0]', '-p', 'other_node.gain:=1.0',
+                 '-p', 'qos_overrides./scan.publisher.depth:=3')
     with NodeProcess(tmp_path, arguments) as node, connected(node) as client:
         play(client, range(10), every(1, client.odom, odometry_at))
         log = node.stderr()
         assert 'parameter wheels.type is not known' in log
         assert 'parameter odom.lever_arm is not known' in log
+        assert log.count('parameter frequncy is not known: did you mean frequency?') == 1
+        assert log.count('odom.sigma_distnce is not known: did you mean odom.sigma_distance?') == 1
+        assert log.count('is not known') == 5  # and `fine`, which is like no other
         assert 'other_node' not in log
 
 
