@@ -190,9 +190,13 @@ class PoseGraphNode(LifecycleNode):
             if not self.has_parameter(name):
                 return SetParametersResult(successful=False, reason=str(unknown(name, self._own)))
             value = self._plain(name, parameter.value)
-            if not is_same(value, self._plain(name, self.get_parameter(name).value)):
-                changes.append(parameter if value != [] else RosParameter(
-                    name, RosParameter.Type.DOUBLE_ARRAY, []))  # rclpy would undeclare it
+            refused_by_rclpy = value == [] or self.describe_parameter(name).read_only
+            if refused_by_rclpy and is_same(
+                    value, self._plain(name, self.get_parameter(name).value)):
+                continue
+            # without a value rclpy would undeclare it
+            changes.append(parameter if value != [] else RosParameter(
+                name, RosParameter.Type.DOUBLE_ARRAY, []))
         if len(changes) == 0:
             return SetParametersResult(successful=True)
         return super().set_parameters_atomically(changes)
