@@ -1,107 +1,165 @@
 # Copyright 2026 The pose_graph_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""After the warm-up nothing is left to be compiled, whatever happens on the way."""
+"""After the warm-up nothing is left to be compiled, whatever the engine does."""
 
+from collections.abc import Iterator
+import importlib
+import inspect
+import itertools
+import os
+import pkgutil
 import subprocess
 import sys
+from types import CodeType, FunctionType, ModuleType
 
+from numba.core.dispatcher import Dispatcher
 import pytest
 
-from pose_graph_ros.core import warm_up
-
-# In an interpreter of its own, where nothing has been compiled or loaded before.
-RUN = """
-import numpy as np
-from pose_graph_ros.core.warm_up import warm_up
-from pose_graph_ros.core.batch import optimizer
+from pose_graph_ros import core
 from pose_graph_ros.core.compiled import jit
-from pose_graph_ros.core.geometry import se2
-from pose_graph_ros.core.backend import PoseGraphBackend
-from pose_graph_ros.core.config import BackendConfig, SmootherConfig
-from pose_graph_ros.core.graph.graph import GraphUpdate
-from pose_graph_ros.core.batch.optimizer import Status
-from pose_graph_ros.core.measurements import GlobalPose, LoopClosure, OdometrySample, Position
+from pose_graph_ros.core.warm_up import warm_up
+
+
+def run_alone(code: str, **environment: str) -> str:
+    """Run code in an interpreter of its own, where nothing has been compiled or loaded before."""
+    path = os.pathsep.join(map(os.path.abspath, sys.path))
+    done = subprocess.run(
+        [sys.executable, '-c', code], capture_output=True, text=True, check=False,
+        env={**os.environ, 'PYTHONPATH': path, **environment})
+    assert done.returncode == 0, f'exit code {done.returncode}: {done.stderr[-3000:]}'
+    return done.stdout
+
+
+# --- what must be covered: all kernels that functions of Python call -----------------------------
+
+def modules_of_core() -> list[ModuleType]:
+    return [importlib.import_module(found.name)
+            for found in pkgutil.walk_packages(core.__path__, 'pose_graph_ros.core.')]
+
+
+def functions_of(owner: ModuleType | type, module: str) -> Iterator[FunctionType]:
+    """Yield the functions of a module or class that Python runs."""
+    for each in vars(owner).values():
+        if isinstance(each, Dispatcher):
+            continue
+        member = getattr(each, 'fget', None) or inspect.unwrap(getattr(each, '__func__', each))
+        if getattr(member, '__module__', None) != module:
+            continue
+        if isinstance(member, FunctionType):
+            yield member
+        elif isinstance(member, type):
+            yield from functions_of(member, module)
+
+
+def codes(code: CodeType) -> Iterator[CodeType]:
+    yield code
+    for constant in code.co_consts:
+        if isinstance(constant, CodeType):
+            yield from codes(constant)
+
+
+def kernels_in(function: FunctionType) -> Iterator[Dispatcher]:
+    """Yield the kernels whose names occur in a function, as globals or after modules."""
+    for code in codes(function.__code__):
+        known = [function.__globals__.get(name) for name in code.co_names]
+        spaces = [vars(value) for value in known if isinstance(value, ModuleType)]
+        in_modules = itertools.chain.from_iterable(
+            map(space.get, code.co_names) for space in spaces)
+        for value in itertools.chain(known, in_modules):
+            if isinstance(value, Dispatcher):
+                yield value
+
+
+def called_from_python() -> set[str]:
+    names = {id(kernel): name for name, kernel in jit._registered.items()}
+    return {names[id(kernel)] for module in modules_of_core()
+            for function in functions_of(module, module.__name__)
+            for kernel in kernels_in(function)}
+
+
+def test_the_kernels_that_python_calls_are_those_that_declare_their_signature() -> None:
+    found = called_from_python()
+    assert len(found) > 20
+    assert found == set(jit.declared())
+
+
+def test_the_warm_up_imports_all_modules_with_kernels() -> None:
+    modules_of_core()
+    names = run_alone('from pose_graph_ros.core import warm_up\n'
+                      'print(*warm_up.jit.declared())').split()
+    assert sorted(names) == sorted(jit.declared())
+
+
+def test_every_declared_kernel_is_ready_after_it() -> None:
+    warm_up()
+    for name in jit.declared():
+        assert jit._signatures[name] in jit._registered[name].overloads, name
+
+
+def test_a_call_with_other_types_is_an_error_not_a_compilation() -> None:
+    for _ in range(2):      # at the first call, and once it is compiled
+        with pytest.raises(TypeError):
+            jit._registered['pose_graph_ros.core.smoother.step.run']('text', 1, 2)
+        warm_up()
+
+
+# --- what the engine does ------------------------------------------------------------------------
+
+LONG_RUN = """
+from helpers.all_kernels import call_all_kernels
+from pose_graph_ros.core.compiled import jit
+from pose_graph_ros.core.warm_up import warm_up
 
 def signatures():
-    return {name: [str(s) for s in kernel.signatures] for name, kernel in jit._registered.items()}
+    return {name: list(map(str, kernel.signatures)) for name, kernel in jit._registered.items()}
 
 assert warm_up() > 0.0
 before = signatures()
-
-rng = np.random.default_rng(0)
-SECOND = 10**9
-for config in (BackendConfig(), BackendConfig(smoother=SmootherConfig(max_iterations=1))):
-    backend, pose, truth = PoseGraphBackend(config), np.array([3.0, 1.0, 0.4]), [np.zeros(3)]
-    step = np.array([1.0, 0.0, 2.0 * np.pi / 100])
-    for k in range(700):
-        stamp = (k + 1) * SECOND
-        backend.add_odometry(OdometrySample(stamp, pose))
-        at = truth[-1]
-        if k > 60 and k % 5 == 0:
-            backend.add_measurement(Position(
-                stamp, at[:2] + rng.normal(0.0, 0.5, 2), 0.25 * np.eye(2), np.array([0.3, 0.1])),
-                'fix')
-        if k > 60 and k % 11 == 0:
-            backend.add_measurement(GlobalPose(
-                stamp - 30 * SECOND, truth[-31], 0.01 * np.eye(3)), 'late')
-        if k > 110 and k % 17 == 0:
-            backend.add_measurement(LoopClosure(
-                stamp, se2.between(truth[-101], at), 0.01 * np.eye(3),
-                reference_ns=stamp - 100 * SECOND), 'scan')
-        if k == 600:    # far off: it is optimised as a whole
-            backend.add_measurement(GlobalPose(stamp, at + 500.0, 0.01 * np.eye(3)), 'outlier')
-        pose = se2.compose(pose, step + rng.normal(0.0, (0.02, 0.01, 0.003)))
-        truth.append(se2.compose(at, step))
-        backend.update()
-        backend.estimate()
-    smoother = backend._smoother
-    for update in (
-            GraphUpdate(remove_edges=(800,)) if backend.graph.n_edges > 800 else GraphUpdate(),
-            GraphUpdate(weigh_observed={3: 0.1}, weigh_edges={5: 2.0}),
-            GraphUpdate(fix=(7,)), GraphUpdate(free=(7,)), GraphUpdate(remove_observed=(4,))):
-        smoother.update(update)
-    smoother.covariances()
-    smoother.joint_covariance(5, 600)
-    alone = smoother.update(GraphUpdate(hidden=np.zeros((1, 3))))
-    assert alone.status is Status.FAILED, alone
-    backend.optimize()
-    backend.update()
-
+call_all_kernels(700)
+call_all_kernels(300, max_iterations=1)
 grown = {name: found for name, found in signatures().items() if found != before[name]}
 assert not grown, grown
 """
-
-
-# The next start must not say that it compiles.
-COMPLETE = """
-from pose_graph_ros.core.warm_up import warm_up
+BUILD = """
+from pose_graph_ros.core.backend import PoseGraphBackend
 from pose_graph_ros.core.compiled import jit
+
+PoseGraphBackend()
+compiled = [name for name, kernel in jit._registered.items() if kernel.signatures]
+assert not compiled, compiled
+"""
+KEPT = """
+from pose_graph_ros.core.compiled import jit
+from pose_graph_ros.core.warm_up import warm_up
+
 warm_up()
-missing = [name for name, kernel in jit._registered.items() if not kernel._cache.holds_code()]
+missing = [name for name in jit.declared() if not jit.is_cached(name)]
 assert jit.is_cached(), missing
 """
 
 
-def run_alone(code: str) -> None:
-    done = subprocess.run(
-        [sys.executable, '-c', code], capture_output=True, text=True, check=False)
-    assert done.returncode == 0, f'exit code {done.returncode}: {done.stderr[-3000:]}'
-
-
-@pytest.mark.timeout(300)
-def test_after_the_warm_up_the_code_of_all_kernels_is_kept() -> None:
-    run_alone(COMPLETE)
-
-
 @pytest.mark.timeout(300)
 def test_a_long_run_after_the_warm_up_compiles_nothing() -> None:
-    run_alone(RUN)
+    run_alone(LONG_RUN)
 
 
-def test_the_warm_up_can_be_stopped_between_its_steps(monkeypatch: pytest.MonkeyPatch) -> None:
-    done: list[int] = []
-    monkeypatch.setattr(warm_up, 'STEPS', tuple(lambda k=k: done.append(k) for k in range(5)))
-    assert warm_up.warm_up(lambda: len(done) == 2) >= 0.0
-    assert done == [0, 1]
-    warm_up.warm_up()
-    assert done == [0, 1, 0, 1, 2, 3, 4]
+def test_a_backend_is_built_without_compiling() -> None:
+    """So that a node is up before anything is compiled."""
+    run_alone(BUILD)
+
+
+@pytest.mark.timeout(300)
+def test_the_next_start_finds_the_code_of_all_kernels() -> None:
+    run_alone(KEPT)
+
+
+def test_it_can_be_stopped_between_two_kernels() -> None:
+    run_alone("""
+from pose_graph_ros.core import warm_up
+loaded = []
+warm_up.jit.compile_kernels = loaded.extend
+warm_up.warm_up(lambda: len(loaded) == 3)
+assert len(loaded) == 3, loaded
+warm_up.warm_up()
+assert loaded[3:] == warm_up.jit.declared()
+""")

@@ -20,7 +20,7 @@ import numpy as np
 
 from pose_graph_ros.core.batch import complex_system
 from pose_graph_ros.core.batch.complex_system import Terms
-from pose_graph_ros.core.compiled.jit import kernel
+from pose_graph_ros.core.compiled.jit import kernel, ROWS
 from pose_graph_ros.core.elimination import symbolic
 from pose_graph_ros.core.exceptions import LinearSolveError
 from pose_graph_ros.core.geometry.se2 import FloatArray
@@ -63,7 +63,7 @@ def chordal(graph: Graph, cliques: symbolic.Cliques) -> FloatArray:
     return np.asarray(_poses(head, u, t))
 
 
-@kernel
+@kernel(signature=(tb.HEAD,))
 def _n_biases(head):  # type: ignore[no-untyped-def]
     node_i, n = tb.node_i(head), 0
     for v in range(head[tb.N_NODES]):
@@ -71,7 +71,7 @@ def _n_biases(head):  # type: ignore[no-untyped-def]
     return n
 
 
-@kernel(allocates=True)
+@kernel(signature=(tb.HEAD,), allocates=True)
 def _rotation_terms(head):  # type: ignore[no-untyped-def]
     """Return the terms for u_j = exp(i th_z) u_i and u_i = exp(i (th_z - th_o))."""
     node_f, edge_f, observed_f = tb.node_f(head), tb.edge_f(head), tb.observed_f(head)
@@ -94,7 +94,7 @@ def _rotation_terms(head):  # type: ignore[no-untyped-def]
     return Terms(of_edges, of_observed, known)
 
 
-@kernel(allocates=True)
+@kernel(signature=(tb.HEAD, ROWS), allocates=True)
 def _translation_terms(head, u):  # type: ignore[no-untyped-def]
     """Return the terms for t_j = t_i + u_i t_z and t_i = t_z - u_i t_o, as complex numbers."""
     node_f, edge_f, observed_f = tb.node_f(head), tb.edge_f(head), tb.observed_f(head)
@@ -119,7 +119,7 @@ def _translation_terms(head, u):  # type: ignore[no-untyped-def]
     return Terms(of_edges, of_observed, known)
 
 
-@kernel(allocates=True)
+@kernel(signature=(tb.HEAD, ROWS, ROWS), allocates=True)
 def _poses(head, u, t):  # type: ignore[no-untyped-def]
     """Return poses, shape (N, 3), from headings u and positions t; those of fixed nodes stay."""
     node_f, node_i = tb.node_f(head), tb.node_i(head)

@@ -17,9 +17,10 @@ update matrices are on a stack, since in postorder those of the children of a cl
 import math
 from typing import Any, NamedTuple
 
+from numba import types
 import numpy as np
 
-from pose_graph_ros.core.compiled.jit import kernel
+from pose_graph_ros.core.compiled.jit import kernel, ROWS
 from pose_graph_ros.core.compiled.simd import (
     add,
     copy,
@@ -30,6 +31,7 @@ from pose_graph_ros.core.compiled.simd import (
     times,
     WIDTH,
 )
+from pose_graph_ros.core.elimination import symbolic
 from pose_graph_ros.core.elimination.fronts import LEAST_PIVOT, padded
 from pose_graph_ros.core.graph import tables as tb
 
@@ -45,6 +47,9 @@ class Terms(NamedTuple):
     """Real and imaginary parts of v, used for fixed nodes only, shape (N, 2)."""
 
 
+TERMS = types.NamedUniTuple(ROWS, len(Terms._fields), Terms)
+
+
 class _Front(NamedTuple):
     """Upper triangle of a clique's equations in rows of `ld` numbers, the last one the rhs."""
 
@@ -53,7 +58,7 @@ class _Front(NamedTuple):
     ld: Any
 
 
-@kernel(allocates=True)
+@kernel(signature=(tb.HEAD, symbolic.CLIQUES, TERMS), allocates=True)
 def solve(head, cliques, terms):  # type: ignore[no-untyped-def]
     """
     Return the minimum v, real and imaginary parts in shape (N, 2), and an undetermined node or -1.

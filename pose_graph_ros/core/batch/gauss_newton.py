@@ -14,7 +14,7 @@ the Jacobians change fast, it does not converge.
 
 import math
 
-from pose_graph_ros.core.compiled.jit import kernel
+from pose_graph_ros.core.compiled.jit import kernel, NUMBER, ROWS
 from pose_graph_ros.core.elimination.assembly import eliminate_clique
 from pose_graph_ros.core.elimination.fronts import backward_rows, forward_rows, solve_rows
 from pose_graph_ros.core.graph import factors, tables as tb
@@ -24,7 +24,7 @@ SUM_ROUNDING = 1e-12
 COORDINATE_ROUNDING = 2.0**-52
 
 
-@kernel
+@kernel(signature=(tb.HEAD, ROWS))
 def keep_poses(head, poses):  # type: ignore[no-untyped-def]
     """Copy the poses of all nodes into an array, shape (N, 3)."""
     node_f = tb.node_f(head)
@@ -33,7 +33,7 @@ def keep_poses(head, poses):  # type: ignore[no-untyped-def]
             poses[v, k] = node_f[v, tb.POSE + k]
 
 
-@kernel
+@kernel(signature=(tb.HEAD, ROWS))
 def put_poses(head, poses):  # type: ignore[no-untyped-def]
     """Write the poses of all nodes, shape (N, 3), unchanged, and make them the references."""
     node_f = tb.node_f(head)
@@ -51,7 +51,7 @@ def _refer_to_poses(head):  # type: ignore[no-untyped-def]
         factors.refer_to_pose(node_f[v])
 
 
-@kernel
+@kernel(signature=(tb.HEAD,))
 def linearize(head):  # type: ignore[no-untyped-def]
     """Make the poses the references and linearize all constraints there."""
     _refer_to_poses(head)
@@ -61,7 +61,7 @@ def linearize(head):  # type: ignore[no-untyped-def]
         factors.linearize_observed(head, k)
 
 
-@kernel
+@kernel(signature=(tb.HEAD, NUMBER))
 def eliminate(head, damping):  # type: ignore[no-untyped-def]
     """
     Eliminate all cliques with a damping lambda, which is 0 for a Gauss-Newton step.
@@ -88,7 +88,7 @@ def _update_pose(f):  # type: ignore[no-untyped-def]
     f[tb.POSE + 2] = factors.wrap(f[tb.REF + 2] + f[tb.DELTA + 2])
 
 
-@kernel
+@kernel(signature=(tb.HEAD,))
 def gauss_newton_step(head):  # type: ignore[no-untyped-def]
     """Solve for all nodes and move them; return the largest change of a coordinate [m, rad]."""
     node_f, pool_f, work_f = tb.node_f(head), tb.pool_f(head), tb.work_f(head)
@@ -117,7 +117,7 @@ def gauss_newton_step(head):  # type: ignore[no-untyped-def]
     return largest
 
 
-@kernel
+@kernel(signature=(tb.HEAD, ROWS))
 def chord_step(head, right):  # type: ignore[no-untyped-def]
     """
     Move all nodes by a step from the present poses, with the factorisation of an earlier step.
@@ -177,7 +177,7 @@ def _larger(largest, number):  # type: ignore[no-untyped-def]
     return largest if number <= largest else number
 
 
-@kernel
+@kernel(signature=(tb.HEAD, ROWS))
 def evaluate(head, right):  # type: ignore[no-untyped-def]
     """
     Return chi2 at the poses and an estimate of its rounding error.
@@ -254,7 +254,7 @@ def _weighted_error(f, ex, ey, eth):  # type: ignore[no-untyped-def]
     return gx, gy, gth, ex * gx + ey * gy + eth * gth
 
 
-@kernel
+@kernel(signature=(tb.HEAD, ROWS))
 def product_with_step(head, right):  # type: ignore[no-untyped-def]
     """Return the scalar product of an array, shape (N, 3), and the last step (DELTA)."""
     node_f = tb.node_f(head)
@@ -265,7 +265,7 @@ def product_with_step(head, right):  # type: ignore[no-untyped-def]
     return total
 
 
-@kernel
+@kernel(signature=(tb.HEAD,))
 def settle(head):  # type: ignore[no-untyped-def]
     """
     Evaluate all constraints and bring the tables into the state after a step of the smoother.

@@ -3,17 +3,19 @@
 """
 The decorator of all compiled functions.
 
-A kernel is a function of arrays and numbers that Numba compiles to machine code, once for each
-signature it is called with. `kernel_cache` keeps the code, so that only the first start takes the
-time to compile. Kernels release the GIL and divide as NumPy does: x / 0.0 is inf or NaN, never an
-exception.
+A kernel is a function of arrays and numbers that Numba compiles to machine code. Those that Python
+calls declare the types of their arguments: nothing has to be called to compile them
+(`compile_kernels`), and other types are a TypeError instead of another version of the code. All
+others are compiled as parts of these. `kernel_cache` keeps the code, so that only the first start
+takes the time to compile. Kernels release the GIL and divide as NumPy does: x / 0.0 is inf or NaN,
+never an exception.
 
 A kernel may only use module globals that are kernels, intrinsics, numbers, arrays, enumerations or
 tuples of these. `kernel_cache` recompiles a kernel if any of them changes, in whichever module it
 is defined.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from contextlib import suppress
 from types import MappingProxyType
 from typing import Any
@@ -36,20 +38,31 @@ OPTIONS = MappingProxyType({
 OWNS = MappingProxyType({'_nrt': True})
 BORROWS = MappingProxyType({'_nrt': False})
 
+# Types of arguments in signatures: numbers, then C-contiguous arrays.
+INTEGER, NUMBER, FLAG = types.int64, types.float64, types.boolean
+INTEGERS, INDICES, BYTES, NUMBERS, ROWS, MATRICES = (
+    types.int64[::1], types.int32[::1], types.uint8[::1], types.float64[::1],
+    types.float64[:, ::1], types.float64[:, :, ::1])
+Signature = tuple[types.Type, ...]
+
 _registered: dict[str, Dispatcher] = {}
+_signatures: dict[str, Signature] = {}
 
 
 def kernel(
-    function: Function | None = None, *, allocates: bool = False, **options: Any,
+    function: Function | None = None, *, signature: Signature | None = None,
+    allocates: bool = False, **options: Any,
 ) -> Function:
     """
-    Return a function that is compiled at its first call with each signature.
+    Return a function that is compiled at its first call.
 
     It is a decorator, used as `@kernel` or with options as `@kernel(fastmath=True)`.
 
     Parameters
     ----------
     function : callable, optional
+    signature : tuple of numba types
+        Of the arguments, for a kernel that Python calls; a call with other types raises TypeError.
     allocates : bool
         Whether the kernel allocates arrays, or calls a kernel that returns a new array. Only then
         are references counted; without it all arrays must belong to the caller or the tables.
@@ -57,17 +70,23 @@ def kernel(
 
     """
     if function is None:
-        return lambda function: _compiled(function, allocates, options)
-    return _compiled(function, allocates, options)
+        return lambda function: _kernel(function, signature, allocates, options)
+    return _kernel(function, signature, allocates, options)
 
 
-def _compiled(function: Function, allocates: bool, options: dict[str, Any]) -> Any:
+def _kernel(
+    function: Function, signature: Signature | None, allocates: bool, options: dict[str, Any],
+) -> Any:
     ownership = OWNS if allocates else BORROWS
     compiled = numba.njit(**{**OPTIONS, **ownership, **options})(function)
     if isinstance(compiled, Dispatcher):    # NUMBA_DISABLE_JIT=1 leaves functions as they are
         _widen_calls(compiled)
         if options.get('inline') != 'always':   # inlined kernels are compiled within their callers
-            _registered[f'{function.__module__}.{function.__qualname__}'] = compiled
+            name = f'{function.__module__}.{function.__qualname__}'
+            _registered[name] = compiled
+            if signature is not None:
+                _signatures[name] = signature
+                _compile_at_first_call(compiled, signature)
         with suppress(RuntimeError):    # no folder for the cache; kernel_cache has logged why
             # as njit(cache=True) does, with our own class of cache
             compiled._cache = KernelCache(compiled)  # noqa: SLF001
@@ -94,15 +113,59 @@ def _widest(argument: Any) -> Any:
     return types.int64 if isinstance(argument, types.Integer) else argument
 
 
-def is_cached(*kernels: Function) -> bool:
-    """
-    Tell whether all kernels have valid code in the cache, for at least one signature each.
+def _compile_at_first_call(compiled: Dispatcher, signature: Signature) -> None:
+    """Make the first call compile a kernel for its declared signature alone."""
+    def compile_for(*arguments: Any) -> Any:
+        given = tuple(map(compiled.typeof_pyval, arguments))
+        convert = compiled.typingctx.can_convert
+        if len(given) != len(signature) or None in map(convert, given, signature):
+            raise TypeError(f'{compiled.py_func.__name__} takes {signature}, not {given}')
+        _compile(compiled, signature)
+        return compiled.overloads[signature].entry_point
 
-    This takes about a millisecond per kernel, and neither loads nor compiles code. By default it
-    tells so of all kernels imported so far.
+    # Numba calls this with arguments that it has no code for, and what it returns with them
+    compiled._compile_for_args = compile_for  # noqa: SLF001
+
+
+def _compile(compiled: Dispatcher, signature: Signature) -> None:
+    """Compile a kernel, or load it from the cache; then it raises TypeError for other types."""
+    if signature not in compiled.overloads:
+        compiled.compile(signature)
+    compiled.disable_compile()
+
+
+def declared() -> list[str]:
+    """Return the names of all kernels with a declared signature that were imported so far."""
+    return list(_signatures)
+
+
+def compile_kernels(names: Iterable[str] | None = None) -> None:
     """
-    caches = [kernel._cache for kernel in kernels or _registered.values()  # noqa: SLF001
-              if isinstance(kernel, Dispatcher)]
+    Compile kernels, or load them from the cache.
+
+    Parameters
+    ----------
+    names : iterable of str
+        Some of those that `declared` returns; all of them by default.
+
+    """
+    for name in declared() if names is None else names:
+        _compile(_registered[name], _signatures[name])
+
+
+def is_cached(*names: str) -> bool:
+    """
+    Tell whether kernels have valid code in the cache.
+
+    This takes about a millisecond per kernel, and neither loads nor compiles code.
+
+    Parameters
+    ----------
+    *names : str
+        Some of those that `declared` returns; all of them by default.
+
+    """
+    caches = [_registered[name]._cache for name in names or _signatures]  # noqa: SLF001
     return all(isinstance(cache, KernelCache) and cache.holds_code() for cache in caches)
 
 
@@ -110,18 +173,3 @@ def can_be_kept() -> bool:
     """Tell whether all kernels imported so far have a folder for their cached code."""
     return all(isinstance(dispatcher._cache, KernelCache)  # noqa: SLF001
                for dispatcher in _registered.values())
-
-
-def compile_only(compiled: Any, signature: tuple[Any, ...]) -> None:
-    """
-    Compile a kernel for one signature; a call with another one then raises TypeError.
-
-    Parameters
-    ----------
-    compiled : kernel
-    signature : tuple of numba types
-
-    """
-    if isinstance(compiled, Dispatcher) and len(compiled.signatures) == 0:
-        compiled.compile(signature)
-        compiled.disable_compile()

@@ -15,7 +15,7 @@ The elements are the cliques, so the ordering yields the symbolic factorisation 
 
 import numpy as np
 
-from pose_graph_ros.core.compiled.jit import kernel
+from pose_graph_ros.core.compiled.jit import INDICES, INTEGER, kernel
 
 
 @kernel(allocates=True)
@@ -58,7 +58,7 @@ def _put(i, member, nodes, end):  # type: ignore[no-untyped-def]
     return end
 
 
-@kernel(allocates=True)
+@kernel(signature=(INTEGER, INTEGER, INTEGER, INDICES, INDICES), allocates=True)
 def minimum_degree(n, n_elements, n_last, start, adjacency):  # type: ignore[no-untyped-def]
     """
     Order n nodes and return the cliques of the elimination, children before parents.

@@ -4,14 +4,14 @@
 
 import numpy as np
 
-from pose_graph_ros.core.compiled.jit import kernel
+from pose_graph_ros.core.compiled.jit import INDICES, INTEGER, kernel
 from pose_graph_ros.core.graph import tables as tb
 
 # Number of the newest nodes that are eliminated last, since the next constraints involve them.
 NEWEST_LAST = 10
 
 
-@kernel
+@kernel(signature=(INDICES, INTEGER))
 def newest_last(affected, newest):  # type: ignore[no-untyped-def]
     """
     Return how many of the newest nodes were moved to the end of the list, in order of age.

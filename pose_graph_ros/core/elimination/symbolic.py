@@ -12,9 +12,10 @@ therefore mostly adjacent in the parent's front as well, and are added in runs.
 
 from typing import Any, NamedTuple
 
+from numba import types
 import numpy as np
 
-from pose_graph_ros.core.compiled.jit import kernel
+from pose_graph_ros.core.compiled.jit import INDICES, INTEGER, INTEGERS, kernel
 from pose_graph_ros.core.elimination.assembly import work_size
 from pose_graph_ros.core.elimination.ordering import minimum_degree
 from pose_graph_ros.core.elimination.quotient_graph import amalgamate, newest_last, structure
@@ -39,6 +40,11 @@ class Cliques(NamedTuple):
     """Nodes of all cliques."""
 
 
+# What `minimum_degree` returns.
+ELIMINATED = types.Tuple((INTEGER, INTEGERS, INDICES, INDICES, INDICES))
+CLIQUES = types.NamedUniTuple(INDICES, len(Cliques._fields), Cliques)
+
+
 class Analysis(NamedTuple):
     """The cliques and the memory that they need."""
 
@@ -60,14 +66,14 @@ def analyse(head: tb.IntHead) -> Analysis:
     return Analysis(cliques, *_required_memory(cliques))
 
 
-@kernel(allocates=True)
+@kernel(signature=(tb.HEAD, INDICES), allocates=True)
 def _adjacency(head, order):  # type: ignore[no-untyped-def]
     """Return the lists of neighbours of all nodes, in this order, for `minimum_degree`."""
     _, start, adjacency = structure(head, np.empty(0, np.int32), order)
     return start, adjacency
 
 
-@kernel(allocates=True)
+@kernel(signature=(INDICES, ELIMINATED), allocates=True)
 def _amalgamated(order, eliminated):  # type: ignore[no-untyped-def]
     """Return the cliques found by `minimum_degree`, amalgamated and in postorder."""
     n_raw, offset, raw_frontal, raw_parent, raw_nodes = eliminated
@@ -107,7 +113,7 @@ def _amalgamated(order, eliminated):  # type: ignore[no-untyped-def]
     return cliques
 
 
-@kernel(allocates=True)
+@kernel(signature=(CLIQUES,), allocates=True)
 def _required_memory(cliques):  # type: ignore[no-untyped-def]
     """Return the memory of the cliques in both pools, and the work space of the largest front."""
     need_f, need_i, largest = np.int64(0), np.int64(0), np.int64(0)
@@ -183,7 +189,7 @@ def _write_separators(cliques, separators, raw_nodes, n):  # type: ignore[no-unt
             filled[holders[m]] += 1
 
 
-@kernel(allocates=True)
+@kernel(signature=(tb.HEAD, CLIQUES), allocates=True)
 def plant(head, cliques):  # type: ignore[no-untyped-def]
     """
     Replace all cliques in the tables by those of a symbolic factorisation, without values.
@@ -217,7 +223,7 @@ def plant(head, cliques):  # type: ignore[no-untyped-def]
     head[tb.LOG_F_END] = head[tb.LOG_I_END] = head[tb.N_FREED] = 0
 
 
-@kernel(allocates=True)
+@kernel(signature=(tb.HEAD,), allocates=True)
 def loose_part(head):  # type: ignore[no-untyped-def]
     """
     Find the parts of the graph that contain no fixed and no observed node.

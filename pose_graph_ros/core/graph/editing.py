@@ -9,7 +9,17 @@ to be eliminated again. Edits of existing rows are not checked here; `graph.Grap
 
 import math
 
-from pose_graph_ros.core.compiled.jit import kernel
+from pose_graph_ros.core.compiled.jit import (
+    BYTES,
+    FLAG,
+    INTEGER,
+    INTEGERS,
+    kernel,
+    MATRICES,
+    NUMBER,
+    NUMBERS,
+    ROWS,
+)
 from pose_graph_ros.core.graph import factors, rows, tables as tb, transaction_log
 
 # Results of `add_rows`.
@@ -211,7 +221,7 @@ def _set_fixed(head, v, fixed):  # type: ignore[no-untyped-def]
         touch(head, v)
 
 
-@kernel
+@kernel(signature=(tb.HEAD, INTEGER, INTEGER, NUMBER))
 def edit(head, what, number, value):  # type: ignore[no-untyped-def]
     """
     Edit one row.
@@ -237,7 +247,9 @@ def _lengths_agree(n, mean, information, kind, weight):  # type: ignore[no-untyp
             and len(weight) == n)
 
 
-@kernel
+@kernel(signature=(
+    tb.HEAD, ROWS, ROWS, INTEGERS, INTEGERS, ROWS, MATRICES, BYTES, NUMBERS, ROWS, INTEGERS,
+    ROWS, ROWS, MATRICES, BYTES, NUMBERS, FLAG))
 def add_rows(  # type: ignore[no-untyped-def]
     head, hidden, biases, i, j, mean, information, kind, weight, bias, node, offset,
     observed_mean, observed_information, observed_kind, observed_weight, checked,
@@ -291,7 +303,7 @@ def add_rows(  # type: ignore[no-untyped-def]
     return ADDED
 
 
-@kernel
+@kernel(signature=(tb.HEAD,))
 def restart(head):  # type: ignore[no-untyped-def]
     """Remove all cliques, linearize all constraints at the present poses and touch all nodes."""
     node_f, edge_f, observed_f = tb.node_f(head), tb.edge_f(head), tb.observed_f(head)

@@ -38,7 +38,7 @@ clique.
 
 import math
 
-from pose_graph_ros.core.compiled.jit import kernel
+from pose_graph_ros.core.compiled.jit import kernel, NUMBERS
 from pose_graph_ros.core.graph import tables as tb
 from pose_graph_ros.core.graph.constraints import EdgeKind
 
@@ -379,7 +379,7 @@ def add_observed(head, k, a, front, ld):  # type: ignore[no-untyped-def]
     front[(a + 2) * ld + right] -= px * gx + py * gy + gth
 
 
-@kernel
+@kernel(signature=(tb.HEAD, NUMBERS, NUMBERS))
 def energies(head, edges, observed):  # type: ignore[no-untyped-def]
     """
     Write the unweighted energies of all constraints at the present poses.

@@ -6,11 +6,9 @@ from collections.abc import Iterable, Mapping, Sequence
 from types import MappingProxyType
 from typing import Any, Final, NamedTuple
 
-from numba import types
 import numpy as np
 import numpy.typing as npt
 
-from pose_graph_ros.core.compiled.jit import compile_only
 from pose_graph_ros.core.exceptions import GraphUpdateError
 from pose_graph_ros.core.geometry import se2
 from pose_graph_ros.core.geometry.se2 import BoolArray, FloatArray, IntArray
@@ -25,12 +23,6 @@ NO_EDGES: Final = Edges()
 NOTHING_OBSERVED: Final = ObservedNodes()
 NO_WEIGHTS: Final[Mapping[int, float]] = MappingProxyType({})
 
-_NUMBERS, _INTEGERS, _POSES, _MATRICES, _KINDS = (
-    types.float64[::1], types.int64[::1], types.float64[:, ::1], types.float64[:, :, ::1],
-    types.uint8[::1])
-_ADD_ROWS = (
-    _INTEGERS, _POSES, _POSES, _INTEGERS, _INTEGERS, _POSES, _MATRICES, _KINDS, _NUMBERS, _POSES,
-    _INTEGERS, _POSES, _POSES, _MATRICES, _KINDS, _NUMBERS, types.boolean)
 # Columns of edge_f with the column `Edges.bias`.
 _BIAS_COLUMNS = [tb.BIAS_OFFSET, tb.BIAS_OFFSET + 1, tb.FACTOR_T, tb.FACTOR_TH]
 
@@ -97,7 +89,6 @@ class Graph:
 
     def __init__(self) -> None:
         self.memory = Memory()
-        compile_only(editing.add_rows, _ADD_ROWS)   # `apply` converts other arrays
 
     @property
     def n_nodes(self) -> int:

@@ -30,6 +30,10 @@ from numba.np.arrayobj import populate_array
 import numpy as np
 import numpy.typing as npt
 
+from pose_graph_ros.core.compiled.jit import INTEGERS
+
+HEAD = INTEGERS     # the type of the head, in signatures of kernels
+
 # --- columns ------------------------------------------------------------------------------------
 
 # node_f; a solve changes the columns before SCALE_T only.

@@ -10,7 +10,7 @@ to the pools on commit. The first entry of the log holds the counters, scalars a
 the update began.
 """
 
-from pose_graph_ros.core.compiled.jit import kernel
+from pose_graph_ros.core.compiled.jit import kernel, ROWS
 from pose_graph_ros.core.graph import pools, tables as tb
 
 # Kinds of entries of the log; an entry ends with its row (but for START) and its kind in log_i.
@@ -178,7 +178,7 @@ def renew_values(head, c):  # type: ignore[no-untyped-def]
     row[tb.VALUES_BORN] = head[tb.UPDATE]
 
 
-@kernel
+@kernel(signature=(tb.HEAD,))
 def begin(head):  # type: ignore[no-untyped-def]
     """
     Log counters, scalars and lists; return whether the counters of stamps are within `LAST_STAMP`.
@@ -236,7 +236,7 @@ def commit(head):  # type: ignore[no-untyped-def]
     head[tb.N_FREED] = head[tb.LOG_F_END] = head[tb.LOG_I_END] = 0
 
 
-@kernel
+@kernel(signature=(tb.HEAD,))
 def rollback(head):  # type: ignore[no-untyped-def]
     """End an update: restore all rows logged since `begin`, the newest entry first."""
     node_f, edge_f, observed_f = tb.node_f(head), tb.edge_f(head), tb.observed_f(head)
@@ -290,7 +290,7 @@ def rollback(head):  # type: ignore[no-untyped-def]
     head[tb.N_FREED] = head[tb.LOG_F_END] = head[tb.LOG_I_END] = 0
 
 
-@kernel
+@kernel(signature=(tb.HEAD, ROWS))
 def poses_before(head, poses):  # type: ignore[no-untyped-def]
     """Write the poses, shape (N, 3), as the update found them; those of new nodes as they are."""
     node_f, log_f, log_i = tb.node_f(head), tb.log_f(head), tb.log_i(head)

@@ -11,7 +11,7 @@ odometry predicts it, and no other node moves.
 
 import math
 
-from pose_graph_ros.core.compiled.jit import kernel
+from pose_graph_ros.core.compiled.jit import FLAG, kernel, NUMBERS, ROWS
 from pose_graph_ros.core.elimination.fronts import LEAST_PIVOT
 from pose_graph_ros.core.graph import factors, pools, rows, tables as tb, transaction_log
 from pose_graph_ros.core.graph.editing import scale_by_edge, scale_by_observed
@@ -98,7 +98,7 @@ def _copy_rows(front, ld, begin, end, at, pool_f):  # type: ignore[no-untyped-de
             at += 1
 
 
-@kernel
+@kernel(signature=(tb.HEAD, NUMBERS, ROWS, NUMBERS, ROWS, FLAG))
 def extend(  # type: ignore[no-untyped-def]
     head, mean, information, observed_mean, observed_information, with_observed,
 ):

@@ -20,7 +20,7 @@ import math
 
 import numpy as np
 
-from pose_graph_ros.core.compiled.jit import kernel
+from pose_graph_ros.core.compiled.jit import INTEGER, kernel, ROWS
 from pose_graph_ros.core.elimination import clique_frames
 from pose_graph_ros.core.graph import tables as tb
 from pose_graph_ros.core.graph.pools import row_start
@@ -28,7 +28,7 @@ from pose_graph_ros.core.graph.pools import row_start
 _FAST = {'reassoc', 'contract', 'nsz'}
 
 
-@kernel(allocates=True)
+@kernel(signature=(tb.HEAD, ROWS), allocates=True)
 def newest_covariance(head, out):  # type: ignore[no-untyped-def]
     """
     Write the covariance of the newest pose, shape (3, 3), in constant time if alone in a root.
@@ -59,7 +59,7 @@ def newest_covariance(head, out):  # type: ignore[no-untyped-def]
     return True
 
 
-@kernel(allocates=True)
+@kernel(signature=(tb.HEAD, INTEGER, ROWS), allocates=True)
 def node_covariance(head, v, out):  # type: ignore[no-untyped-def]
     """
     Write the covariance of a node.
@@ -75,7 +75,7 @@ def node_covariance(head, v, out):  # type: ignore[no-untyped-def]
     _product(y, y, n_rows, out)
 
 
-@kernel(allocates=True)
+@kernel(signature=(tb.HEAD, INTEGER, INTEGER, ROWS), allocates=True)
 def pair_covariance(head, i, j, out):  # type: ignore[no-untyped-def]
     """
     Write the joint covariance of two nodes.

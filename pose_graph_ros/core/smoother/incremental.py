@@ -4,11 +4,9 @@
 
 from typing import Any, NamedTuple
 
-from numba import types
 import numpy as np
 
 from pose_graph_ros.core.batch.optimizer import chi2_of, Status
-from pose_graph_ros.core.compiled.jit import compile_only
 from pose_graph_ros.core.config import SmootherConfig
 from pose_graph_ros.core.exceptions import GraphUpdateError
 from pose_graph_ros.core.geometry import se2
@@ -46,9 +44,6 @@ class UpdateResult(NamedTuple):
 _EXTENDED_RESULT = UpdateResult(Status.CONVERGED, '', 0, 1, 1, 1)
 _NO_POSE: FloatArray = np.zeros(3)
 _NO_MATRIX: FloatArray = np.zeros((3, 3))
-_EXTEND_SIGNATURE = (
-    types.int64[::1], types.float64[::1], types.float64[:, ::1], types.float64[::1],
-    types.float64[:, ::1], types.boolean)
 
 
 class IncrementalSmoother:
@@ -69,7 +64,6 @@ class IncrementalSmoother:
         scalars[tb.SETTING_ALPHA] = self._config.alpha
         scalars[tb.SETTING_BUDGET] = self._config.budget
         scalars[tb.SETTING_SHARE] = self._config.budget_share
-        compile_only(chain.extend, _EXTEND_SIGNATURE)  # `extend` converts other arguments
 
     @property
     def poses(self) -> FloatArray:

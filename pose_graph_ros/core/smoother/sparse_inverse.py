@@ -16,7 +16,7 @@ import math
 
 import numpy as np
 
-from pose_graph_ros.core.compiled.jit import kernel
+from pose_graph_ros.core.compiled.jit import kernel, MATRICES
 from pose_graph_ros.core.elimination import clique_frames
 from pose_graph_ros.core.graph import tables as tb
 from pose_graph_ros.core.graph.pools import row_start
@@ -24,7 +24,7 @@ from pose_graph_ros.core.graph.pools import row_start
 _FAST = {'reassoc', 'contract', 'nsz'}
 
 
-@kernel(allocates=True)
+@kernel(signature=(tb.HEAD, MATRICES), allocates=True)
 def all_covariances(head, out):  # type: ignore[no-untyped-def]
     """
     Write the covariances of all nodes into zeros of shape (N, 3, 3).

@@ -7,7 +7,7 @@ The loop is one kernel, since in most steps its parts take less time than the Py
 would. It returns to Python for more memory and for the batch fallback, and can be re-entered.
 """
 
-from pose_graph_ros.core.compiled.jit import kernel
+from pose_graph_ros.core.compiled.jit import INTEGER, kernel
 from pose_graph_ros.core.graph import tables as tb, transaction_log
 from pose_graph_ros.core.smoother import relinearization, tree_update
 
@@ -47,7 +47,7 @@ def _reset_counters(head):  # type: ignore[no-untyped-def]
     tb.scalars(head)[tb.ERROR2_BEFORE] = 0.0
 
 
-@kernel(allocates=True)    # the elimination does
+@kernel(signature=(tb.HEAD, INTEGER, INTEGER), allocates=True)    # the elimination does
 def run(head, max_iterations, entered):  # type: ignore[no-untyped-def]
     """
     Return SETTLED once the estimate is up to date with all touched nodes and waiting constraints.

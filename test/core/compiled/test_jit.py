@@ -12,6 +12,7 @@ import sys
 import tempfile
 from types import ModuleType
 
+from helpers.all_kernels import call_all_kernels
 import numba
 from numba.core.caching import FunctionCache, NullCache
 from numba.core.dispatcher import Dispatcher
@@ -20,7 +21,6 @@ import numpy as np
 import pytest
 
 from pose_graph_ros.core.compiled import jit, kernel_cache
-from pose_graph_ros.core.warm_up import warm_up
 
 TREE = Path(__file__).resolve().parents[3]
 PACKAGE = 'kernels_of_a_test'
@@ -51,18 +51,20 @@ import logging
 logging.basicConfig()
 import numpy as np
 from {PACKAGE} import outer
-from pose_graph_ros.core.compiled.jit import is_cached
-kept = is_cached()
+from pose_graph_ros.core.compiled import jit
+kept = jit.is_cached(*jit._registered)
 print(outer.total(np.ones(3)), outer.total(np.ones(3, dtype=np.int32)), kept)
 if hasattr(outer.total, 'stats'):
     print(sum(outer.total.stats.cache_hits.values()), outer.total.stats.cache_path)
 """
 ONES = np.ones(3)
+TOTAL = f'{PACKAGE}.outer.total'
 
 
 @pytest.fixture(autouse=True)
 def own_registry(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(jit, '_registered', {})
+    monkeypatch.setattr(jit, '_signatures', {})
 
 
 @pytest.fixture
@@ -133,25 +135,31 @@ def test_other_users_of_numba_keep_their_cache(folder: Path) -> None:
     assert dict(os.environ) == environment
 
 
-def test_warm_up_can_be_stopped(monkeypatch: pytest.MonkeyPatch) -> None:
-    done: list[int] = []
-    steps = tuple((lambda number=number: done.append(number)) for number in range(3))
-    monkeypatch.setattr('pose_graph_ros.core.warm_up.STEPS', steps)
-    assert warm_up(lambda: len(done) == 2) >= 0.0
-    assert done == [0, 1]
-    warm_up()
-    assert done == [0, 1, 0, 1, 2]
+def test_declared_signature_is_the_only_one() -> None:
+    @jit.kernel(signature=(jit.NUMBER, jit.NUMBERS))
+    def scaled_sum(factor, a):
+        return factor * a.sum()
+
+    with pytest.raises(TypeError, match='scaled_sum takes'):
+        scaled_sum(2.0, np.ones(3, dtype=np.float32))
+    assert scaled_sum.signatures == []
+    assert scaled_sum(2, ONES) == 6.0   # an integer is converted
+    assert len(scaled_sum.signatures) == 1
+    for wrong in (np.ones(3, dtype=np.float32), np.ones((2, 2)), np.ones(6)[::2], 'text'):
+        with pytest.raises(TypeError):
+            scaled_sum(2.0, wrong)
+    assert len(scaled_sum.signatures) == 1
 
 
 # --- what is kept is used, and only if it is right ----------------------------------------------
 
 def test_kernels_free_every_array_that_they_make() -> None:
     """Those that count no references must not be handed arrays to keep (`allocates`)."""
-    warm_up()
+    call_all_kernels(150)
     _nrt_python.memsys_enable_stats()
     try:
         before = rtsys.get_allocation_stats()
-        warm_up()
+        call_all_kernels(150)
         after = rtsys.get_allocation_stats()
     finally:
         _nrt_python.memsys_disable_stats()
@@ -161,11 +169,11 @@ def test_kernels_free_every_array_that_they_make() -> None:
 
 def test_second_start_takes_all_from_the_cache(folder: Path) -> None:
     first = start()
-    assert not jit.is_cached()
+    assert not jit.is_cached(TOTAL)
     assert first.total(ONES) == 6.0
     assert not loaded(first.total)
     again = start()
-    assert jit.is_cached()
+    assert jit.is_cached(TOTAL)
     assert again.total is not first.total
     assert again.total(ONES) == 6.0
     assert loaded(again.total)
@@ -181,7 +189,7 @@ def test_change_in_what_a_kernel_calls_is_noticed(
     assert start().total(ONES) == 6.0
     (folder / 'inner.py').write_text(INNER.replace(*change))
     changed = start()
-    assert not jit.is_cached()
+    assert not jit.is_cached(TOTAL)
     assert changed.total(ONES) == 15.0
     again = start()
     assert again.total(ONES) == 15.0
@@ -356,7 +364,7 @@ def test_kernel_without_a_folder_works(
     module = start()
     assert module.total(ONES) == 6.0
     assert isinstance(module.total._cache, NullCache)
-    assert not jit.is_cached()
+    assert not jit.is_cached(TOTAL)
     assert 'compiles them again' in caplog.text
 
 
