@@ -137,6 +137,7 @@ class Session:
             self._subscribe(
                 source.topic, CLASSES[source.kind], partial(self._on_message, source), qos)
         self._watch_time()
+        self.input.liveness.resume(time.monotonic())
         self.active = True
         topics = ', '.join(self.node.resolve_topic_name(source.topic) for source in sources)
         self.node.get_logger().info(f'ready, listening to {topics}')

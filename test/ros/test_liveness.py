@@ -66,6 +66,71 @@ def test_a_silence_does_not_make_a_source_slow() -> None:
     assert liveness.silent(199.9) == ['fix']
 
 
+def reports(liveness: Liveness, source: str, times: list[float], end: float) -> int:
+    """Return how often a source is newly silent while odometry goes on at 10 Hz."""
+    count, said, left = 0, False, list(times)
+    for now in np.arange(0.0, end, 0.1).tolist():
+        liveness.receive('odom', now)
+        while len(left) > 0 and left[0] <= now:
+            liveness.receive(source, left.pop(0))
+        silent = source in liveness.silent(now)
+        count += silent and not said
+        said = silent
+    assert liveness.silent(now) in ([], [source])
+    return count
+
+
+def test_a_sporadic_source_is_not_reported_after_each_message() -> None:
+    rng = np.random.default_rng(3)
+    times = np.cumsum(rng.exponential(10.0, 150)).tolist()
+    assert reports(Liveness(), 'global_pose', times, 1200.0) <= 3
+    # seen now and then, at a high rate: two silences are reported until that is its rhythm
+    times = [start + 0.1 * step for start in range(0, 1200, 60) for step in range(100)]
+    assert reports(Liveness(), 'global_pose', times, 1200.0) <= 2
+    # sent by hand: no rhythm at all
+    assert reports(Liveness(), 'global_pose', [5.0, 6.0, 8.0, 100.0], 300.0) == 0
+
+
+def test_each_outage_of_a_regular_source_is_reported() -> None:
+    times = np.arange(0.0, 1200.0, 0.2)
+    for begin in (200.0, 700.0, 1190.0):
+        times = times[(times < begin) | (times > begin + 20.0)]
+    assert reports(Liveness(), 'fix', times.tolist(), 1200.0) == 3
+
+
+def test_the_time_without_subscriptions_is_no_silence() -> None:
+    liveness = Liveness()
+    receive_all(liveness, 'odom', 0.0, 10.0, 0.1)
+    receive_all(liveness, 'fix', 0.0, 10.0, 0.2)
+    liveness.resume(300.0)
+    assert liveness.quiet(300.0) == 0.0
+    receive_all(liveness, 'odom', 300.1, 301.0, 0.1)
+    assert liveness.silent(301.0) == []
+    assert liveness.silence('fix', 301.0) == pytest.approx(291.0)
+    receive_all(liveness, 'odom', 301.1, 303.0, 0.1)
+    # it does not come back
+    assert liveness.silent(303.0) == ['fix']
+    assert liveness.rate('odom') == pytest.approx(10.0)
+
+
+def test_it_is_said_when_nothing_comes_at_all() -> None:
+    liveness = Liveness(rare=['loop_closure'])
+    assert liveness.quiet(1000.0) == 0.0
+    liveness.receive('odom', 0.0)
+    assert liveness.quiet(9.0) == 0.0
+    assert liveness.quiet(11.0) == 11.0
+    receive_all(liveness, 'odom', 11.0, 20.0, 0.1)
+    liveness.receive('loop_closure', 25.0)
+    assert liveness.quiet(32.0) == 0.0
+    assert liveness.silent(32.0) == ['odom']
+    assert liveness.quiet(36.0) == 11.0
+    # slower than that
+    slow = Liveness()
+    receive_all(slow, 'odom', 0.0, 200.0, 20.0)
+    assert slow.quiet(280.0) == 0.0
+    assert slow.quiet(320.0) == 120.0
+
+
 def drive(
     continuity: PoseContinuity, *places: tuple[float, float], newest: float = 1e9,
 ) -> list[bool]:

@@ -163,6 +163,9 @@ def test_an_inactive_session_keeps_its_graph_and_grows_it_when_it_is_active_agai
     assert active.session.input.received['odom'] == 50
     assert active.session.worker.estimate is before
     active.activate()
+    # as long as it was inactive nobody was silent
+    liveness = active.session.input.liveness
+    assert all(arrivals.since > arrivals.at for arrivals in liveness._arrivals.values())
     active.drive(8.0, 5.0)
     after = active.session.worker.estimate
     assert after.n_hidden > before.n_hidden
