@@ -20,7 +20,6 @@ def main(args: list[str] | None = None) -> int:
         signal.signal(each, lambda number, _: received.append(number))
     # ruff: noqa: PLC0415  the imports take most of the start; signals must be handled before
     import logging
-    import traceback
 
     import rclpy
     from rclpy.exceptions import InvalidParameterTypeException, InvalidParameterValueException
@@ -34,7 +33,7 @@ def main(args: list[str] | None = None) -> int:
     memory.give_back_large_arrays()
     # by default the thread of the engine would delay messages by 5 ms at a time
     sys.setswitchinterval(SWITCH_INTERVAL)
-    logging.basicConfig(level=logging.WARNING, format='[%(levelname)s] [%(name)s] %(message)s')
+    logging.captureWarnings(capture=True)  # the node logs them, as all that is logged
     try:
         rclpy.init(args=args, signal_handler_options=SignalHandlerOptions.NO)
         node = PoseGraphNode()
@@ -52,7 +51,7 @@ def main(args: list[str] | None = None) -> int:
             executor.spin_once(timeout_sec=0.1)
         except Exception:
             # no message, and no error of the middleware, may end the node
-            node.get_logger().error(f'a callback failed:\n{traceback.format_exc()}')
+            logging.getLogger(__name__).exception('a callback failed')
     node.close()
     executor.shutdown()
     node.destroy_node()

@@ -8,6 +8,7 @@ import traceback
 from typing import Any
 
 from rcl_interfaces.msg import FloatingPointRange, ParameterDescriptor, SetParametersResult
+from rclpy.clock import Clock, ClockType
 from rclpy.lifecycle import LifecycleNode, LifecycleState, TransitionCallbackReturn
 from rclpy.parameter import Parameter as RosParameter
 
@@ -33,6 +34,7 @@ from pose_graph_ros.adapters.parameters import (
     unknown,
 )
 from pose_graph_ros.core.exceptions import ConfigError
+from pose_graph_ros.ros.log import NodeLog, PERIOD
 from pose_graph_ros.ros.services import Services
 from pose_graph_ros.ros.session import Session
 
@@ -49,6 +51,8 @@ class PoseGraphNode(LifecycleNode):
 
     def __init__(self, **node_options: Any) -> None:
         super().__init__('pose_graph', **node_options)
+        self._log = NodeLog(self.get_logger())
+        self.create_timer(PERIOD, self._log.flush, clock=Clock(clock_type=ClockType.STEADY_TIME))
         self.failure = ''  # why the last configuration failed
         self._session: Session | None = None
         self._offered: Services | None = None
@@ -58,6 +62,11 @@ class PoseGraphNode(LifecycleNode):
         self.add_on_set_parameters_callback(self._on_set_parameters)
         self.add_post_set_parameters_callback(self._on_parameters_set)
         self._answer_every_change_of_state()
+
+    def destroy_node(self) -> None:
+        """Destroy the node; what is logged from now on goes elsewhere."""
+        self._log.close()
+        super().destroy_node()
 
     # ---- lifecycle
 

@@ -4,6 +4,7 @@
 
 from collections.abc import Iterator
 from contextlib import contextmanager
+import logging
 from pathlib import Path
 import threading
 from typing import Any
@@ -17,9 +18,11 @@ from harness import PREPARE_PATIENCE
 from lifecycle_msgs.msg import Transition
 from lifecycle_msgs.srv import ChangeState
 from local_node import Driver, LocalNode
+from rcl_interfaces.msg import Log
 from rcl_interfaces.srv import SetParameters
 from rclpy.context import Context
 from rclpy.lifecycle import TransitionCallbackReturn
+from rclpy.logging import LoggingSeverity
 from rclpy.parameter import Parameter
 from rclpy.task import Future
 from std_srvs.srv import SetBool, Trigger
@@ -237,6 +240,34 @@ def test_a_change_of_parameters_that_fails_is_answered_and_logged(
     monkeypatch.setattr(managed.session.out, 'configure', fail)
     assert managed.call('set_parameters', wanted, SetParameters).results[0].successful
     assert caplog.messages == 2 * ['a change of parameters failed']
+
+
+def test_what_the_worker_and_the_core_log_reaches_rosout_as_the_nodes(
+    managed: Managed, monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    managed.start()
+    managed.wait(lambda: managed.session.worker.prepared, 'the kernels are there')
+    lines = managed.local.subscribe(Log, '/rosout')
+    worker = managed.session.worker
+
+    def fail(*_: object) -> None:
+        raise ZeroDivisionError('broken')
+    monkeypatch.setattr(worker._backend, 'add_measurement', fail)
+    managed.drive(4.0)
+    assert worker.status.counts['fix', 'internal_error'] == 8
+    logging.getLogger('pose_graph_ros.core.compiled.kernel_cache').warning('no folder')
+    managed.wait(lambda: any(line.msg == 'no folder' for line in lines), 'the warning comes')
+    logger = managed.local.node.get_logger()
+    logger.set_level(LoggingSeverity.ERROR)
+    logging.getLogger('pose_graph_ros.core').warning('not asked for')
+    managed.local.node._log.close()
+    logger.set_level(LoggingSeverity.UNSET)
+    managed.wait(lambda: len(lines) == 3, 'what was left out is said')
+    assert [(line.level, line.msg.partition('\n')[0].partition(' in ')[0]) for line in lines] == [
+        (Log.ERROR, 'a measurement of fix could not be added'), (Log.WARN, 'no folder'),
+        (Log.ERROR, 'a measurement of fix could not be added (7 more like it')]
+    assert 'ZeroDivisionError: broken' in lines[0].msg
+    assert {line.name for line in lines} == {'pose_graph'}
 
 
 def test_pause_answers_whether_it_changed_something(managed: Managed) -> None:

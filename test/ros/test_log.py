@@ -1,0 +1,131 @@
+# Copyright 2026 The pose_graph_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""Python's logging, passed to a node's logger: levels, what repeats, and the end."""
+
+from collections.abc import Iterator
+import logging
+
+import pytest
+
+from pose_graph_ros.ros import log
+from pose_graph_ros.ros.log import NodeLog, PERIOD
+
+core = logging.getLogger('pose_graph_ros.core.somewhere')
+
+
+class Lines(list[tuple[str, str]]):
+    """A logger that keeps what it is given."""
+
+    def __getattr__(self, level: str) -> object:
+        return lambda text: self.append((level, text))
+
+
+class Clock:
+    now = 100.0
+
+    def monotonic(self) -> float:
+        return self.now
+
+
+@pytest.fixture
+def clock(monkeypatch: pytest.MonkeyPatch) -> Clock:
+    clock = Clock()
+    monkeypatch.setattr(log, 'time', clock)
+    return clock
+
+
+@pytest.fixture
+def lines(clock: Clock) -> Iterator[Lines]:
+    lines = Lines()
+    handler = NodeLog(lines)
+    lines.flush = handler.flush
+    yield lines
+    handler.close()
+
+
+def fail(number: int) -> None:
+    try:
+        raise ValueError(number)
+    except ValueError:
+        core.exception('message %d could not be added', number)
+
+
+def test_each_level_is_passed_on_and_nothing_of_others_below_a_warning(lines: Lines) -> None:
+    for level in ('debug', 'info', 'warning', 'error', 'critical'):
+        getattr(core, level)('it is %s, 100 %%', level)
+    logging.getLogger('other').info('not asked for')
+    logging.getLogger('other').warning('asked for')
+    levels = {'critical': 'fatal'}
+    assert lines == [
+        *((levels.get(level, level), f'it is {level}, 100 %')
+          for level in ('debug', 'info', 'warning', 'error', 'critical')),
+        ('warning', 'asked for')]
+
+
+def test_what_repeats_is_left_out_and_counted(lines: Lines, clock: Clock) -> None:
+    for number in range(500):
+        fail(number)
+        clock.now += 0.0001
+    ((level, text),) = lines
+    assert level == 'error'
+    assert text.startswith('message 0 could not be added\nTraceback')
+    assert text.endswith('ValueError: 0')
+    lines.clear()
+    lines.flush()
+    assert lines == []
+    clock.now += PERIOD
+    lines.flush()
+    summary = ('error', 'message 499 could not be added (499 more like it in 10 s)')
+    assert lines == [summary]
+    # once that is said, it is new again
+    fail(500)
+    fail(501)
+    clock.now += PERIOD
+    # the next one comes before the timer
+    fail(502)
+    assert [text.partition('\n')[0] for _, text in lines[1:]] == [
+        'message 500 could not be added', 'message 501 could not be added (1 more like it in '
+        '10 s)', 'message 502 could not be added']
+
+
+def test_what_differs_in_more_than_numbers_is_another_message(lines: Lines) -> None:
+    for source in ('gps1', 'gps2'):
+        for value in (1.5e-7, -3, 0x7f):
+            core.warning('%s: not_finite: got %s', source, value)
+    core.warning('%s: not_finite: got %s', 'gps1', 7)
+    for step in (1.0, 2.0):
+        core.info('the pose is set to %g', step)
+    assert [text for _, text in lines] == [
+        'gps1: not_finite: got 1.5e-07', 'gps2: not_finite: got 1.5e-07',
+        'gps1: not_finite: got 7', 'the pose is set to 1', 'the pose is set to 2']
+
+
+def test_the_same_line_may_fail_in_different_ways(lines: Lines) -> None:
+    def one() -> None:
+        raise ValueError('one')
+
+    def other() -> None:
+        raise ValueError('other')
+    for call in (one, other, one):
+        try:
+            call()
+        except ValueError:
+            core.exception('a callback failed')
+    assert [text.rpartition(' ')[2] for _, text in lines] == ['one', 'other']
+
+
+def test_at_the_end_all_is_said_and_python_logs_as_before(clock: Clock) -> None:
+    package, before = logging.getLogger('pose_graph_ros'), list(logging.getLogger().handlers)
+    lines, others = Lines(), Lines()
+    handler, other = NodeLog(lines), NodeLog(others)
+    for number in range(3):
+        core.error('broken %d', number)
+    other.close()
+    assert package.level == logging.DEBUG
+    handler.close()
+    assert lines == others == [
+        ('error', 'broken 0'), ('error', 'broken 2 (2 more like it in 0 s)')]
+    assert package.level == logging.NOTSET
+    assert logging.getLogger().handlers == before
+    core.error('elsewhere')
+    assert len(lines) == 2
