@@ -7,6 +7,7 @@ Each part of the engine defines a plain dataclass `Saved...` of its own state. T
 annotated with the types of this module, which `io` uses to read, check and write them.
 """
 
+from enum import Enum, IntEnum
 from typing import Annotated, NamedTuple
 
 from pose_graph_ros.core.geometry.scalar_se2 import Pose
@@ -18,6 +19,22 @@ class Column(NamedTuple):
 
     kind: type
     shape: tuple[int, ...] = ()
+
+
+class Choices(NamedTuple):
+    """
+    Members of an enumeration, as an array of numbers: values of an `IntEnum`, else positions.
+
+    Files hold their names, so that the enumeration can grow and be sorted.
+    """
+
+    kind: type[Enum]
+
+    @property
+    def numbers(self) -> dict[str, int]:
+        """Number of each member by its name in files."""
+        return {member.name.lower(): int(member) if isinstance(member, IntEnum) else position
+                for position, member in enumerate(self.kind)}
 
 
 Integers = Annotated[IntArray, Column(int)]

@@ -15,7 +15,13 @@ from pose_graph_ros.core.alignment.estimator import ALIGNING_SIGMA, GraphAlignme
 from pose_graph_ros.core.config import BackendConfig, MeasurementSource, OdometryNoise
 from pose_graph_ros.core.geometry import se2
 from pose_graph_ros.core.geometry.se2 import FloatArray
-from pose_graph_ros.core.graph.constraints import full, ObservedKind, ObservedNodes, upper
+from pose_graph_ros.core.graph.constraints import (
+    full,
+    ObservedKind,
+    ObservedKinds,
+    ObservedNodes,
+    upper,
+)
 from pose_graph_ros.core.odometry.hidden_nodes import HiddenNodes
 from pose_graph_ros.core.saved_columns import Integers, Rows3, Rows6
 from pose_graph_ros.core.sources.factor_builder import AttachedMeasurement
@@ -58,7 +64,7 @@ class SavedAlignment:
     mean: Rows3
     information: Rows6
     """Upper triangles, shape (M, 6)."""
-    kind: Integers
+    kind: ObservedKinds
 
 
 class Evidence(NamedTuple):

@@ -16,13 +16,14 @@ from collections.abc import Sequence
 from dataclasses import dataclass, fields
 from enum import IntEnum
 from operator import attrgetter
-from typing import Any, Self
+from typing import Annotated, Any, Self
 
 import numpy as np
 import numpy.typing as npt
 
 from pose_graph_ros.core.exceptions import GraphUpdateError
 from pose_graph_ros.core.geometry.se2 import BoolArray, FloatArray, IntArray
+from pose_graph_ros.core.saved_columns import Choices
 
 KindArray = npt.NDArray[np.uint8]
 
@@ -53,6 +54,10 @@ class ObservedKind(IntEnum):
     GLOBAL_POSE = 0
     POSITION = 1
     HEADING = 2
+
+
+EdgeKinds = Annotated[IntArray, Choices(EdgeKind)]
+ObservedKinds = Annotated[IntArray, Choices(ObservedKind)]
 
 
 @dataclass(frozen=True, slots=True)

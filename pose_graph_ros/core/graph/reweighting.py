@@ -16,6 +16,7 @@ computed in turn.
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
+from typing import Annotated
 
 import numpy as np
 
@@ -26,7 +27,7 @@ from pose_graph_ros.core.graph.constraints import Edges, ObservedNodes
 from pose_graph_ros.core.graph.error_functions import edge_errors, energies, observed_errors
 from pose_graph_ros.core.graph.graph import Graph
 from pose_graph_ros.core.graph.losses import costs_and_weights
-from pose_graph_ros.core.saved_columns import Integers, Numbers
+from pose_graph_ros.core.saved_columns import Choices, Integers, Numbers
 
 # Number of the newest constraints that are reweighted at each update; as many older ones are, too.
 WINDOW = 200
@@ -42,8 +43,7 @@ class SavedLosses:
 
     rows: Integers
     """Rows in the graph."""
-    losses: Integers
-    """0 none, 1 Huber, 2 Cauchy."""
+    losses: Annotated[IntArray, Choices(Loss)]
     thresholds: Numbers
     """[sigma]."""
     shares: Numbers

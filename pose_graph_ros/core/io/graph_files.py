@@ -25,9 +25,11 @@ from pose_graph_ros.core.geometry.se2 import FloatArray, IntArray
 from pose_graph_ros.core.geometry.trajectory import Trajectory
 from pose_graph_ros.core.graph.constraints import (
     EdgeKind,
+    EdgeKinds,
     Edges,
     full,
     KindArray,
+    ObservedKinds,
     ObservedNodes,
     upper,
 )
@@ -37,10 +39,11 @@ from pose_graph_ros.core.io.g2o import g2o_text, LAYOUT
 from pose_graph_ros.core.io.json_values import annotations, decoded, encoded
 from pose_graph_ros.core.io.saved_graph import SavedGraph
 from pose_graph_ros.core.io.tum import tum_text
+from pose_graph_ros.core.io.version_1 import with_names
 from pose_graph_ros.core.saved_columns import Integers, Numbers, Rows3, Rows4, Rows6
 
 FORMAT = 'pose_graph_ros graph'
-VERSION = 1
+VERSION = 2
 
 SUFFIXES = ('.g2o', '.json', '.tum')
 _OPENING, _MIDDLE = b'{\n"sha256": "', b'",\n'
@@ -59,15 +62,15 @@ class SavedRows:
     biases: Integers
     """Rows of the hidden nodes that are biases; all others are vertices of the g2o file."""
     bias_values: Rows3
-    edge_kind: Integers
-    """Of all edges. Those of kind 2 end at a bias and are given here, others in the g2o file."""
+    edge_kind: EdgeKinds
+    """Of all edges. Those of kind `bias` are given here, others in the g2o file."""
     edge_weight: Numbers
     bias_edge_i: Integers
     bias_edge_j: Integers
     bias_edge_mean: Rows3
     bias_edge_information: Rows6
     bias_edge_bias: Rows4
-    observed_kind: Integers
+    observed_kind: ObservedKinds
     """Of all observed nodes. Those on biases are given here, others in the g2o file."""
     observed_weight: Numbers
     observed_on_bias: Integers
@@ -178,10 +181,12 @@ def _checked_members(path: Path, content: bytes) -> dict[str, Any]:
         members = json.loads(b'{' + body)
     except (ValueError, RecursionError) as error:
         raise FileFormatError(f'{path}: expected JSON ({error})') from error
-    if (members.pop('format', None), members.pop('version', None)) != (FORMAT, VERSION):
-        raise FileFormatError(f'{path}: expected a {FORMAT} of version {VERSION}, created by '
-                              f'pose_graph_ros; this one was by {members.get("created_by")!r}')
-    return dict(members)
+    version = members.pop('version', None)
+    if members.pop('format', None) != FORMAT or version not in (1, VERSION):
+        raise FileFormatError(
+            f'{path}: expected a {FORMAT} of version 1 or {VERSION}, created by pose_graph_ros; '
+            f'this one is of version {version!r}, created by {members.get("created_by")!r}')
+    return with_names(members) if version == 1 else dict(members)
 
 
 def _saved_rows(rows: GraphRows) -> SavedRows:

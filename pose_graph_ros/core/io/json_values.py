@@ -4,7 +4,8 @@
 Conversion of dataclasses and named tuples of numbers and arrays to JSON values, and back.
 
 Decoding follows the annotations of the fields. Values of other types are rejected, as are numbers
-that are not finite.
+that are not finite. Members of enumerations (`Choices`) become the names in use and, for each
+row, the position of its name among these.
 """
 
 from collections.abc import Mapping
@@ -16,17 +17,30 @@ from typing import Annotated, Any, get_args, get_origin, get_type_hints
 import numpy as np
 import numpy.typing as npt
 
-from pose_graph_ros.core.saved_columns import Column
+from pose_graph_ros.core.saved_columns import Choices, Column
 
 _KINDS = {int: ('i', np.int64), float: ('fi', np.float64), bool: ('b', np.bool_)}
 
 
-def encoded(value: Any) -> Any:
-    """Return a value as lists, dictionaries, strings and numbers."""
+def encoded(value: Any, kind: Any = None) -> Any:
+    """
+    Return a value as lists, dictionaries, strings and numbers.
+
+    Parameters
+    ----------
+    value : object
+    kind : type, optional, annotation of the value
+
+    """
     if _has_fields(type(value)):
-        return {name: encoded(getattr(value, name)) for name in annotations(type(value))}
+        return {name: encoded(getattr(value, name), hint)
+                for name, hint in annotations(type(value)).items()}
     if isinstance(value, Mapping):
         return {key: encoded(item) for key, item in value.items()}
+    if get_origin(kind) is Annotated and isinstance(choices := get_args(kind)[1], Choices):
+        names = {number: name for name, number in choices.numbers.items()}
+        used, which = np.unique(value, return_inverse=True)
+        return {'names': [names[number] for number in used.tolist()], 'of': which.tolist()}
     return value.tolist() if isinstance(value, np.ndarray) else value
 
 
@@ -54,7 +68,8 @@ def decoded(kind: Any, plain: Any, where: str) -> Any:
     """
     origin, arguments = get_origin(kind), get_args(kind)
     if origin is Annotated:
-        return _array(arguments[1], plain, where)
+        read = _chosen if isinstance(arguments[1], Choices) else _array
+        return read(arguments[1], plain, where)
     if origin is UnionType:     # of something and None
         return None if plain is None else decoded(arguments[0], plain, where)
     if origin is tuple:
@@ -85,6 +100,19 @@ def _single(kind: type, plain: Any, where: str) -> Any:
     if kind is int:
         _expect(abs(plain) < 2**63, where, 'an integer of 64 bits', plain)
     return plain
+
+
+def _chosen(choices: Choices, plain: Any, where: str) -> npt.NDArray[Any]:
+    """Return the numbers of members of an enumeration, given by their names."""
+    _expect(isinstance(plain, dict) and plain.keys() == {'names', 'of'}, where,
+            "the fields ['names', 'of']", plain)
+    names: tuple[str, ...] = decoded(tuple[str, ...], plain['names'], where)
+    for name in names:
+        _expect(name in choices.numbers, where, f'one of {", ".join(choices.numbers)}', name)
+    of = _array(Column(int), plain['of'], where)
+    _expect(not np.any((of < 0) | (of >= len(names))), where,
+            f'positions among {len(names)} names', plain['of'])
+    return np.array([choices.numbers[name] for name in names], dtype=np.int64)[of]
 
 
 def _array(column: Column, plain: Any, where: str) -> npt.NDArray[Any]:

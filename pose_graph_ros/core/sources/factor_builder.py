@@ -15,7 +15,7 @@ from pose_graph_ros.core.config import (
     MeasurementSource,
     OdometrySource,
 )
-from pose_graph_ros.core.graph.constraints import Edges, ObservedNodes
+from pose_graph_ros.core.graph.constraints import EdgeKinds, Edges, ObservedNodes
 from pose_graph_ros.core.graph.graph import Graph, GraphUpdate
 from pose_graph_ros.core.graph.reweighting import Reweighting
 from pose_graph_ros.core.measurements import Absolute, GlobalPose, LoopClosure, Measurement
@@ -65,7 +65,7 @@ class SavedEdges:
     j: Integers
     mean: Rows3
     information: Rows6
-    kind: Integers
+    kind: EdgeKinds
 
 
 class AttachedMeasurement(NamedTuple):

@@ -20,13 +20,16 @@ from test_delay_invariance import DRIVES
 from tum_files import read_tum
 
 from pose_graph_ros.core.backend import PoseGraphBackend
+from pose_graph_ros.core.config import Loss
 from pose_graph_ros.core.exceptions import FileFormatError, FileWriteError
 from pose_graph_ros.core.geometry.geodesy import MapOrigin
-from pose_graph_ros.core.graph.constraints import EdgeKind
-from pose_graph_ros.core.io import atomic_files
+from pose_graph_ros.core.graph.constraints import EdgeKind, ObservedKind
+from pose_graph_ros.core.io import atomic_files, version_1
 from pose_graph_ros.core.io.g2o import read_g2o
 from pose_graph_ros.core.io.graph_files import graph_paths, read_graph, write_graph
 from pose_graph_ros.core.io.saved_graph import SavedGraph
+
+DATA = Path(__file__).parents[2] / 'data'
 
 
 @functools.cache
@@ -75,7 +78,7 @@ def test_other_programs_read_the_graph_and_the_path(tmp_path: Path) -> None:
     np.testing.assert_array_equal(path.stamps_ns, saved.nodes.stamps_ns)
     np.testing.assert_array_equal(path.poses[:, :2], rows.poses[saved.nodes.rows, :2])
     members = json.loads(side.read_text(encoding='ascii'))
-    assert members['version'] == 1
+    assert members['version'] == 2
     assert members['datum'] == {
         'latitude': 48.1, 'longitude': 11.6, 'altitude': 500.0, 'yaw': 0.25}
     assert members['nodes']['stamps_ns'] == saved.nodes.stamps_ns.tolist()
@@ -196,11 +199,55 @@ def test_another_version_is_refused_and_says_who_wrote_it(tmp_path: Path) -> Non
     assert_same_value(read_graph(side), small_graph())  # the layout of the text does not matter
 
     def renew(members: dict[str, Any]) -> None:
-        members['version'], members['created_by'] = 2, 'pose_graph_ros 9.9'
+        members['version'], members['created_by'] = 3, 'pose_graph_ros 9.9'
 
     rewrite(side, renew)
-    with pytest.raises(FileFormatError, match=r'version 1.*9\.9'):
+    with pytest.raises(FileFormatError, match=r'version 1 or 2, .*version 3, .*9\.9'):
         read_graph(side)
+
+
+def test_a_file_of_version_1_is_read() -> None:
+    """It was written by 0.1.0, with numbers for losses and kinds."""
+    saved = read_graph(DATA / 'version_1.g2o')
+    assert [tuple(Loss)[k] for k in saved.edge_losses.losses] == [Loss.HUBER] * 3
+    assert [tuple(Loss)[k] for k in saved.observed_losses.losses] == [Loss.CAUCHY] * 2
+    assert np.flatnonzero(saved.rows.edges.kind == EdgeKind.BIAS).tolist() == [5, 6, 7, 11, 12]
+    assert saved.rows.observed.kind.tolist() == [
+        ObservedKind.GLOBAL_POSE, ObservedKind.POSITION, ObservedKind.HEADING,
+        ObservedKind.POSITION]
+    assert saved.waiting.kind.tolist() == [EdgeKind.LOOP_CLOSURE]
+    backend = PoseGraphBackend.restored(CORRELATED, saved)
+    assert backend.estimate().chi2 == pytest.approx(27.1463, abs=1e-3)
+
+
+def number_as_version_1_does(members: dict[str, Any]) -> None:
+    members['version'] = 1
+    for (member, field), names in version_1.NUMBERED.items():
+        chosen = members[member][field]
+        members[member][field] = [names.index(chosen['names'][k]) for k in chosen['of']]
+
+
+def test_versions_1_and_2_of_a_graph_are_read_alike(tmp_path: Path) -> None:
+    _, side, _ = write_graph(saved_drive(), tmp_path / 'map')
+    rewrite(side, number_as_version_1_does)
+    assert_same_value(read_graph(side), saved_drive())
+
+
+def test_losses_and_kinds_are_saved_by_their_names(tmp_path: Path) -> None:
+    _, side, _ = write_graph(saved_drive(), tmp_path / 'map')
+    members = json.loads(side.read_text(encoding='ascii'))
+    assert members['edge_losses']['losses']['names'] == ['huber']
+    assert members['graph']['edge_kind']['names'] == ['odometry', 'loop_closure', 'bias']
+    assert members['graph']['observed_kind']['names'] == ['global_pose', 'position', 'heading']
+    # another order of the names is the same graph
+
+    def turn(members: dict[str, Any]) -> None:
+        kind = members['graph']['edge_kind']
+        kind['names'] = kind['names'][::-1]
+        kind['of'] = [2 - k for k in kind['of']]
+
+    rewrite(side, turn)
+    assert_same_value(read_graph(side), saved_drive())
 
 
 @pytest.mark.parametrize(('place', 'value', 'expected'), [
@@ -209,7 +256,9 @@ def test_another_version_is_refused_and_says_who_wrote_it(tmp_path: Path) -> Non
     (('graph', 'biases'), [0], 'no biases as vertices'),
     (('graph', 'observed_on_bias'), [-1], r'graph\.observed_on_bias: expected numbers in 0'),
     (('graph', 'observed_on_bias'), [], r'expected \d+ observed nodes, got \d+'),
-    (('graph', 'edge_kind'), [256], 'expected'),
+    (('graph', 'edge_kind'), [0], r"edge_kind: expected the fields \['names', 'of'\]"),
+    (('graph', 'edge_kind'), {'names': ['odometry'], 'of': [1]}, 'positions among 1 names'),
+    (('edge_losses', 'losses'), {'names': ['l1'], 'of': [0]}, 'one of none, huber, cauchy.*l1'),
     (('graph', 'edge_weight'), [1.0], r'expected \d+ weights, got 1'),
     (('graph', 'bias_edge_bias'), [], r'expected \d+ edges to biases, got 0')])
 def test_rows_that_do_not_fit_together_are_refused_with_what_was_expected(

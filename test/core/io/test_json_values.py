@@ -4,8 +4,9 @@
 
 from collections.abc import Mapping
 from dataclasses import dataclass
+from enum import Enum, IntEnum
 import json
-from typing import Any, NamedTuple
+from typing import Annotated, Any, NamedTuple
 
 from hypothesis import given, strategies as st
 import numpy as np
@@ -14,6 +15,7 @@ from saved_graphs import assert_same_value
 
 from pose_graph_ros.core.io.json_values import annotations, decoded, encoded
 from pose_graph_ros.core.saved_columns import (
+    Choices,
     Flags,
     Integers,
     Matrix,
@@ -29,6 +31,22 @@ class Inner:
     used: bool
     pairs: Pairs
     matrix: Matrix | None
+
+
+class Size(Enum):
+    SMALL = 'small'
+    LARGE = 'large'
+
+
+class Colour(IntEnum):
+    GREEN = 4
+    RED = 2
+
+
+@dataclass(frozen=True)
+class Chosen:
+    sizes: Annotated[np.ndarray, Choices(Size)]
+    colours: Annotated[np.ndarray, Choices(Colour)]
 
 
 class Tuple(NamedTuple):
@@ -143,3 +161,27 @@ def test_columns_without_rows_keep_their_shape_and_type() -> None:
 def test_annotations_keep_the_descriptions_of_columns() -> None:
     assert annotations(Outer)['rows'] == Rows3
     assert list(annotations(Tuple)) == ['count', 'share']
+
+
+@given(arrays(st.integers(0, 1), np.int64), arrays(st.sampled_from([4, 2]), np.int64))
+def test_members_of_enumerations_are_names(sizes: np.ndarray, colours: np.ndarray) -> None:
+    value = Chosen(sizes, colours)
+    plain = json.loads(json.dumps(encoded(value)))
+    assert_same_value(decoded(Chosen, plain, ''), value)
+    assert [plain['sizes']['names'][k] for k in plain['sizes']['of']] == [
+        tuple(Size)[k].value for k in sizes]
+    assert [plain['colours']['names'][k] for k in plain['colours']['of']] == [
+        Colour(k).name.lower() for k in colours]
+
+
+@pytest.mark.parametrize(('plain', 'expected'), [
+    ([0], r"sizes: expected the fields \['names', 'of'\]"),
+    ({'names': ['small']}, 'sizes: expected the fields'),
+    ({'names': ['huge'], 'of': [0]}, "sizes: expected one of small, large, got 'huge'"),
+    ({'names': [0], 'of': [0]}, 'sizes: expected a value of kind str'),
+    ({'names': ['small'], 'of': [1]}, 'sizes: expected positions among 1 names'),
+    ({'names': ['small'], 'of': [-1]}, 'sizes: expected positions among 1 names'),
+    ({'names': ['small'], 'of': [0.0]}, 'sizes: expected ints')])
+def test_a_name_of_no_member_is_refused(plain: Any, expected: str) -> None:
+    with pytest.raises(ValueError, match=expected):
+        decoded(Chosen, {'sizes': plain, 'colours': {'names': [], 'of': []}}, '')

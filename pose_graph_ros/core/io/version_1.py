@@ -1,0 +1,24 @@
+# Copyright 2026 The pose_graph_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""Saved graphs of version 1, which hold losses and kinds as numbers; version 2 holds names."""
+
+from typing import Any
+
+LOSSES = ('none', 'huber', 'cauchy')
+EDGES = ('odometry', 'loop_closure', 'bias')
+OBSERVED = ('global_pose', 'position', 'heading')
+# Names by member and field of the JSON file, in the order of their numbers.
+NUMBERED = {
+    ('edge_losses', 'losses'): LOSSES, ('observed_losses', 'losses'): LOSSES,
+    ('graph', 'edge_kind'): EDGES, ('graph', 'observed_kind'): OBSERVED,
+    ('waiting', 'kind'): EDGES, ('set_aside', 'kind'): EDGES, ('alignment', 'kind'): OBSERVED}
+
+
+def with_names(members: dict[str, Any]) -> dict[str, Any]:
+    """Return the members of a file of version 1 as those of version 2."""
+    upgraded = dict(members)
+    for (member, field), names in NUMBERED.items():
+        fields = upgraded.get(member)
+        if isinstance(fields, dict) and field in fields:
+            upgraded[member] = {**fields, field: {'names': list(names), 'of': fields[field]}}
+    return upgraded
