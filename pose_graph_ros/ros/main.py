@@ -3,32 +3,35 @@
 """
 The process of the node: from the command line to a clean end.
 
-SIGINT and SIGTERM are kept for the loop to check, so a second signal, or one while the node
-starts or ends, has no further effect.
+Callbacks run in a thread of their own, and the main thread waits for SIGINT or SIGTERM, as Python
+handles signals only there. A second one, or one while the node starts or ends, has no further
+effect.
 """
 
+from queue import SimpleQueue
 import signal
 import sys
+from threading import Thread
 
 SWITCH_INTERVAL = 0.0005  # for which a thread may run Python while another one waits [s]
 
 
 def main(args: list[str] | None = None) -> int:
     """Run the node until SIGINT or SIGTERM; return the exit code."""
-    received: list[int] = []
+    ends: SimpleQueue[int] = SimpleQueue()  # signals, or 0 if the callbacks end by themselves
     for each in (signal.SIGINT, signal.SIGTERM):
-        signal.signal(each, lambda number, _: received.append(number))
+        signal.signal(each, lambda number, _: ends.put(number))
     # ruff: noqa: PLC0415  the imports take most of the start; signals must be handled before
     import logging
 
     import rclpy
     from rclpy.exceptions import InvalidParameterTypeException, InvalidParameterValueException
-    from rclpy.executors import SingleThreadedExecutor
     from rclpy.signals import SignalHandlerOptions
 
     from pose_graph_ros.core.exceptions import ConfigError
     from pose_graph_ros.ros import memory
     from pose_graph_ros.ros.node import PoseGraphNode
+    from pose_graph_ros.ros.spinning import Spinner
 
     memory.give_back_large_arrays()
     # by default the thread of the engine would delay messages by 5 ms at a time
@@ -44,16 +47,21 @@ def main(args: list[str] | None = None) -> int:
         print(f'pose_graph_node: {error}', file=sys.stderr)
         rclpy.try_shutdown()
         return 2
-    executor = SingleThreadedExecutor()
-    executor.add_node(node)
-    while len(received) == 0 and rclpy.ok():
+    spinner = Spinner(node)
+
+    def spin() -> None:
         try:
-            executor.spin_once(timeout_sec=0.1)
-        except Exception:
-            # no message, and no error of the middleware, may end the node
-            logging.getLogger(__name__).exception('a callback failed')
+            spinner.spin()
+        finally:
+            ends.put(0)
+
+    thread = Thread(target=spin, name='callbacks')
+    thread.start()
+    ends.get()
+    spinner.stop()
+    thread.join()
     node.close()
-    executor.shutdown()
+    spinner.close()
     node.destroy_node()
     rclpy.try_shutdown()
     return 0

@@ -2,17 +2,16 @@
 # SPDX-License-Identifier: Apache-2.0
 """The services of the node; each answers what was done, or why it was not."""
 
-from collections.abc import Awaitable, Callable, Mapping
-from concurrent.futures import CancelledError, Future as DoneFuture, ThreadPoolExecutor
+from collections import Counter
+from collections.abc import Awaitable, Callable, Coroutine, Generator, Mapping
+from concurrent.futures import CancelledError, Future, ThreadPoolExecutor
 from functools import partial
 import logging
 from pathlib import Path
 from typing import Any
 
-from rclpy.callback_groups import MutuallyExclusiveCallbackGroup
 from rclpy.node import Node
 from rclpy.service import Service
-from rclpy.task import Future
 from std_srvs.srv import SetBool, Trigger
 
 from pose_graph_ros.adapters.sources import backend_config
@@ -28,9 +27,21 @@ logger = logging.getLogger(__name__)
 
 REPLACED = 'the graph was replaced meanwhile'
 CLOSED = 'the node was cleaned up meanwhile'
-ANSWER_TIME = 0.2  # for which a service outlives its last answer, so that it is sent [s]
 Answer = tuple[bool, str]
 """Whether what was asked for was done, and a sentence on it."""
+Action = Coroutine['Future[Any]', None, Answer]
+"""What is done for a request; it awaits futures of other threads, by `_Done`."""
+
+
+class _Done:
+    """Awaits a result of another thread, while other callbacks are served."""
+
+    def __init__(self, future: 'Future[Any]') -> None:
+        self._future = future
+
+    def __await__(self) -> Generator['Future[Any]', None, Any]:
+        yield self._future
+        return self._future.result()
 
 
 class Services:
@@ -47,7 +58,7 @@ class Services:
     def __init__(self, node: Node, session: Session) -> None:
         self._node, self._session = node, session
         self._offered: dict[str, Service] = {}
-        self._answering: set[str] = set()  # services that have a request
+        self._answering: Counter[str] = Counter()  # number of requests by service
         self._closed = False
         # files of a large graph take seconds: neither worker nor executor should wait for them
         self._files = ThreadPoolExecutor(1, 'graph files')
@@ -56,10 +67,7 @@ class Services:
                 ('pause', SetBool, self._pause), ('set_datum', Trigger, self._set_datum),
                 ('save_graph', Trigger, partial(self._with_file, self._save)),
                 ('load_graph', Trigger, partial(self._with_file, self._load))):
-            # each in its own group: a service that awaits blocks all others in its group
-            self._offered[name] = node.create_service(
-                kind, f'~/{name}', partial(self._answer, name, act),
-                callback_group=MutuallyExclusiveCallbackGroup())
+            self._offered[name] = self._offer(name, kind, act)
 
     def close(self) -> None:
         """
@@ -68,47 +76,53 @@ class Services:
         A file that is being written is completed in its thread, for which nobody waits here.
         """
         self._closed = True
-        if 'save_graph' in self._answering:
+        if self._answering['save_graph'] > 0:
             self._node.get_logger().warning('the graph is still being saved')
         self._files.shutdown(wait=False, cancel_futures=True)
-        for name in self._offered.keys() - self._answering:
+        for name in self._offered.keys() - +self._answering:
             self._node.destroy_service(self._offered.pop(name))
 
-    async def _answer(
-        self, name: str, act: Callable[[Any], Awaitable[Answer]], request: Any, response: Any,
-    ) -> Any:
-        """Fill in a response with what an action answers."""
-        self._answering.add(name)
-        try:
+    def _offer(self, name: str, kind: Any, act: Callable[[Any], Action]) -> Service:
+        """Create a service whose response is sent when the action is done."""
+        def respond(request: Any, header: object) -> None:
+            def answer(success: bool, message: str) -> None:
+                self._answering[name] -= 1
+                send(kind.Response(success=success, message=message), header)
+                if self._closed and self._answering[name] == 0:
+                    self._node.destroy_service(self._offered.pop(name))
+
+            self._answering[name] += 1
             if self._closed:
-                raise CancelledError
-            response.success, response.message = await act(request)
+                answer(False, CLOSED)
+            else:
+                self._continue(act(request), answer)
+
+        service = self._node.create_service(kind, f'~/{name}', lambda request, _: request)
+        # not all executors of rclpy await a callback: it is run where they send the response
+        send, service.send_response = service.send_response, respond
+        return service
+
+    def _continue(self, action: Action, answer: Callable[[bool, str], None]) -> None:
+        """Run an action until it awaits another thread; then, in the executor, go on."""
+        try:
+            awaited = action.send(None)
+        except StopIteration as end:
+            answer(*end.value)
         except CancelledError:
-            response.message = CLOSED if self._closed else REPLACED
-        self._answering.discard(name)
-        if self._closed:
-            self._destroy_soon(name)
-        return response
-
-    def _destroy_soon(self, name: str) -> None:
-        def destroy() -> None:
-            self._node.destroy_timer(timer)
-            if name in self._offered:
-                self._node.destroy_service(self._offered.pop(name))
-        timer = self._node.create_timer(ANSWER_TIME, destroy, clock=self._session.steady)
-
-    async def _done(self, future: 'DoneFuture[Any]') -> Any:
-        """Await a result of another thread, while other callbacks are served."""
-        done = Future(executor=self._node.executor)
-        future.add_done_callback(lambda _: done.set_result(None))
-        await done
-        return future.result()
+            answer(False, CLOSED if self._closed else REPLACED)
+        except Exception as error:
+            logger.exception('a service failed')
+            answer(False, f'failed: {type(error).__name__}: {error}')
+        else:
+            executor = self._node.executor
+            awaited.add_done_callback(
+                lambda _: executor.create_task(self._continue, action, answer))
 
     async def _in_file_thread(self, job: Callable[..., Any], *arguments: Any) -> Any:
         """Await what a function returns that reads or writes files."""
         if self._closed:
             raise CancelledError
-        return await self._done(self._files.submit(job, *arguments))
+        return await _Done(self._files.submit(job, *arguments))
 
     def _require_present(self, worker: Worker) -> None:
         """Raise `CancelledError` if a worker's graph is no longer that of the node."""
@@ -118,7 +132,7 @@ class Services:
     async def _optimize(self, _: Trigger.Request) -> Answer:
         worker = self._session.worker
         try:
-            report = await self._done(self._session.optimize())
+            report = await _Done(self._session.optimize())
         except CancelledError:
             raise
         except Exception as error:
@@ -191,7 +205,7 @@ class Services:
             backend.update()
             return backend.saved(None if plane is None else plane.origin)
 
-        saved = await self._done(self._session.worker.call(capture, 'a copy of the graph'))
+        saved = await _Done(self._session.worker.call(capture, 'a copy of the graph'))
         files = await self._in_file_thread(write_graph, saved, path)
         left_out = '' if saved.n_left_out == 0 else (
             f'; {saved.n_left_out} waiting measurements are left out')
@@ -202,7 +216,7 @@ class Services:
         """Replace the graph by the one in a file, if it is of the present site."""
         session, worker = self._session, self._session.worker
         # wait until the worker has prepared the kernels, which reading needs
-        await self._done(worker.call(lambda _: None))
+        await _Done(worker.call(lambda _: None))
         saved, backend = await self._in_file_thread(_restored, path, session.values)
         # all that follows is about now: in the meantime a datum or parameters may have been set
         self._require_present(worker)

@@ -1,0 +1,123 @@
+# Copyright 2026 The pose_graph_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""Both executors under the node: the one of events, and the one that every rclpy has."""
+
+from collections.abc import Callable, Iterator
+from pathlib import Path
+import signal
+import threading
+import time
+from typing import Any
+
+import pytest
+
+pytest.importorskip('rclpy', reason='ROS 2 is not there: no rclpy')
+
+from circle import drive, path_error
+from harness import Client, NodeProcess, PATIENCE, RELIABLE
+import rclpy
+from rclpy.clock import Clock, ClockType
+from rclpy.context import Context
+from rclpy.node import Node
+from rclpy.signals import SignalHandlerOptions
+from std_msgs.msg import String
+
+from pose_graph_ros.cli.demo import isolated_environment
+from pose_graph_ros.ros import spinning
+from pose_graph_ros.ros.spinning import Spinner
+
+WITHOUT_EVENTS = '''
+import sys
+sys.modules['rclpy.experimental'] = None
+from pose_graph_ros.ros.main import main
+sys.exit(main())
+'''
+"""The node with an rclpy that has no EventsExecutor."""
+
+
+class Spun:
+    """A node whose callbacks run in a thread."""
+
+    def __init__(self, node: Node) -> None:
+        self.node, self.spinner = node, Spinner(node)
+        self._thread = threading.Thread(target=self.spinner.spin)
+        self._thread.start()
+
+    def wait(self, done: Callable[[], bool], what: str) -> None:
+        end = time.monotonic() + PATIENCE
+        while not done():
+            assert time.monotonic() < end, f'waited {PATIENCE} s until {what}'
+            time.sleep(0.01)
+
+    def stop(self) -> None:
+        self.spinner.stop()
+        self._thread.join(PATIENCE)
+        assert not self._thread.is_alive()
+
+
+@pytest.fixture(params=['events', 'single'])
+def spun(
+    tmp_path: Path, request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch,
+) -> Iterator[Spun]:
+    if request.param == 'single':
+        monkeypatch.setattr(spinning, 'EventsExecutor', None)
+    elif spinning.EventsExecutor is None:
+        pytest.skip('this rclpy has no EventsExecutor')
+    context = Context()
+    with isolated_environment(tmp_path) as env:
+        rclpy.init(context=context, domain_id=int(env['ROS_DOMAIN_ID']),
+                   signal_handler_options=SignalHandlerOptions.NO)
+        each = Spun(Node('pose_graph', context=context))
+        yield each
+        each.stop()
+        each.spinner.close()
+        each.node.destroy_node()
+        rclpy.shutdown(context=context)
+
+
+def test_it_stops_at_once_though_no_callback_is_due(spun: Spun) -> None:
+    spun.stop()
+    spun.stop()
+
+
+def test_no_exception_of_a_callback_ends_it(
+    spun: Spun, caplog: pytest.LogCaptureFixture,
+) -> None:
+    heard: list[str] = []
+
+    def hear(message: Any) -> None:
+        heard.append(message.data)
+        raise ValueError(f'{message.data} is wrong')
+
+    spun.node.create_subscription(String, 'word', hear, RELIABLE)
+    publisher = spun.node.create_publisher(String, 'word', RELIABLE)
+    spun.wait(lambda: publisher.get_subscription_count() > 0, 'it listens')
+    for k in range(3):
+        publisher.publish(String(data=f'w{k}'))
+        spun.wait(lambda k=k: len(heard) > k, 'the next one comes')
+    spun.wait(lambda: 'w2 is wrong' in caplog.text, 'the last one is logged')
+    assert heard == ['w0', 'w1', 'w2']
+
+
+def test_timers_come_and_go_while_it_runs(spun: Spun) -> None:
+    clock, ticks = Clock(clock_type=ClockType.STEADY_TIME), []
+
+    def replace() -> None:
+        nonlocal timer
+        ticks.append(time.monotonic())
+        spun.node.destroy_timer(timer)
+        timer = spun.node.create_timer(0.01, replace, clock=clock)
+    timer = spun.node.create_timer(0.01, replace, clock=clock)
+    spun.wait(lambda: len(ticks) > 20, 'many have been made')
+
+
+def test_the_node_drives_and_answers_without_the_executor_of_events(tmp_path: Path) -> None:
+    with NodeProcess(tmp_path, program=('-c', WITHOUT_EVENTS)) as node:
+        with Client(int(node.env['ROS_DOMAIN_ID'])) as client:
+            drive(client, 10.0)
+            assert client.optimize().success
+            assert path_error(client) < 1e-2
+            assert client.set_parameter('frequency', 20.0) == (True, '')
+            assert client.trigger('reset').success
+        assert node.signal_and_wait(signal.SIGINT) == 0
+        assert 'Traceback' not in node.stderr()
