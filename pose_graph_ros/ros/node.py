@@ -2,7 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """The managed node: its parameters and the transitions of its lifecycle."""
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 import logging
 import traceback
 from typing import Any
@@ -33,10 +33,12 @@ from pose_graph_ros.adapters.parameters import (
     type_parameter,
     unknown,
 )
+from pose_graph_ros.adapters.sources import source_list
 from pose_graph_ros.core.exceptions import ConfigError
 from pose_graph_ros.ros.log import NodeLog, PERIOD
 from pose_graph_ros.ros.services import Services
 from pose_graph_ros.ros.session import Session
+from pose_graph_ros.ros.topics import check_topics, OVERRIDES
 
 logger = logging.getLogger(__name__)
 
@@ -57,6 +59,9 @@ class PoseGraphNode(LifecycleNode):
         self._session: Session | None = None
         self._offered: Services | None = None
         self._given = self._declared()  # the node's own parameters that have a value
+        # what a file or the command line gives, also to parameters that are not declared
+        self._overrides = {parameter.name: parameter.value for parameter in getattr(
+            self, '_parameter_overrides', {}).values()}
         self._own = {parameter.name: parameter for parameter in all_parameters(self._given)}
         self._warn_of_unknown()
         self.add_on_set_parameters_callback(self._on_set_parameters)
@@ -115,6 +120,7 @@ class PoseGraphNode(LifecycleNode):
     def _configure(self) -> None:
         values = checked(self._given)
         require_together(values)
+        check_topics(self, source_list(values), self._overrides)
         self._session = Session(self, values)
         self._offered = Services(self, self._session)
 
@@ -172,10 +178,9 @@ class PoseGraphNode(LifecycleNode):
 
     def _warn_of_unknown(self) -> None:
         """Warn of unknown parameters: rclpy does not, as a file may be for several nodes."""
-        overrides: Mapping[str, object] = getattr(self, '_parameter_overrides', {})
-        for name in sorted(overrides):
+        for name in sorted(self._overrides):
             # those of rclpy are declared, or will be with the publishers and subscriptions
-            if not self.has_parameter(name) and not name.startswith('qos_overrides.') and (
+            if not self.has_parameter(name) and not name.startswith(OVERRIDES) and (
                     is_own(name, self._own, OF_SOURCES)):
                 self.get_logger().warning(str(unknown(name, self._own)))
 

@@ -43,6 +43,15 @@ OUTPUT_QOS = QoSProfile(depth=10)  # reliable, as profiles are by default
 # Late subscribers receive the newest path and graph at once.
 LATCHED_QOS = QoSProfile(depth=1, durability=QoSDurabilityPolicy.TRANSIENT_LOCAL)
 
+OUTPUTS = {
+    'pose': (PoseWithCovarianceStamped, OUTPUT_QOS),
+    'odometry/filtered': (Odometry, OUTPUT_QOS),
+    'gps/filtered': (NavSatFix, OUTPUT_QOS),
+    'path': (Path, LATCHED_QOS),
+    'graph': (MarkerArray, LATCHED_QOS),
+    '/diagnostics': (DiagnosticArray, OUTPUT_QOS)}
+"""Messages and quality of service by topic, but for /tf."""
+
 
 class Publishers:
     """
@@ -65,14 +74,10 @@ class Publishers:
         self.map_frame = frame(values['map_frame'])
         self.odom_frame = frame(values['odom_frame'])
         self.base_frame = frame(values['base_link_frame'])
-        self._pose = self._publisher(PoseWithCovarianceStamped, 'pose', OUTPUT_QOS)
-        self._odometry = self._publisher(Odometry, 'odometry/filtered', OUTPUT_QOS)
-        self._fix = self._publisher(NavSatFix, 'gps/filtered', OUTPUT_QOS)
-        self._path = self._publisher(Path, 'path', LATCHED_QOS)
-        self._graph = self._publisher(MarkerArray, 'graph', LATCHED_QOS)
-        self._diagnostics = self._publisher(DiagnosticArray, '/diagnostics', OUTPUT_QOS)
-        self._publishers = (self._pose, self._odometry, self._fix, self._path, self._graph,
-                            self._diagnostics)
+        self._publishers = [self._publisher(message_type, topic, qos)
+                            for topic, (message_type, qos) in OUTPUTS.items()]
+        (self._pose, self._odometry, self._fix, self._path, self._graph,
+         self._diagnostics) = self._publishers
         self.transforms: TransformPublisher | None = None
         """None if `publish_tf` is false or tf2_msgs is not installed."""
         self._on_other = on_other

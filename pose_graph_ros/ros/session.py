@@ -40,7 +40,8 @@ from pose_graph_ros.ros.pose_continuity import PoseContinuity
 from pose_graph_ros.ros.publishers import Publishers
 from pose_graph_ros.ros.set_pose_input import SetPoseInput
 from pose_graph_ros.ros.time_jump import ReceivedMessage
-from pose_graph_ros.ros.transforms import TFMessage
+from pose_graph_ros.ros.topics import SET_POSE_TOPICS
+from pose_graph_ros.ros.transforms import STATIC_TOPIC, TFMessage
 from pose_graph_ros.ros.worker import Worker
 
 logger = logging.getLogger(__name__)
@@ -129,8 +130,8 @@ class Session:
         sources = self.input.reader.sources.values()
         # first, since the first fix needs the transforms
         if TFMessage is not None and any(source.kind is Kind.FIX for source in sources):
-            self._subscribe('/tf_static', TFMessage, self.input.reader.frames.receive, STATIC_QOS)
-        for topic in ('initialpose', 'set_pose'):
+            self._subscribe(STATIC_TOPIC, TFMessage, self.input.reader.frames.receive, STATIC_QOS)
+        for topic in SET_POSE_TOPICS:
             self._subscribe(topic, PoseWithCovarianceStamped, self._on_set_pose, SET_POSE_QOS)
         for source in sources:
             qos = LOOP_CLOSURE_QOS if source.kind is Kind.LOOP_CLOSURE else SENSOR_QOS

@@ -24,7 +24,7 @@ except ImportError:  # ROS 2 from PyPI lacks tf2_msgs until it is built
 
 # The profile of tf2_ros, which is reliable.
 TF_QOS = QoSProfile(depth=100)
-TOPIC = '/tf'
+TOPIC, STATIC_TOPIC = '/tf', '/tf_static'
 LISTENING = 2.0  # reading all of /tf costs as much as odometry, so it is read for this time [s]
 PAUSE = 30.0  # period of the listening; a new publisher on /tf starts it at once [s]
 OWN = 2000  # number of the newest transforms of this node that are kept, to recognise them on /tf

@@ -118,7 +118,12 @@ def test_what_does_not_go_together_is_mended_while_unconfigured(tmp_path: Path) 
         assert not manager.change(Transition.TRANSITION_CONFIGURE)
         assert manager.state == State.PRIMARY_STATE_UNCONFIGURED
         assert client.set_parameter('fix.sigma_ceiling', 100.0) == (True, '')
+        assert client.set_parameter('fix.topic', '/odom') == (True, '')
+        assert not manager.change(Transition.TRANSITION_CONFIGURE)
+        assert client.set_parameter('fix.topic', '/fix') == (True, '')
         assert manager.change(Transition.TRANSITION_CONFIGURE)
         client.close()
         assert node.signal_and_wait(signal.SIGTERM) == 0
         assert 'ceiling' in node.stderr()
+        assert 'no transition: parameter fix.topic: expected a topic of' in node.stderr()
+        assert 'Traceback' not in node.stderr()

@@ -275,7 +275,10 @@ BAD = (
     ('map_frame:=3', 'map_frame'), ('odom_frame:=map', 'different'),
     ('fix.lever_arm:=[1.0]', 'fix.lever_arm'),
     ('sources:=[odom, wheels]', 'wheels.type'), ('sources:=[fix]', 'odometry'),
-    ('odom.robust_loss:=l1', 'none, huber, cauchy'), ('fix.sigma_ceiling:=0.001', 'ceiling'))
+    ('odom.robust_loss:=l1', 'none, huber, cauchy'), ('fix.sigma_ceiling:=0.001', 'ceiling'),
+    ('fix.topic:=/odom', 'fix.topic: expected a topic of sensor_msgs/msg/NavSatFix, got /odom'),
+    ('qos_overrides./odom.subscription.reliability:=bestefort', 'best_effort'),
+    ('qos_overrides./path.publisher.lifespan:=5', 'depth, history, reliability'))
 UNREADABLE = (('-p', 'frequency'), ('--params-file', '/no/such.yaml'), ('--no-such',))
 
 
@@ -290,7 +293,7 @@ def errors_of(folder: Path, several: Sequence[Sequence[str]]) -> list[str]:
         return [node.stderr() for node in nodes]
 
 
-@pytest.mark.parametrize('some', [BAD[:3], BAD[3:6], BAD[6:]])
+@pytest.mark.parametrize('some', [BAD[:4], BAD[4:8], BAD[8:]])
 def test_a_bad_parameter_is_one_line_and_no_traceback(
     tmp_path: Path, some: tuple[tuple[str, str], ...],
 ) -> None:

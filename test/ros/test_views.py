@@ -49,14 +49,15 @@ def strings(path: Path) -> set[str]:
 def publications() -> dict[str, str]:
     """Return the topics that the node publishes, each with the name of its quality of service."""
     tree = ast.parse((SOURCES / 'publishers.py').read_text(encoding='utf-8'))
-    return {node.args[1].value: ast.unparse(node.args[2]) for node in ast.walk(tree)
-            if isinstance(node, ast.Call) and ast.unparse(node.func) == 'self._publisher'
-            and isinstance(node.args[1], ast.Constant)}
+    (table,) = (node.value for node in ast.walk(tree) if isinstance(node, ast.Assign)
+                and ast.unparse(node.targets[0]) == 'OUTPUTS')
+    return {key.value: ast.unparse(value.elts[1])
+            for key, value in zip(table.keys, table.values, strict=True)}
 
 
 SOURCES = Path(pose_graph_ros.__file__).parent / 'ros'
 PUBLISHED = publications()
-SUBSCRIBED = strings(SOURCES / 'session.py') & {'initialpose', 'set_pose'}
+SUBSCRIBED = strings(SOURCES / 'topics.py') & {'initialpose', 'set_pose'}
 TOPICS = PUBLISHED.keys() | SUBSCRIBED
 LATCHED = {topic for topic, quality in PUBLISHED.items() if quality == 'LATCHED_QOS'}
 """Topics whose newest message everyone gets who joins late."""
