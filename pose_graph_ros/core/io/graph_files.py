@@ -28,7 +28,6 @@ from pose_graph_ros.core.graph.constraints import (
     EdgeKinds,
     Edges,
     full,
-    KindArray,
     ObservedKinds,
     ObservedNodes,
     upper,
@@ -232,7 +231,8 @@ def _edges(rows: SavedRows, numbers: FloatArray) -> Edges:
         'edges to biases')
     return Edges(
         both[:, 0].astype(np.int64), both[:, 1].astype(np.int64), both[:, 2:5].copy(),
-        full(both[:, 5:]), _kinds(rows.edge_kind), _weights(rows.edge_weight, len(both)), bias)
+        full(both[:, 5:]), rows.edge_kind.astype(np.uint8),
+        _weights(rows.edge_weight, len(both)), bias)
 
 
 def _observed(rows: SavedRows, lines: list[str]) -> ObservedNodes:
@@ -254,7 +254,7 @@ def _observed(rows: SavedRows, lines: list[str]) -> ObservedNodes:
         rows.bias_observed_information)), 'observed nodes on biases')
     return ObservedNodes(
         both[:, 0].astype(np.int64), both[:, 1:4].copy(), both[:, 4:7].copy(), full(both[:, 7:]),
-        _kinds(rows.observed_kind), _weights(rows.observed_weight, size))
+        rows.observed_kind.astype(np.uint8), _weights(rows.observed_weight, size))
 
 
 def _numbers(lines: list[str], tag: str) -> FloatArray:
@@ -273,12 +273,6 @@ def _fill(table: FloatArray, rows: IntArray, numbers: FloatArray, name: str) -> 
     if len(rows) != len(numbers):
         raise ValueError(f'graph: expected {len(rows)} {name}, got {len(numbers)}')
     table[rows] = numbers
-
-
-def _kinds(kind: IntArray) -> KindArray:
-    if np.any((kind < 0) | (kind > 255)):
-        raise ValueError('graph: expected kinds of edges and observed nodes')
-    return kind.astype(np.uint8)
 
 
 def _weights(weight: FloatArray, size: int) -> FloatArray:
