@@ -53,7 +53,7 @@ class Input:
     def configure(self, values: Mapping[str, Any]) -> None:
         """Set the parameters that can change while the node runs."""
         self.reader.configure(values)
-        self.time_jumps.guard.limit_ns = _threshold_ns(values)
+        self.time_jumps.threshold_ns = _threshold_ns(values)
 
     def start_new_graph(self, values: Mapping[str, Any]) -> None:
         """Forget all messages but those of /tf_static; those that are held back stay so."""

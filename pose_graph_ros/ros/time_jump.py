@@ -35,19 +35,40 @@ class Decision(NamedTuple):
     is_old: bool = False  # whether the message is from before the clock was set back
 
 
+class _Watch:
+    """The stamps of one odometry."""
+
+    def __init__(self) -> None:
+        self.guard = StampGuard(0, behind=False)
+        """Follows the newest stamp."""
+        self.behind: list[int] = []
+        """Increasing stamps behind the newest one [ns], if the last ones were."""
+
+    def jump_ns(self, stamp_ns: int, limit_ns: int) -> int:
+        """Return the length of the jump back that this stamp is the last evidence of, else 0."""
+        newest_ns, self.guard.limit_ns = self.guard.newest_ns, limit_ns
+        if newest_ns == 0 or stamp_ns > newest_ns - limit_ns:
+            self.guard.accepts(stamp_ns)
+            self.behind.clear()
+            return 0
+        if self.behind and stamp_ns <= self.behind[-1]:
+            self.behind.clear()
+        self.behind.append(stamp_ns)
+        return newest_ns - self.behind[0] if len(self.behind) >= EVIDENCE else 0
+
+
 class TimeJumpDetector:
     """
-    Watches the stamps of the primary odometry for jumps back in time.
+    Watches the stamps of the primary odometry, or of each odometry before there is a primary one.
 
     A stamp that is behind the newest one by less than the threshold [ns] is late, and no jump.
+    Each odometry is compared with itself alone, as another one may have another clock.
     """
 
     def __init__(self, threshold_ns: int) -> None:
-        self.guard = StampGuard(threshold_ns, behind=False)
-        """Follows the newest stamp of the primary odometry."""
-        self._primary = ''
+        self.threshold_ns = threshold_ns
+        self._watches: dict[str, _Watch] = {}
         self._held: list[ReceivedMessage] = []
-        self._behind: list[int] = []
         self._drained: set[str] | None = None
         """Sources that have sent messages of the new time; None if no old ones are expected."""
         self._old_above_ns = self._n_new = 0
@@ -56,26 +77,24 @@ class TimeJumpDetector:
         """Return which messages can be used, now that this one has come."""
         if self._is_old(received):
             return Decision([], is_old=True)
-        if received.is_primary and received.source != self._primary:
-            # another odometry may have another clock
-            self._primary = received.source
-            self.forget()
-        if not received.is_primary or received.stamp_ns <= 0:
-            return self._release_unless_in_doubt(received)
-        newest_ns = self.guard.newest_ns
-        if newest_ns == 0 or received.stamp_ns > newest_ns - self.guard.limit_ns:
-            self.guard.accepts(received.stamp_ns)
-            self._behind.clear()
-            return Decision(self.release([received]))
-        if self._behind and received.stamp_ns <= self._behind[-1]:
-            self._behind.clear()
-        self._behind.append(received.stamp_ns)
-        if len(self._behind) < EVIDENCE:
-            return self._release_unless_in_doubt(received)
-        jump_ns = newest_ns - self._behind[0]
-        self.forget()
-        self.guard.reset(received.stamp_ns)
-        return Decision(self.release([received]), jump_ns)
+        if not received.is_primary:
+            # if it becomes primary, its stamps are judged by those from then on
+            self._watches.pop(received.source, None)
+        elif received.stamp_ns > 0:
+            watch = self._watches.setdefault(received.source, _Watch())
+            jump_ns = watch.jump_ns(received.stamp_ns, self.threshold_ns)
+            if jump_ns > 0:
+                gone_back = {name for name, each in self._watches.items() if each.behind}
+                self._expect_old(watch.guard.newest_ns, jump_ns, gone_back)
+                self._watches[received.source] = renewed = _Watch()
+                renewed.guard.reset(received.stamp_ns)
+                return Decision(self.release([received]), jump_ns)
+        if len(self._held) < MOST_HELD and any(watch.behind for watch in self._watches.values()):
+            self._held.append(received)
+            return Decision([])
+        for watch in self._watches.values():
+            watch.behind.clear()
+        return Decision(self.release([received]))
 
     def release(self, more: list[ReceivedMessage] | None = None) -> list[ReceivedMessage]:
         """Remove and return the messages that are held back, with more appended."""
@@ -84,23 +103,27 @@ class TimeJumpDetector:
 
     def forget(self) -> None:
         """Forget all stamps; messages that are held back stay so."""
-        self.guard.reset()
-        self._behind.clear()
+        self._watches.clear()
         self._drained = None
 
     def clock_jumped(self, back_ns: int) -> None:
-        """
-        Start again because the clock was set back by an amount [ns].
-
-        Messages of the old time may still be in the queues: those less than half of the jump
-        behind the newest one, of sources that have sent none of the new time before.
-        """
-        newest_ns = self.guard.newest_ns
+        """Start again because the clock was set back by an amount [ns]."""
+        newest_ns = max((watch.guard.newest_ns for watch in self._watches.values()), default=0)
         self.forget()
         if newest_ns > 0:
-            self._drained, self._n_new = set(), 0
-            self._old_above_ns = newest_ns - back_ns // 2
-            self._held = [received for received in self._held if not self._is_old(received)]
+            self._expect_old(newest_ns, back_ns, set())
+
+    def _expect_old(self, newest_ns: int, back_ns: int, drained: set[str]) -> None:
+        """
+        Forget all stamps, and expect messages of the old time that may still be in the queues.
+
+        They are those less than half of the jump behind the newest one, of sources that have sent
+        none of the new time before; such messages that are held back are dropped.
+        """
+        self._watches.clear()
+        self._drained, self._n_new = drained, 0
+        self._old_above_ns = newest_ns - back_ns // 2
+        self._held = [received for received in self._held if not self._is_old(received)]
 
     def _is_old(self, received: ReceivedMessage) -> bool:
         if self._drained is None:
@@ -112,10 +135,3 @@ class TimeJumpDetector:
         if self._n_new > MOST_OLD:
             self._drained = None
         return False
-
-    def _release_unless_in_doubt(self, received: ReceivedMessage) -> Decision:
-        if not self._behind or len(self._held) >= MOST_HELD:
-            self._behind.clear()
-            return Decision(self.release([received]))
-        self._held.append(received)
-        return Decision([])

@@ -235,6 +235,16 @@ def test_only_the_primary_odometry_is_evidence_of_a_jump() -> None:
     assert len(given.receive('odom', odometry(50.0), 'odom').released) == 0
 
 
+def test_before_an_odometry_is_primary_each_of_two_is_watched() -> None:
+    given = Given(sources=['odom', 'visual'], visual__type='odometry')
+    stamps = [100.0 + 0.1 * step for step in range(50)]
+    jumps = []
+    for seconds in stamps + stamps:
+        for source in ('odom', 'visual'):
+            jumps.append(given.receive(source, odometry(seconds)).jump_ns)
+    assert [k for k, jump_ns in enumerate(jumps) if jump_ns > 0] == [100 + 2 * (EVIDENCE - 1)]
+
+
 def test_after_a_jump_of_the_clock_messages_of_the_old_time_are_rejected() -> None:
     given = Given()
     for step in range(20):

@@ -150,7 +150,7 @@ def test_parameters_are_checked_and_reach_the_session(managed: Managed) -> None:
     managed.start()
     assert managed.session.out.map_frame == 'world'
     assert managed.set('clock_jump_threshold', 3.0) == (True, '')
-    assert managed.session.input.time_jumps.guard.limit_ns == 3_000_000_000
+    assert managed.session.input.time_jumps.threshold_ns == 3_000_000_000
     for name, value in (('map_frame', 'elsewhere'), ('frequency', -1.0), ('fix.topic', 'other')):
         successful, reason = managed.set(name, value)
         assert not successful

@@ -183,7 +183,7 @@ def test_parameters_reach_input_outputs_and_engine(active: Robot) -> None:
     active.configure(publish_tf=False, clock_jump_threshold=7.0, path_period=3.0,
                      odom__maximum_speed=4.5, fix__rejection_threshold=2.0)
     assert session.out.transforms is None
-    assert session.input.time_jumps.guard.limit_ns == 7_000_000_000
+    assert session.input.time_jumps.threshold_ns == 7_000_000_000
     assert session._continuity['odom'].maximum_speed == 4.5
     assert session._jump_handle is not handle
     assert session._timers['views'].timer_period_ns == 500_000_000

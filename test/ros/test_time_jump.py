@@ -4,7 +4,7 @@
 
 from hypothesis import given, strategies as st
 
-from pose_graph_ros.ros.time_jump import EVIDENCE, ReceivedMessage, TimeJumpDetector
+from pose_graph_ros.ros.time_jump import Decision, EVIDENCE, ReceivedMessage, TimeJumpDetector
 
 SECOND = 1_000_000_000
 
@@ -135,3 +135,46 @@ def test_another_primary_odometry_may_have_another_clock() -> None:
     released, jumps = decide(time_jumps, messages)
     assert released == messages
     assert jumps == [100]
+
+
+def both(begin: float, seconds: float, later: float = 0.0) -> list[ReceivedMessage]:
+    """Return two odometries in turn, before one of them is primary; the other may be later."""
+    return [each for received in lap(begin, seconds) for each in (
+        received, received._replace(source='visual', stamp_ns=received.stamp_ns + round(
+            (0.01 + later) * SECOND)))]
+
+
+@given(st.sampled_from([0.0, -3000.0, 3000.0]))
+def test_two_odometries_that_start_again_before_one_is_primary_are_one_jump(later: float) -> None:
+    time_jumps = TimeJumpDetector(SECOND)
+    old, new = both(5000.0, 10.0, later), both(5000.0, 10.0, later)
+    released, jumps = decide(time_jumps, old + new)
+    assert jumps == [len(old)]
+    assert released == old + new
+
+
+@given(st.booleans())
+def test_one_of_two_odometries_is_enough_for_a_jump_and_for_a_doubt(first: bool) -> None:
+    source = 'odom' if first else 'visual'
+    time_jumps = TimeJumpDetector(SECOND)
+    decide(time_jumps, both(100.0, 5.0))
+    sent = [odometry(50.0 + 0.1 * k)._replace(source=source) for k in range(EVIDENCE)]
+    other = both(105.0, 5.0)[int(first)::2]
+    assert {each.source for each in other} == {'visual' if first else 'odom'}
+    for k, received in enumerate(sent[:-1]):
+        assert time_jumps.receive(received) == Decision([])
+        # the other goes on, which does not prove that the first was wrong
+        assert time_jumps.receive(other[k]) == Decision([])
+    decision = time_jumps.receive(sent[-1])
+    assert decision.jump_ns > 54 * SECOND
+    assert decision.released == sent    # what the other has sent is of the old time
+    assert time_jumps.receive(other[EVIDENCE]).is_old
+
+
+def test_an_odometry_that_is_not_primary_any_more_is_not_judged_by_what_it_sent_before() -> None:
+    time_jumps = TimeJumpDetector(SECOND)
+    decide(time_jumps, both(100.0, 5.0))
+    visual = odometry(50.0)._replace(source='visual')
+    messages = [*(visual._replace(is_primary=False) for _ in range(3)), *(
+        visual._replace(stamp_ns=visual.stamp_ns + k) for k in range(2 * EVIDENCE))]
+    assert decide(time_jumps, messages) == (messages, [])
