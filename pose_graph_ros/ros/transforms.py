@@ -117,7 +117,10 @@ class TransformPublisher:
                 continue
             wrong = '' if parent == self._map_frame else ', so that it has two parents'
             self.other = (
-                f'another node publishes {parent} -> {self._odom_frame} on {TOPIC}{wrong}: '
-                'set publish_tf of one of the two to false')
+                f'another node publishes {parent} -> {self._odom_frame} on '
+                f'{self._node.resolve_topic_name(TOPIC)}{wrong}: set publish_tf of one of the two '
+                'to false; if it is that of another robot, give each a namespace and its own '
+                'tf, with remap_tf:=true of the launch file or -r /tf:=tf '
+                '-r /tf_static:=tf_static')
             self._on_other(self.other)
             return

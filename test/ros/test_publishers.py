@@ -395,6 +395,7 @@ def test_another_publisher_of_the_transform_is_warned_of_once(
     local.spin_until(lambda: len(received) >= 8, 'those of the other come')
     assert given.others == [out.other]
     assert f'another node publishes {parent} -> odom on /tf' in out.other
+    assert '-r /tf:=tf -r /tf_static:=tf_static' in out.other
     assert ('two parents' in out.other) is two_parents
 
 

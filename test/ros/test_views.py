@@ -1,43 +1,28 @@
 # Copyright 2026 The pose_graph_ros authors
 # SPDX-License-Identifier: Apache-2.0
 """
-Launch file, RViz configuration and Foxglove layout: all that they name is there.
+RViz configuration and Foxglove layout: all that they name is there.
 
-None of the three programs can be asked here, so the names are read from the files, and compared
+Neither program can be asked here, so the names are read from the files, and compared
 with the tables of the node and with the strings in its source.
 """
 
 import ast
 from collections.abc import Iterator
-import importlib.util
 import json
 from pathlib import Path
 import re
 from typing import Any
 
-import pytest
 import yaml
 
 import pose_graph_ros
 from pose_graph_ros.adapters.markers import NAMESPACES
-from pose_graph_ros.adapters.parameters import PARAMETERS
-from pose_graph_ros.adapters.sources import KNOWN_SOURCES
 
 TREE = Path(__file__).resolve().parents[2]
-LAUNCH = TREE / 'launch' / 'pose_graph.launch.py'
 RVIZ = TREE / 'config' / 'pose_graph.rviz'
 FOXGLOVE = TREE / 'config' / 'foxglove_layout.json'
 PARAMETER_FILE = TREE / 'config' / 'pose_graph.yaml'
-
-ARGUMENTS = {
-    'params_file', 'name', 'namespace', 'use_sim_time', 'log_level', 'autostart', 'rviz',
-    'rviz_config', 'odom', 'fix', 'imu', 'global_pose', 'loop_closure', 'path', 'pose',
-    'filtered_odometry'}
-"""Of the launch file."""
-# of launch_ros.actions.Node in Jazzy, and those of launch.actions.ExecuteProcess that are used
-NODE_KEYWORDS = {
-    'executable', 'package', 'name', 'namespace', 'exec_name', 'parameters', 'remappings',
-    'ros_arguments', 'arguments', 'output', 'condition'}
 
 
 def strings(path: Path) -> set[str]:
@@ -61,95 +46,6 @@ SUBSCRIBED = strings(SOURCES / 'topics.py') & {'initialpose', 'set_pose'}
 TOPICS = PUBLISHED.keys() | SUBSCRIBED
 LATCHED = {topic for topic, quality in PUBLISHED.items() if quality == 'LATCHED_QOS'}
 """Topics whose newest message everyone gets who joins late."""
-
-
-# --- The launch file -------------------------------------------------------------------------
-
-TEXT = ast.parse(LAUNCH.read_text(encoding='utf-8'))
-
-
-def calls(name: str) -> list[ast.Call]:
-    return [node for node in ast.walk(TEXT) if isinstance(node, ast.Call)
-            and isinstance(node.func, ast.Name) and node.func.id == name]
-
-
-def constant(name: str) -> Any:
-    """Return a constant of the module."""
-    return next(ast.literal_eval(node.value) for node in TEXT.body
-                if isinstance(node, ast.Assign) and ast.unparse(node.targets[0]) == name)
-
-
-def literal_first_arguments(name: str) -> set[str]:
-    return {call.args[0].value for call in calls(name) if isinstance(call.args[0], ast.Constant)}
-
-
-def keywords(call: ast.Call) -> dict[str, ast.expr]:
-    return {str(keyword.arg): keyword.value for keyword in call.keywords}
-
-
-def test_every_argument_is_declared_and_used() -> None:
-    tables = {name for name, _, _ in constant('INPUTS') + constant('OUTPUTS')}
-    declared = literal_first_arguments('DeclareLaunchArgument') | tables
-    assert declared == ARGUMENTS
-    assert literal_first_arguments('LaunchConfiguration') | tables == declared
-
-
-def test_inputs_are_those_of_the_sources_and_outputs_those_of_the_node() -> None:
-    inputs = {name: topic for name, topic, _ in constant('INPUTS')}
-    assert inputs == {name: topic for name, (_, topic) in KNOWN_SOURCES.items()}
-    kinds = {name: kind.message_type.replace('/msg/', '/') for name, (kind, _)
-             in KNOWN_SOURCES.items()}
-    for name, _, type_name in constant('INPUTS'):
-        assert type_name.startswith(kinds[name])
-    assert {topic for _, topic, _ in constant('OUTPUTS')} <= PUBLISHED.keys()
-
-
-def test_parameters_are_those_of_the_node() -> None:
-    known = {parameter.name for parameter in PARAMETERS} | {'use_sim_time'}     # that of rclpy
-    given = {key.value for node in calls('Node') for item in keywords(node)['parameters'].elts
-             if isinstance(item, ast.Dict) for key in item.keys}
-    assert given == {'use_sim_time', 'autostart'}
-    assert given <= known
-
-
-def test_nodes_are_called_with_what_they_take() -> None:
-    node, rviz = calls('Node')
-    for call in (node, rviz):
-        assert len(call.args) == 0
-        assert set(keywords(call)) <= NODE_KEYWORDS
-    executable = keywords(node)['executable'].value
-    assert f"'{executable} = " in (TREE / 'setup.py').read_text(encoding='utf-8')
-    assert 'condition' not in keywords(node)
-    assert ast.unparse(keywords(rviz)['condition']) == "IfCondition(LaunchConfiguration('rviz'))"
-    # its displays have to find the topics wherever the node has them
-    assert ast.unparse(keywords(rviz)['namespace']) == ast.unparse(keywords(node)['namespace'])
-    assert ast.unparse(keywords(rviz)['remappings']) == 'outputs'
-
-
-def test_files_of_the_package_are_there() -> None:
-    names = [call.args[0].elts[-1].value for call in calls('PathJoinSubstitution')
-             if ast.unparse(call.args[0].elts[0]) == 'config']
-    assert sorted(names) == ['pose_graph.rviz', 'pose_graph.yaml']
-    for name in names:
-        assert (TREE / 'config' / name).is_file()
-
-
-def test_the_description_can_be_made_and_rviz_starts_only_when_asked_for() -> None:
-    launch = pytest.importorskip('launch')
-    pytest.importorskip('launch_ros')
-    specification = importlib.util.spec_from_file_location('pose_graph_launch', LAUNCH)
-    module = importlib.util.module_from_spec(specification)
-    specification.loader.exec_module(module)
-    entities = module.generate_launch_description().entities
-    arguments = {entity.name: entity for entity in entities
-                 if isinstance(entity, launch.actions.DeclareLaunchArgument)}
-    assert set(arguments) == ARGUMENTS
-    node, rviz = entities[len(arguments):]
-    context = launch.LaunchContext()
-    for wanted in (False, True):
-        context.launch_configurations['rviz'] = str(wanted).lower()
-        assert rviz.condition.evaluate(context) is wanted
-    assert node.condition is None
 
 
 # --- RViz ------------------------------------------------------------------------------------
