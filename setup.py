@@ -16,7 +16,7 @@ from setuptools import Distribution, find_packages, setup
 from distutils.command.install_data import install_data  # isort: skip  (setuptools provides it)
 
 PACKAGE = 'pose_graph_ros'
-EXECUTABLES = ('pose_graph_node', 'replay')     # those for `ros2 run`
+EXECUTABLES = ('pose_graph_node', 'replay', 'compile_kernels')     # those for `ros2 run`
 LIBEXEC = Path('lib', PACKAGE)
 HERE = Path(__file__).resolve().parent
 
@@ -61,7 +61,8 @@ setup(
     entry_points={
         'console_scripts': [
             'pose_graph_node = pose_graph_ros.ros.main:main',
-            'replay = pose_graph_ros.cli.replay:main',
+            'replay = pose_graph_ros.cli.main:replay',
+            'compile_kernels = pose_graph_ros.cli.main:compile_kernels',
             'pose-graph = pose_graph_ros.cli.main:main',
         ],
     },
@@ -72,10 +73,11 @@ setup(
     # The lower bounds are what Ubuntu 24.04 has. rclpy and the messages come with ROS.
     # Of Numba it has none; 0.60 is the first with math.log2, and takes its Python and NumPy.
     # Tested with 0.60.0 and 0.68.1 on NumPy 1.26, 0.61.2 on NumPy 2.2, 0.68.1 on NumPy 2.4.
+    # The upper bound is that of core/compiled/numba_internals.py, which says why.
     install_requires=[
         'numpy>=1.26',
         'scipy>=1.11',
-        'numba>=0.60',
+        'numba>=0.60,<0.69',
         'pyproj>=3.6',
         'matplotlib>=3.6',
         'rosbags>=0.11',

@@ -97,6 +97,14 @@ def test_core_imports_only_numbers(path: Path) -> None:
     assert not own_imports(path) & {'adapters', 'ros', 'cli'}
 
 
+@pytest.mark.parametrize('path', MODULES, ids=str)
+def test_only_one_module_imports_what_is_not_public_in_numba(path: Path) -> None:
+    # all the others are stable interfaces by Numba's documentation
+    found = {name for name in imports(path) if name.startswith('numba.') and not name.startswith((
+        'numba.types', 'numba.extending.', 'numba.config'))}
+    assert not found or path.name == 'numba_internals.py'
+
+
 @pytest.mark.parametrize('package', CORE)
 def test_a_package_of_core_imports_only_those_below_it(package: str) -> None:
     paths = modules(*package.split('.'))

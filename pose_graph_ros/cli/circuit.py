@@ -9,10 +9,10 @@ and is zero at traffic lights.
 """
 
 from dataclasses import dataclass
+from itertools import accumulate
 
 import numpy as np
 from scipy.ndimage import gaussian_filter1d
-from scipy.signal import lfilter
 
 from pose_graph_ros.core.geometry import se2
 from pose_graph_ros.core.geometry.se2 import FloatArray, IntArray
@@ -99,7 +99,7 @@ def gauss_markov(
     decay = np.exp(-step)
     noise = generator.normal(0.0, sigma * np.sqrt(1.0 - decay**2), count)
     noise[0] = generator.normal(0.0, sigma)
-    return np.asarray(lfilter([1.0], [1.0, -decay], noise))
+    return np.array(list(accumulate(noise.tolist(), lambda last, new: new + decay * last)))
 
 
 def _circuit(duration_s: float) -> tuple[FloatArray, IntArray, float]:

@@ -1,55 +1,95 @@
 # Copyright 2026 The pose_graph_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""The command `pose-graph` with the tools around the node."""
+"""
+The command `pose-graph` with the tools around the node.
+
+A tool is the module of this package with its name, and has `add_arguments` and `execute`. Only the
+module of the tool that is used is imported: the imports of all take seconds.
+"""
 
 import argparse
-from pathlib import Path
+from collections.abc import Callable
+import importlib
+import os
 import sys
 
 from pose_graph_ros import __version__
-from pose_graph_ros.adapters.parameter_texts import as_markdown, as_yaml, sources_as_markdown
-from pose_graph_ros.cli import demo, replay, solve
-from pose_graph_ros.cli.simulate import simulate_drive, write_drive
+from pose_graph_ros.core.exceptions import PoseGraphError
+
+SUMMARIES = {
+    'demo': 'play a bag to the node over DDS',
+    'replay': 'run a bag through the engine of the node, without ROS',
+    'solve': 'optimise a g2o file',
+    'simulate': 'write a simulated drive as a rosbag2',
+    'parameters': 'print the parameters of the node',
+    'compile-kernels': 'compile the solver for later starts',
+}
+"""Tools and what they do."""
 
 
 def main(args: list[str] | None = None) -> int:
     """Run a tool with command line arguments; return the exit code."""
+    words = sys.argv[1:] if args is None else args
     parser = argparse.ArgumentParser(
         prog='pose-graph', description='Tools around the pose graph node.')
     parser.add_argument('--version', action='version', version=__version__)
     tools = parser.add_subparsers(title='tools', required=True)
+    parsers = {name: tools.add_parser(name, help=text) for name, text in SUMMARIES.items()}
+    # no option before the tool's name has a value
+    chosen = next((word for word in words if not word.startswith('-')), '')
 
-    for module, name, summary in (
-            (demo, 'demo', 'play a bag to the node over DDS'),
-            (replay, 'replay', 'run a bag through the engine of the node, without ROS'),
-            (solve, 'solve', 'optimise a g2o file')):
-        tool = tools.add_parser(name, help=summary, description=module.__doc__,
-                                formatter_class=argparse.RawDescriptionHelpFormatter)
-        module.add_arguments(tool)
-        tool.set_defaults(execute=module.execute)
-
-    simulate = tools.add_parser('simulate', help='write a simulated drive as a rosbag2')
-    simulate.add_argument('out', type=Path, help='folder of the rosbag2')
-    simulate.add_argument('--seed', type=int, default=1, help='(default: %(default)s)')
-    simulate.set_defaults(execute=_simulate)
-
-    parameters = tools.add_parser('parameters', help='print the parameters of the node')
-    parameters.add_argument('--yaml', action='store_true', help='print them as a parameter file')
-    parameters.set_defaults(execute=_parameters)
-
-    options = parser.parse_args(args)
-    return replay.guarded(options)
+    def run() -> int:
+        if chosen in parsers:
+            _complete(parsers[chosen], chosen)
+        options = parser.parse_args(words)
+        return int(options.execute(options))
+    return guarded(run)
 
 
-def _simulate(options: argparse.Namespace) -> int:
-    write_drive(simulate_drive(options.seed), options.out)
-    print(f'written: {options.out}')
-    return 0
+def replay(args: list[str] | None = None) -> int:
+    """Run `replay` as a separate program; return the exit code."""
+    return _alone('replay', args)
 
 
-def _parameters(options: argparse.Namespace) -> int:
-    print(as_yaml() if options.yaml else f'{as_markdown()}\n{sources_as_markdown()}', end='')
-    return 0
+def compile_kernels(args: list[str] | None = None) -> int:
+    """Run `compile-kernels` as a separate program; return the exit code."""
+    return _alone('compile-kernels', args)
+
+
+def _alone(tool: str, args: list[str] | None) -> int:
+    def run() -> int:
+        parser = argparse.ArgumentParser(prog=tool.replace('-', '_'))
+        _complete(parser, tool)
+        options = parser.parse_args(args)
+        return int(options.execute(options))
+    return guarded(run)
+
+
+def _complete(parser: argparse.ArgumentParser, tool: str) -> None:
+    """Import the module of a tool, and add its description and arguments to a parser."""
+    module = importlib.import_module(f'pose_graph_ros.cli.{tool.replace("-", "_")}')
+    parser.description = module.__doc__
+    parser.formatter_class = argparse.RawDescriptionHelpFormatter
+    module.add_arguments(parser)
+    parser.set_defaults(execute=module.execute)
+
+
+def guarded(run: Callable[[], int]) -> int:
+    """
+    Call a function and return the exit code that it returns.
+
+    Errors that the user can correct are printed on one line; the code is then 2.
+    """
+    try:
+        return run()
+    except BrokenPipeError:  # the reader of the output, such as head, has ended
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        return 1
+    except (PoseGraphError, OSError) as error:
+        print(f'error: {error}', file=sys.stderr)
+        return 2
+    except KeyboardInterrupt:
+        return 130
 
 
 if __name__ == '__main__':

@@ -10,9 +10,7 @@ follows at the end. The path is the one of a node that receives the same message
 import argparse
 from collections import Counter
 from collections.abc import Mapping
-import os
 from pathlib import Path
-import sys
 import time
 from typing import Any, NamedTuple
 
@@ -30,7 +28,6 @@ from pose_graph_ros.cli.results import collect_drive, write_results
 from pose_graph_ros.core.backend import PoseGraphBackend
 from pose_graph_ros.core.batch.optimizer import Status
 from pose_graph_ros.core.estimate import UpdateReport
-from pose_graph_ros.core.exceptions import PoseGraphError
 from pose_graph_ros.core.io.g2o import write_g2o
 from pose_graph_ros.core.measurements import Answer, OdometrySample
 
@@ -129,34 +126,3 @@ def execute(options: argparse.Namespace) -> int:
     print('counts: ' + ', '.join(f'{name} {count}' for name, count in counts.items()))
     print(f'\n{table}\n\nwritten: {options.out}/path.tum, drive.png, summary.json, graph.g2o')
     return 0 if report.status is Status.CONVERGED else 1
-
-
-def main(args: list[str] | None = None) -> int:
-    """Run `replay` as a separate program; return the exit code."""
-    parser = argparse.ArgumentParser(
-        prog='replay', description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    add_arguments(parser)
-    parser.set_defaults(execute=execute)
-    return guarded(parser.parse_args(args))
-
-
-def guarded(options: argparse.Namespace) -> int:
-    """
-    Run the tool `options.execute` and return its exit code.
-
-    Errors that the user can correct are printed on one line; the code is then 2.
-    """
-    try:
-        return int(options.execute(options))
-    except BrokenPipeError:  # the reader of the output, such as head, has ended
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
-        return 1
-    except (PoseGraphError, OSError) as error:
-        print(f'error: {error}', file=sys.stderr)
-        return 2
-    except KeyboardInterrupt:
-        return 130
-
-
-if __name__ == '__main__':
-    sys.exit(main())

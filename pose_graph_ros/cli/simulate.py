@@ -15,6 +15,7 @@ of the *first fix of the bag*, including its error, because a localisation that 
 has no better origin. The antenna is above base_link.
 """
 
+import argparse
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -72,6 +73,19 @@ class SimulatedDrive:
     fixes: FloatArray  # latitude, longitude and ellipsoidal height, shape (M, 3) [deg, deg, m]
     loop_stamps_ns: IntArray  # of the earlier and later pose of loop closures, shape (L, 2) [ns]
     loop_poses: FloatArray  # measured later pose in the earlier one, shape (L, 3) [m, m, rad]
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Add the arguments of this tool."""
+    parser.add_argument('out', type=Path, help='folder of the rosbag2')
+    parser.add_argument('--seed', type=int, default=1, help='(default: %(default)s)')
+
+
+def execute(options: argparse.Namespace) -> int:
+    """Run the tool; return the exit code."""
+    write_drive(simulate_drive(options.seed), options.out)
+    print(f'written: {options.out}')
+    return 0
 
 
 def simulate_drive(seed: int = 1, duration_s: float = 440.0) -> SimulatedDrive:

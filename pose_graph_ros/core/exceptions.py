@@ -11,6 +11,10 @@ class ConfigError(PoseGraphError, ValueError):
     """A setting has an invalid value."""
 
 
+class NumbaVersionError(PoseGraphError, ImportError):
+    """The installed version of Numba is not supported."""
+
+
 class GraphUpdateError(PoseGraphError, ValueError):
     """A `GraphUpdate` is inconsistent with the graph, which is unchanged."""
 

@@ -28,10 +28,14 @@ def main(args: list[str] | None = None) -> int:
     from rclpy.exceptions import InvalidParameterTypeException, InvalidParameterValueException
     from rclpy.signals import SignalHandlerOptions
 
-    from pose_graph_ros.core.exceptions import ConfigError
-    from pose_graph_ros.ros import memory
-    from pose_graph_ros.ros.node import PoseGraphNode
-    from pose_graph_ros.ros.spinning import Spinner
+    from pose_graph_ros.core.exceptions import ConfigError, NumbaVersionError
+    try:
+        from pose_graph_ros.ros import memory
+        from pose_graph_ros.ros.node import PoseGraphNode
+        from pose_graph_ros.ros.spinning import Spinner
+    except NumbaVersionError as error:
+        print(f'pose_graph_node: {error}', file=sys.stderr)
+        return 2
 
     memory.give_back_large_arrays()
     # by default the thread of the engine would delay messages by 5 ms at a time

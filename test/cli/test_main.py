@@ -3,6 +3,8 @@
 """The command `pose-graph`: its tools, and those of them that need no module of their own."""
 
 from pathlib import Path
+import subprocess
+import sys
 
 import numpy as np
 import pytest
@@ -10,11 +12,14 @@ import pytest
 from pose_graph_ros import __version__
 from pose_graph_ros.adapters.bags import open_bag
 from pose_graph_ros.adapters.parameter_texts import as_markdown, as_yaml, sources_as_markdown
-from pose_graph_ros.cli import main as command
-from pose_graph_ros.cli.main import main
+from pose_graph_ros.cli import simulate
+from pose_graph_ros.cli.main import main, SUMMARIES
 from pose_graph_ros.cli.simulate import simulate_drive
 
-TOOLS = ('demo', 'replay', 'solve', 'simulate', 'parameters')
+TOOLS = tuple(SUMMARIES)
+RING = Path(__file__).parents[1] / 'data' / 'ring.g2o'
+# What only some tools need, and what takes a tenth of a second or more to import.
+HEAVY = ('rclpy', 'rosbags', 'pyproj', 'matplotlib', 'PIL', 'scipy', 'numba', 'numpy', 'yaml')
 
 
 def test_help_lists_all_tools(capsys: pytest.CaptureFixture[str]) -> None:
@@ -40,6 +45,34 @@ def test_the_version_is_that_of_the_package(capsys: pytest.CaptureFixture[str]) 
     assert capsys.readouterr().out == f'{__version__}\n'
 
 
+def loaded(*words: str | Path) -> set[str]:
+    """Return the names of all modules that are loaded after a tool has run in its own process."""
+    code = ('import sys; from pose_graph_ros.cli.main import main\n'
+            'try: main(sys.argv[1:])\n'
+            'except SystemExit: pass\n'
+            'print(*sys.modules)')
+    done = subprocess.run([sys.executable, '-c', code, *map(str, words)], check=True,
+                          capture_output=True, text=True, timeout=100)
+    return set(done.stdout.splitlines()[-1].split())
+
+
+@pytest.mark.parametrize('word', ['--help', '--version', 'no_such_tool'])
+def test_what_needs_no_tool_loads_none(word: str) -> None:
+    assert not loaded(word) & set(HEAVY)
+
+
+def test_solve_loads_what_it_needs() -> None:
+    loaded('solve', RING)   # compiles, if no other test has
+    names = loaded('solve', RING)
+    assert 'pose_graph_ros.core.batch.optimizer' in names
+    # (Numba reads a settings file with PyYAML, and the version of SciPy)
+    assert names & set(HEAVY) <= {'numpy', 'numba', 'yaml', 'scipy'}
+    assert not {name for name in names if name.startswith((
+        'scipy.linalg', 'scipy.sparse', 'numba.np.linalg', 'numba.np.arraymath'))}
+    assert not {name for name in names if name.startswith((
+        'pose_graph_ros.adapters', 'pose_graph_ros.ros', 'pose_graph_ros.core.smoother'))}
+
+
 @pytest.mark.parametrize('words', [[], ['no_such_tool'], ['solve'], ['solve', 'a', '--edge2', 'b'],
                                    ['replay', 'bag', '--hold-out', 'some']])
 def test_wrong_words_are_refused(words: list[str], capsys: pytest.CaptureFixture[str]) -> None:
@@ -61,7 +94,7 @@ def test_parameters_are_printed_as_tables_and_as_a_file(
 def test_a_drive_is_simulated_once(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str],
 ) -> None:
-    monkeypatch.setattr(command, 'simulate_drive', lambda seed: simulate_drive(seed, 12.0))
+    monkeypatch.setattr(simulate, 'simulate_drive', lambda seed: simulate_drive(seed, 12.0))
     folder = tmp_path / 'drive'
     assert main(['simulate', str(folder), '--seed', '5']) == 0
     assert capsys.readouterr().out == f'written: {folder}\n'

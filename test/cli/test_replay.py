@@ -2,7 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """The tool `pose-graph replay` without ROS: its files, counts, comparisons and exit codes."""
 
-import argparse
 import json
 import os
 from pathlib import Path
@@ -26,7 +25,7 @@ from pose_graph_ros.cli.bag_messages import (
     odometry_messages,
     write_bag,
 )
-from pose_graph_ros.cli.main import main
+from pose_graph_ros.cli.main import guarded, main, replay as replay_alone
 from pose_graph_ros.cli.results import collect_drive, read_truth
 from pose_graph_ros.core.batch.optimizer import Status
 from pose_graph_ros.core.exceptions import PoseGraphError
@@ -256,7 +255,7 @@ def test_replay_is_a_program_of_its_own(
     tmp_path: Path, capsys: pytest.CaptureFixture[str],
 ) -> None:
     write_bag(tmp_path / 'bag', odometry())
-    assert replay.main([str(tmp_path / 'bag'), '-o', str(tmp_path)]) == 0
+    assert replay_alone([str(tmp_path / 'bag'), '-o', str(tmp_path)]) == 0
     assert len(read_tum(tmp_path / 'path.tum')) > 20
     assert 'nothing to compare' in capsys.readouterr().out
 
@@ -283,29 +282,29 @@ def test_the_exit_code_says_whether_the_optimisation_converged(
 def test_errors_of_the_user_are_one_line_and_an_exit_code(
     error: BaseException, code: int, said: str, capsys: pytest.CaptureFixture[str],
 ) -> None:
-    def execute(_: argparse.Namespace) -> int:
+    def execute() -> int:
         raise error
 
-    assert replay.guarded(argparse.Namespace(execute=execute)) == code
+    assert guarded(execute) == code
     assert capsys.readouterr() == ('', said)
 
 
 def test_an_error_of_the_program_is_not_hidden() -> None:
-    def execute(_: argparse.Namespace) -> int:
+    def execute() -> int:
         raise ZeroDivisionError
 
     with pytest.raises(ZeroDivisionError):
-        replay.guarded(argparse.Namespace(execute=execute))
+        guarded(execute)
 
 
 def test_a_pipe_whose_reader_has_ended_is_no_traceback(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    def execute(_: argparse.Namespace) -> int:
+    def execute() -> int:
         raise BrokenPipeError
 
     with (tmp_path / 'out').open('w', encoding='utf-8') as stream:
         monkeypatch.setattr(sys, 'stdout', stream)
-        assert replay.guarded(argparse.Namespace(execute=execute)) == 1
+        assert guarded(execute) == 1
         # what is still in the buffer goes nowhere
         assert os.path.samestat(os.fstat(stream.fileno()), os.stat(os.devnull))

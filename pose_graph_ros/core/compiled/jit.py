@@ -17,14 +17,15 @@ is defined.
 
 from collections.abc import Callable, Iterable
 from contextlib import suppress
+from pathlib import Path
 from types import MappingProxyType
 from typing import Any
 
 import numba
 from numba import types
-from numba.core.dispatcher import Dispatcher
 
 from pose_graph_ros.core.compiled.kernel_cache import KernelCache
+from pose_graph_ros.core.compiled.numba_internals import Dispatcher
 
 # Arguments may have types that only Numba knows, so the type checker does not see signatures.
 Function = Callable[..., Any]
@@ -170,6 +171,18 @@ def is_cached(*names: str) -> bool:
 
 
 def can_be_kept() -> bool:
-    """Tell whether all kernels imported so far have a folder for their cached code."""
-    return all(isinstance(dispatcher._cache, KernelCache)  # noqa: SLF001
-               for dispatcher in _registered.values())
+    """Tell whether all kernels imported so far have a writeable folder for their code."""
+    caches = [dispatcher._cache for dispatcher in _registered.values()]  # noqa: SLF001
+    return all(isinstance(cache, KernelCache) and cache.is_writable for cache in caches)
+
+
+def cache_folders() -> set[Path]:
+    """Return the folders that the code of all kernels imported so far is kept in."""
+    caches = [dispatcher._cache for dispatcher in _registered.values()]  # noqa: SLF001
+    return {Path(cache.cache_path) for cache in caches if isinstance(cache, KernelCache)}
+
+
+def processor() -> str:
+    """Return the name of the processor that kernels are compiled for."""
+    dispatcher = next(iter(_registered.values()))
+    return str(dispatcher.targetctx.codegen().magic_tuple()[1])

@@ -11,7 +11,8 @@ the name of the other. The cache in this module uses Numba's files with these di
 
 - The folder is the first writeable one of: `NUMBA_CACHE_DIR` if it is set, `__pycache__` beside
   the source, `pose_graph_ros` in the user's cache, a private folder in the temporary directory.
-  If none is writeable, a warning is logged and every start compiles again.
+  Code is also loaded from those before it, such as the `__pycache__` that root has filled when it
+  made a robot's image. If there is none, a warning is logged and every start compiles again.
 - Each entry contains a fingerprint of everything that its code was made from, and a check sum. It
   is used only if both are correct.
 - A cache that cannot be read or written costs time, but never raises an exception.
@@ -20,10 +21,11 @@ Only the dispatchers of our kernels are changed. Numba's settings and the enviro
 whole process and stay as they are.
 """
 
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from enum import Enum
 import functools
 import hashlib
+from itertools import takewhile
 import logging
 import os
 from pathlib import Path
@@ -34,10 +36,17 @@ from types import CodeType, FunctionType, ModuleType
 from typing import Any, ClassVar
 
 import numba
-from numba.core import serialize, sigutils
-from numba.core.caching import CompileResultCacheImpl, FunctionCache
-from numba.core.dispatcher import Dispatcher
 import numpy as np
+
+from pose_graph_ros.core.compiled.numba_internals import (
+    CompileResultCacheImpl,
+    Dispatcher,
+    FunctionCache,
+    IndexDataCacheFile,
+    rtsys,
+    serialize,
+    sigutils,
+)
 
 logger = logging.getLogger(__name__)
 
@@ -59,10 +68,24 @@ def find_folder(source: Path) -> Path | None:
             tried.append(f'{folder} ({error.strerror or error})')
         else:
             return folder
-    logger.warning(
-        'compiled kernels cannot be kept, every start compiles them again; set NUMBA_CACHE_DIR to '
-        'a folder that can be written to; tried: %s', ', '.join(tried))
+    if len(_readable(_candidates(source))) == 0:
+        logger.warning(
+            'compiled kernels cannot be kept, every start compiles them again; set '
+            'NUMBA_CACHE_DIR to a folder that can be written to; tried: %s', ', '.join(tried))
     return None
+
+
+def read_only_folders(source: Path) -> list[Path]:
+    """Return the existing folders that come before the writeable one; all if none is writeable."""
+    own = find_folder(source)
+    return _readable(takewhile(lambda folder: folder != own, _candidates(source)))
+
+
+def _readable(folders: Iterable[Path]) -> list[Path]:
+    # what is in a private folder that is not writeable may be of another user
+    private = _private_folder()
+    return [folder for folder in folders if folder.is_dir() and os.access(folder, os.R_OK)
+            and not folder.is_relative_to(private)]
 
 
 def _candidates(source: Path) -> Iterator[Path]:
@@ -190,7 +213,7 @@ class _Locator:
         if not source.is_file():
             _warn_once(f'compiled kernels of {py_file} cannot be kept: it is no file')
             return None
-        folder = find_folder(source.parent)
+        folder = find_folder(source.parent) or next(iter(read_only_folders(source.parent)), None)
         return None if folder is None else cls(source, folder)
 
     def ensure_cache_path(self) -> None:
@@ -235,6 +258,13 @@ class KernelCache(FunctionCache):  # type: ignore[misc]
         super().__init__(dispatcher.py_func)
         self._impl.dispatcher = dispatcher
         self._dispatcher = dispatcher
+        source = Path(dispatcher.py_func.__code__.co_filename).absolute().parent
+        self.is_writable = find_folder(source) is not None
+        # its own files first
+        self._files = [self._cache_file, *(
+            IndexDataCacheFile(
+                str(folder), self._impl.filename_base, self._impl.locator.get_source_stamp())
+            for folder in read_only_folders(source) if str(folder) != self.cache_path)]
 
     def load_overload(self, signature: Any, target_context: Any) -> Any:
         """
@@ -245,14 +275,21 @@ class KernelCache(FunctionCache):  # type: ignore[misc]
         signature, target_context : as Numba passes them
 
         """
-        try:
-            found = super().load_overload(signature, target_context)
-            wanted, _ = sigutils.normalize_signature(signature)
-            if found is not None and tuple(found.signature.args) == tuple(wanted):
-                return found
-        except Exception as error:
-            _warn('read', self.cache_path, error)
-            self._forget()
+        # Numba refreshes the context, which imports all that can be compiled (0.5 s) and does
+        # this, which is all that machine code needs. The compiler refreshes the context itself.
+        rtsys.initialize(target_context)
+        key = self._index_key(signature, target_context.codegen())
+        wanted, _ = sigutils.normalize_signature(signature)
+        for file in self._files:
+            try:
+                kept = file.load(key)
+                found = None if kept is None else self._impl.rebuild(target_context, kept)
+                if found is not None and tuple(found.signature.args) == tuple(wanted):
+                    return found
+            except Exception as error:
+                _warn('read', file._cache_path, error)  # noqa: SLF001
+                if file is self._cache_file:
+                    self._forget()
         return None
 
     def save_overload(self, signature: Any, result: Any) -> None:
@@ -271,8 +308,10 @@ class KernelCache(FunctionCache):  # type: ignore[misc]
 
     def holds_code(self) -> bool:
         """Tell whether the cache has a valid entry for at least one signature."""
+        return any(map(self._holds_code, self._files))
+
+    def _holds_code(self, file: IndexDataCacheFile) -> bool:
         # Numba has no public method that checks an entry without loading its code
-        file = self._cache_file
         try:
             names = file._load_index().values()  # noqa: SLF001
             kept = [file._load_data(name) for name in names]  # noqa: SLF001

@@ -16,11 +16,10 @@ from collections.abc import Callable
 from typing import Any, Final
 
 from numba import types
-from numba.core.cgutils import ir  # llvmlite, which Numba brings along
-from numba.core.datamodel import models
-from numba.extending import intrinsic, register_model
+from numba.extending import intrinsic, models, register_model
 
 from pose_graph_ros.core.compiled.jit import kernel
+from pose_graph_ros.core.compiled.numba_internals import ir
 
 # Number of elements of a vector.
 WIDTH: Final = 4

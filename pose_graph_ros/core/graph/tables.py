@@ -26,11 +26,11 @@ from typing import Any, Final
 
 from numba import types
 from numba.extending import intrinsic
-from numba.np.arrayobj import populate_array
 import numpy as np
 import numpy.typing as npt
 
 from pose_graph_ros.core.compiled.jit import INTEGERS
+from pose_graph_ros.core.compiled.numba_internals import populate_array
 
 HEAD = INTEGERS     # the type of the head, in signatures of kernels
 

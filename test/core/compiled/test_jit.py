@@ -370,11 +370,15 @@ def test_kernel_without_a_folder_works(
 
 # --- whole processes ----------------------------------------------------------------------------
 
-def launch(folder: Path, **environment: str) -> 'subprocess.Popen[str]':
+# Root can write everywhere, unless it gives up this right.
+UNPRIVILEGED = ('setpriv', '--bounding-set', '-dac_override', '--inh-caps', '-all')
+
+
+def launch(folder: Path, *prefix: str, **environment: str) -> 'subprocess.Popen[str]':
     inherited = os.environ.get('PYTHONPATH', '').split(os.pathsep)
     path = os.pathsep.join([str(folder.parent), str(TREE), *inherited])
     return subprocess.Popen(
-        [sys.executable, '-c', START], env={'PYTHONPATH': path, **environment}, text=True,
+        [*prefix, sys.executable, '-c', START], env={'PYTHONPATH': path, **environment}, text=True,
         cwd=folder.parent, stdout=subprocess.PIPE, stderr=subprocess.PIPE)
 
 
@@ -405,6 +409,35 @@ def test_service_without_home_and_in_a_read_only_installation(
     second, _ = output(launch(folder, **environment))
     assert second[0] == '6.0 6.0 True'
     assert second[1].startswith(f'2 {tmp_path / "tmp"}')
+
+
+def test_code_of_a_read_only_installation_is_loaded(folder: Path, tmp_path: Path) -> None:
+    # as in a robot's image: root compiles beside the source, and another user runs the node
+    bytecode = {'PYTHONDONTWRITEBYTECODE': '1'}     # its stamps are in seconds
+    assert output(launch(folder, **bytecode))[0][0] == '6.0 6.0 False'
+    own = {'XDG_CACHE_HOME': str(tmp_path / 'own'), **bytecode}
+    (folder / '__pycache__').chmod(0o555)
+    try:
+        user = UNPRIVILEGED if os.getuid() == 0 else ()
+        lines, errors = output(launch(folder, *user, **own))
+        assert lines[0] == '6.0 6.0 True'
+        assert errors == ''
+        # what has changed since is compiled again, and kept where this user can write
+        (folder / 'inner.py').write_text(INNER.replace('2.0', '3.0'))
+        changed = lines[0].replace('6.0 6.0', '9.0 9.0')
+        lines, errors = output(launch(folder, *user, **own))
+        assert (lines[0], errors) == (changed.replace('True', 'False'), '')
+        lines, _ = output(launch(folder, *user, **own))
+        assert lines[0] == changed
+        assert lines[1].startswith(f'2 {tmp_path / "own"}')
+        # with no folder at all to write in, nothing is lost either
+        (folder / 'inner.py').write_text(INNER)
+        (tmp_path / 'own').rename(tmp_path / 'other')
+        nowhere = own | dict.fromkeys(('HOME', 'XDG_CACHE_HOME', 'TMPDIR'), '/proc/nowhere')
+        lines, errors = output(launch(folder, *user, **nowhere))
+        assert (lines[0], errors) == ('6.0 6.0 True', '')
+    finally:
+        (folder / '__pycache__').chmod(0o755)
 
 
 def test_nothing_is_compiled_where_numba_is_told_so(folder: Path) -> None:

@@ -1,0 +1,54 @@
+# Copyright 2026 The pose_graph_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""
+Compile the solver and keep its code, so that the next start of the node need not.
+
+For a robot's image, run this as the user who installs the package, on the model of processor that
+the robot has. The code is kept beside the package, where the node of any user finds it; or in
+NUMBA_CACHE_DIR if that is set, which the node needs as well. Code for another processor, another
+version of Numba or of this package is not used, but compiled again when the node starts.
+"""
+
+import argparse
+import os
+import sys
+import time
+
+import numba
+
+from pose_graph_ros.core.compiled import jit
+from pose_graph_ros.core.exceptions import ConfigError
+from pose_graph_ros.core.warm_up import warm_up
+
+
+def add_arguments(_: argparse.ArgumentParser) -> None:
+    """Add no arguments: this tool has none."""
+
+
+def execute(_: argparse.Namespace) -> int:
+    """Run the tool; return the exit code: 1 if the next start has to compile."""
+    if numba.config.DISABLE_JIT:
+        raise ConfigError('NUMBA_DISABLE_JIT is set, so nothing is compiled')
+    complete = jit.is_cached()
+    print(f'{"loading" if complete else "compiling"} the solver for this processor '
+          f'({jit.processor()})', flush=True)
+    start = time.perf_counter()
+    warm_up()
+    seconds = time.perf_counter() - start
+    if not jit.is_cached():
+        print(f'compiled in {seconds:.1f} s, but not kept: the next start compiles again',
+              file=sys.stderr)
+        return 1
+    print(f'{"loaded" if complete else "compiled"} in {seconds:.1f} s; kept {_place()}')
+    return 0
+
+
+def _place() -> str:
+    """Return where the code is, and for whom."""
+    folders = jit.cache_folders()
+    place = f'in {os.path.commonpath(folders)}'
+    if numba.config.CACHE_DIR:
+        return f'{place} (NUMBA_CACHE_DIR)'
+    if all(folder.name == '__pycache__' for folder in folders):
+        return f'{place}, in each __pycache__'
+    return f'{place}, where only this user finds it; set NUMBA_CACHE_DIR for others'

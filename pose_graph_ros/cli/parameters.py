@@ -1,0 +1,18 @@
+# Copyright 2026 The pose_graph_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""Print the parameters of the node, as tables for docs/parameters.md or as a parameter file."""
+
+import argparse
+
+from pose_graph_ros.adapters.parameter_texts import as_markdown, as_yaml, sources_as_markdown
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Add the arguments of this tool."""
+    parser.add_argument('--yaml', action='store_true', help='print them as a parameter file')
+
+
+def execute(options: argparse.Namespace) -> int:
+    """Run the tool; return the exit code."""
+    print(as_yaml() if options.yaml else f'{as_markdown()}\n{sources_as_markdown()}', end='')
+    return 0

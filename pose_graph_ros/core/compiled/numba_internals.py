@@ -1,0 +1,60 @@
+# Copyright 2026 The pose_graph_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""
+All that this package uses of Numba beyond its public interface; no other module imports such.
+
+Numba promises nothing about these, so versions that the tests have not run with are refused. To
+take a newer one, run all tests with it, and raise the bound here, in setup.py and in package.xml.
+
+- `Dispatcher` is the type of kernels. Its `_cache` holds our cache instead of the one of
+  `njit(cache=True)`; `targetctx`, its `magic_tuple` (the processor), `targetoptions` and the
+  function `_defn` of an intrinsic are part of a kernel's fingerprint; `get_call_template` is
+  replaced, as without widening of integers the compilation takes three times as long;
+  `_compile_for_args` is replaced, with `typeof_pyval`, `typingctx`, `overloads` and their
+  `entry_point`, so that the first call compiles for the declared signature alone.
+- The options `_nrt` and `no_cfunc_wrapper` of `njit`: kernels that own no array count no
+  references, and no wrapper for C is compiled.
+- `FunctionCache`, `CompileResultCacheImpl` and `IndexDataCacheFile` write and read the files of
+  the cache (`_index_key`, `_impl`, `_cache_file`, `_load_index`, `_load_data`), in our folders and
+  with our checks; `serialize` and `sigutils` belong to them. `rtsys`, which kernels that allocate
+  arrays run on, has to be initialized before their code is loaded.
+- `ir` makes vectors of numbers, `populate_array` an array over the memory of the tables.
+"""
+
+import re
+from typing import Any
+
+import numba
+
+from pose_graph_ros.core.exceptions import NumbaVersionError
+
+OLDEST, NEWEST = (0, 60), (0, 68)  # tested with
+
+
+def check_version(version: str) -> None:
+    """Raise `NumbaVersionError` for a version of Numba that is not supported."""
+    major, minor = map(int, re.findall(r'\d+', version)[:2])
+    if not OLDEST <= (major, minor) <= NEWEST:
+        bounds = f'>={OLDEST[0]}.{OLDEST[1]},<{NEWEST[0]}.{NEWEST[1] + 1}'
+        raise NumbaVersionError(
+            f"Numba {version} is not supported: pip install 'numba{bounds}'")
+
+
+check_version(numba.__version__)
+
+# ruff: noqa: E402  another version may lack them
+from numba.core import serialize, sigutils
+from numba.core.caching import CompileResultCacheImpl, FunctionCache, IndexDataCacheFile
+from numba.core.cgutils import ir
+from numba.core.dispatcher import Dispatcher
+from numba.core.runtime import rtsys
+
+__all__ = [
+    'CompileResultCacheImpl', 'Dispatcher', 'FunctionCache', 'IndexDataCacheFile', 'ir', 'rtsys',
+    'serialize', 'sigutils']
+
+
+def populate_array(*arguments: Any) -> None:
+    """Call Numba's function, whose module only the compiler needs, and which takes 0.1 s."""
+    from numba.np import arrayobj  # noqa: PLC0415
+    arrayobj.populate_array(*arguments)
