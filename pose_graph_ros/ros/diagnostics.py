@@ -122,7 +122,9 @@ def _concerns(session: 'Session') -> Iterator[tuple[bytes, str]]:
     if session.input.paused:
         yield warn, 'Paused: call ~/pause with false to resume.'
     if not worker.prepared:
-        yield warn, 'Compiling kernels, as at every first start; messages wait until then.'
+        waiting = f'{session.input.posted} measurements wait until then.'
+        yield warn, (f'Compiling kernels, as at every first start: {waiting}'
+                     if session.compiling else f'Loading compiled kernels: {waiting}')
     if estimate is None:
         yield warn, f'No odometry yet: check {" or ".join(session.odometry_topics)}.'
         return

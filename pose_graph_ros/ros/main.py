@@ -3,24 +3,41 @@
 """
 The process of the node: from the command line to a clean end.
 
-Callbacks run in a thread of their own, and the main thread waits for SIGINT or SIGTERM, as Python
-handles signals only there. A second one, or one while the node starts or ends, has no further
-effect.
+Callbacks run in a thread of their own, and the main thread waits for SIGINT or SIGTERM. It waits
+for a byte in a pipe, which Python writes at once: the system may hand a signal to any thread, and
+that alone would not wake this one. A second signal, or one while the node starts or ends, has no
+further effect. At the end nothing is waited for that cannot be interrupted, such as a compilation
+or a solve: `ros2 launch` kills a node that does not end within 5 s.
 """
 
-from queue import SimpleQueue
+import os
+import select
 import signal
 import sys
-from threading import Thread
+from threading import enumerate as all_threads, Thread
+from typing import NoReturn
 
 SWITCH_INTERVAL = 0.0005  # for which a thread may run Python while another one waits [s]
+# Longest waits at the end, for a callback and for files of the graph that are written [s].
+CALLBACK_TIMEOUT, FILES_TIMEOUT = 0.5, 1.0
 
 
-def main(args: list[str] | None = None) -> int:
+def main() -> NoReturn:
+    """Run the node, with the arguments of the command line, and end the process."""
+    code = run()
+    # without the end of the interpreter: it takes 0.5 s, and threads may be in compiled code
+    sys.stdout.flush()
+    sys.stderr.flush()
+    os._exit(code)
+
+
+def run(args: list[str] | None = None) -> int:
     """Run the node until SIGINT or SIGTERM; return the exit code."""
-    ends: SimpleQueue[int] = SimpleQueue()  # signals, or 0 if the callbacks end by themselves
-    for each in (signal.SIGINT, signal.SIGTERM):
-        signal.signal(each, lambda number, _: ends.put(number))
+    ends, end = os.pipe()   # a byte for each signal, and one if the callbacks end by themselves
+    os.set_blocking(end, False)
+    signal.set_wakeup_fd(end)
+    for number in (signal.SIGINT, signal.SIGTERM):
+        signal.signal(number, lambda *_: None)
     # ruff: noqa: PLC0415  the imports take most of the start; signals must be handled before
     import logging
 
@@ -32,6 +49,7 @@ def main(args: list[str] | None = None) -> int:
     try:
         from pose_graph_ros.ros import memory
         from pose_graph_ros.ros.node import PoseGraphNode
+        from pose_graph_ros.ros.services import FILE_THREADS
         from pose_graph_ros.ros.spinning import Spinner
     except NumbaVersionError as error:
         print(f'pose_graph_node: {error}', file=sys.stderr)
@@ -41,6 +59,8 @@ def main(args: list[str] | None = None) -> int:
     # by default the thread of the engine would delay messages by 5 ms at a time
     sys.setswitchinterval(SWITCH_INTERVAL)
     logging.captureWarnings(capture=True)  # the node logs them, as all that is logged
+    if select.select([ends], [], [], 0.0)[0]:
+        return 0
     try:
         rclpy.init(args=args, signal_handler_options=SignalHandlerOptions.NO)
         node = PoseGraphNode()
@@ -57,14 +77,17 @@ def main(args: list[str] | None = None) -> int:
         try:
             spinner.spin()
         finally:
-            ends.put(0)
+            os.write(end, b'\0')
 
     thread = Thread(target=spin, name='callbacks')
     thread.start()
-    ends.get()
+    os.read(ends, 1)
     spinner.stop()
-    thread.join()
+    thread.join(CALLBACK_TIMEOUT)
     node.close()
+    for each in all_threads():
+        if each.name.startswith(FILE_THREADS):
+            each.join(FILES_TIMEOUT)
     spinner.close()
     node.destroy_node()
     rclpy.try_shutdown()
@@ -72,4 +95,4 @@ def main(args: list[str] | None = None) -> int:
 
 
 if __name__ == '__main__':
-    sys.exit(main())
+    main()

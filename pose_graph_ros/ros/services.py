@@ -27,6 +27,7 @@ logger = logging.getLogger(__name__)
 
 REPLACED = 'the graph was replaced meanwhile'
 CLOSED = 'the node was cleaned up meanwhile'
+FILE_THREADS = 'graph files'  # what the names of the threads that read and write them begin with
 Answer = tuple[bool, str]
 """Whether what was asked for was done, and a sentence on it."""
 Action = Coroutine['Future[Any]', None, Answer]
@@ -61,7 +62,7 @@ class Services:
         self._answering: Counter[str] = Counter()  # number of requests by service
         self._closed = False
         # files of a large graph take seconds: neither worker nor executor should wait for them
-        self._files = ThreadPoolExecutor(1, 'graph files')
+        self._files = ThreadPoolExecutor(1, FILE_THREADS)
         for name, kind, act in (
                 ('optimize', Trigger, self._optimize), ('reset', Trigger, self._reset),
                 ('pause', SetBool, self._pause), ('set_datum', Trigger, self._set_datum),

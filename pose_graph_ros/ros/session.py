@@ -55,7 +55,7 @@ LOOP_CLOSURE_QOS = QoSProfile(depth=100)  # a loop closure is rare and must not 
 STATIC_QOS = QoSProfile(depth=100, durability=QoSDurabilityPolicy.TRANSIENT_LOCAL)
 SET_POSE_QOS = QoSProfile(depth=1)
 
-STOP_TIMEOUT = 4.0  # longest wait for a solve at the end; launch kills a node after 5 s [s]
+STOP_TIMEOUT = 0.5  # longest wait at the end for what the worker does [s]
 SILENCE_PERIOD = 0.2  # period of the check whether all sources are silent [s]
 # Period of the search for the constraints with the largest energies [s], and their number.
 ENERGY_PERIOD, N_ENERGIES = 5.0, 3
@@ -82,6 +82,7 @@ class Session:
             self.out.map_frame, self.out.odom_frame, self.out.base_frame)
         self.active = False
         self.n_resets, self.reset_reason = 0, ''
+        self.compiling = False  # whether kernels are compiled, which a start from the cache is not
         self._subscriptions: list[Subscription] = []
         self._timers: dict[str, Timer] = {}
         self._jump_handle: JumpHandle | None = None
@@ -116,9 +117,12 @@ class Session:
         from pose_graph_ros.core.warm_up import warm_up  # noqa: PLC0415
 
         if not is_cached():
+            self.compiling = True
             self.node.get_logger().info(
-                'compiling kernels, 20 s to a minute on the first start; messages wait until then')
+                'compiling kernels, up to a minute and only at the first start; measurements wait '
+                'until then, none is lost')
         seconds = warm_up(stopped)
+        self.compiling = False
         memory.release_memory()
         if not stopped():
             self.node.get_logger().info(f'kernels ready after {seconds:.1f} s')

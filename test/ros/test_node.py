@@ -4,6 +4,7 @@
 
 from collections.abc import Sequence
 from contextlib import ExitStack
+import ctypes
 import math
 from pathlib import Path
 import random
@@ -268,6 +269,16 @@ def test_signals_end_the_node_without_a_traceback(
     drive(client, 3.0)
     assert node.signal_and_wait(*signals) == 0
     assert 'Traceback' not in node.stderr()
+
+
+def test_a_signal_that_the_system_hands_to_another_thread_ends_the_node(
+    node: NodeProcess, client: Client,
+) -> None:
+    process = node.process.pid
+    for thread in sorted(int(path.name) for path in Path(f'/proc/{process}/task').iterdir())[1:]:
+        if node.process.poll() is None:
+            ctypes.CDLL(None).tgkill(process, thread, signal.SIGINT)
+    assert node.process.wait(20.0) == 0
 
 
 BAD = (

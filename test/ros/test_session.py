@@ -486,7 +486,7 @@ def test_the_most_urgent_state_is_said_with_what_to_do(active: Robot) -> None:
     worker = Space(alive=True, prepared=True, status=session.worker.status,
                    estimate=replace(session.worker.estimate, alignment=AlignmentState.UNALIGNED))
     seen = Space(worker=worker, active=True, input=session.input, silent=[], odometry_topics=[],
-                 out=Space(transforms=Space(other='')))
+                 out=Space(transforms=Space(other='')), compiling=False)
 
     def said(expected: bytes, *words: str) -> None:
         level, text = diagnostics.health(seen)
@@ -502,7 +502,9 @@ def test_the_most_urgent_state_is_said_with_what_to_do(active: Robot) -> None:
     seen.out.transforms.other = 'another node publishes map -> odom on /tf'
     said(WARN, 'Another node publishes map -> odom on /tf.')
     worker.prepared = False
-    said(WARN, 'Compiling')
+    said(WARN, 'Loading compiled kernels')
+    seen.compiling = True
+    said(WARN, 'Compiling kernels', 'measurements wait')
     seen.active = False
     said(OK, 'Inactive')
     worker.status = replace(worker.status, report=UpdateReport(

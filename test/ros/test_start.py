@@ -1,9 +1,10 @@
 # Copyright 2026 The pose_graph_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""The first start, while kernels are compiled: no message is lost meanwhile."""
+"""Starts and ends: while kernels are compiled nothing is lost, and any moment can be the last."""
 
 from pathlib import Path
 import signal
+import time
 
 from circle import fix_at, odometry_at, path_error
 from harness import Client, copy_kernels, NodeProcess, PREPARE_PATIENCE
@@ -24,7 +25,6 @@ def test_nothing_is_lost_while_kernels_are_compiled(
                           and client.fix.get_subscription_count() > 0, 'it listens')
         client.spin_for(0.3)
         assert client.values['prepared'] == '0'
-        assert client.diagnostics[-1].status[0].message.startswith('Compiling')
         for step in range(200):
             client.odom.publish(odometry_at(step / 10.0))
             if step % 5 == 0:
@@ -33,6 +33,9 @@ def test_nothing_is_lost_while_kernels_are_compiled(
         client.spin_until(lambda: client.values['received'] == '240', 'all are heard')
         assert client.values['prepared'] == '0'
         assert client.values['processed'] == '0'
+        client.spin_until(lambda: client.diagnostics[-1].status[0].message == (
+            'Compiling kernels, as at every first start: 240 measurements wait until then.'),
+            'it says what it waits for')
         client.spin_until(lambda: client.values['prepared'] == '1', 'it has compiled',
                           PREPARE_PATIENCE)
         client.wait_processed(240)
@@ -59,3 +62,23 @@ def test_a_signal_while_kernels_are_compiled_ends_the_node(
         client.close()
         assert node.signal_and_wait(signal.SIGINT, signal.SIGINT) == 0
         assert 'Traceback' not in node.stderr()
+
+
+def catches(pid: int, number: signal.Signals) -> bool:
+    """Tell whether a process has a handler for a signal."""
+    [line] = [line for line in Path(f'/proc/{pid}/status').read_text().splitlines()
+              if line.startswith('SigCgt')]
+    return bool(int(line.split()[1], 16) >> (number - 1) & 1)
+
+
+@pytest.mark.parametrize('number', [signal.SIGINT, signal.SIGTERM])
+def test_a_signal_while_modules_are_imported_ends_the_node(
+    tmp_path: Path, number: signal.Signals,
+) -> None:
+    with NodeProcess(tmp_path) as node:
+        deadline = time.monotonic() + 20.0
+        while not catches(node.process.pid, signal.SIGTERM):
+            assert time.monotonic() < deadline
+            time.sleep(0.001)
+        assert node.signal_and_wait(number, signal.SIGINT) == 0
+        assert node.stderr() == ''
