@@ -22,10 +22,10 @@ SWITCH_INTERVAL = 0.0005  # for which a thread may run Python while another one 
 CALLBACK_TIMEOUT, FILES_TIMEOUT = 0.5, 1.0
 
 
-def main() -> NoReturn:
-    """Run the node, with the arguments of the command line, and end the process."""
-    code = run()
-    # without the end of the interpreter: it takes 0.5 s, and threads may be in compiled code
+def main(args: list[str] | None = None) -> NoReturn:
+    """Run the node, by default with the arguments of the command line, and end the process."""
+    code = run(args)
+    # without ending the interpreter, which takes 0.5 s, and threads may be in compiled code
     sys.stdout.flush()
     sys.stderr.flush()
     os._exit(code)
