@@ -113,6 +113,11 @@ class PoseGraphBackend:
         return self._pipeline.counts
 
     @property
+    def refusals(self) -> dict[tuple[str, str], str]:
+        """Detail of the newest refusal by (source, reason)."""
+        return self._pipeline.refusals
+
+    @property
     def node_stamps_ns(self) -> IntArray:
         """Stamps of the hidden nodes [ns], shape (N,), a read-only view."""
         return self._nodes.stamps_ns

@@ -125,8 +125,8 @@ def _concerns(session: 'Session') -> Iterator[tuple[bytes, str]]:
         waiting = f'{session.input.posted} measurements wait until then.'
         yield warn, (f'Compiling kernels, as at every first start: {waiting}'
                      if session.compiling else f'Loading compiled kernels: {waiting}')
+    yield from _missing_input(session)
     if estimate is None:
-        yield warn, f'No odometry yet: check {" or ".join(session.odometry_topics)}.'
         return
     transforms, silent = session.out.transforms, session.silent
     if transforms is not None and transforms.other != '':
@@ -137,12 +137,46 @@ def _concerns(session: 'Session') -> Iterator[tuple[bytes, str]]:
     if estimate.alignment is AlignmentState.UNALIGNED:
         yield warn, ('Unaligned: the angle between odometry and map is not known yet. Drive some '
                      'metres while fixes come in.')
+    yield from _doubts(session)
     if estimate.alignment is AlignmentState.LOCAL:
         yield good, ('Running without measurements in the map: its frame is that of the first '
                      'odometry.')
-    for name, fit in worker.status.sources.items():
+    yield good, 'Running.'
+
+
+def _missing_input(session: 'Session') -> Iterator[tuple[bytes, str]]:
+    """Yield what is to be said if odometry, or all messages of a source, do not get in."""
+    warn, estimate, refused = DiagnosticStatus.WARN, session.worker.estimate, session.refused
+    odometry = session.odometry_topics
+    if estimate is None or (session.is_loaded and not any(
+            session.worker.status.counts[name, 'accepted'] > 0 for name in odometry)):
+        why = '; '.join(refused[name] for name in odometry if name in refused)
+        if why == '':
+            why = f'check {" or ".join(odometry.values())}'
+        state = 'No odometry yet' if estimate is None else (
+            f'A graph of {estimate.n_hidden} hidden nodes is loaded and waits for odometry')
+        yield warn, f'{state}: {why}.'
+    if session.quiet > 0.0:
+        final = session.final
+        ended = (final is not None and final.done() and not final.cancelled()
+                 and final.exception() is None and final.result().status is Status.CONVERGED)
+        yield warn, (f'Nothing has been received for {session.quiet:.0f} s: the drivers have '
+                     'stopped, or a bag has ended'
+                     + ('; the graph has been optimised.' if ended else '.'))
+    if len(refused) > 0:
+        text = '; '.join(refused.values())
+        yield warn, f'{text[0].upper()}{text[1:]}.'
+
+
+def _doubts(session: 'Session') -> Iterator[tuple[bytes, str]]:
+    """Yield what is to be said of a node that works, but with wrong settings or errors."""
+    warn, status = DiagnosticStatus.WARN, session.worker.status
+    for name, fit in status.sources.items():
         if fit.wrongly_white:
             yield warn, (f'The errors of {name} are correlated in time but treated as white, so '
                          f'the covariances are too small: set {name}.correlation_time to about '
                          f'{fit.errors.tau:.2g} s.')
-    yield good, 'Running.'
+    errors = sum(count for (_, reason), count in status.counts.items()
+                 if reason == 'internal_error')
+    if errors > 0:
+        yield warn, f'Running, but {errors} internal errors are in the log: please report them.'

@@ -44,6 +44,7 @@ class Input:
     def _clear(self) -> None:
         self.received: Counter[str] = Counter()  # number of messages by source
         self.rejected: Counter[tuple[str, str]] = Counter()  # number by source and reason
+        self.refusals: dict[tuple[str, str], str] = {}  # detail of the newest by the same
         self.posted = 0  # number of measurements that were handed to the engine
         self.liveness = Liveness([source.name for source in self.reader.sources.values()
                                   if source.kind is Kind.LOOP_CLOSURE])
@@ -134,6 +135,7 @@ class Input:
 
         """
         self.rejected[source, answer.reason] += 1
+        self.refusals[source, answer.reason] = answer.detail
         self.warn_once(source, answer.reason, f'{source}: {answer.reason}: {answer.detail} '
                                               '(logged once, counted in diagnostics)')
 

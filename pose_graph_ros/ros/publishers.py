@@ -216,18 +216,23 @@ class Publishers:
             self._graph.publish(markers_cdr(view, self._graph_stamp_ns, self.map_frame))
 
     def start_new_graph(self) -> None:
-        """Forget all stamps; publish an empty path and the deletion of all markers."""
+        """Forget all stamps; take path and markers back if any were published."""
         self._newest_ns, self._aligned = 0, False
         self._slew.forget()
         if self.transforms is not None:
             self.transforms.forget()
         with self._lock:
             self.graph += 1
+            path_ns, graph_ns = self._path_stamp_ns, self._graph_stamp_ns
             self._forget_views()
-            header = Header(frame_id=self.map_frame)
-            self._path.publish(Path(header=header))
-            self._graph.publish(MarkerArray(
-                markers=[Marker(header=header, action=Marker.DELETEALL)]))
+            if path_ns > 0:
+                self._path.publish(Path(header=self._after(path_ns)))
+            if graph_ns > 0:
+                self._graph.publish(MarkerArray(
+                    markers=[Marker(header=self._after(graph_ns), action=Marker.DELETEALL)]))
+
+    def _after(self, stamp_ns: int) -> Header:
+        return Header(stamp=messages.time_message(stamp_ns + 1), frame_id=self.map_frame)
 
     def publish_diagnostics(self, level: bytes, text: str, values: Mapping[str, object]) -> None:
         """

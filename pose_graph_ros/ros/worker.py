@@ -38,6 +38,8 @@ class WorkerStatus:
     processed: int = 0  # number of measurements that the engine has accepted or rejected
     counts: Counter[tuple[str, str]] = field(default_factory=Counter)
     """Number of measurements by source and 'accepted' or a reason."""
+    refusals: Mapping[tuple[str, str], str] = field(default_factory=dict)
+    """Detail of the newest refusal by source and reason."""
     pending: int = 0
     quarantined: int = 0
     updates: int = 0  # number of updates that ran the solver
@@ -230,8 +232,9 @@ class Worker:
                 self._warned.add(key)
                 logger.warning('%s: %s: %s (logged once, counted in diagnostics)', source,
                                answer.reason, answer.detail)
-        except Exception:
+        except Exception as error:
             self._backend.counts[source, 'internal_error'] += 1
+            self._backend.refusals[source, 'internal_error'] = f'{type(error).__name__}: {error}'
             logger.exception('a measurement of %s could not be added', source)
 
     def _update(self, update: Callable[[], UpdateReport]) -> UpdateReport:
@@ -256,6 +259,7 @@ class Worker:
         status, backend = self.status, self._backend
         self.status = WorkerStatus(
             processed=status.processed + processed, counts=Counter(backend.counts),
+            refusals=dict(backend.refusals),
             pending=backend.n_waiting, quarantined=backend.n_quarantined, updates=self._solves,
             solve_mean=self._solve_total / max(self._solves, 1), solve_max=self._solve_max,
             report=status.report if report is None else report,

@@ -310,24 +310,27 @@ def test_a_new_graph_removes_path_and_markers_and_forgets_all_stamps(local: Loca
     poses = given.subscribe(PoseWithCovarianceStamped, 'pose')
     paths = given.subscribe(PathMessage, 'path')
     graphs = given.subscribe(MarkerArray, 'graph')
-    given.publish(100.0)
-    given.out.publish_path(estimate(100.0), trajectory(99.0), graph=0)
+    # nothing has been published that could be taken back
     given.out.start_new_graph()
-    assert given.out.graph == 1
+    given.publish(100.0)
+    given.out.publish_path(estimate(100.0), trajectory(99.0), graph=1)
+    given.out.publish_graph(VIEW, 99 * SECOND, graph=1)
+    given.out.start_new_graph()
+    assert given.out.graph == 2
     given.publish(1.0)
     given.wait_for(poses, 2)
     assert stamps(poses) == [100.0, 1.0]
     # what a worker of the old graph still publishes is dropped
-    given.out.publish_path(estimate(101.0), trajectory(101.0), graph=0)
-    given.out.publish_graph(VIEW, 101 * SECOND, graph=0)
-    given.out.publish_path(estimate(1.0), trajectory(1.0), graph=1)
-    given.out.publish_graph(VIEW, SECOND, graph=1)
+    given.out.publish_path(estimate(101.0), trajectory(101.0), graph=1)
+    given.out.publish_graph(VIEW, 101 * SECOND, graph=1)
+    given.out.publish_path(estimate(1.0), trajectory(1.0), graph=2)
+    given.out.publish_graph(VIEW, SECOND, graph=2)
     given.wait_for(paths, 3)
-    given.wait_for(graphs, 2)
+    given.wait_for(graphs, 3)
     assert [len(path.poses) for path in paths] == [1, 0, 1]
-    assert stamps(paths) == [100.0, 0.0, 1.0]
-    assert [item.action for item in graphs[0].markers] == [Marker.DELETEALL]
-    assert stamps(graphs[1].markers)[-1] == 1.0
+    assert stamps(paths) == [100.0, 100.0 + 1e-9, 1.0]
+    assert [item.action for item in graphs[1].markers] == [Marker.DELETEALL]
+    assert stamps(graphs[2].markers)[-1] == 1.0
 
 
 @needs_tf2_msgs

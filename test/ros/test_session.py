@@ -141,7 +141,7 @@ def test_before_it_is_active_nothing_is_received(robot: Robot) -> None:
     robot.wait(lambda: robot.session.worker.prepared, 'the kernels are there')
     robot.activate()
     assert robot.health() == (WARN, 'No odometry yet: check /odom.')
-    assert robot.session.odometry_topics == ['/odom']
+    assert robot.session.odometry_topics == {'odom': '/odom'}
 
 
 def test_an_inactive_session_keeps_its_graph_and_grows_it_when_it_is_active_again(
@@ -485,8 +485,9 @@ def test_the_most_urgent_state_is_said_with_what_to_do(active: Robot) -> None:
     session = active.session
     worker = Space(alive=True, prepared=True, status=session.worker.status,
                    estimate=replace(session.worker.estimate, alignment=AlignmentState.UNALIGNED))
-    seen = Space(worker=worker, active=True, input=session.input, silent=[], odometry_topics=[],
-                 out=Space(transforms=Space(other='')), compiling=False)
+    seen = Space(worker=worker, active=True, input=session.input, silent=[], odometry_topics={},
+                 quiet=0.0, refused={}, final=None, is_loaded=False, compiling=False,
+                 out=Space(transforms=Space(other='')))
 
     def said(expected: bytes, *words: str) -> None:
         level, text = diagnostics.health(seen)
@@ -501,6 +502,14 @@ def test_the_most_urgent_state_is_said_with_what_to_do(active: Robot) -> None:
     said(WARN, 'fix and imu are silent')
     seen.out.transforms.other = 'another node publishes map -> odom on /tf'
     said(WARN, 'Another node publishes map -> odom on /tf.')
+    seen.refused = {'fix': 'the newest 7 messages of fix were refused: no_fix (none)'}
+    said(WARN, 'The newest 7 messages of fix were refused: no_fix (none).')
+    seen.quiet = 12.3
+    said(WARN, 'Nothing has been received for 12 s')
+    assert 'optimised' not in diagnostics.health(seen)[1]
+    seen.final = session.optimize()
+    active.wait(seen.final.done, 'it is optimised')
+    said(WARN, 'Nothing has been received for 12 s', 'has been optimised.')
     worker.prepared = False
     said(WARN, 'Loading compiled kernels')
     seen.compiling = True
@@ -530,6 +539,63 @@ def test_errors_that_are_correlated_but_treated_as_white_are_warned_of(
         '12 s, with a sigma of 0.8 m; treated as white: set fix.correlation_time')
     assert level == WARN
     assert 'set fix.correlation_time to about 12 s' in text
+
+
+def test_a_source_that_all_is_refused_from_is_named_with_the_reason(active: Robot) -> None:
+    active.wait(lambda: active.session.worker.prepared, 'the kernels are there')
+    active.send('odom', *(odometry(0.0, 0.1 * step, 0.0, 0.0) for step in range(20)))
+    refused = ('20 of 20 messages of odom were refused: zero_stamp (expected a stamp above 0, got '
+               '0 ns).')
+    active.wait(lambda: active.health() == (WARN, f'No odometry yet: {refused}'), 'it is said')
+    active.drive(2.0, fixes=False)
+    lost = fix_at(1.0)
+    lost.status.status = -1
+    active.send('fix', *4 * [lost])
+    active.wait(lambda: active.health() == (WARN, (
+        '4 of 4 messages of fix were refused: no_fix (the receiver reports no fix).')), 'it is')
+    active.send('fix', fix_at(1.5))
+    active.wait(lambda: active.session.refused == {}, 'it is not any more')
+
+
+def test_it_is_said_once_that_nothing_comes_in_any_more(
+    active: Robot, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str],
+) -> None:
+    active.configure(closing_silence=0.05)
+    active.drive(3.0, fixes=False)
+    for limit in ('LEAST_SILENCE', 'MEDIANS', 'LONGEST', 'QUIET'):
+        monkeypatch.setattr(f'pose_graph_ros.ros.liveness.{limit}', 0.3)
+    active.wait(lambda: active.health()[1].endswith('the graph has been optimised.'), 'it is said')
+    level, text = active.health()
+    assert (level, text.startswith('Nothing has been received for 0 s')) == (WARN, True)
+    active.session.publish_diagnostics()
+    assert capfd.readouterr().err.count('nothing has been received') == 1
+    active.send('odom', odometry_at(3.0))
+    active.session.publish_diagnostics()
+    assert active.health()[0] == OK
+
+
+def test_a_graph_that_was_loaded_waits_for_odometry(active: Robot) -> None:
+    paths = active.local.subscribe(PathMessage, 'path', LATCHED)
+    graphs = active.local.subscribe(MarkerArray, 'graph', LATCHED)
+    active.drive(4.0)
+    session = active.session
+    saved = session.worker.call(lambda backend: backend.saved()).result(10.0)
+    active.wait(lambda: len(paths) > 0 and len(graphs) > 0, 'path and markers come')
+    session.reset()
+    active.wait(lambda: len(paths[-1].poses) == 0, 'the path is taken back')
+    session.reset()
+    session.load(saved, PoseGraphBackend.restored(backend_config(session.values), saved), 'map')
+    n_hidden = len(saved.nodes.rows)
+    active.wait(lambda: len(paths[-1].poses) >= n_hidden, 'its path comes')
+    assert all(stamp_ns(message) > 0 for message in (*paths, *(
+        marker for array in graphs for marker in array.markers)))
+    waits = f'A graph of {n_hidden} hidden nodes is loaded and waits for odometry: '
+    assert active.health() == (WARN, f'{waits}check /odom.')
+    active.send('odom', *(odometry(0.0, 0.1 * step, 0.0, 0.0) for step in range(3)))
+    active.wait(lambda: active.health()[1].startswith(f'{waits}3 of 3 messages'), 'it is said')
+    active.drive(6.0, 4.0)
+    active.session.publish_diagnostics()
+    assert active.health() == (OK, 'Running.')
 
 
 def test_a_source_that_ends_is_said_to_be_silent_once(

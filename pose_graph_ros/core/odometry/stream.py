@@ -187,7 +187,7 @@ class OdometryStream:
         """Add a sample; return whether it is accepted, or the reason for its rejection."""
         if not 0 < sample.stamp_ns <= LARGEST_STAMP:
             return rejected('zero_stamp' if sample.stamp_ns <= 0 else 'no_stamp',
-                            f'odometry at {sample.stamp_ns}')
+                            f'expected a stamp above 0, got {sample.stamp_ns} ns')
         x, y, theta = sample.pose.tolist()
         if not (abs(x) <= LARGEST_COORDINATE and abs(y) <= LARGEST_COORDINATE
                 and abs(theta) <= LARGEST_COORDINATE):

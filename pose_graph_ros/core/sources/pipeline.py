@@ -61,6 +61,8 @@ class MeasurementPipeline:
         """Constraints for the next update."""
         self.counts: Counter[tuple[str, str]] = Counter()
         """How often each source got each answer: (source, 'accepted' or the reason)."""
+        self.refusals: dict[tuple[str, str], str] = {}
+        """Detail of the newest refusal by source and reason."""
 
     def configure(self, config: BackendConfig) -> None:
         """Set the settings for later measurements."""
@@ -182,4 +184,5 @@ class MeasurementPipeline:
             self.counts[source, 'accepted'] += 1
         elif answer.status is AnswerStatus.REJECTED:
             self.counts[source, answer.reason] += 1
+            self.refusals[source, answer.reason] = answer.detail
         return answer

@@ -60,7 +60,8 @@ def validate(measurement: Measurement, policy: CovariancePolicy) -> Validated | 
         return rejected(defect, f'{kind}: {numbers.tolist()}')
     stamps = _stamps(measurement)
     if stamps[0] <= 0 or any(abs(stamp) > LARGEST_STAMP for stamp in stamps):
-        return rejected('zero_stamp' if stamps[0] <= 0 else 'no_stamp', f'{kind}: {stamps}')
+        return rejected('zero_stamp' if stamps[0] <= 0 else 'no_stamp',
+                        f'{kind}: expected stamps above 0, got {stamps} ns')
     if isinstance(measurement, HeadingOnly):
         return _validate_heading(measurement, policy)
     cov, repairs = np.array(measurement.covariance, dtype=np.float64), []
