@@ -1,9 +1,11 @@
 # Copyright 2026 The pose_graph_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""Convert GNSS fixes to positions in the map, by the datum and the lever arms of the antennas."""
+"""Convert GNSS fixes for the engine, by the datum and the lever arms of the antennas."""
 
 from collections.abc import Mapping, Sequence
+from functools import partial
 import math
+import threading
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -15,7 +17,7 @@ from pose_graph_ros.core.exceptions import ConfigError
 from pose_graph_ros.core.geometry import covariance
 from pose_graph_ros.core.geometry.geodesy import MapOrigin, TangentPlane
 from pose_graph_ros.core.geometry.se2 import FloatArray
-from pose_graph_ros.core.measurements import Answer, Position, rejected
+from pose_graph_ros.core.measurements import Answer, Fix, rejected
 
 STATUS_NO_FIX = -1
 COVARIANCE_TYPE_UNKNOWN = 0
@@ -24,13 +26,13 @@ LARGEST_ALTITUDE = 1e5  # largest valid distance from the ellipsoid [m]
 
 class Datum:
     """
-    The origin of the map on the Earth: a given one, or the position of a fix.
+    The origin of the map on the Earth: a given one, or the position of the first fix in the graph.
 
     Parameters
     ----------
     given : sequence of float
         Latitude and longitude [degrees] and, if there are three numbers, the angle of the map's x
-        axis from east [rad]; empty to use the first valid fix.
+        axis from east [rad]; empty to use the first fix that the engine attaches to the graph.
     wait : bool
         Whether to wait for a call of `renew` before a fix is used, if `given` is empty.
 
@@ -48,26 +50,35 @@ class Datum:
         self.is_of_graph = False  # whether the datum comes from a loaded graph
         self.plane = TangentPlane(given[0], given[1], yaw=self.yaw) if self.is_given else None
         """Tangent plane of the map; None without a datum."""
-        self.altitude = 0.0  # altitude of the newest fix that has one [m]
+        self.altitude = math.nan
+        """Altitude of the newest fix in the graph that has one [m]; NaN before that."""
         self._waits = wait
-        # a given datum takes its altitude from the first fix; east and north do not depend on it
+        # a plane lies on the ellipsoid until an altitude is known; east and north do not change
         self._to_lift = self.is_given
+        # fixes are placed by the thread of the engine
+        self._lock = threading.Lock()
+
+    @property
+    def is_awaited(self) -> bool:
+        """Whether fixes are refused until a call of `renew`."""
+        return self._waits and self.plane is None
 
     def keep(self, origin: MapOrigin) -> None:
         """Use the datum of a loaded graph from now on."""
-        self.plane, self.yaw, self.altitude = TangentPlane(*origin), origin.yaw, origin.altitude
-        self._waits = self._to_lift = False
-        self.is_of_graph = True
+        with self._lock:
+            self.plane, self.yaw, self.altitude = (
+                TangentPlane(*origin), origin.yaw, origin.altitude)
+            self._waits = self._to_lift = False
+            self.is_of_graph = True
 
     def renew(self) -> None:
-        """Make the next valid fix the datum."""
-        self.plane, self._waits, self._to_lift = None, False, False
+        """Make the next fix that is used the datum."""
+        with self._lock:
+            self.plane, self._waits, self._to_lift = None, False, False
 
-    def plane_for(
-        self, latitude: float, longitude: float, altitude: float,
-    ) -> TangentPlane | None:
+    def plane_for(self, latitude: float, longitude: float, altitude: float) -> TangentPlane:
         """
-        Return the plane for a valid fix, which becomes the datum if there is none and none waits.
+        Return the plane for a fix that is used, which becomes the datum if there is none.
 
         Parameters
         ----------
@@ -77,15 +88,33 @@ class Datum:
             Of the fix [m]; NaN if unknown.
 
         """
-        if math.isfinite(altitude):
-            self.altitude = altitude
-        if self.plane is None and not self._waits:
-            self.plane = TangentPlane(latitude, longitude, self.altitude, self.yaw)
-        elif self.plane is not None and self._to_lift:
-            self.plane = TangentPlane(
-                self.plane.latitude, self.plane.longitude, self.altitude, self.yaw)
-            self._to_lift = False
-        return self.plane
+        with self._lock:
+            if math.isfinite(altitude):
+                self.altitude = altitude
+            known = math.isfinite(self.altitude)
+            if self.plane is None:
+                self.plane = TangentPlane(
+                    latitude, longitude, self.altitude if known else 0.0, self.yaw)
+                self._to_lift = not known
+            elif self._to_lift and known:
+                self.plane = TangentPlane(
+                    self.plane.latitude, self.plane.longitude, self.altitude, self.yaw)
+                self._to_lift = False
+            return self.plane
+
+    def place(self, latitude: float, longitude: float, altitude: float) -> FloatArray:
+        """
+        Return the position in the map of a fix that is used, shape (2,) [m].
+
+        Parameters
+        ----------
+        latitude, longitude, altitude : float
+            As for `plane_for`.
+
+        """
+        plane = self.plane_for(latitude, longitude, altitude)
+        return plane.to_map(
+            latitude, longitude, altitude if math.isfinite(altitude) else plane.altitude)
 
 
 def datum_of(values: Mapping[str, Any]) -> Datum:
@@ -105,7 +134,7 @@ class Antenna(NamedTuple):
 
 class FixReader:
     """
-    Converts the NavSatFix messages of one source to positions.
+    Converts the NavSatFix messages of one source to fixes.
 
     Parameters
     ----------
@@ -128,9 +157,9 @@ class FixReader:
         self.antenna: Antenna | None = None  # antenna of the newest fix; None before the first
         self.without_lever_arm = 0  # number of fixes that were read while the antenna was unknown
 
-    def position(self, message: Message) -> Position | Answer:
+    def position(self, message: Message) -> Fix | Answer:
         """
-        Return the position in a sensor_msgs/NavSatFix, or the reason for rejecting it.
+        Return the fix in a sensor_msgs/NavSatFix, or the reason for rejecting it.
 
         An unknown covariance is returned as zeros.
         """
@@ -146,21 +175,18 @@ class FixReader:
         stamp = stamp_ns(message, self.source.time_offset_ns)
         if stamp <= 0:
             return rejected('zero_stamp', 'a fix without a stamp')
-        plane = self._datum.plane_for(latitude, longitude, altitude)
-        if plane is None:
+        if self._datum.is_awaited:
             return rejected('no_datum', 'wait_for_datum is set: call ~/set_datum, or set datum')
-        if not math.isfinite(altitude):
-            altitude = plane.altitude
         cov = np.zeros((2, 2))
         if message.position_covariance_type != COVARIANCE_TYPE_UNKNOWN:
             cov = np.asarray(message.position_covariance, dtype=float).reshape(3, 3)[:2, :2]
         if np.all(np.isfinite(cov)):
             with np.errstate(over='ignore', invalid='ignore'):
-                cov = covariance.turned(cov, plane.yaw)
+                cov = covariance.turned(cov, self._datum.yaw)
         self.antenna = self._find_antenna(frame(message.header.frame_id))
         self.without_lever_arm += self.antenna.origin == 'none'
-        return Position(stamp, plane.to_map(latitude, longitude, altitude), cov,
-                        self.antenna.lever_arm)
+        return Fix(stamp, partial(self._datum.place, latitude, longitude, altitude), cov,
+                   self.antenna.lever_arm)
 
     def _find_antenna(self, frame_id: str) -> Antenna:
         given = np.array(self.source.lever_arm, dtype=np.float64)

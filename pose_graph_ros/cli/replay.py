@@ -28,6 +28,7 @@ from pose_graph_ros.cli.results import collect_drive, write_results
 from pose_graph_ros.core.backend import PoseGraphBackend
 from pose_graph_ros.core.batch.optimizer import Status
 from pose_graph_ros.core.estimate import UpdateReport
+from pose_graph_ros.core.geometry.geodesy import MapOrigin
 from pose_graph_ros.core.io.g2o import write_g2o
 from pose_graph_ros.core.measurements import Answer, OdometrySample
 
@@ -40,6 +41,7 @@ class Replayed(NamedTuple):
     backend: PoseGraphBackend
     report: UpdateReport  # report of the final optimisation
     refused: Counter[tuple[str, str]]  # messages without a valid measurement, by source and reason
+    origin: MapOrigin | None = None  # datum of the graph
 
 
 def run(bag: BagReader, inputs: Inputs, values: Mapping[str, Any]) -> Replayed:
@@ -77,7 +79,8 @@ def run(bag: BagReader, inputs: Inputs, values: Mapping[str, Any]) -> Replayed:
         if backend.graph.n_nodes >= next_update:
             backend.update()
             next_update = backend.graph.n_nodes + UPDATE_EVERY
-    return Replayed(backend, backend.optimize(), refused)
+    report, plane = backend.optimize(), reader.datum.plane
+    return Replayed(backend, report, refused, None if plane is None else plane.origin)
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -97,13 +100,14 @@ def execute(options: argparse.Namespace) -> int:
         for source, topic in inputs.topics.items():
             print(f'{source}: {topic}')
         start = time.monotonic()
-        backend, report, refused = run(bag, inputs, values)
+        backend, report, refused, origin = run(bag, inputs, values)
         seconds = time.monotonic() - start
         estimate = backend.estimate()
         if estimate is None:
             topics = ' or '.join(inputs.topics[name] for name in inputs.of(Kind.ODOMETRY))
             raise BagError(f'{options.bag}: no usable odometry on {topics}')
-        drive = collect_drive(bag, inputs, values, estimate.path, options.truth)
+        drive = collect_drive(
+            bag, inputs, values, estimate.path, options.truth, origin=origin)
     counts = {f'{source}.{answer}': count for (source, answer), count
               in sorted((backend.counts + refused).items())}
     table = write_results(drive, options.out, options.bag.stem, {

@@ -18,9 +18,10 @@ from pose_graph_ros.adapters.sources import Kind
 from pose_graph_ros.cli.evaluation import Drive, evaluate, format_table, summary
 from pose_graph_ros.cli.picture import draw_drive
 from pose_graph_ros.core.geometry import se2
+from pose_graph_ros.core.geometry.geodesy import MapOrigin
 from pose_graph_ros.core.geometry.trajectory import Trajectory
 from pose_graph_ros.core.io.tum import write_tum
-from pose_graph_ros.core.measurements import GlobalPose, LoopClosure, OdometrySample, Position
+from pose_graph_ros.core.measurements import Fix, GlobalPose, LoopClosure, OdometrySample
 
 TRUTH_TYPES = ('nav_msgs/msg/Odometry', 'geometry_msgs/msg/PoseStamped',
                'geometry_msgs/msg/PoseWithCovarianceStamped')
@@ -28,7 +29,7 @@ TRUTH_TYPES = ('nav_msgs/msg/Odometry', 'geometry_msgs/msg/PoseStamped',
 
 def collect_drive(
     bag: BagReader, inputs: Inputs, values: Mapping[str, Any], corrected: Trajectory,
-    truth_topic: str | None,
+    truth_topic: str | None, *, origin: MapOrigin | None = None,
 ) -> Drive:
     """
     Return the corrected path together with the measurements of the bag that went into the graph.
@@ -43,6 +44,8 @@ def collect_drive(
         Result, `T_map_base`.
     truth_topic : str or None
         Topic of true poses in the map.
+    origin : MapOrigin, optional
+        Datum of the graph.
 
     Raises
     ------
@@ -53,9 +56,11 @@ def collect_drive(
     reader = MessageReader(values)
     for frames in read_static_frames(bag):
         reader.frames.receive(frames.decode())
+    if origin is not None:
+        reader.datum.keep(origin)
     preferred = inputs.of(Kind.ODOMETRY)[0]
     odometry: dict[int, np.ndarray] = {}
-    observed: list[tuple[int, np.ndarray, np.ndarray, bool]] = []
+    observed: list[tuple[int, np.ndarray | Fix, np.ndarray, bool]] = []
     loops: list[tuple[int, int]] = []
     for source, message, held_out in read_inputs(bag, inputs):
         try:
@@ -63,8 +68,8 @@ def collect_drive(
         except MessageError:
             continue
         match measurement:
-            case Position(stamp, position, _, lever_arm):
-                observed.append((stamp, position, lever_arm, held_out))
+            case Fix(stamp, _, _, lever_arm):
+                observed.append((stamp, measurement, lever_arm, held_out))
             case GlobalPose(stamp, pose, _):
                 observed.append((stamp, pose[:2], np.zeros(2), held_out))
             case LoopClosure(stamp, _, _, int(reference)):
@@ -72,9 +77,14 @@ def collect_drive(
             case OdometrySample(stamp, pose) if source == preferred:
                 odometry.setdefault(stamp, pose)
     stamps = np.array([row[0] for row in observed], dtype=np.int64)
+    inside = corrected.covers(stamps)
+    # without the datum of the graph: the first fix that can have been used in it is placed first
+    for at in sorted(range(len(observed)), key=lambda at: bool(observed[at][3] or not inside[at])):
+        stamp, position, arm, held_out = observed[at]
+        if isinstance(position, Fix):
+            observed[at] = stamp, position.place(), arm, held_out
     positions = np.array([row[1] for row in observed]).reshape(-1, 2)
     arms = np.array([row[2] for row in observed]).reshape(-1, 2)
-    inside = corrected.covers(stamps)
     if np.any(arms):  # from the antenna to the robot, with the heading of the corrected path
         turn = corrected.at(stamps[inside]) * (0.0, 0.0, 1.0)
         positions[inside] -= se2.transform(turn, arms[inside])

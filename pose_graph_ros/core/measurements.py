@@ -7,6 +7,7 @@ The axes of covariances are those of ROS messages, the frame in which the pose i
 docs/conventions.md, section "Covariances".
 """
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from enum import Enum
 
@@ -58,6 +59,28 @@ class Position:
 
 
 @dataclass(frozen=True, slots=True)
+class Fix:
+    """
+    Position on the Earth of a point of the robot; see `Position`.
+
+    The first fix that the engine attaches to the graph makes the map's origin. So the position in
+    the map is computed then, and not for a fix that is rejected.
+    """
+
+    stamp_ns: int
+    place: Callable[[], FloatArray]
+    """Returns the position in the map, shape (2,) [m]."""
+    covariance: FloatArray
+    """In map axes, shape (2, 2)."""
+    lever_arm: FloatArray
+    """The point in the robot's frame, shape (2,) [m]."""
+
+    def placed(self) -> Position:
+        """Return the position in the map."""
+        return Position(self.stamp_ns, self.place(), self.covariance, self.lever_arm)
+
+
+@dataclass(frozen=True, slots=True)
 class HeadingOnly:
     """Heading of the robot in the map."""
 
@@ -88,7 +111,7 @@ class LoopClosure:
 
 Absolute = GlobalPose | Position | HeadingOnly
 """Measurements relative to the map."""
-Measurement = Absolute | LoopClosure
+Measurement = Absolute | LoopClosure | Fix
 
 
 class AnswerStatus(Enum):

@@ -62,11 +62,12 @@ def fix_message(
     prediction : Prediction
     plane : TangentPlane
     altitude : float
-        Above the ellipsoid [m].
+        Above the ellipsoid [m]; NaN if unknown.
     base_frame : str
 
     """
-    latitude, longitude, _ = plane.to_geodetic(prediction.T_map_base[:2], altitude)
+    latitude, longitude, _ = plane.to_geodetic(
+        prediction.T_map_base[:2], altitude if math.isfinite(altitude) else plane.altitude)
     covariance = np.diag((0.0, 0.0, UNKNOWN_VARIANCE))
     turned = cov.turned(prediction.covariance[:2, :2], -plane.yaw)
     covariance[:2, :2] = 0.5 * (turned + turned.T)

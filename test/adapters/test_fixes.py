@@ -8,6 +8,7 @@ from harness import fix, TFMessage, transform
 import numpy as np
 import pyproj
 import pytest
+from sensor_msgs.msg import NavSatFix
 
 from pose_graph_ros.adapters.fixes import Datum, FixReader
 from pose_graph_ros.adapters.message_reader import MessageReader
@@ -15,12 +16,17 @@ from pose_graph_ros.adapters.parameters import checked
 from pose_graph_ros.adapters.sources import Kind, Source
 from pose_graph_ros.adapters.static_frames import StaticFrames
 from pose_graph_ros.core.exceptions import ConfigError
-from pose_graph_ros.core.measurements import Answer, Position
+from pose_graph_ros.core.measurements import Answer, Fix, Position
 
 
 def fixes(**values: object) -> FixReader:
     return MessageReader(checked({
         name.replace('__', '.'): value for name, value in values.items()})).fixes['fix']
+
+
+def placed(reader: FixReader, message: NavSatFix) -> Position:
+    """Return the position of a fix that the engine uses."""
+    return reader.position(message).placed()
 
 
 def test_the_first_good_fix_is_the_datum() -> None:
@@ -29,10 +35,12 @@ def test_the_first_good_fix_is_the_datum() -> None:
     bad.status.status = -1
     assert isinstance(reader.position(bad), Answer)
     assert reader.position(fix(0.0, 48.0, 11.0)).reason == 'zero_stamp'
-    first = reader.position(fix(2.0, 48.1, 11.6))
+    # one that the engine does not use is none
+    assert isinstance(reader.position(fix(1.5, 48.0, 11.0)), Fix)
+    first = placed(reader, fix(2.0, 48.1, 11.6))
     assert isinstance(first, Position)
     assert first.position == pytest.approx([0.0, 0.0], abs=1e-9)
-    second = reader.position(fix(3.0, 48.101, 11.6))
+    second = placed(reader, fix(3.0, 48.101, 11.6))
     # a thousandth of a degree of latitude is 111 m
     assert second.position == pytest.approx([0.0, 111.2], abs=0.1)
 
@@ -41,26 +49,43 @@ def test_a_datum_with_a_yaw_turns_positions_and_covariances() -> None:
     reader = fixes(datum=[48.1, 11.6, math.pi / 2.0])
     message = fix(1.0, 48.101, 11.6)
     message.position_covariance = [1.0, 0.0, 0.0, 0.0, 4.0, 0.0, 0.0, 0.0, 9.0]
-    measurement = reader.position(message)
+    measurement = placed(reader, message)
     assert measurement.position == pytest.approx([111.2, 0.0], abs=0.1)
     assert np.diagonal(measurement.covariance) == pytest.approx([4.0, 1.0])
 
 
 def test_an_altitude_that_is_not_known_is_that_of_the_datum() -> None:
     reader = fixes()
-    reader.position(fix(1.0, 48.1, 11.6))
+    placed(reader, fix(1.0, 48.1, 11.6))
     message = fix(2.0, 48.101, 11.6)
-    known = reader.position(message).position
+    known = placed(reader, message).position
     message.altitude = math.nan
-    assert reader.position(message).position == pytest.approx(known, abs=1e-6)
+    assert placed(reader, message).position == pytest.approx(known, abs=1e-6)
+
+
+@pytest.mark.parametrize('given', [[], [48.1, 11.6]])
+def test_the_plane_is_at_the_first_altitude_that_is_known(given: list[float]) -> None:
+    datum = Datum(given)
+    assert math.isnan(datum.altitude)
+    datum.place(48.1, 11.6, math.nan)
+    assert math.isnan(datum.altitude)
+    there = datum.place(48.101, 11.61, 1500.0)
+    # the place of what has an altitude does not depend on the plane's
+    assert there == pytest.approx(Datum([48.1, 11.6]).place(48.101, 11.61, 1500.0), abs=1e-9)
+    assert (datum.plane.altitude, datum.altitude) == (1500.0, 1500.0)
+    assert (datum.plane.latitude, datum.plane.longitude) == (48.1, 11.6)
+    # one without is as high as the plane, and a later altitude moves nothing
+    assert datum.place(48.101, 11.61, math.nan) == pytest.approx(there, abs=1e-3)
+    datum.place(48.101, 11.61, 1600.0)
+    assert (datum.plane.altitude, datum.altitude) == (1500.0, 1600.0)
 
 
 def test_with_a_datum_the_altitudes_of_the_first_fixes_do_not_matter() -> None:
     there = [fix(2.0, 48.101, 11.61), fix(3.0, 48.09, 11.6)]
     there[1].altitude = 900.0
     forth, back = fixes(datum=[48.1, 11.6]), fixes(datum=[48.1, 11.6])
-    positions = [forth.position(message).position for message in there]
-    turned = [back.position(message).position for message in reversed(there)]
+    positions = [placed(forth, message).position for message in there]
+    turned = [placed(back, message).position for message in reversed(there)]
     np.testing.assert_allclose(positions, turned[::-1], atol=1e-8)
 
 
@@ -74,8 +99,7 @@ def test_covariances_are_handed_on_by_their_type(
     message = fix(1.0, 48.1, 11.6, sigma=2.0)
     assert reader.position(message).covariance == pytest.approx(4.0 * np.eye(2))
     message.position_covariance = covariance
-    read = reader.position(message)
-    assert isinstance(read, Position)
+    read = placed(reader, message)
     assert np.all(np.isfinite(read.position))
     if covariance[0] in (0.0, -1.0):
         # a singular one turned by the datum's yaw is the same, but for rounding
@@ -95,7 +119,7 @@ def test_what_is_no_place_is_refused_and_no_datum(
     message = fix(1.0, latitude, longitude)
     message.altitude = altitude
     assert reader.position(message).reason == reason
-    assert reader.position(fix(2.0, 10.0, 20.0)).position == pytest.approx([0.0, 0.0], abs=1e-9)
+    assert placed(reader, fix(2.0, 10.0, 20.0)).position == pytest.approx([0.0, 0.0], abs=1e-9)
 
 
 def test_fixes_wait_for_a_datum_if_they_are_told_to() -> None:
@@ -103,17 +127,17 @@ def test_fixes_wait_for_a_datum_if_they_are_told_to() -> None:
     reader = FixReader(Source('fix', Kind.FIX, 'fix'), datum, StaticFrames(), 'base_link')
     assert reader.position(fix(1.0, 48.0, 11.0)).reason == 'no_datum'
     datum.renew()
-    assert isinstance(reader.position(fix(2.0, 48.1, 11.6)), Position)
+    assert isinstance(placed(reader, fix(2.0, 48.1, 11.6)), Position)
     assert (datum.plane.latitude, datum.plane.longitude) == (48.1, 11.6)
     # one that is given need not be waited for
-    assert isinstance(fixes(datum=[48.1, 11.6], wait_for_datum=True).position(
-        fix(1.0, 48.0, 11.0)), Position)
+    assert isinstance(placed(fixes(datum=[48.1, 11.6], wait_for_datum=True),
+                             fix(1.0, 48.0, 11.0)), Position)
 
 
 def test_all_sources_of_fixes_share_the_datum() -> None:
     reader = MessageReader(checked({'sources': ['odom', 'fix', 'rear'], 'rear.type': 'fix'}))
-    reader.read('rear', fix(1.0, 48.1, 11.6))
-    assert reader.read('fix', fix(1.0, 48.101, 11.6)).position == pytest.approx(
+    reader.read('rear', fix(1.0, 48.1, 11.6)).placed()
+    assert reader.read('fix', fix(1.0, 48.101, 11.6)).placed().position == pytest.approx(
         [0.0, 111.2], abs=0.1)
 
 
@@ -140,11 +164,11 @@ def test_two_fixes_are_as_far_apart_as_on_the_earth(
         message.altitude = 0.0
     expected = 100.0 * np.array([math.sin(math.radians(azimuth)), math.cos(math.radians(azimuth))])
     for reader in (fixes(), fixes(datum=list(place))):
-        start = reader.position(here).position
-        np.testing.assert_allclose(reader.position(there).position - start, expected, atol=1e-3)
+        start = placed(reader, here).position
+        np.testing.assert_allclose(placed(reader, there).position - start, expected, atol=1e-3)
     # from a datum elsewhere the distance is the same
     reader = fixes(datum=[place[0], place[1] + 1e-4])
-    step = reader.position(there).position - reader.position(here).position
+    step = placed(reader, there).position - placed(reader, here).position
     assert math.hypot(*step) == pytest.approx(100.0, abs=1e-3)
 
 
@@ -210,11 +234,11 @@ def test_the_antenna_is_where_the_parameter_says_else_where_tf_static_does() -> 
 def test_another_lever_arm_is_taken_for_fixes_from_then_on_and_all_else_stays() -> None:
     values = checked({'fix.lever_arm': [0.5, 0.0]})
     reader = MessageReader(values)
-    first = reader.read('fix', fix(1.0, 48.1, 11.6))
+    first = reader.read('fix', fix(1.0, 48.1, 11.6)).placed()
     plane, one = reader.datum.plane, reader.fixes['fix']
     reader.frames.receive(Transforms(transform('base_link', 'gps', (0.75, -0.25, 1.0))))
     reader.configure({**values, 'fix.lever_arm': [1.5, 0.25], 'fix.time_offset': -0.5})
-    second = reader.read('fix', fix(2.0, 48.1, 11.6))
+    second = reader.read('fix', fix(2.0, 48.1, 11.6)).placed()
     assert (first.lever_arm.tolist(), second.lever_arm.tolist()) == ([0.5, 0.0], [1.5, 0.25])
     assert second.stamp_ns == 1_500_000_000
     assert second.position == pytest.approx(first.position, abs=1e-9)

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from pose_graph_ros.adapters.parameters import checked
-from pose_graph_ros.core.measurements import GlobalPose, OdometrySample, Position
+from pose_graph_ros.core.measurements import Fix, GlobalPose, OdometrySample
 from pose_graph_ros.ros import input as input_module
 from pose_graph_ros.ros.input import Input, LONGEST_DOUBT
 from pose_graph_ros.ros.time_jump import Decision, EVIDENCE
@@ -111,7 +111,7 @@ def test_every_message_is_counted_and_each_measurement_reaches_the_engine() -> N
     assert given.rejected() == {}
     assert given.log == []
     kinds = {source: type(measurement) for source, measurement in given.engine.posted}
-    assert kinds == {'odom': OdometrySample, 'fix': Position, 'global_pose': GlobalPose}
+    assert kinds == {'odom': OdometrySample, 'fix': Fix, 'global_pose': GlobalPose}
 
 
 def not_finite(seconds: float) -> Space:
@@ -169,8 +169,7 @@ def test_while_paused_measurements_are_read_but_not_posted() -> None:
     assert given.engine.posted == []
     assert given.rejected() == {'odom.paused': 5, 'fix.paused': 1}
     assert not given.input.is_streaming
-    # the first fix is the datum nevertheless
-    assert given.input.reader.datum.plane is not None
+    assert given.input.reader.datum.plane is None
     given.input.paused = False
     given.use('odom', odometry(1.6))
     assert given.input.posted == 1
@@ -182,7 +181,9 @@ def test_a_full_inbox_is_a_reason_and_no_measurement() -> None:
     for step in range(5):
         given.use('odom', odometry(1.0 + 0.1 * step))
     assert given.input.posted == 3
-    assert given.rejected() == {'odom.inbox_full': 2}
+    given.use('fix', fix(1.2))
+    assert given.rejected() == {'odom.inbox_full': 2, 'fix.inbox_full': 1}
+    assert given.input.reader.datum.plane is None
     assert 'the solver does not keep up' in given.log[0]
 
 

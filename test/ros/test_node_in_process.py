@@ -13,7 +13,7 @@ import pytest
 
 pytest.importorskip('rclpy', reason='ROS 2 is not there: no rclpy')
 
-from circle import PLANE
+from circle import fix_at, PLANE, true_pose
 from harness import PREPARE_PATIENCE
 from lifecycle_msgs.msg import Transition
 from lifecycle_msgs.srv import ChangeState
@@ -280,12 +280,26 @@ def test_pause_answers_whether_it_changed_something(managed: Managed) -> None:
     assert not managed.session.input.paused
 
 
+def test_a_fix_that_is_refused_is_not_the_datum(managed: Managed) -> None:
+    managed.start()
+    assert managed.pause(data=True).success
+    managed.send('fix', fix_at(0.0))
+    assert managed.session.input.rejected['fix', 'paused'] == 1
+    assert managed.pause(data=False).success
+    assert managed.session.input.reader.datum.plane is None
+    managed.drive(6.0, 2.0)
+    plane = managed.session.input.reader.datum.plane
+    # the first that came while it was not paused
+    first = PLANE.to_geodetic(true_pose(2.0)[:2])
+    assert (plane.latitude, plane.longitude) == pytest.approx(tuple(first[:2]), abs=1e-6)
+
+
 def test_the_datum_can_be_set_until_the_graph_refers_to_it(managed: Managed) -> None:
     managed.start()
     assert managed.call('set_datum').success
     managed.drive(2.0, fixes=False)
     datum = managed.session.input.reader.datum
-    # read, but not posted: nothing refers to it
+    # placed, but not in the graph: nothing refers to it
     datum.plane_for(48.0, 11.0, 0.0)
     assert managed.call('set_datum').success
     assert datum.plane is None

@@ -12,9 +12,11 @@ from pose_graph_ros.core.measurements import (
     ACCEPTED,
     Answer,
     AnswerStatus,
+    Fix,
     LoopClosure,
     Measurement,
     rejected,
+    value_defect,
 )
 from pose_graph_ros.core.odometry.hidden_nodes import HiddenNodes
 from pose_graph_ros.core.odometry.motion import Attachment
@@ -122,6 +124,11 @@ class MeasurementPipeline:
         attachment = attach(self._nodes, measurement.stamp_ns)
         if isinstance(attachment, Answer):
             return attachment
+        if isinstance(measurement, Fix):
+            # the last step: only a fix that nothing else is wrong with may become the datum
+            measurement = measurement.placed()
+            if (defect := value_defect(measurement.position)) is not None:
+                return rejected(defect, f'Fix: {measurement.position.tolist()} m from the datum')
         if not isinstance(measurement, LoopClosure):
             self._enqueue(measurement, source, attachment)
             return ACCEPTED

@@ -18,6 +18,7 @@ from pose_graph_ros.core.geometry import covariance
 from pose_graph_ros.core.geometry.se2 import BoolArray, FloatArray
 from pose_graph_ros.core.measurements import (
     Answer,
+    Fix,
     GlobalPose,
     HeadingOnly,
     LARGEST_STAMP,
@@ -126,6 +127,8 @@ def _numbers(measurement: Measurement) -> FloatArray:
         return np.concatenate((measurement.position, measurement.lever_arm))
     if isinstance(measurement, HeadingOnly):
         return np.array([measurement.heading])
+    if isinstance(measurement, Fix):
+        return measurement.lever_arm    # its position is checked when it is placed
     return measurement.pose
 
 
@@ -161,12 +164,13 @@ def _validate_heading(measurement: HeadingOnly, policy: CovariancePolicy) -> Val
 
 
 def _without_position(
-    measurement: GlobalPose | LoopClosure | Position, cov: FloatArray, policy: CovariancePolicy,
+    measurement: GlobalPose | LoopClosure | Position | Fix, cov: FloatArray,
+    policy: CovariancePolicy,
 ) -> Validated | Answer:
     """Return what is left of a pose without information on the position: its known heading."""
     variance = float(cov[2, 2]) if len(policy.override) < 2 else policy.override[1]**2
     never = isinstance(measurement, GlobalPose) and policy.heading is Heading.NEVER
-    if isinstance(measurement, Position) or never or not _is_known_heading(variance):
+    if isinstance(measurement, Position | Fix) or never or not _is_known_heading(variance):
         return rejected('no_information', f'{type(measurement).__name__}: {cov.tolist()}')
     variance = _heading_variance(variance, policy)
     if isinstance(measurement, LoopClosure):
