@@ -172,7 +172,8 @@ class Session:
         for timer in self._timers.values():
             self.node.destroy_timer(timer)
         if not self.worker.stop(STOP_TIMEOUT):
-            self.node.get_logger().warning('stopping while a solve is still running')
+            self.node.get_logger().warning(
+                f'stopping in the middle of {"a compilation" if self.compiling else "a solve"}')
         self.out.close()
 
     def configure(self, values: Mapping[str, Any]) -> None:
