@@ -128,7 +128,7 @@ def _concerns(session: 'Session') -> Iterator[tuple[bytes, str]]:
     yield from _missing_input(session)
     if estimate is None:
         return
-    transforms, silent = session.out.transforms, session.silent
+    transforms, silent = session.out.transforms, session.input.silent
     if transforms is not None and transforms.other != '':
         yield warn, transforms.other[0].upper() + transforms.other[1:] + '.'
     if len(silent) > 0:
@@ -146,8 +146,8 @@ def _concerns(session: 'Session') -> Iterator[tuple[bytes, str]]:
 
 def _missing_input(session: 'Session') -> Iterator[tuple[bytes, str]]:
     """Yield what is to be said if odometry, or all messages of a source, do not get in."""
-    warn, estimate, refused = DiagnosticStatus.WARN, session.worker.estimate, session.refused
-    odometry = session.odometry_topics
+    warn, estimate = DiagnosticStatus.WARN, session.worker.estimate
+    odometry, quiet, refused = session.odometry_topics, session.input.quiet, session.input.refused
     if estimate is None or (session.is_loaded and not any(
             session.worker.status.counts[name, 'accepted'] > 0 for name in odometry)):
         why = '; '.join(refused[name] for name in odometry if name in refused)
@@ -156,12 +156,12 @@ def _missing_input(session: 'Session') -> Iterator[tuple[bytes, str]]:
         state = 'No odometry yet' if estimate is None else (
             f'A graph of {estimate.n_hidden} hidden nodes is loaded and waits for odometry')
         yield warn, f'{state}: {why}.'
-    if session.quiet > 0.0:
+    if quiet > 0.0:
         final = session.final
         ended = (final is not None and final.done() and not final.cancelled()
                  and final.exception() is None and final.result().status is Status.CONVERGED)
-        yield warn, (f'Nothing has been received for {session.quiet:.0f} s: the drivers have '
-                     'stopped, or a bag has ended'
+        yield warn, (f'Nothing has been received for {quiet:.0f} s: the drivers have stopped, or '
+                     'a bag has ended'
                      + ('; the graph has been optimised.' if ended else '.'))
     if len(refused) > 0:
         text = '; '.join(refused.values())

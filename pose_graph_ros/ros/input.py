@@ -12,6 +12,7 @@ from pose_graph_ros.adapters.message_reader import MessageReader
 from pose_graph_ros.adapters.sources import Kind, NANOSECONDS, Source
 from pose_graph_ros.core.measurements import Answer, Measurement, OdometrySample, rejected
 from pose_graph_ros.ros.liveness import Liveness
+from pose_graph_ros.ros.refusals import Refusals
 from pose_graph_ros.ros.time_jump import Decision, ReceivedMessage, TimeJumpDetector
 
 PAUSED = rejected('paused', 'call ~/pause with false to resume')
@@ -44,10 +45,14 @@ class Input:
     def _clear(self) -> None:
         self.received: Counter[str] = Counter()  # number of messages by source
         self.rejected: Counter[tuple[str, str]] = Counter()  # number by source and reason
-        self.refusals: dict[tuple[str, str], str] = {}  # detail of the newest by the same
+        self._details: dict[tuple[str, str], str] = {}  # of the newest by source and reason
         self.posted = 0  # number of measurements that were handed to the engine
         self.liveness = Liveness([source.name for source in self.reader.sources.values()
                                   if source.kind is Kind.LOOP_CLOSURE])
+        self._refusals = Refusals()
+        self.silent: list[str] = []  # sources that are silent while others are not
+        self.quiet = 0.0  # for how long nothing at all has come, if that is long [s]
+        self.refused: dict[str, str] = {}  # what to say of sources that all is refused from
         self.posted_at = time.monotonic()  # time of the last of them, by a monotonic clock [s]
         self.is_streaming = False  # whether any were posted since the final optimisation
 
@@ -124,6 +129,33 @@ class Input:
             self.posted += 1
             self.posted_at, self.is_streaming = time.monotonic(), True
 
+    def watch(
+        self, counts: Counter[tuple[str, str]], details: Mapping[tuple[str, str], str], *,
+        active: bool,
+    ) -> None:
+        """
+        Find the sources that are silent or refused, and log each silence once.
+
+        Parameters
+        ----------
+        counts : Counter
+            Number of measurements by source and 'accepted' or a reason, of the engine.
+        details : mapping
+            Of its newest refusal by source and reason.
+        active : bool
+            Whether messages can be received.
+
+        """
+        now, silent, quiet = time.monotonic(), self.silent, self.quiet
+        self.silent = self.liveness.silent(now) if active else []
+        self.quiet = self.liveness.quiet(now) if active else 0.0
+        if self.quiet > 0.0 and quiet == 0.0:
+            self._warn(f'nothing has been received for {self.quiet:.0f} s')
+        for name in sorted(set(self.silent) - set(silent)):
+            self._warn(f'{name} is silent while other sources are not')
+        self.refused = self._refusals.update(
+            self.received, counts + self.rejected, {**details, **self._details}, now)
+
     def reject(self, source: str, answer: Answer) -> None:
         """
         Count a message that cannot be used; log the first for each source and reason.
@@ -135,7 +167,7 @@ class Input:
 
         """
         self.rejected[source, answer.reason] += 1
-        self.refusals[source, answer.reason] = answer.detail
+        self._details[source, answer.reason] = answer.detail
         self.warn_once(source, answer.reason, f'{source}: {answer.reason}: {answer.detail} '
                                               '(logged once, counted in diagnostics)')
 

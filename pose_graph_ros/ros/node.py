@@ -55,7 +55,7 @@ class PoseGraphNode(LifecycleNode):
         super().__init__('pose_graph', **node_options)
         self._log = NodeLog(self.get_logger())
         self.create_timer(PERIOD, self._log.flush, clock=Clock(clock_type=ClockType.STEADY_TIME))
-        self.failure = ''  # why the last configuration failed
+        self.failure = ''  # why the last transition or change of parameters failed
         self._session: Session | None = None
         self._offered: Services | None = None
         self._given = self._declared()  # the node's own parameters that have a value
@@ -213,7 +213,10 @@ class PoseGraphNode(LifecycleNode):
                 name, RosParameter.Type.DOUBLE_ARRAY, []))
         if len(changes) == 0:
             return SetParametersResult(successful=True)
-        return super().set_parameters_atomically(changes)
+        self.failure = ''
+        result = super().set_parameters_atomically(changes)
+        return result if self.failure == '' else SetParametersResult(
+            successful=False, reason=self.failure)
 
     def _plain(self, name: str, value: Any) -> Any:
         """Return a value of a parameter with its arrays as lists, also where it is unset."""
@@ -236,8 +239,9 @@ class PoseGraphNode(LifecycleNode):
             if self._session is not None:
                 try:
                     self._session.configure(checked(self._given))
-                except Exception:
+                except Exception as error:
                     # raised from here, the client would get no answer
+                    self.failure = f'failed: {type(error).__name__}: {error}'
                     logger.exception('a change of parameters failed')
 
     def _changed(self, parameters: list[RosParameter]) -> dict[str, Any]:

@@ -38,7 +38,6 @@ from pose_graph_ros.ros.input import Input, PAUSED
 from pose_graph_ros.ros.messages import CLASSES
 from pose_graph_ros.ros.pose_continuity import PoseContinuity
 from pose_graph_ros.ros.publishers import Publishers
-from pose_graph_ros.ros.refusals import Refusals
 from pose_graph_ros.ros.set_pose_input import SetPoseInput
 from pose_graph_ros.ros.time_jump import ReceivedMessage
 from pose_graph_ros.ros.topics import SET_POSE_TOPICS
@@ -98,11 +97,7 @@ class Session:
             name: PoseContinuity(source.maximum_speed, resumes=resumes)
             for name, source in self._config.odometry.items()}
         self.is_loaded = resumes  # whether the graph began as one that was loaded
-        self.silent: list[str] = []  # sources that are silent while others are not
-        self.quiet = 0.0  # for how long nothing at all has come, if that is long [s]
         self.final: Future[UpdateReport] | None = None  # optimisation at the end of the stream
-        self._refusals = Refusals()
-        self.refused: dict[str, str] = {}  # what to say of sources that all is refused from
         self.largest_energies: Sequence[ConstraintEnergy] = []
         # of this graph, so that the answer of an earlier worker is nobody's
         self._energies: Future[list[ConstraintEnergy]] | None = None
@@ -398,27 +393,13 @@ class Session:
     def publish_diagnostics(self) -> None:
         """Publish the state of the node."""
         now = time.monotonic()
-        self._watch_sources(now)
+        status = self.worker.status
+        self.input.watch(status.counts, status.refusals, active=self.active)
         if self.out.transforms is not None and self.active:
             self.out.transforms.check_for_others()
         self._update_largest_energies(now)
         level, text = diagnostics.health(self)
         self.out.publish_diagnostics(level, text, diagnostics.values(self))
-
-    def _watch_sources(self, now: float) -> None:
-        """Find the sources that are silent or refused, and log each silence once."""
-        warn, liveness, status = (
-            self.node.get_logger().warning, self.input.liveness, self.worker.status)
-        silent, quiet = self.silent, self.quiet
-        self.silent = liveness.silent(now) if self.active else []
-        self.quiet = liveness.quiet(now) if self.active else 0.0
-        if self.quiet > 0.0 and quiet == 0.0:
-            warn(f'nothing has been received for {self.quiet:.0f} s')
-        for name in sorted(set(self.silent) - set(silent)):
-            warn(f'{name} is silent while other sources are not')
-        self.refused = self._refusals.update(
-            self.input.received, status.counts + self.input.rejected,
-            {**status.refusals, **self.input.refusals}, now)
 
     def _update_largest_energies(self, now: float) -> None:
         """Take the newest answer of the worker, and ask again after a while."""

@@ -238,7 +238,8 @@ def test_a_change_of_parameters_that_fails_is_answered_and_logged(
     managed.wait(lambda: worker.status.counts['worker', 'internal_error'] == 1, 'it is counted')
     assert caplog.messages == ['a change of parameters failed']
     monkeypatch.setattr(managed.session.out, 'configure', fail)
-    assert managed.call('set_parameters', wanted, SetParameters).results[0].successful
+    result = managed.call('set_parameters', wanted, SetParameters).results[0]
+    assert (result.successful, result.reason) == (False, 'failed: MemoryError: no memory')
     assert caplog.messages == 2 * ['a change of parameters failed']
 
 

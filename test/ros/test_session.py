@@ -485,9 +485,9 @@ def test_the_most_urgent_state_is_said_with_what_to_do(active: Robot) -> None:
     session = active.session
     worker = Space(alive=True, prepared=True, status=session.worker.status,
                    estimate=replace(session.worker.estimate, alignment=AlignmentState.UNALIGNED))
-    seen = Space(worker=worker, active=True, input=session.input, silent=[], odometry_topics={},
-                 quiet=0.0, refused={}, final=None, is_loaded=False, compiling=False,
-                 out=Space(transforms=Space(other='')))
+    received = Space(paused=False, posted=7, silent=[], quiet=0.0, refused={})
+    seen = Space(worker=worker, active=True, input=received, odometry_topics={}, final=None,
+                 is_loaded=False, compiling=False, out=Space(transforms=Space(other='')))
 
     def said(expected: bytes, *words: str) -> None:
         level, text = diagnostics.health(seen)
@@ -496,15 +496,15 @@ def test_the_most_urgent_state_is_said_with_what_to_do(active: Robot) -> None:
 
     said(WARN, 'Unaligned')
     # each is more urgent than the one before
-    seen.silent = ['fix']
+    received.silent = ['fix']
     said(WARN, 'fix is silent', 'check the drivers')
-    seen.silent = ['fix', 'imu']
+    received.silent = ['fix', 'imu']
     said(WARN, 'fix and imu are silent')
     seen.out.transforms.other = 'another node publishes map -> odom on /tf'
     said(WARN, 'Another node publishes map -> odom on /tf.')
-    seen.refused = {'fix': 'the newest 7 messages of fix were refused: no_fix (none)'}
+    received.refused = {'fix': 'the newest 7 messages of fix were refused: no_fix (none)'}
     said(WARN, 'The newest 7 messages of fix were refused: no_fix (none).')
-    seen.quiet = 12.3
+    received.quiet = 12.3
     said(WARN, 'Nothing has been received for 12 s')
     assert 'optimised' not in diagnostics.health(seen)[1]
     seen.final = session.optimize()
@@ -554,7 +554,7 @@ def test_a_source_that_all_is_refused_from_is_named_with_the_reason(active: Robo
     active.wait(lambda: active.health() == (WARN, (
         '4 of 4 messages of fix were refused: no_fix (the receiver reports no fix).')), 'it is')
     active.send('fix', fix_at(1.5))
-    active.wait(lambda: active.session.refused == {}, 'it is not any more')
+    active.wait(lambda: active.session.input.refused == {}, 'it is not any more')
 
 
 def test_it_is_said_once_that_nothing_comes_in_any_more(
@@ -604,7 +604,7 @@ def test_a_source_that_ends_is_said_to_be_silent_once(
     active.drive(2.0)
     liveness = active.session.input.liveness
     monkeypatch.setattr(liveness, 'silent', lambda now: ['fix'])
-    active.wait(lambda: active.session.silent == ['fix'], 'it is noticed')
+    active.wait(lambda: active.session.input.silent == ['fix'], 'it is noticed')
     assert 'fix is silent' in active.health()[1]
     active.session.deactivate()
-    active.wait(lambda: active.session.silent == [], 'an inactive node misses nobody')
+    active.wait(lambda: active.session.input.silent == [], 'an inactive node misses nobody')
