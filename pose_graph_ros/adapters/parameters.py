@@ -93,6 +93,9 @@ PARAMETERS: tuple[Parameter, ...] = (
               'the stamps of the odometry jump back by more than this time.', 0.01, 3600.0),
     Parameter('graph_file', '', '', 'File that `~/save_graph` writes and `~/load_graph` reads, '
               'such as graph.g2o. Files with the suffixes .json and .tum are stored next to it.'),
+    Parameter('load_graph_on_start', False, '', 'Whether to continue with the graph in '
+              '`graph_file`. If it cannot be loaded, the node is not configured.',
+              change=Change.UNCONFIGURED),
     Parameter('datum', [], 'deg, deg, rad', 'Latitude and longitude of the origin of the map and, '
               'optionally, the angle from east to its x axis. If unset, the first fix is the '
               'origin and the x axis points east.', sizes=(0, 2, 3), change=Change.UNCONFIGURED),

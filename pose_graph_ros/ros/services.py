@@ -3,7 +3,7 @@
 """The services of the node; each answers what was done, or why it was not."""
 
 from collections import Counter
-from collections.abc import Awaitable, Callable, Coroutine, Generator, Mapping
+from collections.abc import Awaitable, Callable, Coroutine, Generator
 from concurrent.futures import CancelledError, Future, ThreadPoolExecutor
 from functools import partial
 import logging
@@ -18,8 +18,9 @@ from pose_graph_ros.adapters.sources import backend_config
 from pose_graph_ros.core.backend import PoseGraphBackend
 from pose_graph_ros.core.batch.optimizer import Status
 from pose_graph_ros.core.exceptions import FileFormatError, PoseGraphError
-from pose_graph_ros.core.io.graph_files import read_graph, write_graph
+from pose_graph_ros.core.io.graph_files import write_graph
 from pose_graph_ros.core.io.saved_graph import SavedGraph, site_refusal
+from pose_graph_ros.ros.graph_file import graph_path, restored
 from pose_graph_ros.ros.session import Session
 from pose_graph_ros.ros.worker import Worker
 
@@ -184,16 +185,14 @@ class Services:
         self, act: Callable[[Path], Awaitable[str]], _: Trigger.Request,
     ) -> Answer:
         """Return the answer of an action on the file of the graph."""
-        name = self._session.values['graph_file']
-        if name == '':
-            return False, (
-                'refused: set the parameter graph_file first, for example to ~/map.g2o')
+        hint = (f'; to name another file: ros2 param set {self._node.get_fully_qualified_name()} '
+                'graph_file FILE')
         try:
-            return True, await act(Path(name).expanduser())
+            return True, await act(graph_path(self._session.values)) + hint
         except CancelledError:
             raise
         except PoseGraphError as error:
-            return False, f'refused: {error}'
+            return False, f'refused: {error}{hint}'
         except Exception as error:
             logger.exception('the file of the graph failed')
             return False, f'failed: {type(error).__name__}: {error}'
@@ -218,7 +217,8 @@ class Services:
         session, worker = self._session, self._session.worker
         # wait until the worker has prepared the kernels, which reading needs
         await _Done(worker.call(lambda _: None))
-        saved, backend = await self._in_file_thread(_restored, path, session.values)
+        saved, backend = await self._in_file_thread(
+            restored, path, backend_config(session.values))
         # all that follows is about now: in the meantime a datum or parameters may have been set
         self._require_present(worker)
         datum = session.input.reader.datum
@@ -230,10 +230,3 @@ class Services:
         session.load(saved, backend, str(path))
         return (f'{len(saved.nodes.rows)} hidden nodes from {path}, datum '
                 f'{"none" if saved.datum is None else saved.datum}')
-
-
-def _restored(path: Path, values: Mapping[str, Any]) -> tuple[SavedGraph, PoseGraphBackend]:
-    saved = read_graph(path)
-    backend = PoseGraphBackend.restored(backend_config(values), saved)
-    backend.update()
-    return saved, backend

@@ -34,6 +34,7 @@ from pose_graph_ros.core.io.saved_graph import SavedGraph
 from pose_graph_ros.core.measurements import AnswerStatus, GlobalPose, OdometrySample
 from pose_graph_ros.core.sources.constraint_names import ConstraintEnergy
 from pose_graph_ros.ros import diagnostics, memory
+from pose_graph_ros.ros.graph_file import initial_graph, InitialGraph, restored
 from pose_graph_ros.ros.input import Input, PAUSED
 from pose_graph_ros.ros.messages import CLASSES
 from pose_graph_ros.ros.pose_continuity import PoseContinuity
@@ -76,6 +77,7 @@ class Session:
     def __init__(self, node: Node, values: Mapping[str, Any]) -> None:
         self.node, self.values = node, dict(values)
         self._config = backend_config(values)
+        initial = initial_graph(values)
         self.input = Input(values, node.get_logger().warning)
         self.out = Publishers(node, values, node.get_logger().warning)
         self._set_pose_input = SetPoseInput(
@@ -88,8 +90,12 @@ class Session:
         self._jump_handle: JumpHandle | None = None
         # a clock that is set back, or a bag that starts again, must not stall a timer
         self.steady = Clock(clock_type=ClockType.STEADY_TIME)
-        self._clear()
-        self._start_worker(PoseGraphBackend(self._config))
+        self._clear(resumes=initial is not None)
+        self._start_worker(PoseGraphBackend(self._config), initial=initial)
+        if initial is not None:
+            if initial.datum is not None:
+                self.input.reader.datum.keep(initial.datum)
+            self.worker.request_update()
         self._set_timer('diagnostics', values['diagnostics_period'], self.publish_diagnostics)
 
     def _clear(self, *, resumes: bool = False) -> None:
@@ -103,13 +109,33 @@ class Session:
         self._energies: Future[list[ConstraintEnergy]] | None = None
         self._energies_at = -math.inf
 
-    def _start_worker(self, backend: PoseGraphBackend, *, prepared: bool = False) -> None:
+    def _start_worker(
+        self, backend: PoseGraphBackend, *, prepared: bool = False,
+        initial: InitialGraph | None = None,
+    ) -> None:
         """Start the thread that owns a graph."""
         graph = self.out.graph
         self.worker = worker = Worker(
             backend, lambda backend: self._publish_views(worker, graph, backend),
-            None if prepared else self._warm_up)
+            None if prepared else partial(self._prepare, initial))
         self.worker.start()
+
+    def _prepare(
+        self, initial: InitialGraph | None, stopped: Callable[[], bool],
+    ) -> PoseGraphBackend | None:
+        """Prepare the kernels, then read the graph to start with; for the worker's thread."""
+        self._warm_up(stopped)
+        if initial is None or stopped():
+            return None
+        try:
+            saved, backend = restored(initial.path, self._config)
+        except Exception:
+            # its files were whole when the node was configured
+            logger.exception('%s could not be loaded: a new graph is started', initial.path)
+            return None
+        self.node.get_logger().info(
+            f'continuing with {len(saved.nodes.rows)} hidden nodes from {initial.path}')
+        return backend
 
     def _warm_up(self, stopped: Callable[[], bool]) -> None:
         """Compile or load all kernels before the first measurement; for the worker's thread."""

@@ -86,7 +86,8 @@ def test_every_parameter_says_when_it_changes() -> None:
     taken = {name.rpartition('.')[2] if '.' in name else name
              for name, change in changes.items() if change is Change.UNCONFIGURED}
     assert taken == {'map_frame', 'odom_frame', 'base_link_frame', 'datum', 'wait_for_datum',
-                     'topic', 'noise', 'correlation_time', 'correlation_model', 'white_share'}
+                     'topic', 'noise', 'correlation_time', 'correlation_model', 'white_share',
+                     'load_graph_on_start'}
     assert {name for name, change in changes.items() if change is Change.START} == {
         'sources', 'autostart', 'odom.type', 'global_pose.type', 'fix.type', 'imu.type',
         'loop_closure.type'}

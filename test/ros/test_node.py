@@ -289,6 +289,7 @@ BAD = (
     ('odom.robust_loss:=l1', 'none, huber, cauchy'), ('fix.sigma_ceiling:=0.001', 'ceiling'),
     ('fix.topic:=/odom', 'fix.topic: expected a topic of sensor_msgs/msg/NavSatFix, got /odom'),
     ('qos_overrides./odom.subscription.reliability:=bestefort', 'best_effort'),
+    ('load_graph_on_start:=true', 'parameter graph_file: expected the name of a file'),
     ('qos_overrides./path.publisher.lifespan:=5', 'depth, history, reliability'))
 UNREADABLE = (('-p', 'frequency'), ('--params-file', '/no/such.yaml'), ('--no-such',))
 

@@ -7,13 +7,14 @@ from contextlib import contextmanager
 import logging
 from pathlib import Path
 import threading
+from types import ModuleType
 from typing import Any
 
 import pytest
 
 pytest.importorskip('rclpy', reason='ROS 2 is not there: no rclpy')
 
-from circle import fix_at, PLANE, true_pose
+from circle import fix_at, odometry_at, PLANE, true_pose
 from harness import PREPARE_PATIENCE
 from lifecycle_msgs.msg import Transition
 from lifecycle_msgs.srv import ChangeState
@@ -29,7 +30,7 @@ from std_srvs.srv import SetBool, Trigger
 
 from pose_graph_ros.core.exceptions import ConfigError
 from pose_graph_ros.core.warm_up import warm_up
-from pose_graph_ros.ros import memory, services
+from pose_graph_ros.ros import diagnostics, graph_file, memory, services
 from pose_graph_ros.ros.node import PoseGraphNode
 from pose_graph_ros.ros.services import CLOSED, REPLACED
 from pose_graph_ros.ros.session import Session
@@ -315,7 +316,7 @@ def test_the_datum_can_be_set_until_the_graph_refers_to_it(managed: Managed) -> 
 def test_a_graph_is_saved_and_loaded(managed: Managed, tmp_path: Path) -> None:
     managed.start()
     for name in ('save_graph', 'load_graph'):
-        assert 'set the parameter graph_file first' in managed.call(name).message
+        assert 'ros2 param set /pose_graph graph_file FILE' in managed.call(name).message
     assert managed.set('graph_file', str(tmp_path / 'map.g2o')) == (True, '')
     assert not managed.call('load_graph').success
     assert 'no graph to save' in managed.call('save_graph').message
@@ -324,6 +325,7 @@ def test_a_graph_is_saved_and_loaded(managed: Managed, tmp_path: Path) -> None:
     answer = managed.call('save_graph')
     assert answer.success, answer.message
     assert f'{before.n_hidden} hidden nodes in ' in answer.message
+    assert 'to name another file: ros2 param set /pose_graph graph_file FILE' in answer.message
     managed.call('reset')
     answer = managed.call('load_graph')
     assert answer.success, answer.message
@@ -338,10 +340,77 @@ def test_a_graph_is_saved_and_loaded(managed: Managed, tmp_path: Path) -> None:
     assert 'another site' in answer.message
 
 
+def test_a_node_starts_with_a_graph(
+    managed: Managed, tmp_path: Path, monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    node = managed.local.node
+    managed.start()
+    managed.drive(8.0)
+    before = managed.session.worker.estimate
+    managed.set('graph_file', str(tmp_path / 'map.g2o'))
+    assert managed.call('save_graph').success
+    assert not managed.set('load_graph_on_start', True)[0], 'while it is configured'
+
+    assert node.trigger_deactivate() is node.trigger_cleanup() is SUCCESS
+    assert managed.set('load_graph_on_start', True) == (True, '')
+    # as Path.home does not know everyone
+    for wrong in ('', str(tmp_path), str(tmp_path / 'no.g2o'), '~nobody_of_this_name/map.g2o'):
+        managed.set('graph_file', wrong)
+        with pytest.raises(ConfigError, match=r'parameter (graph_file|load_graph_on_start): '):
+            node.start()
+        assert node._session is None
+    managed.set('graph_file', str(tmp_path / 'map'))
+    managed.set('datum', [50.0, 8.0])
+    with pytest.raises(ConfigError, match='another site'):
+        node.start()
+    managed.set('datum', [])
+
+    with held(monkeypatch, 'read_graph', graph_file) as reading:
+        # it is read in the thread of the graph, while messages come
+        managed.start()
+        assert managed.session.input.reader.datum.is_of_graph
+        managed.wait(reading.is_set, 'the file is read')
+        managed.send('odom', *(odometry_at(8.0 + 0.1 * step) for step in range(20)))
+        assert managed.session.worker.estimate is None
+    managed.wait(lambda: managed.session.worker.status.processed == 20, 'all are processed')
+    managed.drive(12.0, 10.0)
+    after = managed.session.worker.estimate
+    assert after.n_hidden > before.n_hidden
+    assert 'odom.jump' not in diagnostics.values(managed.session)
+    assert managed.session.n_resets == 0
+
+    # a new graph is an empty one
+    managed.session.reset()
+    managed.drive(14.0, 12.0)
+    assert managed.session.worker.estimate.n_hidden < before.n_hidden
+
+
+def test_a_graph_that_cannot_be_restored_after_all_is_logged(
+    managed: Managed, tmp_path: Path, monkeypatch: pytest.MonkeyPatch,
+    caplog: pytest.LogCaptureFixture,
+) -> None:
+    managed.start()
+    managed.drive(4.0)
+    managed.set('graph_file', str(tmp_path / 'map.g2o'))
+    assert managed.call('save_graph').success
+    assert managed.local.node.trigger_deactivate() is managed.local.node.trigger_cleanup()
+    managed.set('load_graph_on_start', True)
+
+    def fail(_: Path) -> None:
+        raise MemoryError('no memory')
+    monkeypatch.setattr(graph_file, 'read_graph', fail)
+    managed.start()
+    managed.drive(2.0)
+    assert managed.session.worker.estimate is not None
+    assert 'map.g2o could not be loaded: a new graph is started' in caplog.text
+
+
 @contextmanager
-def held(monkeypatch: pytest.MonkeyPatch, name: str) -> Iterator[threading.Event]:
-    """Let a function of the services wait; yield an event that is set while it does."""
-    function = getattr(services, name)
+def held(
+    monkeypatch: pytest.MonkeyPatch, name: str, module: ModuleType = services,
+) -> Iterator[threading.Event]:
+    """Let a function of a module wait; yield an event that is set while it does."""
+    function = getattr(module, name)
     running, release = threading.Event(), threading.Event()
 
     def wait(*given: object) -> object:
@@ -349,7 +418,7 @@ def held(monkeypatch: pytest.MonkeyPatch, name: str) -> Iterator[threading.Event
         assert release.wait(10.0)
         return function(*given)
     with monkeypatch.context() as patch:
-        patch.setattr(services, name, wait)
+        patch.setattr(module, name, wait)
         yield running
         release.set()
 
@@ -379,7 +448,7 @@ def test_a_cleanup_waits_for_no_file_and_each_request_is_answered(
 
     node.start()
     session = managed.session
-    with held(monkeypatch, 'read_graph') as reading:
+    with held(monkeypatch, 'read_graph', graph_file) as reading:
         answer = managed.request('load_graph')
         managed.wait(reading.is_set, 'the file is read')
         clean_up()
@@ -395,7 +464,7 @@ def test_a_graph_is_not_replaced_by_one_that_was_asked_for_before(
     managed.set('graph_file', str(tmp_path / 'map.g2o'))
     managed.drive(4.0)
     assert managed.call('save_graph').success
-    with held(monkeypatch, 'read_graph') as reading:
+    with held(monkeypatch, 'read_graph', graph_file) as reading:
         answer = managed.request('load_graph')
         managed.wait(reading.is_set, 'the file is read')
         managed.session.reset()
@@ -403,7 +472,7 @@ def test_a_graph_is_not_replaced_by_one_that_was_asked_for_before(
     assert (answer.result().success, answer.result().message) == (False, REPLACED)
     assert managed.session.worker.estimate is None
     # a datum that came while the file was read, of another site
-    with held(monkeypatch, 'read_graph') as reading:
+    with held(monkeypatch, 'read_graph', graph_file) as reading:
         answer = managed.request('load_graph')
         managed.wait(reading.is_set, 'the file is read')
         managed.session.input.reader.datum.plane_for(50.0, 8.0, 0.0)

@@ -8,7 +8,7 @@ import re
 
 from circle import drive, odometry_at, odometry_pose, path_error, START, true_pose
 from geometry_msgs.msg import PoseWithCovarianceStamped
-from harness import Client, LATCHED, NodeProcess, pose, RELIABLE, yaw
+from harness import Client, LATCHED, NodeProcess, PATIENCE, pose, RELIABLE, yaw
 import numpy as np
 import pytest
 from std_srvs.srv import SetBool
@@ -185,6 +185,31 @@ def test_a_graph_is_saved_and_another_node_goes_on_with_it(tmp_path: Path) -> No
         assert path_error(client) < 1e-3
         assert len(client.paths[-1].poses) > 1.9 * nodes
         assert 'odom.jump' not in client.values
+
+
+def test_a_node_is_started_with_a_graph(tmp_path: Path) -> None:
+    for folder in ('b', 'c'):
+        (tmp_path / folder).mkdir()
+    arguments = ('-p', f'graph_file:={tmp_path / "map"}', '-p', 'load_graph_on_start:=true')
+    with NodeProcess(tmp_path, arguments[:2]) as node, \
+            Client(int(node.env['ROS_DOMAIN_ID'])) as client:
+        drive(client, 5.0)
+        assert client.trigger('save_graph').success
+        nodes = client.values['hidden_nodes']
+    with NodeProcess(tmp_path / 'b', arguments) as node, \
+            Client(int(node.env['ROS_DOMAIN_ID'])) as client:
+        client.spin_until(lambda: client.values.get('hidden_nodes') == nodes, 'it is there')
+        assert client.values['datum'].startswith('[48.1')
+        drive(client, 20.0, begin=5.0)
+        assert client.optimize().success
+        assert path_error(client) < 1e-3
+        assert 'odom.jump' not in client.values
+    (tmp_path / 'map.g2o').write_text('VERTEX_SE2 0 0 0 0\n')
+    with NodeProcess(tmp_path / 'c', arguments) as node:
+        assert node.process.wait(PATIENCE) == 2
+        (line,) = node.stderr().splitlines()
+        assert 'parameter load_graph_on_start: ' in line
+        assert 'map.g2o: is damaged' in line
 
 
 def test_a_graph_that_cannot_be_loaded_is_refused_and_the_present_one_stays(

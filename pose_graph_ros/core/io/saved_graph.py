@@ -167,18 +167,32 @@ def site_refusal(
     """
     if saved.datum is None:
         return None
-    if datum is not None:
-        metres = float(distances(saved.datum, datum.latitude, datum.longitude)[0])
-        turned = abs(wrap(datum.yaw - saved.datum.yaw))
-        if metres > SAME_PLACE or turned > SAME_YAW:
-            return (f'the saved graph is of another site: its datum is {saved.datum}, the present '
-                    f'one {datum}; they are {metres:.2f} m and {turned:.6f} rad apart')
+    if datum is not None and (refusal := datum_refusal(saved.datum, datum)) is not None:
+        return refusal
     if fix is not None:
         metres = _distance_to(saved, fix)
         if not metres <= SAME_SITE:
             return (f'the saved graph is of another site: its datum is {saved.datum}, the present '
                     f'one {fix}, which is {metres / 1000.0:.1f} km from the nearest node')
     return None
+
+
+def datum_refusal(saved: MapOrigin, datum: MapOrigin) -> str | None:
+    """
+    Return why the datum of a saved graph is not the one that was set; None if it is.
+
+    Parameters
+    ----------
+    saved, datum : MapOrigin
+        They must be equal except for the altitude.
+
+    """
+    metres = float(distances(saved, datum.latitude, datum.longitude)[0])
+    turned = abs(wrap(datum.yaw - saved.yaw))
+    if metres <= SAME_PLACE and turned <= SAME_YAW:
+        return None
+    return (f'the saved graph is of another site: its datum is {saved}, the present one {datum}; '
+            f'they are {metres:.2f} m and {turned:.6f} rad apart')
 
 
 def _distance_to(saved: SavedGraph, fix: MapOrigin) -> float:

@@ -26,7 +26,7 @@ from pose_graph_ros.core.geometry.geodesy import MapOrigin
 from pose_graph_ros.core.graph.constraints import EdgeKind, ObservedKind
 from pose_graph_ros.core.io import atomic_files, version_1
 from pose_graph_ros.core.io.g2o import read_g2o
-from pose_graph_ros.core.io.graph_files import graph_paths, read_graph, write_graph
+from pose_graph_ros.core.io.graph_files import graph_paths, read_datum, read_graph, write_graph
 from pose_graph_ros.core.io.saved_graph import SavedGraph
 
 DATA = Path(__file__).parents[2] / 'data'
@@ -133,16 +133,32 @@ def test_a_place_that_cannot_be_written_to_is_refused(
 
 # --- damaged files -------------------------------------------------------------------------------
 
-def test_files_that_are_not_there_or_not_readable_are_refused(tmp_path: Path) -> None:
+@pytest.mark.parametrize('read', [read_graph, read_datum])
+def test_files_that_are_not_there_or_not_readable_are_refused(
+    tmp_path: Path, read: Callable[[Path], object],
+) -> None:
     with pytest.raises(FileFormatError, match=r'map\.json: cannot be read'):
-        read_graph(tmp_path / 'map')
+        read(tmp_path / 'map')
     for path in (tmp_path / 'a\0b', tmp_path / ('m' * 300), Path('')):
         with pytest.raises(FileFormatError):
-            read_graph(path)
+            read(path)
     write_graph(small_graph(), tmp_path / 'map')
     (tmp_path / 'map.g2o').unlink()
     with pytest.raises(FileFormatError, match=r'map\.g2o: cannot be read'):
-        read_graph(tmp_path / 'map')
+        read(tmp_path / 'map')
+
+
+def test_the_datum_is_read_alone(tmp_path: Path) -> None:
+    for saved in (small_graph(), saved_drive()):
+        _, side, _ = write_graph(saved, tmp_path / 'map')
+        assert read_datum(side) == saved.datum
+    for datum in ([91.0, 0.0, 0.0, 0.0], 'here', [1.0]):
+        rewrite(side, lambda members, wrong=datum: members.update(datum=wrong))
+        with pytest.raises(FileFormatError, match=r'map\.json: expected a datum'):
+            read_datum(side)
+    rewrite(side, lambda members: members.pop('datum'))
+    with pytest.raises(FileFormatError, match=r'map\.json: expected a datum'):
+        read_datum(side)
 
 
 def test_the_g2o_file_of_another_graph_is_refused(tmp_path: Path) -> None:
@@ -179,8 +195,9 @@ def test_no_damage_goes_unnoticed(suffix: str, where: float, byte: int, cut: boo
         if same:
             assert_same_value(read_graph(path), small_graph())
         else:
-            with pytest.raises(FileFormatError, match=path.name):
-                read_graph(path)
+            for read in (read_graph, read_datum):
+                with pytest.raises(FileFormatError, match=path.name):
+                    read(path)
 
 
 def rewrite(path: Path, change: Callable[[dict[str, Any]], None]) -> None:
