@@ -4,6 +4,7 @@
 
 from collections.abc import Mapping
 from dataclasses import dataclass
+import logging
 from pathlib import Path
 from typing import Any
 
@@ -15,6 +16,8 @@ from pose_graph_ros.core.geometry.geodesy import MapOrigin
 from pose_graph_ros.core.io.graph_files import read_datum, read_graph
 from pose_graph_ros.core.io.saved_graph import datum_refusal, SavedGraph
 
+logger = logging.getLogger(__name__)
+
 
 @dataclass(frozen=True, slots=True)
 class InitialGraph:
@@ -22,6 +25,16 @@ class InitialGraph:
 
     path: Path
     datum: MapOrigin | None
+
+    def read(self, config: BackendConfig) -> PoseGraphBackend | None:
+        """Return an engine that continues it; None, which is logged, if that fails after all."""
+        try:
+            saved, backend = restored(self.path, config)
+        except Exception:
+            logger.exception('%s could not be loaded: a new graph is started', self.path)
+            return None
+        logger.info('continuing with %d hidden nodes from %s', len(saved.nodes.rows), self.path)
+        return backend
 
 
 def graph_path(values: Mapping[str, Any]) -> Path:

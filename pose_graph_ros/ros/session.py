@@ -21,7 +21,7 @@ from nav_msgs.msg import Odometry
 from rclpy.clock import Clock, ClockType, JumpHandle, JumpThreshold, TimeJump
 from rclpy.duration import Duration
 from rclpy.node import Node
-from rclpy.qos import QoSDurabilityPolicy, QoSProfile, QoSReliabilityPolicy
+from rclpy.qos import QoSProfile
 from rclpy.qos_overriding_options import QoSOverridingOptions
 from rclpy.subscription import Subscription
 from rclpy.timer import Timer
@@ -34,27 +34,24 @@ from pose_graph_ros.core.io.saved_graph import SavedGraph
 from pose_graph_ros.core.measurements import AnswerStatus, GlobalPose, OdometrySample
 from pose_graph_ros.core.sources.constraint_names import ConstraintEnergy
 from pose_graph_ros.ros import diagnostics, memory
-from pose_graph_ros.ros.graph_file import initial_graph, InitialGraph, restored
+from pose_graph_ros.ros.graph_file import initial_graph, InitialGraph
 from pose_graph_ros.ros.input import Input, PAUSED
 from pose_graph_ros.ros.messages import CLASSES
 from pose_graph_ros.ros.pose_continuity import PoseContinuity
 from pose_graph_ros.ros.publishers import Publishers
 from pose_graph_ros.ros.set_pose_input import SetPoseInput
 from pose_graph_ros.ros.time_jump import ReceivedMessage
-from pose_graph_ros.ros.topics import SET_POSE_TOPICS
+from pose_graph_ros.ros.topics import (
+    LOOP_CLOSURE_QOS,
+    SENSOR_QOS,
+    SET_POSE_QOS,
+    SET_POSE_TOPICS,
+    STATIC_QOS,
+)
 from pose_graph_ros.ros.transforms import STATIC_TOPIC, TFMessage
 from pose_graph_ros.ros.worker import Worker
 
 logger = logging.getLogger(__name__)
-
-# Profiles are reliable if they do not say otherwise.
-# The queue is deep since no odometry may be lost. A best-effort reader matches reliable and
-# best-effort writers.
-SENSOR_QOS = QoSProfile(depth=1000, reliability=QoSReliabilityPolicy.BEST_EFFORT)
-LOOP_CLOSURE_QOS = QoSProfile(depth=100)  # a loop closure is rare and must not get lost
-# Late subscribers receive the newest message of every broadcaster.
-STATIC_QOS = QoSProfile(depth=100, durability=QoSDurabilityPolicy.TRANSIENT_LOCAL)
-SET_POSE_QOS = QoSProfile(depth=1)
 
 STOP_TIMEOUT = 0.5  # longest wait at the end for what the worker does [s]
 SILENCE_PERIOD = 0.2  # period of the check whether all sources are silent [s]
@@ -125,17 +122,7 @@ class Session:
     ) -> PoseGraphBackend | None:
         """Prepare the kernels, then read the graph to start with; for the worker's thread."""
         self._warm_up(stopped)
-        if initial is None or stopped():
-            return None
-        try:
-            saved, backend = restored(initial.path, self._config)
-        except Exception:
-            # its files were whole when the node was configured
-            logger.exception('%s could not be loaded: a new graph is started', initial.path)
-            return None
-        self.node.get_logger().info(
-            f'continuing with {len(saved.nodes.rows)} hidden nodes from {initial.path}')
-        return backend
+        return None if initial is None or stopped() else initial.read(self._config)
 
     def _warm_up(self, stopped: Callable[[], bool]) -> None:
         """Compile or load all kernels before the first measurement; for the worker's thread."""

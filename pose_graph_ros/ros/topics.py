@@ -1,7 +1,7 @@
 # Copyright 2026 The pose_graph_ros authors
 # SPDX-License-Identifier: Apache-2.0
 """
-The topics of the node, checked before it is configured.
+The topics that the node reads, and a check of all its topics before it is configured.
 
 Where a topic has two types, or a quality of service is wrong, rclpy and the middleware say too
 little to find out which parameter to correct.
@@ -12,13 +12,27 @@ from typing import Any
 
 from geometry_msgs.msg import PoseWithCovarianceStamped
 from rclpy.node import Node
-from rclpy.qos import QoSHistoryPolicy, QoSReliabilityPolicy
+from rclpy.qos import (
+    QoSDurabilityPolicy,
+    QoSHistoryPolicy,
+    QoSProfile,
+    QoSReliabilityPolicy,
+)
 
 from pose_graph_ros.adapters.sources import Source
 from pose_graph_ros.core.exceptions import ConfigError
 from pose_graph_ros.ros.messages import CLASSES
 from pose_graph_ros.ros.publishers import OUTPUTS
 from pose_graph_ros.ros.transforms import STATIC_TOPIC, TFMessage, TOPIC
+
+# Profiles are reliable if they do not say otherwise.
+# The queue is deep since no odometry may be lost. A best-effort reader matches reliable and
+# best-effort writers.
+SENSOR_QOS = QoSProfile(depth=1000, reliability=QoSReliabilityPolicy.BEST_EFFORT)
+LOOP_CLOSURE_QOS = QoSProfile(depth=100)  # a loop closure is rare and must not get lost
+# Late subscribers receive the newest message of every broadcaster.
+STATIC_QOS = QoSProfile(depth=100, durability=QoSDurabilityPolicy.TRANSIENT_LOCAL)
+SET_POSE_QOS = QoSProfile(depth=1)
 
 SET_POSE_TOPICS = ('initialpose', 'set_pose')
 OVERRIDES = 'qos_overrides.'  # prefix of the parameters for the quality of service
