@@ -112,17 +112,17 @@ class Session:
     ) -> None:
         """Start the thread that owns a graph."""
         graph = self.out.graph
+
+        def prepare(stopped: Callable[[], bool]) -> None:
+            self._warm_up(stopped)
+            if initial is not None and not stopped() and (
+                    saved := initial.read(self._config)) is not None:
+                worker.adopt(saved)
+
         self.worker = worker = Worker(
             backend, lambda backend: self._publish_views(worker, graph, backend),
-            None if prepared else partial(self._prepare, initial))
+            None if prepared else prepare)
         self.worker.start()
-
-    def _prepare(
-        self, initial: InitialGraph | None, stopped: Callable[[], bool],
-    ) -> PoseGraphBackend | None:
-        """Prepare the kernels, then read the graph to start with; for the worker's thread."""
-        self._warm_up(stopped)
-        return None if initial is None or stopped() else initial.read(self._config)
 
     def _warm_up(self, stopped: Callable[[], bool]) -> None:
         """Compile or load all kernels before the first measurement; for the worker's thread."""

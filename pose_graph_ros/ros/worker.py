@@ -60,14 +60,13 @@ class Worker:
     on_estimate : callable
         Called in the thread after each new estimate, with the backend.
     prepare : callable
-        Called in the thread before its first work, with a function that returns whether to end;
-        returns a backend to run instead, or None.
+        Called in the thread before its first work, with a function that returns whether to end.
 
     """
 
     def __init__(
         self, backend: PoseGraphBackend, on_estimate: Callable[[PoseGraphBackend], None],
-        prepare: Callable[[Callable[[], bool]], PoseGraphBackend | None] | None = None,
+        prepare: Callable[[Callable[[], bool]], None] | None = None,
     ) -> None:
         self._backend, self._on_estimate, self._prepare = backend, on_estimate, prepare
         self.prepared = False  # whether the preparation has ended
@@ -86,6 +85,10 @@ class Worker:
     def start(self) -> None:
         """Start the thread."""
         self._thread.start()
+
+    def adopt(self, backend: PoseGraphBackend) -> None:
+        """Run another backend; only for `prepare`, as nothing has been added yet."""
+        self._backend = backend
 
     @property
     def alive(self) -> bool:
@@ -152,8 +155,7 @@ class Worker:
     def _run(self) -> None:
         try:
             if self._prepare is not None:
-                other = self._prepare(lambda: self._stopping)
-                self._backend = self._backend if other is None else other
+                self._prepare(lambda: self._stopping)
         except Exception:
             # kernels are then compiled when they are first needed
             logger.exception('the preparation of the worker failed')
