@@ -9,6 +9,7 @@ from typing import Self
 
 import numpy as np
 
+from pose_graph_ros.core import isolation
 from pose_graph_ros.core.alignment import estimator
 from pose_graph_ros.core.alignment.monitor import AlignmentMonitor, AlignmentState, placed
 from pose_graph_ros.core.batch import final_optimization, optimizer
@@ -57,9 +58,9 @@ class PoseGraphBackend:
     new node at once. A measurement waits until odometry has reached its stamp, is attached to the
     hidden node before that stamp, and is added to the graph by the next update. An update first
     aligns the odometry frame with the map, if they are not aligned yet. It then passes all new
-    constraints to the smoother, whose work does not grow with the graph. If the update fails, it
-    is rolled back, and its constraints are set aside until the next full optimisation. Stamps are
-    integer nanoseconds; the back end has no clock.
+    constraints to the smoother, whose work does not grow with the graph. Constraints that make an
+    update fail are set aside until the next full optimisation. Stamps are integer nanoseconds; the
+    back end has no clock.
 
     Parameters
     ----------
@@ -129,8 +130,13 @@ class PoseGraphBackend:
 
     @property
     def n_quarantined(self) -> int:
-        """Number of constraints that were set aside after a failed solve."""
+        """Number of constraints that were set aside because the solver fails with them."""
         return len(self._quarantine)
+
+    def set_aside(self, n: int) -> list[str]:
+        """Return the names of the newest n constraints that were set aside."""
+        edges, observed = self._quarantine.edges[-n:], self._quarantine.observed[-n:]
+        return constraint_names.queued(Queue(edges, observed), self._nodes)[-n:]
 
     @property
     def revision(self) -> int:
@@ -256,16 +262,36 @@ class PoseGraphBackend:
         """
         Add all new constraints to the graph and update the estimate; to be called by a timer.
 
-        The work depends on how much the new constraints change, not on the size of the graph.
+        The work depends on how much the new constraints change, not on the size of the graph. If
+        it fails, the constraints to blame are set aside until the next full optimisation, and all
+        others are added, by this update or by the next ones; the report names those set aside.
         """
+        report, untried = self._update()
+        self._pipeline.queue = untried.joined(self._pipeline.queue)
+        return report
+
+    def _update(self) -> tuple[UpdateReport, Queue]:
+        """Return the report of an update, and the constraints for which it had no time."""
+        return isolation.update(
+            self._add_queue, self._can_solve, self._pipeline, self._quarantine,
+            lambda one: constraint_names.queued(one, self._nodes)[0])
+
+    def _can_solve(self) -> bool:
+        """Tell whether an update without new constraints succeeds."""
+        with self._transaction() as transaction:
+            transaction.solved(self._smoother.update(self._factors.build(Queue(), self.graph)))
+        return transaction.failure == ''
+
+    def _add_queue(self) -> tuple[UpdateReport, Queue]:
+        """Add the constraints in the queue and solve; a failure returns those that it removed."""
         if self.graph.n_nodes == 0:
-            return UpdateReport(Status.CONVERGED, '', 0, 0, 0.0)
+            return UpdateReport(Status.CONVERGED, '', 0, 0, 0.0), Queue()
         with self._transaction() as transaction:
             T_map_graph = self._alignment.find(
                 self.graph.poses, self._pipeline.queue.observed, self._nodes.primary)
             queue = transaction.add(self._pipeline.take_ready(aligned=self._alignment.is_aligned))
             if len(queue) == 0 and self._settled:
-                return UpdateReport(Status.CONVERGED, '', 0, 0, self._chi2)
+                return UpdateReport(Status.CONVERGED, '', 0, 0, self._chi2), Queue()
             if T_map_graph is not None:
                 transaction.move_graph(T_map_graph)
             # once aligned, measurements fix the gauge, and the first node is no longer fixed
@@ -273,7 +299,9 @@ class PoseGraphBackend:
             change = self._factors.build(queue, self.graph)._replace(free=freed)
             transaction.solved(self._smoother.update(change))
         if transaction.failure != '':
-            return self._failed(transaction)
+            self._settled = self._settled and not transaction.moved_back
+            return (UpdateReport(Status.FAILED, transaction.failure, 0, 0, self._chi2),
+                    transaction.queue)
         self._factors.commit()
         self._alignment.add(queue.observed)
         result = self._reweight(transaction.result)
@@ -281,15 +309,10 @@ class PoseGraphBackend:
         self._evaluate()
         return UpdateReport(
             result.status, '', len(queue), result.iterations, self._chi2, result.relinearized,
-            result.eliminated, result.visited)
+            result.eliminated, result.visited), Queue()
 
     def _transaction(self) -> Transaction:
-        return Transaction(self.graph, self._alignment, self._factors, self._quarantine)
-
-    def _failed(self, transaction: Transaction) -> UpdateReport:
-        self._settled = self._settled and not transaction.moved_back
-        self.counts['solver', 'failed'] += 1
-        return UpdateReport(Status.FAILED, transaction.failure, 0, 0, self._chi2)
+        return Transaction(self.graph, self._alignment, self._factors)
 
     def _evaluate(self) -> None:
         """Update chi2 and the covariance of the newest node."""
@@ -337,12 +360,7 @@ class PoseGraphBackend:
     def optimize(self) -> UpdateReport:
         """Optimise the whole graph with all quarantined constraints; for the end of a stream."""
         self.finish()
-        report = self.update()
-        if len(self._quarantine) > 0:
-            self._pipeline.queue.extend(self._quarantine)
-            self._quarantine = Queue()
-            again = self.update()
-            report = replace(again, new_constraints=report.new_constraints + again.new_constraints)
+        report = isolation.update_with_all(self._update, self._pipeline, self._quarantine)
         if self.graph.n_nodes == 0:
             return report
         return report.after(self._optimize_whole())

@@ -29,6 +29,10 @@ class UpdateReport:
     visited: int = 0
     """Number of cliques of hidden nodes that it solved for again."""
 
+    def before(self, again: 'UpdateReport') -> 'UpdateReport':
+        """Return one report of this update and the one after it; only the last may have failed."""
+        return replace(again, new_constraints=self.new_constraints + again.new_constraints)
+
     def after(self, solved: 'UpdateReport') -> 'UpdateReport':
         """Return one report of this update and the optimisation of the whole graph after it."""
         failed = next((part for part in (self, solved) if part.status is Status.FAILED), solved)

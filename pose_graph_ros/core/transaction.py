@@ -20,35 +20,33 @@ class Transaction:
     Context manager in which an update is built and solved.
 
     If the solver fails or the context raises an `Exception`, it restores the poses of the graph,
-    the state of the alignment and the records of the factor builder, and moves the new constraints
-    to the quarantine. It suppresses the exception and stores its message in `failure`. The
-    smoother rolls back its own changes, bit for bit.
+    the state of the alignment and the records of the factor builder. It suppresses the exception
+    and stores its message in `failure`. The smoother rolls back its own changes, bit for bit.
 
     Parameters
     ----------
     graph : Graph
     alignment : AlignmentMonitor
     factors : FactorBuilder
-    quarantine : Queue, receives the constraints of a failed update
 
     """
 
     def __init__(
-        self, graph: Graph, alignment: AlignmentMonitor, factors: FactorBuilder, quarantine: Queue,
+        self, graph: Graph, alignment: AlignmentMonitor, factors: FactorBuilder,
     ) -> None:
         self._graph, self._alignment, self._factors = graph, alignment, factors
-        self._quarantine = quarantine
         self._before = alignment.copy()
         self._poses: FloatArray | None = None
-        self._queue = Queue()
+        self.queue = Queue()
+        """The new constraints."""
         self.result = UpdateResult(Status.CONVERGED, '', 0, 0, 0, 0)
         """Result of the solver."""
         self.failure = ''
         """Why the update was rolled back; empty if it succeeded."""
 
     def add(self, queue: Queue) -> Queue:
-        """Return the given constraints; a failure moves them to the quarantine."""
-        self._queue = queue
+        """Return the new constraints after storing them."""
+        self.queue = queue
         return queue
 
     def move_graph(self, T_map_graph: FloatArray) -> None:
@@ -80,7 +78,6 @@ class Transaction:
         if self._poses is not None:
             self._graph.set_poses(self._poses)
         self._alignment.restore(self._before)
-        self._quarantine.extend(self._queue)
         self.failure = str(error)
         if not isinstance(error, LinearSolveError):
             self.failure = f'{type(error).__name__}: {error}'

@@ -43,6 +43,7 @@ def _state(session: 'Session') -> dict[str, object]:
     found |= {f'received.{source}': count for source, count in sorted(received.items())}
     found |= {f'{source}.{answer}': count
               for (source, answer), count in sorted((status.counts + rejected).items())}
+    found |= {f'quarantined.{rank}': name for rank, name in enumerate(status.set_aside, 1)}
     if estimate is not None:
         found.update({
             'odometry': estimate.primary, 'alignment': estimate.alignment.value,
@@ -115,8 +116,9 @@ def _concerns(session: 'Session') -> Iterator[tuple[bytes, str]]:
     if not worker.alive:
         yield error, 'The worker thread has ended: restart the node.'
     if report is not None and report.status is Status.FAILED:
-        yield error, ('The solver failed with the newest measurements, which were set aside; the '
-                      'last good estimate is kept. See the log for the reason.')
+        names = ', '.join(worker.status.set_aside) or 'the newest measurements'
+        yield error, (f'The solver failed with {names}: set aside until ~/optimize; the estimate '
+                      'is without them. See the log for the reason.')
     if not session.active:
         yield good, 'Inactive: activate the node (ros2 lifecycle set).'
     if session.input.paused:

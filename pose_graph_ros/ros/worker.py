@@ -8,7 +8,7 @@ an immutable estimate that the thread replaces as a whole.
 """
 
 from collections import Counter, deque
-from collections.abc import Callable, Collection, Mapping
+from collections.abc import Callable, Collection, Mapping, Sequence
 from concurrent.futures import Future
 from dataclasses import dataclass, field
 import logging
@@ -28,6 +28,7 @@ Result = TypeVar('Result')
 Job = Callable[[PoseGraphBackend], Result]
 """A function that is called in the worker's thread with the engine."""
 
+N_SET_ASIDE = 3  # number of constraints in the quarantine that the status names
 INBOX_LIMIT = 100_000  # measurements that wait for the thread; further ones are rejected
 
 
@@ -42,6 +43,7 @@ class WorkerStatus:
     """Detail of the newest refusal by source and reason."""
     pending: int = 0
     quarantined: int = 0
+    set_aside: Sequence[str] = ()  # names of the newest of these
     updates: int = 0  # number of updates that ran the solver
     solve_mean: float = 0.0  # mean duration of such an update [s]
     solve_max: float = 0.0  # longest such duration [s]
@@ -249,7 +251,8 @@ class Worker:
             self._solves, self._solve_total = self._solves + 1, self._solve_total + seconds
             self._solve_max = max(self._solve_max, seconds)
         if report.reason != '':
-            logger.warning('the solver failed, the last good estimate is kept: %s', report.reason)
+            logger.warning('the solver failed with what is set aside, the estimate is without it: '
+                           '%s', report.reason)
         return report
 
     def _publish(self) -> None:
@@ -264,7 +267,8 @@ class Worker:
         self.status = WorkerStatus(
             processed=status.processed + processed, counts=Counter(backend.counts),
             refusals=dict(backend.refusals),
-            pending=backend.n_waiting, quarantined=backend.n_quarantined, updates=self._solves,
+            pending=backend.n_waiting, quarantined=backend.n_quarantined,
+            set_aside=backend.set_aside(N_SET_ASIDE), updates=self._solves,
             solve_mean=self._solve_total / max(self._solves, 1), solve_max=self._solve_max,
             report=status.report if report is None else report,
             sources=status.sources if report is None else backend.reports())

@@ -198,6 +198,7 @@ def test_what_cannot_be_solved_for_is_set_aside_and_the_node_goes_on(
         START + 2.0, 0.0, 0.0, 1.0, variances=(1e10, 1e10, 1e-6)))
     client.spin_until(lambda: client.values.get('quarantined') == '1', 'it is set aside')
     assert client.values['solver.failed'] == '1'
+    assert client.values['quarantined.1'] == f'global_pose at {START + 2.0:.3f} s near x3'
     assert client.diagnostics[-1].status[0].level == b'\x02'
     assert client.values['alignment'] == 'local'
     client.global_pose.publish(pose(START + 3.0, *true_pose(3.0).tolist()))

@@ -12,7 +12,7 @@ from pose_graph_ros.core.graph.constraints import EdgeKind
 from pose_graph_ros.core.graph.graph import Graph
 from pose_graph_ros.core.graph.graph_view import constraint_tables, ConstraintTable, DIAGONAL
 from pose_graph_ros.core.odometry.hidden_nodes import HiddenNodes
-from pose_graph_ros.core.sources.factor_builder import ConstraintOrigin, FactorBuilder
+from pose_graph_ros.core.sources.factor_builder import ConstraintOrigin, FactorBuilder, Queue
 
 
 @dataclass(frozen=True, slots=True)
@@ -62,6 +62,23 @@ def largest(
         named.append(ConstraintEnergy(float(energies[row]), float(table.energies[number]),
                                       int(table.freedom[number]), *names))
     return named
+
+
+def queued(queue: Queue, nodes: HiddenNodes) -> list[str]:
+    """
+    Return the names of constraints that are not in the graph, as in `ConstraintEnergy`.
+
+    Parameters
+    ----------
+    queue : Queue
+    nodes : HiddenNodes
+
+    """
+    ends = [(source, np.searchsorted(nodes.rows, (edge.i[0], edge.j[0])).tolist())
+            for source, edge in queue.edges]
+    return [f'{source} x{i} - x{j}' for source, (i, j) in ends] + [
+        f'{each.source} at {each.measurement.stamp_ns * 1e-9:.3f} s near '
+        f'x{int(np.searchsorted(nodes.rows, each.attachment.node))}' for each in queue.observed]
 
 
 def _names(

@@ -93,6 +93,18 @@ class Queue:
         self.edges += other.edges
         self.observed += other.observed
 
+    def joined(self, other: 'Queue') -> 'Queue':
+        """Return a new queue with the constraints of this one, then those of another one."""
+        return Queue([*self.edges, *other.edges], [*self.observed, *other.observed])
+
+    def halves(self) -> 'tuple[Queue, Queue]':
+        """Return the first half of the constraints and the rest, as new queues."""
+        half = len(self) // 2
+        n_edges = min(half, len(self.edges))
+        n_observed = half - n_edges
+        return (Queue(self.edges[:n_edges], self.observed[:n_observed]),
+                Queue(self.edges[n_edges:], self.observed[n_observed:]))
+
 
 class ConstraintOrigin(NamedTuple):
     """The measurement that a constraint was made from."""
