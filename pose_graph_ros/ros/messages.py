@@ -1,7 +1,7 @@
 # Copyright 2026 The pose_graph_ros authors
 # SPDX-License-Identifier: Apache-2.0
 """
-From estimates to messages.
+From estimates to messages, and from bytes to odometry.
 
 What is sent with each odometry message is written as the bytes of the middleware (CDR, little
 endian): filling in message objects would take ten times as long. In CDR every number is aligned to
@@ -16,10 +16,12 @@ from builtin_interfaces.msg import Time
 from geometry_msgs.msg import PoseWithCovarianceStamped
 from nav_msgs.msg import Odometry
 import numpy as np
+from rclpy.serialization import deserialize_message
 from sensor_msgs.msg import Imu, NavSatFix, NavSatStatus
 from std_msgs.msg import Header
 
-from pose_graph_ros.adapters.conversions import PLANAR
+from pose_graph_ros.adapters.conversions import Message
+from pose_graph_ros.adapters.odometry_cdr import LITTLE_ENDIAN, read_odometry
 from pose_graph_ros.adapters.sources import Kind, NANOSECONDS
 from pose_graph_ros.core.geometry import covariance as cov
 from pose_graph_ros.core.geometry.geodesy import TangentPlane
@@ -40,7 +42,8 @@ PATH_CHUNK = 2048  # number of poses of a path that are written at a time
 
 CDR = b'\x00\x01\x00\x00'
 _STAMP, _LENGTH = struct.Struct('<iI'), struct.Struct('<I')
-_POSE, _TWIST = struct.Struct('<7d'), struct.Struct('<6d')
+_POSE, _POSE_WITH_COVARIANCE = struct.Struct('<7d'), struct.Struct('<43d')
+_TWIST_WITH_COVARIANCE = struct.Struct('<42d')
 _UNKNOWN_TWIST = bytes(48) + (UNKNOWN_VARIANCE * np.eye(6)).tobytes()
 
 
@@ -48,6 +51,13 @@ def time_message(stamp_ns: int) -> Time:
     """Return a stamp [ns] as a message."""
     seconds, nanoseconds = divmod(stamp_ns, NANOSECONDS)
     return Time(sec=seconds, nanosec=nanoseconds)
+
+
+def odometry_message(data: bytes) -> Message:
+    """Return serialised odometry as an object with the same fields; raises ValueError."""
+    if data.startswith(LITTLE_ENDIAN):
+        return read_odometry(data)
+    return deserialize_message(data, Odometry)  # of a rare middleware
 
 
 def fix_message(
@@ -91,7 +101,7 @@ def _names(at: int, frame_id: str, child_frame_id: str = '') -> bytes:
 
 
 def odometry_cdr(
-    stamp_ns: int, prediction: Prediction, source: Odometry, map_frame: str, base_frame: str,
+    stamp_ns: int, prediction: Prediction, source: Message, map_frame: str, base_frame: str,
 ) -> bytes:
     """
     Return a serialised nav_msgs/Odometry: the pose in the map and the twist of the odometry.
@@ -107,13 +117,13 @@ def odometry_cdr(
     """
     twist = source.twist
     linear, angular = twist.twist.linear, twist.twist.angular
-    numbers = (linear.x, linear.y, linear.z, angular.x, angular.y, angular.z)
-    covariance = np.asarray(twist.covariance, dtype='<f8')
-    finite = all(map(math.isfinite, numbers)) and bool(np.isfinite(covariance).all())
+    numbers = (linear.x, linear.y, linear.z, angular.x, angular.y, angular.z, *twist.covariance)
+    # a finite sum is the quick way to tell
+    finite = math.isfinite(sum(numbers)) or all(map(math.isfinite, numbers))
     return b''.join((
         CDR, _STAMP.pack(*divmod(stamp_ns, NANOSECONDS)), _names(8, map_frame, base_frame),
         _pose_with_covariance_cdr(prediction, UNKNOWN_VARIANCE),
-        _TWIST.pack(*numbers) + covariance.tobytes() if finite else _UNKNOWN_TWIST))
+        _TWIST_WITH_COVARIANCE.pack(*numbers) if finite else _UNKNOWN_TWIST))
 
 
 def stamped_pose_cdr(stamp_ns: int, prediction: Prediction, map_frame: str) -> bytes:
@@ -133,15 +143,21 @@ def stamped_pose_cdr(stamp_ns: int, prediction: Prediction, map_frame: str) -> b
 
 def _pose_with_covariance_cdr(prediction: Prediction, unknown: float) -> bytes:
     """Serialise a planar pose; height, roll and pitch have the unknown variance."""
-    covariance = np.diag(np.full(6, unknown))
-    covariance[PLANAR] = prediction.covariance
-    return _pose_cdr(prediction.T_map_base) + covariance.astype('<f8').tobytes()
+    (xx, xy, xt), (yx, yy, yt), (tx, ty, tt) = prediction.covariance.tolist()
+    return _POSE_WITH_COVARIANCE.pack(
+        *_position_and_quaternion(prediction.T_map_base),
+        xx, xy, 0.0, 0.0, 0.0, xt,
+        yx, yy, 0.0, 0.0, 0.0, yt,
+        0.0, 0.0, unknown, 0.0, 0.0, 0.0,
+        0.0, 0.0, 0.0, unknown, 0.0, 0.0,
+        0.0, 0.0, 0.0, 0.0, unknown, 0.0,
+        tx, ty, 0.0, 0.0, 0.0, tt)
 
 
-def _pose_cdr(pose: FloatArray) -> bytes:
-    """Serialise a planar pose, as position and quaternion."""
+def _position_and_quaternion(pose: FloatArray) -> tuple[float, ...]:
+    """Return the seven numbers of a planar pose in messages."""
     x, y, theta = pose.tolist()
-    return _POSE.pack(x, y, 0.0, 0.0, 0.0, math.sin(theta / 2.0), math.cos(theta / 2.0))
+    return x, y, 0.0, 0.0, 0.0, math.sin(theta / 2.0), math.cos(theta / 2.0)
 
 
 def transform_cdr(
@@ -158,7 +174,8 @@ def transform_cdr(
 
     """
     return b''.join((CDR, _LENGTH.pack(1), _STAMP.pack(*divmod(stamp_ns, NANOSECONDS)),
-                     _names(12, map_frame, odom_frame), _pose_cdr(T_map_odom)))
+                     _names(12, map_frame, odom_frame),
+                     _POSE.pack(*_position_and_quaternion(T_map_odom))))
 
 
 def path_cdr(path: Trajectory, stamp_ns: int, frame_id: str) -> bytes:

@@ -25,7 +25,7 @@ from sensor_msgs.msg import NavSatFix
 from std_msgs.msg import Header
 from visualization_msgs.msg import Marker, MarkerArray
 
-from pose_graph_ros.adapters.conversions import frame
+from pose_graph_ros.adapters.conversions import frame, Message
 from pose_graph_ros.adapters.fixes import Datum
 from pose_graph_ros.adapters.markers import markers_cdr
 from pose_graph_ros.adapters.sources import NANOSECONDS
@@ -119,7 +119,7 @@ class Publishers:
         self._path_period, self._graph_period = values['path_period'], values['graph_period']
 
     def publish_pose(
-        self, estimate: Estimate, odometry: Odometry, sample: OdometrySample, datum: Datum,
+        self, estimate: Estimate, odometry: Message, sample: OdometrySample, datum: Datum,
     ) -> None:
         """
         Publish pose, odometry, fix and transform at an odometry message.
@@ -128,7 +128,8 @@ class Publishers:
         ----------
         estimate : Estimate
             The newest estimate, with the same primary odometry.
-        odometry : nav_msgs.msg.Odometry
+        odometry : Message
+            With the fields of nav_msgs/Odometry.
         sample : OdometrySample
             The same message, as it was read.
         datum : Datum

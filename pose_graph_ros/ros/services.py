@@ -166,8 +166,12 @@ class Services:
 
     async def _set_datum(self, _: Trigger.Request) -> Answer:
         """Let the next good fix be the datum, unless the graph refers to the present one."""
-        session = self._session
-        status, datum = session.worker.status, session.input.reader.datum
+        session, worker = self._session, self._session.worker
+        for _ in range(10):  # more may be posted meanwhile
+            if worker.status.processed < session.input.posted:
+                await _Done(worker.call(lambda _: None))
+        self._require_present(worker)
+        status, datum = worker.status, session.input.reader.datum
         used = sum(status.counts[name, 'accepted'] for name in session.input.reader.fixes)
         if datum.is_of_graph:
             return False, 'refused: the graph that was loaded refers to the present datum'

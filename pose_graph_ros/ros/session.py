@@ -17,7 +17,6 @@ import time
 from typing import Any
 
 from geometry_msgs.msg import PoseWithCovarianceStamped
-from nav_msgs.msg import Odometry
 from rclpy.clock import Clock, ClockType, JumpHandle, JumpThreshold, TimeJump
 from rclpy.duration import Duration
 from rclpy.node import Node
@@ -36,10 +35,11 @@ from pose_graph_ros.core.sources.constraint_names import ConstraintEnergy
 from pose_graph_ros.ros import diagnostics, memory
 from pose_graph_ros.ros.graph_file import initial_graph, InitialGraph
 from pose_graph_ros.ros.input import Input, PAUSED
-from pose_graph_ros.ros.messages import CLASSES
+from pose_graph_ros.ros.messages import CLASSES, odometry_message
 from pose_graph_ros.ros.pose_continuity import PoseContinuity
 from pose_graph_ros.ros.publishers import Publishers
 from pose_graph_ros.ros.set_pose_input import SetPoseInput
+from pose_graph_ros.ros.spinning import guarded
 from pose_graph_ros.ros.time_jump import ReceivedMessage
 from pose_graph_ros.ros.topics import (
     LOOP_CLOSURE_QOS,
@@ -79,7 +79,7 @@ class Session:
         self.out = Publishers(node, values, node.get_logger().warning)
         self._set_pose_input = SetPoseInput(
             self.out.map_frame, self.out.odom_frame, self.out.base_frame)
-        self.active = False
+        self.active = self._closed = False
         self.n_resets, self.reset_reason = 0, ''
         self.compiling = False  # whether kernels are compiled, which a start from the cache is not
         self._subscriptions: list[Subscription] = []
@@ -153,8 +153,10 @@ class Session:
             self._subscribe(topic, PoseWithCovarianceStamped, self._on_set_pose, SET_POSE_QOS)
         for source in sources:
             qos = LOOP_CLOSURE_QOS if source.kind is Kind.LOOP_CLOSURE else SENSOR_QOS
-            self._subscribe(
-                source.topic, CLASSES[source.kind], partial(self._on_message, source), qos)
+            # rclpy takes longest to fill in the message, and odometry comes at a high rate
+            raw = source.kind is Kind.ODOMETRY
+            self._subscribe(source.topic, CLASSES[source.kind], partial(
+                self._on_odometry if raw else self._on_message, source), qos, raw=raw)
         self._watch_time()
         self.input.liveness.resume(time.monotonic())
         self.active = True
@@ -177,6 +179,7 @@ class Session:
         """Stop the worker; destroy subscriptions, timers and publishers."""
         if self.active:
             self.deactivate()
+        self._closed = True
         for timer in self._timers.values():
             self.node.destroy_timer(timer)
         if not self.worker.stop(STOP_TIMEOUT):
@@ -199,17 +202,30 @@ class Session:
 
     def _subscribe(
         self, topic: str, message_type: type, callback: Callable[[Any], None], qos: QoSProfile,
+        *, raw: bool = False,
     ) -> None:
         self._subscriptions.append(self.node.create_subscription(
-            message_type, topic, callback, copy(qos),  # rclpy writes the overrides into it
-            qos_overriding_options=QoSOverridingOptions.with_default_policies()))
+            message_type, topic, guarded(callback, lambda: self.active),
+            copy(qos),  # rclpy writes the overrides into it
+            qos_overriding_options=QoSOverridingOptions.with_default_policies(), raw=raw))
 
     def _set_timer(self, name: str, period: float, tick: Callable[[], None]) -> None:
         if name in self._timers:
             self.node.destroy_timer(self._timers.pop(name))
-        self._timers[name] = self.node.create_timer(period, tick, clock=self.steady)
+        is_due = (lambda: not self._closed) if name == 'diagnostics' else (lambda: self.active)
+        self._timers[name] = self.node.create_timer(
+            period, guarded(tick, is_due), clock=self.steady)
 
     # ---- messages
+
+    def _on_odometry(self, source: Source, data: bytes) -> None:
+        """Receive a serialised message."""
+        try:
+            message = odometry_message(data)
+        except ValueError as error:
+            self.input.refuse(source.name, error)
+        else:
+            self._on_message(source, message)
 
     def _on_message(self, source: Source, message: Message) -> None:
         """Receive a message; never raises, whatever its content."""
@@ -232,7 +248,7 @@ class Session:
         if isinstance(measurement, OdometrySample):
             self._publish_prediction(received.source, measurement, received.message)
 
-    def _publish_prediction(self, name: str, sample: OdometrySample, message: Odometry) -> None:
+    def _publish_prediction(self, name: str, sample: OdometrySample, message: Message) -> None:
         """Publish the newest estimate, propagated to a message of the primary odometry."""
         estimate = self.worker.estimate
         covers = self._continuity[name].covers(estimate, sample)
@@ -244,7 +260,7 @@ class Session:
         elif not self.input.paused:
             self.worker.request_update()  # with this sample
 
-    def _check_frames(self, odometry: Odometry) -> None:
+    def _check_frames(self, odometry: Message) -> None:
         """Warn once if the odometry's frames differ from those of the parameters."""
         for name, parameter, expected in (
                 (odometry.header.frame_id, 'odom_frame', self.out.odom_frame),

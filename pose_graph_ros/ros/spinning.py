@@ -2,6 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Runs the callbacks of a node, by the executor that takes the least time of the processor."""
 
+from collections.abc import Callable
 import logging
 
 from rclpy.executors import Executor, SingleThreadedExecutor
@@ -10,7 +11,7 @@ from rclpy.task import Future
 
 try:
     from rclpy.experimental import EventsExecutor
-except ImportError:  # rclpy before 7.1.5
+except ImportError:  # an older rclpy
     EventsExecutor = None
 
 logger = logging.getLogger(__name__)
@@ -20,6 +21,7 @@ logger = logging.getLogger(__name__)
 LONGEST_WAIT = 3600.0
 # Of the SingleThreadedExecutor, which begins each wait with all that has changed [s].
 SHORT_WAIT = 0.1
+CLOSE_TIMEOUT = 1.0  # longest wait for a callback at the end [s]
 
 
 class Spinner:
@@ -60,4 +62,26 @@ class Spinner:
 
     def close(self) -> None:
         """Release the node, before it is destroyed."""
-        self._executor.shutdown()
+        self._executor.shutdown(timeout_sec=CLOSE_TIMEOUT)
+
+
+def guarded(callback: Callable[..., None], is_due: Callable[[], bool]) -> Callable[..., None]:
+    """
+    Return a callback that never raises, and does nothing if it is not due any more.
+
+    Of messages that came together, the executor would leave those behind an error for later; and
+    events that were under way when subscriptions and timers were destroyed still come.
+
+    Parameters
+    ----------
+    callback : callable
+    is_due : callable
+
+    """
+    def call(*arguments: object) -> None:
+        try:
+            if is_due():
+                callback(*arguments)
+        except Exception:
+            logger.exception('a callback failed')
+    return call

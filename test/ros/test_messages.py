@@ -106,6 +106,54 @@ def test_a_long_path_is_quick() -> None:
     assert time.process_time() - start < 1.0
 
 
+def fields(message: object) -> object:
+    """Return a message, or what stands in for one, as nested dictionaries."""
+    names = (message.get_fields_and_field_types() if hasattr(message, 'get_fields_and_field_types')
+             else getattr(message, '_fields', None))
+    if names is None:
+        return message if isinstance(message, (str, int, float)) else list(message)
+    return {name: fields(getattr(message, name)) for name in names}
+
+
+def random_odometry(frame: str, child_frame: str) -> Odometry:
+    generator = np.random.default_rng(len(frame) + 100 * len(child_frame))
+    message = Odometry(child_frame_id=child_frame)
+    message.header.frame_id = frame
+    message.header.stamp.sec, message.header.stamp.nanosec = -5, 2**32 - 1
+    for part, vectors in ((message.pose, ('position', 'orientation')),
+                          (message.twist, ('linear', 'angular'))):
+        inner = part.pose if part is message.pose else part.twist
+        for vector in vectors:
+            for axis in getattr(inner, vector).get_fields_and_field_types():
+                setattr(getattr(inner, vector), axis, generator.normal())
+        part.covariance = generator.normal(size=36)
+    message.pose.pose.position.z = math.inf
+    return message
+
+
+@pytest.mark.parametrize('child_frame', ['', 'b', 'base_link', 'robot/1'])
+@pytest.mark.parametrize('frame', ['', 'o', 'od', 'odo', 'odom', 'Größe 地図', 'a' * 5000])
+def test_odometry_is_read_as_rclpy_reads_it(frame: str, child_frame: str) -> None:
+    message = random_odometry(frame, child_frame)
+    data = bytes(serialize_message(message))
+    assert fields(messages.odometry_message(data)) == fields(message)
+
+
+def test_odometry_in_big_endian_is_read_and_what_is_no_odometry_is_refused() -> None:
+    message = random_odometry('odom', 'base_link')
+    data = bytes(serialize_message(message))
+    # the stamp, two names of which the length stands before, and then only doubles
+    names = b''.join(length[::-1] + name for length, name in (
+        (data[12:16], data[16:24]), (data[24:28], data[28:44])))
+    stamp, numbers = np.frombuffer(data[4:12], '<u4'), np.frombuffer(data[44:], '<f8')
+    big = b'\0\0\0\0' + stamp.astype('>u4').tobytes() + names + numbers.astype('>f8').tobytes()
+    assert fields(messages.odometry_message(big)) == fields(message)
+    for broken in (data[:-8], data[:30], data[:4], data[:12] + b'\xff' * 4 + data[16:],
+                   data.replace(b'odom', b'od\xffm')):
+        with pytest.raises(ValueError, match=r'too few|decode'):
+            messages.odometry_message(broken)
+
+
 def pose_message(pose: np.ndarray) -> Pose:
     """Return a planar pose, shape (3,), as a message."""
     message = Pose()

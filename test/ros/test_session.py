@@ -20,6 +20,7 @@ from harness import LATCHED, odometry, pose, PREPARE_PATIENCE, stamp_ns, TFMessa
 from local_node import Driver, LocalNode
 from nav_msgs.msg import Odometry, Path as PathMessage
 import numpy as np
+from rclpy.serialization import serialize_message
 from rclpy.time import Time
 from visualization_msgs.msg import MarkerArray
 
@@ -274,6 +275,50 @@ def test_rejected_messages_are_counted_with_those_of_the_engine(active: Robot) -
     assert (values['odom.not_finite'], values['fix.no_fix']) == ('1', '2')
     assert (values['odom.duplicate_stamp'], values['odom.accepted']) == ('1', '30')
     assert values['received'] == values['processed'] == '40'
+
+
+def test_odometry_that_cannot_be_read_is_counted_and_the_next_is_used(active: Robot) -> None:
+    active.drive(1.0)
+    whole = bytes(serialize_message(odometry_at(1.0)))
+    active.send('odom', whole[:-100], whole.replace(b'odom', b'od\xffm'))
+    assert active.values()['odom.malformed'] == '2'
+    active.drive(3.0, begin=2.0)
+    assert active.values()['odom.accepted'] == '20'
+
+
+def test_an_error_in_a_callback_costs_one_message_and_is_logged(
+    active: Robot, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture,
+) -> None:
+    active.drive(1.0)
+    outputs = active.local.subscribe(Odometry, 'odometry/filtered')
+
+    def fail(*_: object) -> None:
+        raise RuntimeError('nobody knows why')
+    with monkeypatch.context() as patch:
+        patch.setattr(active.session.out, 'publish_pose', fail)
+        active.send('odom', odometry_at(1.1), odometry_at(1.2))
+    assert 'a callback failed' in caplog.text
+    assert 'nobody knows why' in caplog.text
+    active.send('odom', odometry_at(1.3))
+    active.wait(lambda: len(outputs) == 1, 'only the last one is answered')
+
+
+def test_what_was_under_way_when_it_became_inactive_does_nothing(active: Robot) -> None:
+    active.drive(1.0)
+    (hear,) = (subscription.callback for subscription in active.local.node.subscriptions
+               if subscription.topic_name == '/odom')
+    ticks = {name: timer.callback for name, timer in active.session._timers.items()}
+    states = active.local.subscribe(DiagnosticArray, '/diagnostics')
+    active.wait(lambda: len(states) > 0, 'diagnostics come')
+    active.session.deactivate()
+    hear(bytes(serialize_message(odometry_at(1.0))))
+    ticks['update']()
+    assert active.session.input.received['odom'] == 10
+    states.clear()
+    ticks['diagnostics']()
+    active.wait(lambda: len(states) > 0, 'they still do')
+    active.session.close()
+    ticks['diagnostics']()
 
 
 def test_while_paused_nothing_reaches_the_engine_but_poses_follow_odometry(active: Robot) -> None:

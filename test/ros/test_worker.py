@@ -2,7 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """The worker's thread: everything posted is processed, whatever the engine does."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Collection
 import threading
 import time
 
@@ -46,6 +46,36 @@ def test_all_that_is_posted_is_processed_and_one_estimate_follows_the_other() ->
     assert worker.status.counts['pose', 'accepted'] == 100
     assert worker.estimate.stamp_ns == estimates[-1].stamp_ns
     assert worker.estimate.n_observed == 100
+    assert worker.stop(PATIENCE)
+
+
+def test_measurements_are_added_many_at_a_time_and_an_update_has_all_of_them() -> None:
+    backend, turns = PoseGraphBackend(), []
+    worker = Worker(backend, lambda _: None)
+    process = worker._process
+
+    def count(batch: Collection[object], *, wanted: bool) -> None:
+        turns.append(len(batch))
+        process(batch, wanted=wanted)
+    worker._process = count
+    worker.start()
+    for step in range(5):
+        worker.post('odom', sample(1 + step))
+    wait_until(lambda: worker.estimate is not None and worker.status.processed == 5)
+    turns.clear()
+    for step in range(6, 206):
+        worker.post('odom', sample(step))
+        time.sleep(0.001)
+    wait_until(lambda: worker.status.processed == 205)
+    assert sum(turns) == 200
+    assert len(turns) <= 100
+    worker.post('odom', sample(206))
+    worker.request_update()
+    wait_until(lambda: worker.estimate.stamp_ns == 206 * 100_000_000)
+    # an answer of the thread does not wait for more either
+    worker.post('odom', sample(207))
+    worker.call(lambda _: None).result(PATIENCE)
+    assert worker.status.processed == 207
     assert worker.stop(PATIENCE)
 
 
