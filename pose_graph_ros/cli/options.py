@@ -14,6 +14,9 @@ from pose_graph_ros.adapters.bags import one_line
 from pose_graph_ros.adapters.parameters import checked
 from pose_graph_ros.core.exceptions import ConfigError
 
+OF_RCLPY = ('qos_overrides.', 'use_sim_time', 'start_type_description_service')
+"""What the names of parameters begin with that every node has."""
+
 
 def add_inputs(parser: argparse.ArgumentParser) -> None:
     """Add the options that choose topics and the fixes to hold out."""
@@ -84,8 +87,9 @@ def _read_file(path: Path) -> dict[str, Any]:
         if not isinstance(parameters, Mapping):
             raise ConfigError(f'{path}: {name}: expected ros__parameters')
         _flatten(parameters, '', given)
-    given.pop('use_sim_time', None)
-    return {name: value for name, value in given.items() if not name.startswith('qos_overrides')}
+    # `ros2 param dump` writes null for what is not set
+    return {name: value for name, value in given.items()
+            if value is not None and not name.startswith(OF_RCLPY)}
 
 
 def _flatten(tree: Mapping[str, Any], prefix: str, flat: dict[str, Any]) -> None:

@@ -6,6 +6,7 @@ import argparse
 from pathlib import Path
 
 import pytest
+import yaml
 
 from pose_graph_ros.adapters.parameters import checked
 from pose_graph_ros.cli import options as shared
@@ -72,6 +73,16 @@ def test_a_file_without_a_section_for_the_node_sets_nothing(tmp_path: Path) -> N
     for text in ('', '- a list', 'other: {ros__parameters: {frequency: 1.0}}'):
         path.write_text(text, encoding='utf-8')
         assert shared.parameter_values(parsed('--params-file', str(path))) == checked({})
+
+
+def test_a_file_of_ros2_param_dump_is_taken(tmp_path: Path) -> None:
+    path = tmp_path / 'dump.yaml'
+    path.write_text(yaml.safe_dump({'/pose_graph': {'ros__parameters': {
+        'datum': None, 'fix': {'covariance_override': None, 'sigma_ceiling': 9.0},
+        'use_sim_time': False, 'start_type_description_service': True,
+        'qos_overrides': {'/odom': {'subscription': {'depth': 7}}}}}}), encoding='utf-8')
+    assert shared.parameter_values(parsed('--params-file', str(path))) == checked(
+        {'fix.sigma_ceiling': 9.0})
 
 
 @pytest.mark.parametrize(('text', 'said'), [

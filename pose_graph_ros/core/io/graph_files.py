@@ -143,7 +143,7 @@ def read_datum(path: Path) -> MapOrigin | None:
     """
     Return the datum of a saved graph after a check that its files are whole; None without one.
 
-    It takes a tenth of the time of `read_graph`, and raises FileFormatError in the same cases,
+    It takes a third of the time of `read_graph`, and raises FileFormatError in the same cases,
     except for contents that are wrong although their checksum is right.
     """
     _, path, members, _ = _verified(path)
