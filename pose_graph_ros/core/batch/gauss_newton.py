@@ -187,7 +187,7 @@ def evaluate(head, right):  # type: ignore[no-untyped-def]
     node_f, edge_f, observed_f = tb.node_f(head), tb.edge_f(head), tb.observed_f(head)
     edge_i, observed_i = tb.edge_i(head), tb.observed_i(head)
     right[:] = 0.0
-    chi2 = gradient_sum = reach = 0.0
+    chi2 = gradient_sum = cancelled = reach = 0.0
     for e in range(head[tb.N_EDGES]):
         f = edge_f[e]
         w = f[tb.WEIGHT]
@@ -196,8 +196,9 @@ def evaluate(head, right):  # type: ignore[no-untyped-def]
             start, end = node_f[i], node_f[j]
             if edge_i[e, tb.EDGE_KIND] == factors.BIAS:
                 ex, ey, eth, dx, dy = factors.error_to_bias(f, start, end)
-                gx, gy, gth, energy = _weighted_error(f, ex, ey, eth)
+                gx, gy, gth, energy, terms = _weighted_error(f, ex, ey, eth)
                 chi2 += energy
+                cancelled += terms
                 gradient_sum += abs(gx) + abs(gy)
                 right[i, 0] += gx
                 right[i, 1] += gy
@@ -211,8 +212,9 @@ def evaluate(head, right):  # type: ignore[no-untyped-def]
             dx, dy = end[tb.POSE] - start[tb.POSE], end[tb.POSE + 1] - start[tb.POSE + 1]
             ex, ey = c * dx + s * dy - f[tb.OWN_T], c * dy - s * dx - f[tb.OWN_T + 1]
             eth = factors.wrap(end[tb.POSE + 2] - start[tb.POSE + 2] - f[tb.MEAN + 2])
-            gx, gy, gth, energy = _weighted_error(f, ex, ey, eth)
+            gx, gy, gth, energy, terms = _weighted_error(f, ex, ey, eth)
             chi2 += energy
+            cancelled += terms
             gx, gy = c * gx - s * gy, s * gx + c * gy
             gradient_sum += abs(gx) + abs(gy)
             right[i, 0] += gx
@@ -232,8 +234,10 @@ def evaluate(head, right):  # type: ignore[no-untyped-def]
             c, s = math.cos(f[tb.MEAN + 2]), math.sin(f[tb.MEAN + 2])
             dx, dy = node[tb.POSE] + ax - f[tb.MEAN], node[tb.POSE + 1] + ay - f[tb.MEAN + 1]
             eth = factors.wrap(node[tb.POSE + 2] + f[tb.OBS_OFFSET + 2] - f[tb.MEAN + 2])
-            gx, gy, gth, energy = _weighted_error(f, c * dx + s * dy, c * dy - s * dx, eth)
+            gx, gy, gth, energy, terms = _weighted_error(
+                f, c * dx + s * dy, c * dy - s * dx, eth)
             chi2 += energy
+            cancelled += terms
             gx, gy = c * gx - s * gy, s * gx + c * gy
             gradient_sum += abs(gx) + abs(gy)
             right[v, 0] -= gx
@@ -241,17 +245,23 @@ def evaluate(head, right):  # type: ignore[no-untyped-def]
             right[v, 2] -= ax * gy - ay * gx + gth
     for v in range(head[tb.N_NODES]):
         reach = max(reach, abs(node_f[v, tb.POSE]), abs(node_f[v, tb.POSE + 1]))
-    return chi2, SUM_ROUNDING * max(chi2, 1.0) + COORDINATE_ROUNDING * reach * gradient_sum
+    return chi2, SUM_ROUNDING * max(chi2, 1.0) + COORDINATE_ROUNDING * (
+        reach * gradient_sum + cancelled)
 
 
 @kernel
 def _weighted_error(f, ex, ey, eth):  # type: ignore[no-untyped-def]
-    """Return W e and e^T W e of a constraint, given as its row and its error e."""
+    """
+    Return W e, e^T W e and the sum of its diagonal terms, given a constraint's row and error e.
+
+    The terms cancel each other where W is nearly singular.
+    """
     i, w = tb.INFO, f[tb.WEIGHT]
     gx = w * (f[i] * ex + f[i + 1] * ey + f[i + 2] * eth)
     gy = w * (f[i + 1] * ex + f[i + 3] * ey + f[i + 4] * eth)
     gth = w * (f[i + 2] * ex + f[i + 4] * ey + f[i + 5] * eth)
-    return gx, gy, gth, ex * gx + ey * gy + eth * gth
+    terms = w * (f[i] * ex * ex + f[i + 3] * ey * ey + f[i + 5] * eth * eth)
+    return gx, gy, gth, ex * gx + ey * gy + eth * gth, terms
 
 
 @kernel(signature=(tb.HEAD, ROWS))

@@ -9,8 +9,8 @@ of units (Marquardt 1963). With lambda = 0 the step is that of Gauss-Newton.
 
 chi2 may rise for up to `UPHILL_STEPS` Gauss-Newton steps in a row, since the path to a minimum can
 cross a ridge that no damped step crosses. If chi2 is not below its lowest value after these, the
-best poses are restored and lambda grows until a step lowers chi2. Each step that lowers chi2
-reduces lambda, which is set to 0 below `LEAST_DAMPING`.
+best poses are restored and lambda grows until a step, or half of it, lowers chi2. Each step that
+lowers chi2 reduces lambda, which is set to 0 below `LEAST_DAMPING` and after `DAMPED_STEPS`.
 """
 
 from enum import Enum
@@ -21,6 +21,7 @@ import numpy as np
 
 from pose_graph_ros.core.batch import gauss_newton as gn
 from pose_graph_ros.core.config import SolverConfig
+from pose_graph_ros.core.geometry import se2
 from pose_graph_ros.core.geometry.se2 import FloatArray
 from pose_graph_ros.core.graph import tables as tb
 
@@ -31,12 +32,19 @@ DAMPING_GROWTH = 10.0
 DAMPING_DECAY = 0.1
 LEAST_DAMPING = 1e-9
 LARGEST_DAMPING = 1e12
-# Number of steps in a row for which chi2 may exceed the lowest so far, and by what factor.
+# Number of steps in a row for which chi2 may exceed the lowest so far, by any factor: a step along
+# a narrow curved valley, as stiff constraints make it, ends high up, the next one far down.
 UPHILL_STEPS = 2
-UPHILL_LIMIT = 2.0
+# Number of damped steps in a row after which one without damping is tried again.
+DAMPED_STEPS = 10
+# Number of steps that change chi2 by rounding only and do not become shorter, until convergence.
+LEVEL_STEPS = 2
 # Where no step lowers chi2, the optimisation has stalled if the linear model predicts a decrease
-# by more than this fraction of chi2 (of 1 if chi2 is smaller), and has converged otherwise.
+# by more than this fraction of chi2 (of 1 if chi2 is smaller), and has converged otherwise. After
+# the last iteration it has converged below the second, and it ends early below the third.
 STALL = 1e-6
+AT_THE_END = 1e-9
+LEAST_DECREASE = 1e-16
 # A step that is no shorter than the last one but below this is rounding noise [m, rad].
 NOISE_STEP = 1e-7
 # Limit of the predicted sum of all further steps at convergence [fraction of the tolerance].
@@ -88,37 +96,52 @@ def minimize(head: tb.IntHead, chi2: float, config: SolverConfig) -> Minimum:
     chord = False  # whether the next step is a chord step
     current = False  # whether the tree is that of the best poses, without damping
     damping = 0.0
-    previous, last_damping = math.inf, 0.0
+    n_damped = n_level = 0
+    rounding, shortest, previous, last_damping = 0.0, math.inf, math.inf, 0.0
     while iterations < config.max_iterations:
-        trial, rounding = math.inf, 0.0
+        trial = math.inf
         length = _step(head, damping, right, chord=chord)
         if length < math.inf:
             solved = True
+            if damping == uphill == 0 and not chord and iterations > 0 and (
+                    gn.product_with_step(head, right) < LEAST_DECREASE * max(chi2, 1.0)):
+                end = Termination.CONVERGED
+                break
             trial, rounding = gn.evaluate(head, right)
+            if damping > 0.0 and not trial <= chi2 + rounding < math.inf:
+                trial, rounding = _shortened(head, best, right)
         lower = trial <= chi2 + rounding
         current = lower and damping == 0.0
         if lower:
+            if not (current and chi2 - trial <= rounding):
+                n_level, shortest = 0, math.inf
+            elif length >= shortest:
+                n_level += 1
+            shortest = min(shortest, length)
             chi2 = trial
             gn.keep_poses(head, best)
             iterations += 1
             # an uphill step or stronger damping before this step changes its length
             comparable = uphill == 0 and damping <= last_damping
-            if comparable and _has_converged(length, previous, config.step_tolerance):
+            if n_level >= LEVEL_STEPS or (
+                    comparable and _has_converged(length, previous, config.step_tolerance)):
                 end = Termination.CONVERGED
                 break
             chord = comparable and damping == 0.0 and previous < math.inf and (
                 length < (CHORD_RATIO if chord else KEEP_RATIO) * previous)
             last_damping = damping
+            n_damped = n_damped + 1 if damping > 0.0 else 0
             damping *= DAMPING_DECAY
-            if damping < LEAST_DAMPING:
-                damping = 0.0
+            if damping < LEAST_DAMPING or n_damped >= DAMPED_STEPS:
+                damping, n_damped = 0.0, 0
             uphill, previous = 0, length
-        elif (damping == 0.0 and not chord and trial < UPHILL_LIMIT * chi2
+        elif (damping == 0.0 and not chord and trial < math.inf
               and uphill < UPHILL_STEPS and iterations + 1 < config.max_iterations):
             iterations += 1
             uphill, previous = uphill + 1, length
         else:
             gn.put_poses(head, best)
+            gn.evaluate(head, right)
             if not chord:
                 damping = max(FIRST_DAMPING, damping * DAMPING_GROWTH)
                 if damping > LARGEST_DAMPING:
@@ -126,12 +149,21 @@ def minimize(head: tb.IntHead, chi2: float, config: SolverConfig) -> Minimum:
                     break
             # a rejected chord step is repeated with a new factorisation before any damping
             chord, uphill = False, 0
-    if not current and end is not Termination.UNDETERMINED:
+    if end is Termination.MAX_ITERATIONS or not current and end is not Termination.UNDETERMINED:
         gn.put_poses(head, best)
         end = _refactorized(head, best, end, chi2)
     if end is not Termination.UNDETERMINED:
         gn.settle(head)
     return Minimum(end, iterations, chi2)
+
+
+def _shortened(head: tb.IntHead, best: FloatArray, right: FloatArray) -> tuple[float, float]:
+    """Move to half of the last step from the best poses; return chi2 there and its rounding."""
+    poses = np.empty_like(best)
+    gn.keep_poses(head, poses)
+    gn.put_poses(head, se2.wrapped(best + 0.5 * se2.wrapped(poses - best)))
+    chi2, rounding = gn.evaluate(head, right)
+    return float(chi2), float(rounding)
 
 
 def _step(head: tb.IntHead, damping: float, right: FloatArray, *, chord: bool) -> float:
@@ -151,14 +183,15 @@ def _refactorized(
     gn.linearize(head)
     if not gn.eliminate(head, 0.0):
         return Termination.UNDETERMINED
-    if end is Termination.STALLED:
+    if end is not Termination.CONVERGED:
         right = np.empty_like(best)
         gn.evaluate(head, right)
         gn.gauss_newton_step(head)
         # b^T H^-1 b, the decrease of a quadratic chi2
         predicted = gn.product_with_step(head, right)
         gn.put_poses(head, best)
-        if not predicted > STALL * max(chi2, 1.0):
+        least = STALL if end is Termination.STALLED else AT_THE_END
+        if not predicted > least * max(chi2, 1.0):
             return Termination.CONVERGED
     return end
 

@@ -9,13 +9,20 @@ from pose_graph_ros.core.elimination.fronts import factorize, LEAST_PIVOT, padde
 from pose_graph_ros.core.graph import factors, tables as tb, transaction_log
 from pose_graph_ros.core.graph.pools import row_start, triangle_size
 
+# Where constraints are stiff in one direction and weak in another, as those of a turn on the spot,
+# small pivots are expected: the smallest one, as a fraction of what the constraints of its node
+# add in their weakest direction, and, because of rounding, of all that they add.
+LEAST_WEAK_PIVOT = 1e-9
+LEAST_STIFF_PIVOT = 1e-15
+
 
 @kernel
 def eliminate_clique(head, c, relinearize):  # type: ignore[no-untyped-def]
     """
     Return a node with a bad pivot, or -1, after the elimination of a clique.
 
-    Its front is assembled and factorised, and the rows of R and the update matrix are stored.
+    Its front is assembled and factorised, and the rows of R and the update matrix are stored. If
+    a pivot is small, it is judged again by the weakest direction of the constraints of its node.
 
     Parameters
     ----------
@@ -25,6 +32,13 @@ def eliminate_clique(head, c, relinearize):  # type: ignore[no-untyped-def]
         they were linearized may have turned since. Their rows are logged for a rollback.
 
     """
+    bad = _eliminate(head, c, relinearize, False)
+    return bad if bad < 0 else _eliminate(head, c, relinearize, True)
+
+
+@kernel
+def _eliminate(head, c, relinearize, by_weakest):  # type: ignore[no-untyped-def]
+    """Eliminate a clique, with bounds of the pivots by the weakest direction if asked for."""
     node_f, edge_f, observed_f = tb.node_f(head), tb.edge_f(head), tb.observed_f(head)
     pool_f, work_f, scalars = tb.pool_f(head), tb.work_f(head), tb.scalars(head)
     node_i, edge_i, observed_i = tb.node_i(head), tb.edge_i(head), tb.observed_i(head)
@@ -78,6 +92,8 @@ def eliminate_clique(head, c, relinearize):  # type: ignore[no-untyped-def]
         scale_r = node_f[v, tb.SCALE_R] * node_f[v, tb.SCALE_R]
         least[3 * k] = least[3 * k + 1] = LEAST_PIVOT * scale_t
         least[3 * k + 2] = LEAST_PIVOT * scale_r
+        if by_weakest:
+            _lower_bounds(head, v, least[3 * k:3 * k + 3])
         damping = scalars[tb.DAMPING]
         if damping > 0.0:
             for m in range(3):
@@ -116,6 +132,29 @@ def eliminate_clique(head, c, relinearize):  # type: ignore[no-untyped-def]
         scale += arm2 * (front[i] + front[i + ld + 1])
     clique_f[c, tb.SLIP_SCALE] = 0.25 * scale
     return -1
+
+
+@kernel
+def _lower_bounds(head, v, least):  # type: ignore[no-untyped-def]
+    """Lower the bounds of a node's pivots, shape (3,), where its constraints are weak."""
+    edge_f, observed_f, node_i = tb.edge_f(head), tb.observed_f(head), tb.node_i(head)
+    edge_i, observed_i = tb.edge_i(head), tb.observed_i(head)
+    weak_t = weak_r = 0.0
+    entry = node_i[v, tb.EDGE_LIST]
+    while entry >= 0:
+        e, side = entry >> 1, entry & 1
+        entry = edge_i[e, tb.NEXT_J if side == 1 else tb.NEXT_I]
+        t, r = factors.weakest(edge_f[e])
+        weak_t, weak_r = weak_t + t, weak_r + r
+    entry = node_i[v, tb.OBSERVED_LIST]
+    while entry >= 0:
+        t, r = factors.weakest(observed_f[entry])
+        weak_t, weak_r = weak_t + t, weak_r + r
+        entry = observed_i[entry, tb.OBS_NEXT]
+    for m in range(3):
+        weak = LEAST_WEAK_PIVOT * (weak_t if m < 2 else weak_r)
+        if weak > 0.0:
+            least[m] = max(min(least[m], weak), least[m] * (LEAST_STIFF_PIVOT / LEAST_PIVOT))
 
 
 @kernel

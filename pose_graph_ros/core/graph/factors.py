@@ -199,6 +199,23 @@ def _form(f, x, y, th):  # type: ignore[no-untyped-def]
 
 
 @kernel
+def weakest(f):  # type: ignore[no-untyped-def]
+    """
+    Return the weighted information of a constraint in its weakest direction and on its heading.
+
+    The first is the smaller eigenvalue of the information on the position, the second that on the
+    heading if the position is unknown; both are lower bounds, to rounding.
+    """
+    i, w = tb.INFO, f[tb.WEIGHT]
+    xx, xy, xt, yy, yt, tt = f[i], f[i + 1], f[i + 2], f[i + 3], f[i + 4], f[i + 5]
+    trace, determinant = xx + yy, xx * yy - xy * xy
+    if not determinant > 0.0:
+        return 0.0, 0.0
+    joint = (yy * xt * xt - 2.0 * xy * xt * yt + xx * yt * yt) / determinant
+    return w * determinant / trace, w * max(tt - joint, 0.0)
+
+
+@kernel
 def _turned(f, c, s):  # type: ignore[no-untyped-def]
     """Return the weighted information, rotated by the angle with cosine c and sine s."""
     i, w = tb.INFO, f[tb.WEIGHT]
