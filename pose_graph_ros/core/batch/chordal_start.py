@@ -28,8 +28,9 @@ from pose_graph_ros.core.graph import tables as tb
 from pose_graph_ros.core.graph.factors import wrap
 from pose_graph_ros.core.graph.graph import Graph
 
-# Smallest |u| before normalisation; below it the measured headings cancel each other out.
-SMALLEST_ROTATION = 1e-9
+# Smallest |u| before normalisation; below it the measured headings cancel each other out, and what
+# remains of u often leads to a minimum that is not the lowest one.
+SMALLEST_ROTATION = 1e-6
 
 
 def chordal(graph: Graph, cliques: symbolic.Cliques) -> FloatArray:

@@ -10,6 +10,9 @@ does not need a measured heading.
 The module loads SciPy, which takes time and memory: import it only where a joint start is needed.
 """
 
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
 import numpy as np
 import scipy.sparse
 import scipy.sparse.linalg
@@ -19,6 +22,24 @@ from pose_graph_ros.core.geometry import se2
 from pose_graph_ros.core.geometry.se2 import BoolArray, ComplexArray, FloatArray
 from pose_graph_ros.core.graph.constraints import EdgeKind, Edges, ObservedKind, ObservedNodes
 from pose_graph_ros.core.graph.graph import Graph
+
+# The headings of `unit_headings` are pulled to length 1 with these fractions of their information,
+# so many times with each.
+PULLS = (1e-4, 1e-3, 1e-2)
+PULLED = 20
+# Fraction with which positions follow from the headings at last.
+FIRMLY = 1e6
+
+
+class _Problem(NamedTuple):
+    """The objective |matrix v - right|^2 of v = (t, u): t of all nodes, then u of all nodes."""
+
+    matrix: Any
+    right: ComplexArray
+    known: ComplexArray
+    """v of the nodes that are fixed, any numbers for the others."""
+    held: BoolArray
+    """Which unknowns are fixed."""
 
 
 def joint(graph: Graph) -> FloatArray:
@@ -32,6 +53,32 @@ def joint(graph: Graph) -> FloatArray:
     Biases start at zero. A measurement with a bias is treated as an observed node whose variance
     includes that of the bias. Raises LinearSolveError if the poses are not determined.
     """
+    problem = _problem(graph)
+    return _poses(graph, _solver(problem)(problem.right))
+
+
+def unit_headings(graph: Graph) -> FloatArray:
+    """
+    Return initial poses, shape (N, 3), where the measured headings nearly cancel each other out.
+
+    Far from what holds the graph u of the joint start tends to zero, as the mean of headings that
+    contradict each other does, and so do all distances. Here |u| = 1 is approached: u is pulled to
+    u / |u| of the last solution, at first weakly. The matrix remains the same for each strength
+    of the pull. Poses and errors are those of `joint`.
+    """
+    problem = _problem(graph)
+    n = graph.n_nodes
+    v = _solver(problem)(problem.right)
+    for pull in (*PULLS, FIRMLY):
+        solve, weight = _pulled(problem, n, pull)
+        for _ in range(PULLED if pull < FIRMLY else 1):
+            length = np.abs(v[n:])
+            unit = np.where(length > 0.0, v[n:] / np.where(length > 0.0, length, 1.0), 1.0)
+            v = solve(np.concatenate((problem.right, weight * unit)))
+    return _poses(graph, v)
+
+
+def _problem(graph: Graph) -> _Problem:
     n, is_bias, fixed = graph.n_nodes, graph.is_bias, graph.fixed
     edges, observed = _of_poses(graph.edges, graph.observed, is_bias)
     edge_rows, observed_rows = np.arange(len(edges)), np.arange(len(observed))
@@ -58,11 +105,26 @@ def joint(graph: Graph) -> FloatArray:
         np.zeros(2 * len(edges)), seen_t * _complex(observed.mean),
         seen_u * np.exp(1j * (observed.mean[:, 2] - observed.offset[:, 2]))))
     known = np.concatenate((_complex(graph.poses), np.exp(1j * graph.poses[:, 2])))
-    solution = _least_squares(matrix, right, known, np.tile(fixed | is_bias, 2))
-    t, u = solution[:n], solution[n:]
-    theta = np.where(fixed, graph.poses[:, 2], se2.wrap(np.angle(u)))
-    poses = np.column_stack((t.real, t.imag, theta))
-    poses[is_bias & ~fixed] = 0.0
+    return _Problem(matrix, right, known, np.tile(fixed | is_bias, 2))
+
+
+def _pulled(
+    problem: _Problem, n: int, pull: float,
+) -> tuple[Callable[[ComplexArray], ComplexArray], FloatArray]:
+    """Return a solver with one more row for each u, w u = w u / |u|, and these weights w."""
+    columns = problem.matrix[:, n:]
+    weight = np.sqrt(pull * np.asarray(abs(columns).power(2).sum(axis=0)).ravel())
+    rows = scipy.sparse.hstack((scipy.sparse.csc_array((n, n)), scipy.sparse.diags_array(weight)))
+    return _solver(problem._replace(
+        matrix=scipy.sparse.vstack((problem.matrix, rows)).tocsc())), weight
+
+
+def _poses(graph: Graph, v: ComplexArray) -> FloatArray:
+    """Return poses, shape (N, 3), from t and u of all nodes; those of fixed nodes stay."""
+    n = graph.n_nodes
+    theta = np.where(graph.fixed, graph.poses[:, 2], se2.wrap(np.angle(v[n:])))
+    poses = np.column_stack((v[:n].real, v[:n].imag, theta))
+    poses[graph.is_bias & ~graph.fixed] = 0.0
     return poses
 
 
@@ -96,22 +158,24 @@ def _isotropic(information: FloatArray) -> FloatArray:
     return 0.5 * (information[:, 0, 0] + information[:, 1, 1])
 
 
-def _least_squares(
-    matrix: scipy.sparse.csc_array, right: ComplexArray, known: ComplexArray,
-    fixed: BoolArray,
-) -> ComplexArray:
-    """Return v that minimises |matrix v - right|^2, equal to `known` where it is fixed."""
-    solution = np.where(fixed, known, 0.0)
-    right = right - matrix @ solution
-    free = matrix[:, np.flatnonzero(~fixed)]
+def _solver(problem: _Problem) -> Callable[[ComplexArray], ComplexArray]:
+    """Return a function from right-hand sides to v; it and this raise LinearSolveError."""
+    matrix, held = problem.matrix, problem.held
+    fixed = np.where(held, problem.known, 0.0)
+    free = matrix[:, np.flatnonzero(~held)]
     adjoint = free.conj().T.tocsc()
     try:
         factorized = scipy.sparse.linalg.splu(
             (adjoint @ free).tocsc(), permc_spec='MMD_AT_PLUS_A', diag_pivot_thresh=0.0,
             options={'SymmetricMode': True})
-        solution[~fixed] = factorized.solve(np.asarray(adjoint @ right))
     except RuntimeError as error:
         raise LinearSolveError(f'linear start: not determined ({error})') from error
-    if not np.all(np.isfinite(solution)):
-        raise LinearSolveError('linear start: not determined to working precision')
-    return solution
+
+    def solve(right: ComplexArray) -> ComplexArray:
+        solution = fixed.copy()
+        solution[~held] = factorized.solve(np.asarray(adjoint @ (right - matrix @ fixed)))
+        if not np.all(np.isfinite(solution)):
+            raise LinearSolveError('linear start: not determined to working precision')
+        return solution
+
+    return solve

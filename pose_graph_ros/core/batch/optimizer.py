@@ -9,8 +9,7 @@ poses, with which the incremental smoother can continue.
 """
 
 from collections.abc import Callable
-import contextlib
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from enum import Enum
 
 import numpy as np
@@ -37,6 +36,16 @@ class Status(Enum):
     FAILED = 'failed'
 
 
+class Start(Enum):
+    """Poses from which an optimisation began."""
+
+    CHORDAL = 'chordal start'
+    JOINT = 'joint start'
+    """Headings and positions solved for together, where nodes are observed."""
+    UNIT = 'start with unit headings'
+    PRESENT = 'present poses'
+
+
 @dataclass(frozen=True, slots=True)
 class BatchResult:
     """Result of an optimisation."""
@@ -48,6 +57,7 @@ class BatchResult:
     """Number of steps."""
     chi2: float
     """chi2 at the poses after the call."""
+    start: Start = Start.PRESENT
 
 
 Solve = Callable[[Graph, SolverConfig], BatchResult]
@@ -55,6 +65,8 @@ Solve = Callable[[Graph, SolverConfig], BatchResult]
 
 # Relative difference of chi2 below which two minima count as the same.
 SAME_MINIMUM = 1e-9
+# Iterations within which a good start converges; if it takes more, the next one is tried.
+TRUSTED_ITERATIONS = 20
 
 _STATUS = {Termination.CONVERGED: Status.CONVERGED, Termination.STALLED: Status.STALLED,
            Termination.MAX_ITERATIONS: Status.MAX_ITERATIONS}
@@ -85,8 +97,9 @@ def optimize_from_linear_start(graph: Graph, config: SolverConfig) -> BatchResul
     """
     Return the result of moving the hidden nodes to a minimum from a start without initial poses.
 
-    If the linear start leads to a higher chi2 than that of the present poses, the optimisation
-    starts from the present poses instead. Failures are treated as in `optimize`.
+    Starts are tried in the order of `Start` until one converges in a few iterations, to a chi2 not
+    above that of the present poses, which are the last to be tried. The lowest minimum is kept,
+    and the result says from which start it is. Failures are treated as in `optimize`.
 
     Parameters
     ----------
@@ -99,13 +112,28 @@ def optimize_from_linear_start(graph: Graph, config: SolverConfig) -> BatchResul
         return answer
     poses, cliques = graph.poses.copy(), _analysed(graph)
     head = graph.memory.head
-    result = None
-    with contextlib.suppress(LinearSolveError):
-        gauss_newton.put_poses(head, _linear_start(graph, cliques))
-        result = _minimize(graph, config, cliques, chi2_of(graph))
-    if result is None or result.status is Status.FAILED or not result.chi2 <= chi2:
+    few = replace(config, max_iterations=min(config.max_iterations, TRUSTED_ITERATIONS))
+    best, best_poses = _failed('', chi2), poses
+    result = best
+    for start in Start:
         gauss_newton.put_poses(head, poses)
-        result = _minimize(graph, config, cliques, chi2)
+        try:
+            gauss_newton.put_poses(head, _start(graph, start, cliques))
+        except LinearSolveError:
+            continue
+        result = replace(_minimize(graph, few, cliques, chi2_of(graph)), start=start)
+        if result.status is not Status.FAILED and (
+                best.status is Status.FAILED or result.chi2 < best.chi2 * (1.0 - SAME_MINIMUM)):
+            best, best_poses = result, graph.poses.copy()
+        if result.status is Status.CONVERGED and result.chi2 <= chi2:
+            break
+    if best is not result or best.status is Status.MAX_ITERATIONS:
+        if best.status is Status.FAILED:
+            return _finished(graph, poses, chi2, result)
+        gauss_newton.put_poses(head, best_poses)
+        rest = replace(config, max_iterations=max(config.max_iterations - best.iterations, 1))
+        result = _minimize(graph, rest, cliques, best.chi2)
+        result = replace(result, start=best.start, iterations=best.iterations + result.iterations)
     return _finished(graph, poses, chi2, result)
 
 
@@ -141,17 +169,23 @@ def optimize_from_two_starts(graph: Graph, config: SolverConfig, solve: Solve) -
     return other
 
 
-def _linear_start(graph: Graph, cliques: symbolic.Cliques) -> FloatArray:
+def _start(graph: Graph, start: Start, cliques: symbolic.Cliques) -> FloatArray:
     """
-    Return initial poses, shape (N, 3), from the constraints and the poses of fixed nodes alone.
+    Return the poses of a start, shape (N, 3), or raise LinearSolveError if there are none.
 
-    The chordal start is used if the constraints determine the headings; otherwise the joint start,
-    which solves for headings and positions together, or raises LinearSolveError.
+    The modules that load SciPy are imported where they are needed.
     """
-    try:
+    if start is Start.CHORDAL:
         return chordal_start.chordal(graph, cliques)
-    except LinearSolveError:
+    if start is Start.PRESENT:
+        return graph.poses.copy()
+    if start is Start.JOINT:
+        if len(graph.observed) == 0:
+            raise LinearSolveError('joint start: no node is observed')
         return _joint(graph)
+    from pose_graph_ros.core.batch.joint_start import unit_headings  # noqa: PLC0415
+
+    return unit_headings(graph)
 
 
 def _joint(graph: Graph) -> FloatArray:
