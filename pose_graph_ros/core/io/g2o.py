@@ -24,11 +24,17 @@ matrix the upper triangle is written.
 
 The tags `VERTEX2` and `EDGE2` are used by two formats with different numbers: TORO orders the
 information as 11 12 22 33 13 23, iSAM stores its square root as R11 R12 R13 R22 R23 R33. The
-caller has to say which of them a file has.
+caller has to say which of them a file has. `VERTEX` and `EDGE` are TORO's old tags, `ODOMETRY` is
+another one of iSAM's for `EDGE2`.
+
+Lines with any other tag are skipped and counted: landmarks and their measurements, parameters of
+sensors, constraints in space. So are the lines `EQUIV i j` of TORO: they allow it to merge two
+nodes that an edge of the file connects, and add nothing to that edge.
 """
 
 from dataclasses import dataclass
 from pathlib import Path
+from typing import NoReturn
 
 import numpy as np
 
@@ -49,12 +55,17 @@ EDGE2_ORDERS = ('toro', 'isam')
 # Row and column of each of six numbers: of an upper triangle, and of the information in TORO.
 _UPPER = ((0, 0), (0, 1), (0, 2), (1, 1), (1, 2), (2, 2))
 _TORO = ((0, 0), (0, 1), (1, 1), (2, 2), (0, 2), (1, 2))
+# Tags with the format that the caller names.
+_AMBIGUOUS = ('EDGE2', 'ODOMETRY')
 # Numbers of ids and of values behind each tag; FIX is followed by any number of ids.
 LAYOUT = {
     'VERTEX_SE2': (1, 3),
     'VERTEX2': (1, 3),
+    'VERTEX': (1, 3),
     'EDGE_SE2': (2, 9),
     'EDGE2': (2, 9),
+    'ODOMETRY': (2, 9),
+    'EDGE': (2, 9),
     'EDGE_PRIOR_SE2': (1, 9),
     'EDGE_PRIOR_SE2_XY': (1, 5),
     'OBSERVED_SE2_OFFSET': (1, 12),
@@ -70,6 +81,8 @@ class GraphFile:
     """Id in the file of each hidden node, shape (N,), increasing."""
     has_start: bool
     """Whether the file has the poses of all nodes; else missing ones were composed from edges."""
+    skipped: dict[str, int]
+    """Number of lines that were skipped, by their tag."""
 
 
 class _Rows:
@@ -93,8 +106,8 @@ def read_g2o(path: Path, edge2_order: str | None = None) -> GraphFile:
 
     Without `FIX` and without priors the node with the smallest id is fixed. The pose of a node
     without `VERTEX_SE2` is composed from edges, breadth-first from the nodes with a pose, else
-    from the smallest id. If the file is not such a graph, a FileFormatError names the file and
-    the line, what was expected and what was found.
+    from the smallest id. Lines with tags that are not known are skipped. If the file is not such
+    a graph, a FileFormatError names the file and the line, what was expected and what was found.
 
     Parameters
     ----------
@@ -106,6 +119,7 @@ def read_g2o(path: Path, edge2_order: str | None = None) -> GraphFile:
         raise ValueError(f'edge2_order: expected one of {EDGE2_ORDERS}, got {edge2_order!r}')
     rows = {tag: _Rows(n_ids) for tag, (n_ids, _) in LAYOUT.items()}
     fixes = _Rows(1)
+    skipped: dict[str, list[list[str]]] = {}
     try:
         text = path.read_text(encoding='utf-8')
     except (OSError, UnicodeDecodeError) as error:
@@ -118,24 +132,43 @@ def read_g2o(path: Path, edge2_order: str | None = None) -> GraphFile:
         if words[0] == 'FIX':
             for word in words[1:]:
                 _add(where, fixes, [word], 'FIX', line)
-        else:
+        elif words[0] in rows:
             _read_line(where, words, rows, edge2_order, line)
-    return _build(path, rows, fixes, edge2_order)
+        else:
+            skipped.setdefault(words[0], []).append([str(line), *words[1:2]])
+    _forget_landmarks(fixes, skipped)
+    if all(len(table.lines) == 0 for table in rows.values()):
+        _raise_empty(path, skipped)
+    graph, ids, has_start = _build(path, rows, fixes, edge2_order)
+    return GraphFile(graph, ids, has_start, {tag: len(found) for tag, found in skipped.items()})
+
+
+def _forget_landmarks(fixes: _Rows, skipped: dict[str, list[list[str]]]) -> None:
+    """Remove the FIX of vertices that were skipped."""
+    names = {words[1] for tag, found in skipped.items() if tag.startswith('VERTEX')
+             for words in found if len(words) > 1}
+    kept = [k for k, (name,) in enumerate(fixes.ids) if str(name) not in names]
+    fixes.ids, fixes.lines = [fixes.ids[k] for k in kept], [fixes.lines[k] for k in kept]
+
+
+def _raise_empty(path: Path, skipped: dict[str, list[list[str]]]) -> NoReturn:
+    for tag, found in skipped.items():
+        raise FileFormatError(
+            f'{path}:{found[0][0]}: tag {tag!r} is not known, and there is no line with one of '
+            f'{", ".join(LAYOUT)}')
+    raise FileFormatError(f'{path}: holds no vertex and no edge')
 
 
 def _read_line(
     where: str, words: list[str], rows: dict[str, _Rows], edge2_order: str | None, line: int,
 ) -> None:
     tag, values = words[0], words[1:]
-    if tag not in rows:
-        known = ', '.join(['FIX', *rows])
-        raise FileFormatError(f'{where}: tag {tag!r} is not known; known are {known}')
     if len(values) != sum(LAYOUT[tag]):
         raise FileFormatError(
             f'{where}: {tag} is followed by {sum(LAYOUT[tag])} numbers, got {len(values)}')
-    if tag == 'EDGE2' and edge2_order is None:
+    if tag in _AMBIGUOUS and edge2_order is None:
         raise FileFormatError(
-            f'{where}: EDGE2 means two formats with the information in different order; '
+            f'{where}: {tag} means two formats with the information in different order; '
             f'say which this is: {" or ".join(EDGE2_ORDERS)}')
     _add(where, rows[tag], values, tag, line)
 
@@ -151,11 +184,9 @@ def _add(where: str, rows: _Rows, values: list[str], tag: str, line: int) -> Non
 
 def _build(
     path: Path, rows: dict[str, _Rows], fixes: _Rows, edge2_order: str | None,
-) -> GraphFile:
-    vertices = _joined(rows['VERTEX_SE2'], rows['VERTEX2'])
+) -> tuple[Graph, IntArray, bool]:
+    vertices = _joined(rows['VERTEX_SE2'], rows['VERTEX2'], rows['VERTEX'])
     ids = np.unique(np.concatenate([_ids(table).ravel() for table in rows.values()]))
-    if len(ids) == 0:
-        raise FileFormatError(f'{path}: holds no vertex and no edge')
     given, first = np.unique(_ids(vertices).ravel(), return_index=True)
     if len(given) < len(vertices.lines):
         again = sorted(set(range(len(vertices.lines))) - set(first.tolist()))[0]
@@ -177,7 +208,7 @@ def _build(
         graph.apply(GraphUpdate(edges=edges, observed=observed, fix=fixed))
     except GraphUpdateError as error:
         raise FileFormatError(f'{_refused_line(path, rows, ids, edge2_order)}: {error}') from error
-    return GraphFile(graph, ids, bool(len(given) == len(ids)))
+    return graph, ids, bool(len(given) == len(ids))
 
 
 def _joined(*tables: _Rows) -> _Rows:
@@ -200,7 +231,8 @@ def _numbers(table: _Rows, width: int) -> FloatArray:
 
 def _edges(rows: dict[str, _Rows], ids: IntArray, edge2_order: str | None) -> Edges:
     parts = []
-    for tag, order in (('EDGE_SE2', None), ('EDGE2', edge2_order)):
+    for tag, order in (('EDGE_SE2', None), ('EDGE', 'toro'),
+                       *((tag, edge2_order) for tag in _AMBIGUOUS)):
         numbers, ends = _numbers(rows[tag], 9), _ids(rows[tag])
         kind = np.where(np.diff(ends, axis=1)[:, 0] == 1, EdgeKind.ODOMETRY, EdgeKind.LOOP_CLOSURE)
         i, j = np.searchsorted(ids, ends).T
