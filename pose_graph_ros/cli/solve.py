@@ -3,16 +3,28 @@
 """Optimise a g2o file, and print the constraints with the largest energies."""
 
 import argparse
+from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
+import re
+import sys
 import time
 
 import numpy as np
 
 from pose_graph_ros.core.batch import optimizer
+from pose_graph_ros.core.batch.optimizer import BatchResult, Status
 from pose_graph_ros.core.config import SolverConfig
-from pose_graph_ros.core.io.g2o import EDGE2_ORDERS, read_g2o, write_g2o
+from pose_graph_ros.core.elimination import symbolic
+from pose_graph_ros.core.geometry.se2 import IntArray
+from pose_graph_ros.core.graph.constraints import ObservedKind, ObservedNodes
+from pose_graph_ros.core.graph.graph import Graph, GraphUpdate
+from pose_graph_ros.core.io.g2o import EDGE2_ORDERS, GraphFile, read_g2o, write_g2o
 
-N_LARGEST = 5  # number of edges, and of observed nodes, that are printed
+N_LARGEST = 5  # number of edges, of observed nodes, and of names, that are printed
+N_TAGS = 10  # number of warnings of tags
+WEAK = 1e-7  # information of a weak prior, as a fraction of that of the median constraint
+CONFIG = SolverConfig(max_iterations=200)
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -30,16 +42,24 @@ def execute(options: argparse.Namespace) -> int:
     """Run the tool; return the exit code."""
     file = read_g2o(options.graph, options.edge2)
     graph = file.graph
+    for line in _skipped(options.graph, file):
+        print(line, file=sys.stderr)
+    held = _hold_parts(graph)
     print(f'{graph.n_nodes} hidden nodes, {len(graph.edges)} edges, '
           f'{len(graph.observed)} observed nodes; chi2 {graph.energies().chi2:.9g} as read')
     if not file.has_start:
         print('nodes without a pose in the file start at poses composed from the edges')
+    if len(held) > 0:
+        print(f'nothing held {len(held)} more parts of the graph; now their first nodes are '
+              f'fixed: {_listed(file.ids[held])}')
     start = time.monotonic()
-    optimize = (optimizer.optimize if options.start == 'file'
-                else optimizer.optimize_from_linear_start)
-    result = optimize(graph, SolverConfig(max_iterations=200))
-    print(f'chi2 {result.chi2:.9g}, {result.status.value} after {result.iterations} iterations, '
-          f'{time.monotonic() - start:.3f} s{": " if result.reason else ""}{result.reason}')
+    result = _solve(graph, optimizer.optimize if options.start == 'file'
+                    else optimizer.optimize_from_linear_start)
+    reason = re.sub(r'hidden node (\d+)', lambda node: f'hidden node {file.ids[int(node[1])]}',
+                    result.reason)
+    print(f'chi2 {result.chi2:.9g}, {result.status.value} after {result.iterations} iterations '
+          f'from the {result.start.value}, {time.monotonic() - start:.3f} s'
+          f'{": " if reason else ""}{reason}')
     energies = graph.energies()
     for k in np.argsort(energies.edges)[::-1][:N_LARGEST]:
         print(f'  edge {file.ids[graph.edges.i[k]]} -> {file.ids[graph.edges.j[k]]}: '
@@ -49,4 +69,56 @@ def execute(options: argparse.Namespace) -> int:
               f'energy {energies.observed[k]:.4g}')
     if options.out is not None:
         write_g2o(graph, options.out, file.ids)
-    return 0 if result.status is optimizer.Status.CONVERGED else 1
+    return 0 if result.status is Status.CONVERGED else 1
+
+
+def _skipped(path: Path, file: GraphFile) -> list[str]:
+    """Return a warning for each tag that is not known, the most frequent ones first."""
+    tags = sorted(file.skipped, key=lambda tag: -file.skipped[tag])
+    lines = [f'warning: {path}: {file.skipped[tag]} lines {tag!r} are skipped'
+             + (': TORO may merge these nodes, which their edges connect anyway'
+                if tag == 'EQUIV' else '') for tag in tags[:N_TAGS]]
+    if len(tags) > N_TAGS:
+        lines.append(f'warning: {path}: lines with {len(tags) - N_TAGS} other tags are skipped')
+    return lines
+
+
+def _hold_parts(graph: Graph) -> list[int]:
+    """Fix the first node of each part that has no fixed and no observed one; return these."""
+    held = []
+    while (node := symbolic.loose_part(graph.memory.head)[0]) >= 0:
+        graph.apply(GraphUpdate(fix=[int(node)]))
+        held.append(int(node))
+    return held
+
+
+def _solve(graph: Graph, optimize: Callable[[Graph, SolverConfig], BatchResult]) -> BatchResult:
+    """
+    Optimise a graph; if poses are not determined, choose those near the present ones.
+
+    The result has the reason then. It is the minimum of chi2 with a weak prior on each node, which
+    is not added to the graph.
+    """
+    result = optimize(graph, CONFIG)
+    if result.status is not Status.FAILED or not np.isfinite(result.chi2):
+        return result
+    copy, n = Graph(), graph.n_nodes
+    copy.fill(graph.rows())
+    typical = np.concatenate([np.einsum('mii->mi', table.weighted_information).ravel()
+                              for table in (graph.edges, graph.observed)])
+    weak = WEAK * np.median(typical[typical > 0.0]) * np.eye(3)
+    copy.apply(GraphUpdate(observed=ObservedNodes(
+        np.arange(n), None, graph.poses.copy(), np.tile(weak, (n, 1, 1)),
+        [ObservedKind.GLOBAL_POSE] * n)))
+    other = optimize(copy, CONFIG)
+    if other.status is Status.FAILED:
+        return result
+    graph.set_poses(copy.poses)
+    return replace(other, chi2=graph.energies().chi2,
+                   reason=f'{result.reason}; it is held near its start')
+
+
+def _listed(names: IntArray) -> str:
+    """Return names separated by commas, at most five."""
+    return ', '.join(map(str, names[:N_LARGEST].tolist())) + (
+        ', ...' if len(names) > N_LARGEST else '')

@@ -9,9 +9,10 @@ import re
 
 import numpy as np
 import pytest
+from random_graphs import corridor_graph
 
 from pose_graph_ros.cli.main import main
-from pose_graph_ros.core.io.g2o import read_g2o
+from pose_graph_ros.core.io.g2o import read_g2o, write_g2o
 
 DATA = Path(__file__).resolve().parents[1] / 'data'
 GOLDEN = json.loads((DATA / 'golden.json').read_text(encoding='utf-8'))
@@ -126,24 +127,94 @@ def test_edge2_is_read_as_said(tmp_path: Path, capsys: pytest.CaptureFixture[str
     assert 'toro or isam' in capsys.readouterr().err
 
 
-def test_a_failed_solve_is_exit_code_1(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str],
+# Graphs that nothing, or not enough, holds, with what is said.
+LOOSE = {
+    'one_node': ('VERTEX_SE2 7 1 2 0.5', r'1 hidden nodes, 0 edges'),
+    'no_edges': ('VERTEX_SE2 7 1 2 0.5\nVERTEX_SE2 9 3 2 0', r'nothing held 1 more .*: 9$'),
+    'parts': (f"""
+        EDGE_SE2 10 11 1 0 0 {IDENTITY}
+        EDGE_SE2 12 13 1 0 0 {IDENTITY}
+        EDGE_SE2 14 15 1 0 0 {IDENTITY}
+    """, 'nothing held 2 more parts of the graph; now their first nodes are fixed: 12, 14$'),
+    'half_held': (f"""
+        EDGE_PRIOR_SE2 20 1 1 0 {IDENTITY}
+        EDGE_SE2 30 31 1 0 0 {IDENTITY}
+    """, r'nothing held 1 more .*: 30$'),
+    'only_observed': (f'EDGE_PRIOR_SE2 5 1 1 0 {IDENTITY}\nEDGE_PRIOR_SE2 7 2 1 0 {IDENTITY}',
+                      r'converged after'),
+    'only_positions': ('EDGE_PRIOR_SE2_XY 5 1 1 1 0 1\nEDGE_PRIOR_SE2_XY 7 2 1 1 0 1',
+                       r'converged .*: hidden node [57] is not determined; it is held near'),
+    'one_position': (f"""
+        EDGE_SE2 50 51 1 0 0 {IDENTITY}
+        EDGE_SE2 51 52 1 0 1 {IDENTITY}
+        EDGE_PRIOR_SE2_XY 51 3 3 1 0 1
+    """, r'converged .*: hidden node 5[012] is not determined; it is held near'),
+    'all_fixed': (f'EDGE_SE2 1 2 1 0 0 {IDENTITY}\nFIX 1 2', r'converged after 0 iterations'),
+}
+
+
+@pytest.mark.parametrize('start', ['chordal', 'file'])
+@pytest.mark.parametrize('name', LOOSE)
+def test_there_is_an_answer_wherever_there_is_a_graph(
+    name: str, start: str, tmp_path: Path, capsys: pytest.CaptureFixture[str],
 ) -> None:
-    path = write(tmp_path / 'loose.g2o', f"""
-        VERTEX_SE2 0 0 0 0
-        VERTEX_SE2 1 5 0 0
-        VERTEX_SE2 2 0 9 0
-        VERTEX_SE2 3 0 5 0
-        EDGE_SE2 0 1 1 0 0 {IDENTITY}
-        EDGE_SE2 2 3 1 0 0 {IDENTITY}
-    """)
-    out = tmp_path / 'out.g2o'
-    assert main(['solve', str(path), '-o', str(out)]) == 1
+    text, said = LOOSE[name]
+    path, out = write(tmp_path / 'graph.g2o', text), tmp_path / 'out.g2o'
+    assert main(['solve', str(path), '-o', str(out), '--start', start]) == 0
     captured = capsys.readouterr()
     assert captured.err == ''
-    assert re.search(r'failed after 0 iterations, .*: .*not determined', captured.out)
-    # the poses are those that were read
-    np.testing.assert_array_equal(read_g2o(out).graph.poses, read_g2o(path).graph.poses)
+    assert re.search(said, captured.out, re.MULTILINE)
+    before, after = read_g2o(path).graph, read_g2o(out).graph
+    assert (len(after.edges), len(after.observed)) == (len(before.edges), len(before.observed))
+    if name != 'all_fixed':
+        assert after.energies().chi2 == pytest.approx(0.0, abs=1e-6)
+
+
+def test_lines_of_other_tools_are_one_warning_for_each_tag(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str],
+) -> None:
+    path = write(tmp_path / 'other.graph', CONFLICT + """
+        PARAMS_SE2OFFSET 0 0 0 0
+        VERTEX_XY 100 3 4
+        VERTEX_XY 101 5 6
+        FIX 100
+        EDGE_SE2_XY 20 100 1 2 1 0 1
+        EQUIV 20 22
+        EQUIV 21 23
+        EQUIV 20 23
+    """)
+    plain = write(tmp_path / 'plain.g2o', CONFLICT)
+    printed = []
+    for each in (path, plain):
+        assert main(['solve', str(each)]) == 0
+        captured = capsys.readouterr()
+        printed.append(printed_chi2(captured.out.splitlines()))
+        warnings = captured.err.splitlines()
+        if each is path:
+            assert [re.findall(r": (\d+) lines '(\S+)' are skipped", line)
+                    for line in warnings] == [
+                [('3', 'EQUIV')], [('2', 'VERTEX_XY')], [('1', 'PARAMS_SE2OFFSET')],
+                [('1', 'EDGE_SE2_XY')]]
+            assert all(line.startswith(f'warning: {path}: ') for line in warnings)
+        else:
+            assert warnings == []
+    assert printed[0] == printed[1]
+
+
+def test_strong_noise_of_the_headings_is_solved_from_another_start(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str],
+) -> None:
+    path = tmp_path / 'corridor.g2o'
+    write_g2o(corridor_graph(1, sigma=0.3), path)
+    assert main(['solve', str(path), '--start', 'file']) == 0
+    from_truth = capsys.readouterr().out.splitlines()
+    assert 'from the present poses' in from_truth[1]
+    path.write_text(re.sub(r'(?m)^VERTEX_SE2 .*\n', '', path.read_text(encoding='ascii')),
+                    encoding='ascii')
+    assert main(['solve', str(path)]) == 0
+    lines = capsys.readouterr().out.splitlines()
+    assert 'from the start with unit headings' in lines[2]
+    assert printed_chi2(lines) <= 1.01 * printed_chi2(from_truth)
 
 
 def test_the_constraints_with_the_largest_energies_are_named(
@@ -179,6 +250,7 @@ def test_at_most_five_of_each_are_named(capsys: pytest.CaptureFixture[str]) -> N
     ('', 'holds no vertex and no edge'),
     ('# nothing but a comment\n', 'holds no vertex and no edge'),
     ('VERTEX_SE3:QUAT 0 0 0 0 0 0 0 1\n', r"graph\.g2o:1: tag 'VERTEX_SE3:QUAT' is not known"),
+    ('VERTEX_XY 0 0 0\nEDGE_SE2_XY 0 1 1 0 1 0 1\n', r":1: tag 'VERTEX_XY' is not known"),
     ('VERTEX_SE2 0 0 0 0\nVERTEX_SE2 1 0 0\n', r'graph\.g2o:2: VERTEX_SE2 is followed by 4'),
     (f'EDGE_SE2 0 1 1 x 0 {IDENTITY}\n', r'graph\.g2o:1: EDGE_SE2: could not convert'),
     (f'EDGE_SE2 0 1 1 nan 0 {IDENTITY}\n', r'graph\.g2o:1: EDGE_SE2 holds a number that is not'),

@@ -11,6 +11,7 @@ import numpy as np
 
 from pose_graph_ros.core.batch import chordal_start
 from pose_graph_ros.core.elimination import symbolic
+from pose_graph_ros.core.geometry import se2
 from pose_graph_ros.core.geometry.se2 import FloatArray
 from pose_graph_ros.core.graph.constraints import EdgeKind, Edges, ObservedKind, ObservedNodes
 from pose_graph_ros.core.graph.graph import Graph, GraphUpdate
@@ -202,3 +203,28 @@ def free_part(graph: Graph, H: FloatArray, b: FloatArray) -> tuple[FloatArray, F
 def chordal(graph: Graph) -> FloatArray:
     """Return the chordal start of a graph, shape (N, 3)."""
     return chordal_start.chordal(graph, symbolic.analyse(graph.memory.head).cliques)
+
+
+def corridor_graph(seed: int, sigma: float, length: int = 150, width: int = 3) -> Graph:
+    """
+    Return a graph of lanes beside each other, with measured headings as bad as sigma [rad].
+
+    Node 0 is fixed; each node is connected with its neighbours. The poses are the truth.
+    """
+    rng = np.random.default_rng(seed)
+    lane, column = np.divmod(np.arange(length * width), length)
+    truth = np.column_stack((np.where(lane % 2 == 0, column, length - 1 - column), lane,
+                             np.where(lane % 2 == 0, 0.0, -np.pi))).astype(np.float64)
+    number = {(x, y): k for k, (x, y) in enumerate(truth[:, :2].tolist())}
+    pairs = [(k, k + 1) for k in range(len(truth) - 1)]
+    pairs += [(k, number[x, y + 1]) for k, (x, y) in enumerate(truth[:, :2].tolist())
+              if (x, y + 1) in number and number[x, y + 1] != k + 1]
+    i, j = np.array(pairs).T
+    sigmas = np.array([0.15, 0.15, sigma])
+    mean = se2.wrapped(se2.between(truth[i], truth[j]) + sigmas * rng.standard_normal((len(i), 3)))
+    information = np.tile(np.diag(sigmas**-2), (len(i), 1, 1))
+    kind = np.where(j - i == 1, EdgeKind.ODOMETRY, EdgeKind.LOOP_CLOSURE)
+    graph = Graph()
+    graph.apply(GraphUpdate(
+        hidden=truth, edges=Edges(i, j, mean, information, kind), fix=[0]))
+    return graph

@@ -149,7 +149,8 @@ def minimize(head: tb.IntHead, chi2: float, config: SolverConfig) -> Minimum:
                     break
             # a rejected chord step is repeated with a new factorisation before any damping
             chord, uphill = False, 0
-    if end is Termination.MAX_ITERATIONS or not current and end is not Termination.UNDETERMINED:
+    at_best = current and end is not Termination.MAX_ITERATIONS
+    if not at_best and end is not Termination.UNDETERMINED:
         gn.put_poses(head, best)
         end = _refactorized(head, best, end, chi2)
     if end is not Termination.UNDETERMINED:

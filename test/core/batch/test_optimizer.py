@@ -12,6 +12,7 @@ import pytest
 from random_graphs import (
     chordal,
     consistent_graph,
+    corridor_graph,
     dense_system,
     free_part,
     random_edges,
@@ -26,8 +27,9 @@ from scipy.optimize import least_squares
 from slow_smoother import EXACT
 
 from pose_graph_ros.core.batch import optimizer
-from pose_graph_ros.core.batch.optimizer import Status
+from pose_graph_ros.core.batch.optimizer import Start, Status
 from pose_graph_ros.core.config import SolverConfig
+from pose_graph_ros.core.exceptions import LinearSolveError
 from pose_graph_ros.core.geometry import se2
 from pose_graph_ros.core.geometry.se2 import FloatArray
 from pose_graph_ros.core.graph.constraints import EdgeKind, Edges, ObservedKind, ObservedNodes
@@ -463,3 +465,48 @@ def test_public_graphs_reach_their_known_optima(name: str, *, from_nothing: bool
         result = optimizer.optimize(graph, SolverConfig())
     assert result.status is Status.CONVERGED
     assert result.chi2 == pytest.approx(chi2, rel=1e-5)
+
+
+# --- Several starts --------------------------------------------------------------------------
+
+@pytest.mark.parametrize(('sigma', 'length'), [(0.3, 150), (0.5, 250)])
+@pytest.mark.parametrize('seed', [0, 2])
+def test_headings_that_cancel_each_other_out_have_a_start(
+    seed: int, sigma: float, length: int,
+) -> None:
+    graph = corridor_graph(seed, sigma, length)
+    from_truth = optimizer.optimize(graph, THOROUGH)
+    assert from_truth.start is Start.PRESENT
+    poses = random_poses(np.random.default_rng(seed), graph.n_nodes, 50.0)
+    poses[0] = graph.poses[0]
+    graph.set_poses(poses)
+    with pytest.raises(LinearSolveError, match='cancel each other out'):
+        chordal(graph)
+    result = optimizer.optimize_from_linear_start(graph, THOROUGH)
+    assert (result.status, result.start) == (Status.CONVERGED, Start.UNIT)
+    assert result.chi2 <= 1.01 * from_truth.chi2
+
+
+def test_an_easy_graph_needs_one_start(monkeypatch: pytest.MonkeyPatch) -> None:
+    tried, start = [], optimizer._start
+    monkeypatch.setattr(optimizer, '_start', lambda graph, name, cliques: (
+        tried.append(name), start(graph, name, cliques))[1])
+    result = optimizer.optimize_from_linear_start(corridor_graph(0, sigma=0.02), SolverConfig())
+    assert (result.start, tried) == (Start.CHORDAL, [Start.CHORDAL])
+
+
+def test_the_present_poses_are_kept_if_no_start_is_better() -> None:
+    graph = consistent_graph(seed=3, noise=0.1)
+    best = optimizer.optimize(graph, THOROUGH)
+    poses = graph.poses.copy()
+    result = optimizer.optimize_from_linear_start(graph, THOROUGH)
+    assert result.chi2 == pytest.approx(best.chi2, rel=SAME_CHI2)
+    np.testing.assert_allclose(graph.poses, poses, atol=1e-7)
+
+
+@pytest.mark.parametrize('seed', [69, 100, 287])
+def test_at_the_minimum_an_optimisation_has_converged(seed: int) -> None:
+    graph = consistent_graph(seed=seed, noise=0.8, n_nodes=12)
+    result = optimizer.optimize(graph, THOROUGH)
+    assert np.max(np.abs(gradient(graph))) < STATIONARY
+    assert result.status is Status.CONVERGED

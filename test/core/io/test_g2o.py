@@ -214,13 +214,34 @@ def test_the_meaning_of_edge2_is_never_guessed(folder: Path) -> None:
         read(folder, line, 'g2o')
 
 
+def test_the_other_tags_of_toro_and_isam_are_read(folder: Path) -> None:
+    six = '11 0.12 22 33 0.13 0.23'
+    first = read(folder, f'VERTEX2 0 1 2 3\nEDGE2 0 1 1 0 0 {six}', 'toro').graph
+    old = read(folder, f'VERTEX 0 1 2 3\nEDGE 0 1 1 0 0 {six}').graph
+    assert snapshot(old) == snapshot(first)
+    root = '3 0.1 0.2 4 0.3 5'
+    first = read(folder, f'EDGE2 0 1 1 0 0 {root}', 'isam').graph
+    assert snapshot(read(folder, f'ODOMETRY 0 1 1 0 0 {root}', 'isam').graph) == snapshot(first)
+    with pytest.raises(FileFormatError, match=r'graph\.g2o:1: ODOMETRY means two'):
+        read(folder, f'ODOMETRY 0 1 1 0 0 {root}')
+
+
+def test_lines_with_other_tags_are_skipped_and_counted(folder: Path) -> None:
+    foreign = ('EQUIV 0 1', 'EQUIV 1 0', 'VERTEX_XY 77 1 2', 'EDGE_SE2_XY 0 77 1 2 1 0 1',
+               'PARAMS_SE2OFFSET 0 0 0 0', 'FIX 77', 'VERTEX_SE3 5 0 0 0', 'edge_se2 x')
+    plain, file = read(folder, GOOD), read(folder, '\n'.join((*foreign, GOOD)))
+    assert plain.skipped == {}
+    assert file.skipped == {'EQUIV': 2, 'VERTEX_XY': 1, 'EDGE_SE2_XY': 1, 'PARAMS_SE2OFFSET': 1,
+                            'VERTEX_SE3': 1, 'edge_se2': 1}
+    assert snapshot(file.graph) == snapshot(plain.graph)
+
+
 # --- invalid files ---------------------------------------------------------------------------
 
 GOOD = f'VERTEX_SE2 0 0 0 0\nVERTEX_SE2 1 1 0 0\nEDGE_SE2 0 1 1 0 0 {IDENTITY}\n'
 HUGE_ID = 10**30
 # The text of line 4, and the message.
 MISTAKES = {
-    'tag': ('VERTEX_SE3 0 0 0 0', r"tag 'VERTEX_SE3' is not known; known are FIX, VERTEX_SE2"),
     'few': ('VERTEX_SE2 2 0 0', r'VERTEX_SE2 is followed by 4 numbers, got 3'),
     'many': (f'EDGE_SE2 0 1 1 0 0 {IDENTITY} 7', r'followed by 11 numbers, got 12'),
     'word': ('VERTEX_SE2 2 0 zero 0', r"VERTEX_SE2: .*'zero'"),
