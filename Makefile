@@ -3,6 +3,8 @@
 VENV := $(if $(ROS_DISTRO),.venv-ros,.venv)
 PYTEST_ARGS ?=
 BENCH_ARGS ?=
+# Modules are byte-compiled when they are first imported, and not in each process anew.
+unexport PYTHONDONTWRITEBYTECODE
 
 # make variable -> option of `pose-graph demo`; only those that are given
 option = $(if $($(1)),--$(2) '$($(1))')
@@ -11,7 +13,7 @@ DEMO_ARGS = $(call option,BAG,bag) $(call option,ODOM,odom) $(call option,FIX,fi
 	$(call option,TRUTH,truth) $(call option,HOLD_OUT,hold-out) $(call option,RATE,rate) \
 	$(call option,OUT,out)
 
-.PHONY: help setup demo test bench lint types fmt lock clean
+.PHONY: help setup setup-test demo test bench lint types fmt lock clean
 
 help:
 	@echo 'make demo    set up, then simulate a drive, replay it through the node and judge the result'
@@ -20,18 +22,22 @@ help:
 	@echo 'make test    set up, then run the checks (ruff, mypy) and all tests; PYTEST_ARGS="-k word"'
 	@echo 'make bench   measure the engine against GTSAM; BENCH_ARGS="--quick --gate", or --help'
 	@echo 'make lint    ruff alone;  make types: mypy alone;  make fmt: let ruff mend what it can'
-	@echo 'make setup   set up alone: $(VENV), from wheels, or on top of ROS where one is sourced'
-	@echo 'make lock    resolve dev/requirements.in again into requirements.lock'
+	@echo 'make setup   set up alone: $(VENV), from wheels, or on top of ROS where one is sourced;'
+	@echo '             compiles the solver'
+	@echo 'make lock    resolve dev/requirements*.in again into requirements*.lock'
 	@echo 'make clean   remove the set-up and what builds leave behind'
 	@echo 'PYTHON=python3.12 chooses the Python of the set-up.'
 
 setup:
 	@dev/setup.sh
 
+setup-test:
+	@dev/setup.sh --test
+
 demo: setup
 	@$(VENV)/bin/pose-graph demo $(DEMO_ARGS)
 
-test: setup
+test: setup-test
 	@dev/test.sh $(VENV) $(PYTEST_ARGS)
 
 bench: setup
@@ -39,13 +45,13 @@ bench: setup
 		-r benchmark/requirements.txt
 	@$(VENV)/bin/python -m benchmark $(BENCH_ARGS)
 
-lint: setup
+lint: setup-test
 	$(VENV)/bin/ruff check
 
-types: setup
+types: setup-test
 	$(VENV)/bin/mypy
 
-fmt: setup
+fmt: setup-test
 	$(VENV)/bin/ruff check --fix
 
 lock: setup

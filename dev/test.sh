@@ -40,9 +40,6 @@ if [ -z "${ROS_DISTRO:-}" ]; then
 else
     echo '--- mypy: left out, it is exact only with the NumPy of requirements.lock'
 fi
-# once, not in each of the processes that tests start
-run kernels "$PYTHON" -c 'from pose_graph_ros.core.warm_up import warm_up
-print(f"compiled, or loaded, in {warm_up():.1f} s")'
 if [ "$#" -gt 0 ]; then
     run pytest "$PYTHON" -m pytest -ra --durations=10 "$@"
 else

@@ -53,7 +53,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
                         help='rosbag2 folder, .mcap or .db3 (default: a simulated drive)')
     parser.add_argument('-o', '--out', metavar='DIR', type=Path, default=Path('demo'),
                         help='folder for the results (default: %(default)s)')
-    parser.add_argument('--rate', type=float, default=20.0,
+    parser.add_argument('--rate', type=float, default=50.0,
                         help='speed as a multiple of real time, 0 for as fast as the node can '
                              '(default: %(default)s)')
     parser.add_argument('--seed', type=int, default=1, help='seed of the simulated drive '
