@@ -46,8 +46,7 @@ from pose_graph_ros.core.transaction import Transaction
 
 # Sigmas of the edge to a pose that was set by `set_pose` [m, m, rad]: the motion is unknown.
 RELOCATION_SIGMA = (1000.0, 1000.0, 3.0)
-# Maximum number of reweightings of robust losses in one update.
-REWEIGHTINGS = 3
+REWEIGHTINGS = 3  # maximum number of reweightings of robust losses in one update
 
 
 class PoseGraphBackend:
@@ -135,8 +134,8 @@ class PoseGraphBackend:
 
     def set_aside(self, n: int) -> list[str]:
         """Return the names of the newest n constraints that were set aside."""
-        edges, observed = self._quarantine.edges[-n:], self._quarantine.observed[-n:]
-        return constraint_names.queued(Queue(edges, observed), self._nodes)[-n:]
+        newest = Queue(self._quarantine.edges[-n:], self._quarantine.observed[-n:])
+        return constraint_names.queued(newest, self._nodes)[-n:]
 
     @property
     def revision(self) -> int:
@@ -262,9 +261,8 @@ class PoseGraphBackend:
         """
         Add all new constraints to the graph and update the estimate; to be called by a timer.
 
-        The work depends on how much the new constraints change, not on the size of the graph. If
-        it fails, the constraints to blame are set aside until the next full optimisation, and all
-        others are added, by this update or by the next ones; the report names those set aside.
+        The work depends on how much the new constraints change, not on the size of the graph.
+        Constraints that make it fail are set aside and named by the report.
         """
         report, untried = self._update()
         self._pipeline.queue = untried.joined(self._pipeline.queue)
@@ -273,13 +271,15 @@ class PoseGraphBackend:
     def _update(self) -> tuple[UpdateReport, Queue]:
         """Return the report of an update, and the constraints for which it had no time."""
         return isolation.update(
-            self._add_queue, self._can_solve, self._pipeline, self._quarantine,
+            self._add_queue, self._settle, self._pipeline, self._quarantine,
             lambda one: constraint_names.queued(one, self._nodes)[0])
 
-    def _can_solve(self) -> bool:
-        """Tell whether an update without new constraints succeeds."""
+    def _settle(self) -> bool:
+        """Set all weights that wait; tell whether an update without new constraints succeeds."""
         with self._transaction() as transaction:
-            transaction.solved(self._smoother.update(self._factors.build(Queue(), self.graph)))
+            change = self._factors.build(Queue(), self.graph, settle=True)
+            transaction.solved(self._smoother.update(change))
+            self._factors.commit()
         return transaction.failure == ''
 
     def _add_queue(self) -> tuple[UpdateReport, Queue]:
@@ -363,6 +363,7 @@ class PoseGraphBackend:
         report = isolation.update_with_all(self._update, self._pipeline, self._quarantine)
         if self.graph.n_nodes == 0:
             return report
+        self._settle()
         return report.after(self._optimize_whole())
 
     def _optimize_whole(self) -> UpdateReport:

@@ -152,6 +152,13 @@ class Reweighting:
             table.losses.append_one((_LOSSES.index(loss), threshold))
             table.base_weights.append_one(1.0)
 
+    def base_weight(self, row: int) -> float | None:
+        """Return the base weight of an observed node, by its row; None without a loss."""
+        table = self._observed
+        at = int(np.searchsorted(table.rows.values, row))
+        found = at < len(table.rows) and table.rows.values[at] == row
+        return float(table.base_weights.values[at]) if found else None
+
     def set_base_weight(self, row: int, weight: float) -> None:
         """
         Set the base weight of an observed node, if it was added.

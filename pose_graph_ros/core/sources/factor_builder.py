@@ -2,6 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """From attached measurements to one update of the graph."""
 
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import NamedTuple
 
@@ -15,6 +16,7 @@ from pose_graph_ros.core.config import (
     MeasurementSource,
     OdometrySource,
 )
+from pose_graph_ros.core.graph import tables as tb
 from pose_graph_ros.core.graph.constraints import EdgeKinds, Edges, ObservedNodes
 from pose_graph_ros.core.graph.graph import Graph, GraphUpdate
 from pose_graph_ros.core.graph.reweighting import Reweighting
@@ -178,7 +180,7 @@ class FactorBuilder:
         """Number of measurements in the graph, without loop closures."""
         return sum(len(each.rows) + each.n_otherwise for each in self._constraints.values())
 
-    def build(self, queue: Queue, graph: Graph) -> GraphUpdate:
+    def build(self, queue: Queue, graph: Graph, *, settle: bool = False) -> GraphUpdate:
         """
         Return the update that adds the constraints of a queue to the graph.
 
@@ -188,6 +190,7 @@ class FactorBuilder:
         ----------
         queue : Queue
         graph : Graph, it is not changed
+        settle : bool, whether to set all weights that older measurements wait for
 
         """
         additions = Additions(GraphSizes(graph.n_nodes, graph.n_edges, graph.n_observed))
@@ -208,12 +211,31 @@ class FactorBuilder:
             self._new.append(_NewConstraint(
                 isinstance(error_model, GaussMarkovBias), row, source, stamp_ns, kind))
         self._n_new_bias_edges = len(additions.edges) - len(queue.edges)
+        for model in self._error_models.values() if settle else ():
+            if isinstance(model, InflatedWeights):
+                model.settle(additions)
         self._new_weights = additions.weigh_observed
         return GraphUpdate(
             biases=np.array(additions.biases).reshape(-1, 3),
             edges=Edges.joined(additions.edges), observed=ObservedNodes.joined(additions.observed),
             remove_edges=additions.remove_edges, remove_observed=additions.remove_observed,
-            weigh_observed=additions.weigh_observed)
+            weigh_observed=self._changed_weights(additions.weigh_observed, graph))
+
+    def _changed_weights(
+        self, base_weights: Mapping[int, float], graph: Graph,
+    ) -> dict[int, float]:
+        """Return the weights that differ from those in the graph, given the new base weights."""
+        present, changed = graph.memory['observed_f'][:graph.n_observed, tb.WEIGHT], {}
+        for row, wanted in base_weights.items():
+            if row >= graph.n_observed:
+                changed[row] = wanted
+                continue
+            base, weight = self._reweighting.base_weight(row), float(present[row])
+            # what a robust loss has taken off stays off
+            target = wanted if base is None else wanted * (weight / base)
+            if target != weight:
+                changed[row] = target
+        return changed
 
     def _error_model(
         self, source: str, kind: type[Measurement],

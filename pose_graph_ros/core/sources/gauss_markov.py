@@ -16,11 +16,14 @@ alone, and the state of a bin that is filled later is inserted between its neigh
 of arrival does not matter.
 
 `InflatedWeights` is a cheap approximation: each of n measurements within 2 tau has the weight
-1 / n, because together they are worth about one measurement with an independent error.
+1 / n, because together they are worth about one measurement with an independent error. A new
+measurement changes the weights of all others. To bound the work, each one sets those of `RENEWED`
+others, in turn, so that no weight is off by more than about 1 / `RENEWED`; `settle` sets the rest.
 """
 
 import bisect
 from dataclasses import dataclass, field
+import itertools
 import math
 from typing import NamedTuple
 
@@ -43,6 +46,8 @@ LEAST_WHITE = 1e-3
 # 1 / STRETCH^2: the number is wrapped like an angle and must stay well below pi.
 STRETCH = 10.0
 _INFORMATION = np.diag((1.0, 1.0, STRETCH**2))
+# Number of older weights in its bin that a measurement renews, and of such weights in other bins.
+RENEWED = 32
 
 
 @dataclass(frozen=True, slots=True)
@@ -210,13 +215,28 @@ class GaussMarkovBias:
             bias=np.array([(0.0, 0.0, phi, phi)])))
 
 
+@dataclass(slots=True)
+class _WeightBin:
+    """The measurements within 2 tau."""
+
+    rows: list[int] = field(default_factory=list)
+    """Rows of their observed nodes."""
+    next: int = 0
+    """Index of the weight that is renewed next."""
+    n_waiting: int = 0
+    """Number of weights, from there on and in a circle, that are not yet 1 / n."""
+
+
 class InflatedWeights:
     """Weights of the measurements of one source, lower the more of them lie within 2 tau."""
 
     def __init__(self, source: MeasurementSource) -> None:
         self._width_ns = max(round(2e9 * source.correlation_time), 1)
-        self._bins: dict[int, list[int]] = {}
-        self._log: list[int] = []
+        self._bins: dict[int, _WeightBin] = {}
+        self._waiting: dict[int, None] = {}
+        """Numbers of the bins with weights that wait to be renewed, the first one first."""
+        self._log: list[tuple[int, int, int, int]] = []
+        """Number of each bin that has changed since `begin`, and what it was like."""
 
     def begin(self) -> None:
         """Begin an update that `rollback` can revert."""
@@ -224,14 +244,21 @@ class InflatedWeights:
 
     def rollback(self) -> None:
         """Remove what was added since `begin`."""
-        for number in reversed(self._log):
-            self._bins[number].pop()
+        for number, size, at, n_waiting in reversed(self._log):
+            made = self._bins[number]
+            del made.rows[size:]
+            made.next, made.n_waiting = at, n_waiting
+            self._note(number)
         self._log.clear()
 
     def restore(self, rows: IntArray) -> None:
         """Restore the measurements of a loaded graph: stamps [ns] and rows, shape (K, 2)."""
         for stamp_ns, row in rows.tolist():
-            self._bins.setdefault(stamp_ns // self._width_ns, []).append(row)
+            number = stamp_ns // self._width_ns
+            made = self._bins.setdefault(number, _WeightBin())
+            made.rows.append(row)
+            made.n_waiting += 1     # which of them waited is not saved
+            self._note(number)
 
     def add(self, stamp_ns: int, observed: ObservedNodes, additions: Additions) -> int:
         """
@@ -241,16 +268,46 @@ class InflatedWeights:
         ----------
         stamp_ns : int
         observed : ObservedNodes, one row
-        additions : Additions, receives the row, and the weights of all measurements in its bin
+        additions : Additions, receives the row, its weight and some weights of older measurements
 
         """
         row = additions.add_observed(observed)
         number = stamp_ns // self._width_ns
-        rows = self._bins.setdefault(number, [])
-        rows.append(row)
-        self._log.append(number)
-        additions.weigh_observed |= dict.fromkeys(rows, 1.0 / len(rows))
+        made = self._bins.setdefault(number, _WeightBin())
+        self._log.append((number, len(made.rows), made.next, made.n_waiting))
+        made.rows.append(row)
+        made.n_waiting = len(made.rows)
+        additions.weigh_observed[row] = 1.0 / len(made.rows)
+        self._renew(number, RENEWED, additions)
+        left = RENEWED
+        for other in list(itertools.islice(self._waiting, RENEWED)):
+            if other != number and left > 0:
+                left -= self._renew(other, left, additions)
         return row
+
+    def settle(self, additions: Additions) -> None:
+        """Add the weights of all measurements that wait to be renewed."""
+        for number in list(self._waiting):
+            self._renew(number, len(self._bins[number].rows), additions)
+
+    def _renew(self, number: int, most: int, additions: Additions) -> int:
+        """Add some weights of a bin that wait to be renewed, and return how many."""
+        made = self._bins[number]
+        self._log.append((number, len(made.rows), made.next, made.n_waiting))
+        count = min(most, made.n_waiting)
+        for k in range(made.next, made.next + count):
+            additions.weigh_observed[made.rows[k % len(made.rows)]] = 1.0 / len(made.rows)
+        made.next = (made.next + count) % len(made.rows)
+        made.n_waiting -= count
+        self._note(number)
+        return count
+
+    def _note(self, number: int) -> None:
+        """Keep the list of bins with weights that wait up to date."""
+        if self._bins[number].n_waiting > 0:
+            self._waiting[number] = None
+        else:
+            self._waiting.pop(number, None)
 
 
 def _biased_constraint(

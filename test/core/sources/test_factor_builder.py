@@ -149,6 +149,15 @@ def test_an_update_that_is_rolled_back_is_built_again_as_it_was() -> None:
         first.remove_edges, first.remove_observed, first.weigh_observed)
 
 
+def test_what_a_loss_has_taken_off_stays_off_when_a_weight_is_renewed() -> None:
+    graph, (factors, _) = line(), builder()
+    committed(factors, graph, Queue([], [fix('inflated', k) for k in (3, 4)]))
+    assert graph.observed.weight.tolist() == [0.5, 0.5]
+    graph.apply(GraphUpdate(weigh_observed={0: 0.05}))
+    committed(factors, graph, Queue([], [fix('inflated', 5)]))
+    assert graph.observed.weight == pytest.approx([0.1 / 3, 1 / 3, 1 / 3])
+
+
 def restored(factors: FactorBuilder, config: BackendConfig) -> FactorBuilder:
     other = FactorBuilder(config, Reweighting())
     for name, saved in factors.saved().items():

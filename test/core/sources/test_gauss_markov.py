@@ -4,6 +4,7 @@
 
 from dataclasses import replace
 import itertools
+import math
 
 from hypothesis import given, settings, strategies as st
 import numpy as np
@@ -31,6 +32,7 @@ from pose_graph_ros.core.measurements import (
     Position,
 )
 from pose_graph_ros.core.odometry.motion import Attachment
+from pose_graph_ros.core.sources import gauss_markov
 from pose_graph_ros.core.sources.gauss_markov import (
     Additions,
     BINS,
@@ -126,6 +128,61 @@ def test_the_weights_of_measurements_within_two_time_constants_add_up_to_one() -
         inflated.add(round(seconds * SECOND), None, additions)  # type: ignore[arg-type]
         weights |= additions.weigh_observed
     assert weights == {0: 1 / 3, 1: 1 / 3, 2: 1.0, 3: 1 / 3}
+
+
+INFLATED = MeasurementSource(correlation_time=5.0, correlation=Correlation.INFLATE)
+
+
+@settings(max_examples=60, deadline=None)
+@given(st.lists(st.tuples(st.integers(0, 300), st.sampled_from([0, 0, 0, 1, 2])), max_size=120),
+       st.sampled_from([1, 4, 32]))
+def test_weights_are_renewed_in_turn_and_all_of_them_in_the_end(
+    steps: list[tuple[int, int]], renewed: int,
+) -> None:
+    """Against the slow oracle, which sets all weights of a bin at each measurement."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(gauss_markov, 'RENEWED', renewed)
+        inflated, weights, bins = InflatedWeights(INFLATED), {}, {}
+        for tenths, what in steps:
+            additions = Additions(GraphSizes(1, 0, len(weights)))
+            inflated.begin()
+            row = inflated.add(tenths * SECOND // 10, None, additions)  # type: ignore[arg-type]
+            assert len(additions.weigh_observed) <= 2 * renewed + 1
+            if what == 1:
+                inflated.rollback()
+                continue
+            bins.setdefault(tenths // 100, []).append(row)
+            weights |= additions.weigh_observed
+            for rows in bins.values():
+                n, least = len(rows), len(rows) - math.ceil(len(rows) / renewed)
+                assert all(1 / n <= weights[each] <= 1 / max(least, 1) for each in rows)
+            if what == 2:
+                additions = Additions(GraphSizes(1, 0, len(weights)))
+                inflated.begin()
+                inflated.settle(additions)
+                weights |= additions.weigh_observed
+                assert weights == {row: 1 / len(rows) for rows in bins.values() for row in rows}
+        additions = Additions(GraphSizes(1, 0, len(weights)))
+        inflated.settle(additions)
+        weights |= additions.weigh_observed
+        assert weights == {row: 1 / len(rows) for rows in bins.values() for row in rows}
+
+
+@pytest.mark.parametrize('loss', [Loss.NONE, Loss.HUBER])
+def test_after_the_full_optimisation_inflated_weights_are_as_defined(loss: Loss) -> None:
+    fixes = [Position(round((1.0 + 0.1 * k) * SECOND), np.array([0.1 * k, 0.0]), np.eye(2),
+                      np.zeros(2)) for k in range(350)]
+    backend = run([], replace(INFLATED, loss=loss))
+    for fix in fixes:
+        backend.add_measurement(fix, 'fix')
+        backend.update()
+    restored = PoseGraphBackend.restored(backend._config, backend.saved())
+    for each in (backend, restored):
+        assert each.optimize().status is Status.CONVERGED
+        sizes = np.unique([fix.stamp_ns // (10 * SECOND) for fix in fixes], return_counts=True)[1]
+        # the start pose is the first observed node
+        np.testing.assert_array_equal(
+            each.graph.observed.weight[1:], np.repeat(1.0 / sizes, sizes))
 
 
 STIFF = OdometrySource(
