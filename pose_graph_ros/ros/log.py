@@ -14,6 +14,7 @@ import time
 from typing import Any
 
 PERIOD = 10.0  # for which a warning or an error is logged once [s]
+FLUSH_PERIOD = 2.0  # of the calls of `NodeLog.flush` [s]
 NUMBER = re.compile(r'(?<!\w)[-+]?\d[\w.+-]*')  # numbers do not make it another message
 PACKAGE = __name__.partition('.')[0]
 

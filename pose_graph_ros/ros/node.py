@@ -35,7 +35,7 @@ from pose_graph_ros.adapters.parameters import (
 )
 from pose_graph_ros.adapters.sources import source_list
 from pose_graph_ros.core.exceptions import ConfigError
-from pose_graph_ros.ros.log import NodeLog, PERIOD
+from pose_graph_ros.ros.log import FLUSH_PERIOD, NodeLog
 from pose_graph_ros.ros.services import Services
 from pose_graph_ros.ros.session import Session
 from pose_graph_ros.ros.topics import check_topics, OVERRIDES
@@ -54,7 +54,8 @@ class PoseGraphNode(LifecycleNode):
     def __init__(self, **node_options: Any) -> None:
         super().__init__('pose_graph', **node_options)
         self._log = NodeLog(self.get_logger())
-        self.create_timer(PERIOD, self._log.flush, clock=Clock(clock_type=ClockType.STEADY_TIME))
+        self.create_timer(
+            FLUSH_PERIOD, self._log.flush, clock=Clock(clock_type=ClockType.STEADY_TIME))
         self.failure = ''  # why the last transition or change of parameters failed
         self._session: Session | None = None
         self._offered: Services | None = None

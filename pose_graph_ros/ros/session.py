@@ -136,9 +136,9 @@ class Session:
                 'compiling kernels, up to a minute and only at the first start; measurements wait '
                 'until then, none is lost')
         seconds = warm_up(stopped)
-        self.compiling = False
-        memory.release_memory()
-        if not stopped():
+        if not stopped():   # else another worker may be compiling by now
+            self.compiling = False
+            memory.release_memory()
             self.node.get_logger().info(f'kernels ready after {seconds:.1f} s')
 
     # ---- transitions of the node
@@ -311,7 +311,7 @@ class Session:
             min_forward=None, on_clock_change=False,
             min_backward=Duration(seconds=-values['clock_jump_threshold']))
         self._jump_handle = self.node.get_clock().create_jump_callback(
-            threshold, post_callback=self._on_clock_jump)
+            threshold, post_callback=guarded(self._on_clock_jump, lambda: self.active))
 
     def _on_clock_jump(self, jump: TimeJump) -> None:
         back_ns = -jump.delta.nanoseconds

@@ -16,6 +16,7 @@ from rclpy.subscription import Subscription
 from pose_graph_ros.adapters.conversions import frame, stamp_ns
 from pose_graph_ros.core.geometry.se2 import FloatArray
 from pose_graph_ros.ros import messages
+from pose_graph_ros.ros.spinning import guarded
 
 try:
     from tf2_msgs.msg import TFMessage
@@ -93,7 +94,7 @@ class TransformPublisher:
         if len(everyone) > 1 and (not everyone <= self._known or now - self._since > PAUSE):
             self._known, self._since = everyone, now
             self._subscription = self._node.create_subscription(
-                TFMessage, TOPIC, self._on_transforms, TF_QOS, raw=True)
+                TFMessage, TOPIC, guarded(self._on_transforms, lambda: True), TF_QOS, raw=True)
 
     def close(self) -> None:
         """Destroy the publisher and the subscription."""
