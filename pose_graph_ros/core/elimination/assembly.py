@@ -32,8 +32,12 @@ def eliminate_clique(head, c, relinearize):  # type: ignore[no-untyped-def]
         they were linearized may have turned since. Their rows are logged for a rollback.
 
     """
-    bad = _eliminate(head, c, relinearize, False)
-    return bad if bad < 0 else _eliminate(head, c, relinearize, True)
+    by_weakest = False
+    while True:     # one call, as the compiler then inlines it
+        bad = _eliminate(head, c, relinearize, by_weakest)
+        if bad < 0 or by_weakest:
+            return bad
+        by_weakest = True
 
 
 @kernel
