@@ -14,7 +14,7 @@ it gets: what DDS and rclpy cost alone. Pacing is how late the sender itself was
 """
 
 import argparse
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 import os
 from pathlib import Path
@@ -34,6 +34,7 @@ from benchmark.section import say, Section, Table
 from pose_graph_ros.cli.demo import isolated_environment
 from pose_graph_ros.core.geometry.trajectory import Trajectory
 from pose_graph_ros.ros.messages import path_cdr
+from pose_graph_ros.ros.spinning import EventsExecutor
 
 NODE = 'pose_graph_ros.ros.main'
 PARAMETERS = (f'datum:=[{DATUM[0]}, {DATUM[1]}]', 'closing_silence:=0.0')
@@ -43,6 +44,8 @@ LATENCY_RATE, LATENCY = 500.0, 10.0
 """[Hz], and p99 [ms]."""
 CPU_RATE, CPU = 200.0, 0.6
 """[Hz], and parts of one core."""
+CPU_BESIDE, LATENCY_BESIDE = 1.5, 3.0
+"""Times those of the echo by rclpy.spin, at 200 and 500 Hz, with a graph of any size."""
 MEMORY = 250.0
 """[MB]."""
 PATH_TIME, START_TIME = 10.0, 3.0
@@ -136,25 +139,48 @@ HEADER = ('odometry [Hz]', 'sent', 'lost', 'no output', 'p50 [ms]', 'p99 [ms]', 
           'CPU [% of a core]', 'pacing p50 / p99 [ms]')
 
 
-def echo(rates: Sequence[float], seconds: float) -> Section:
-    """Measure a process that does nothing but send back."""
+def echo(rates: Sequence[float], seconds: float) -> tuple[Section, dict[float, Phase]]:
+    """Measure a process that does nothing but send back; return also its phases by rate."""
     section = Section(
         'The floor: an echo', 'A node of rclpy that republishes the bytes of each odometry '
         'message. No lost messages are counted: it has no diagnostics.')
-    table = Table('', HEADER)
-    with started('benchmark.echo') as (process, feeder):
-        feeder.wait_for_listener()
-        feeder.rest(1.0)
-        for rate in (*rates, *LADDER[1:3]):
-            phase = feeder.run(rate, seconds, process.cpu_seconds)
-            table.add(*cells(phase))
-            say(f'echo: {" ".join(cells(phase))}')
-    section.tables.append(table)
-    return section
+    floor: dict[float, Phase] = {}
+    for title, parameters, higher in (
+            ('as rclpy.spin runs it', (), LADDER[1:3]),
+            ('by the EventsExecutor, as the node', ('events:=true',), ())):
+        table = Table(title, HEADER)
+        if parameters and EventsExecutor is None:
+            continue
+        with started('benchmark.echo', parameters) as (process, feeder):
+            feeder.wait_for_listener()
+            feeder.rest(1.0)
+            for rate in (*rates, *higher):
+                phase = feeder.run(rate, seconds, process.cpu_seconds)
+                floor.setdefault(rate, phase)
+                table.add(*cells(phase))
+                say(f'echo {title}: {" ".join(cells(phase))}')
+        section.tables.append(table)
+    return section, floor
+
+
+def beside(nodes: int, phase: Phase, floor: Phase | None) -> list[Metric]:
+    """Return what the node takes beside the echo, where something is asked of it."""
+    if floor is None or phase.rate not in (CPU_RATE, LATENCY_RATE):
+        return []
+    key = f'{nodes} nodes, {phase.rate:.0f} Hz'
+    metrics = [Metric(f'{key}: CPU beside the echo', phase.cpu / floor.cpu, ' times',
+                      target=CPU_BESIDE)]
+    if phase.rate == LATENCY_RATE and len(phase.latency) > 0 and len(floor.latency) > 0:
+        metrics.append(Metric(
+            f'{key}: latency, p99, beside the echo',
+            float(np.percentile(phase.latency, 99) / np.percentile(floor.latency, 99)), ' times',
+            target=LATENCY_BESIDE))
+    return metrics
 
 
 def graphs(
-    nodes: Sequence[int], rates: Sequence[float], seconds: float, *, path: bool,
+    nodes: Sequence[int], rates: Sequence[float], seconds: float, floor: Mapping[float, Phase], *,
+    path: bool,
 ) -> list[Section]:
     """Measure the node with graphs of some sizes."""
     rate_section = Section(
@@ -182,6 +208,7 @@ def graphs(
                 say(f'  {" ".join(cells(phase))}, {phase.error:.2f} m')
                 error = float(np.fmax(error, phase.error))
                 rate_section.metrics += asked(count, phase)
+                rate_section.metrics += beside(count, phase, floor.get(rate))
             solves = f'{feeder.values["solve_mean_ms"]} / {feeder.values["solve_max_ms"]}'
             best, ladder = highest_rate(process, feeder)
             for phase in ladder:
@@ -294,8 +321,10 @@ def main(arguments: list[str]) -> int:
     parser.add_argument('--out', type=Path, default=Path('build/benchmark/load'), metavar='DIR')
     options = parser.parse_args(arguments)
     nodes, seconds = ([1000], 3.0) if options.quick else (options.nodes, options.seconds)
-    sections = [starting(), echo(options.rates, seconds),
-                *graphs(nodes, options.rates, seconds, path=options.path), path_time(LARGE)]
+    start = starting()
+    echoes, floor = echo(options.rates, seconds)
+    sections = [start, echoes, *graphs(nodes, options.rates, seconds, floor, path=options.path),
+                path_time(LARGE)]
     command = shlex.join(['python', '-m', 'benchmark.load', *arguments])
     about = (__doc__ or '').strip().split('\n\n')[-1].replace('\n', ' ')
     page = report.write(sections, options.out, command, title='The node under load',
