@@ -13,7 +13,7 @@ DEMO_ARGS = $(call option,BAG,bag) $(call option,ODOM,odom) $(call option,FIX,fi
 	$(call option,TRUTH,truth) $(call option,HOLD_OUT,hold-out) $(call option,RATE,rate) \
 	$(call option,OUT,out)
 
-.PHONY: help setup setup-test demo test bench lint types fmt lock clean
+.PHONY: help setup setup-demo setup-test demo test bench lint types fmt lock clean
 
 help:
 	@echo 'make demo    set up, then simulate a drive, replay it through the node and judge the result'
@@ -31,10 +31,13 @@ help:
 setup:
 	@dev/setup.sh
 
+setup-demo:
+	@dev/setup.sh $(if $(BAG),,--demo)
+
 setup-test:
 	@dev/setup.sh --test
 
-demo: setup
+demo: setup-demo
 	@$(VENV)/bin/pose-graph demo $(DEMO_ARGS)
 
 test: setup-test

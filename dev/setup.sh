@@ -8,6 +8,7 @@
 # Done once; later calls only compare checksums, and repeat what has changed or was interrupted.
 #
 # dev/setup.sh --test              also installs what tests and checks need, requirements-test.lock.
+# dev/setup.sh --demo              leaves out tf2_msgs, without which the node has no /tf.
 # PYTHON=python3.12 dev/setup.sh   takes that Python (3.11 or 3.12; the wheels exist for these).
 
 set -euo pipefail
@@ -115,12 +116,17 @@ install_uv() { # unless it cannot be had, or pip is told to use another index, w
     fi
 }
 
-install_wheels() {
+begin_with_wheels() { # what compiling the solver needs, so that it can start
     local total
     total=$(cat "${LOCKS[@]}" | grep -c '==')
     say "installing ROS 2 Jazzy and $total packages into $VENV (Python $(version_of "$BASE_PYTHON"))"
     create_venv --without-pip
     install_uv
+    grep -E '^(numpy|scipy|numba|llvmlite|pyproj|certifi)==' requirements.lock >"$STAMPS/first.txt"
+    install_locks "$STAMPS/first.txt"
+}
+
+install_wheels() {
     install_locks "${LOCKS[@]}"
     if [ "${#LOCKS[@]}" -gt 1 ]; then mark_done tools "$(tools_checksum)"; fi
 }
@@ -144,7 +150,7 @@ ros_constraints() { # numpy as ROS has it (its messages are compiled for that), 
 }
 
 install_package() {
-    is_done package "$(package_checksum)" && return
+    if is_done package "$(package_checksum)"; then return; fi
     say 'installing pose_graph_ros (editable)'
     if [ "$MODE" = ros ]; then
         pip_install 'installing pose_graph_ros' -c "$STAMPS/constraints.txt" -e .
@@ -155,7 +161,7 @@ install_package() {
 }
 
 install_tools() {
-    is_done tools "$(tools_checksum)" && return
+    if is_done tools "$(tools_checksum)"; then return; fi
     say 'installing what tests and checks need'
     if [ "$MODE" = ros ]; then
         pip_install 'installing the tools' -c "$STAMPS/constraints.txt" -e '.[test,dev]'
@@ -166,7 +172,7 @@ install_tools() {
 }
 
 compile_kernels() {
-    is_done kernels "$(kernels_checksum)" && return
+    if is_done kernels "$(kernels_checksum)"; then return; fi
     say 'compiling the solver (20 s to a minute)'
     if "$VENV/bin/python" -m pose_graph_ros.cli.main compile-kernels >>"$LOG" 2>&1; then
         mark_done kernels "$(kernels_checksum)"
@@ -186,7 +192,7 @@ missing_for_tf2() { # names of the Debian packages that building tf2_msgs needs 
 
 build_tf2() {
     local missing
-    is_done tf2_msgs "$(tf2_checksum)" && return
+    if is_done tf2_msgs "$(tf2_checksum)"; then return; fi
     if [ "$MODE" = ros ]; then check_tf2_of_ros; return; fi
     missing=$(missing_for_tf2 | xargs)
     if [ -n "$missing" ]; then
@@ -222,13 +228,24 @@ one_at_a_time() { # wait while another set-up of this checkout runs
     flock -n 9 || { say 'waiting for another set-up of this checkout'; flock 9; }
 }
 
-at_once() { # functions...: run all at the same time, each with its own log; fail if one fails
+beside_the_compiler() { # all steps but the compilation of the solver
+    if ! environment_is_done; then
+        if [ "$MODE" = wheels ]; then install_wheels; fi
+        mark_done python "$BASE_PYTHON"
+        mark_done environment "$(environment_checksum)"
+    fi
+    install_package
+    if [ "${#LOCKS[@]}" -gt 1 ]; then install_tools; fi
+    if [ "${1:-}" != --demo ]; then build_tf2; fi
+}
+
+at_once() { # two functions with one argument: run both at the same time; fail if one fails
     local name pids=() pid status=0
     set -m      # each with its children is a group of processes, to be ended together
-    for name in "$@"; do
-        LOG=$VENV/setup_$name.log
+    for name in "$1" "$2"; do
+        LOG=$VENV/$name.log
         : >"$LOG"
-        "$name" </dev/null &
+        "$name" "$3" </dev/null &
         pids+=($!)
     done
     set +m
@@ -243,14 +260,11 @@ main() {
     one_at_a_time
     if ! environment_is_done; then
         find_python
-        if [ "$MODE" = ros ]; then install_beside_ros; else install_wheels; fi
-        mark_done python "$BASE_PYTHON"
-        mark_done environment "$(environment_checksum)"
+        if [ "$MODE" = ros ]; then install_beside_ros; else begin_with_wheels; fi
     fi
-    # the kernels need what the package requires, which ROS may lack
+    # the solver needs what the package requires, which ROS may lack
     if [ "$MODE" = ros ]; then install_package; fi
-    if [ "${#LOCKS[@]}" -gt 1 ]; then install_tools; fi
-    at_once install_package build_tf2 compile_kernels
+    at_once beside_the_compiler compile_kernels "${1:-}"
 }
 
-main
+main "$@"

@@ -12,6 +12,7 @@ from collections import deque
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager, ExitStack
 import fcntl
+from importlib.util import find_spec
 import os
 from pathlib import Path
 import random
@@ -114,6 +115,8 @@ def _run(
     """Tell whether the optimisation converged after playing the bag to the node."""
     node_command = [sys.executable, '-m', 'pose_graph_ros.ros.main',
                     *shared.ros_arguments(options), *DEMO_PARAMETERS]
+    if find_spec('tf2_msgs') is None:  # make demo does not build it for the simulated drive
+        node_command += ['-p', 'publish_tf:=false']
     player = [sys.executable, '-m', 'pose_graph_ros.ros.player', str(bag.resolve()),
               str((options.out / 'corrected').resolve()), '--rate', str(options.rate),
               '--hold-out', str(inputs.hold_out)]
