@@ -93,6 +93,7 @@ def minimize(head: tb.IntHead, chi2: float, config: SolverConfig) -> Minimum:
     gn.keep_poses(head, best)
     end, iterations, uphill = Termination.MAX_ITERATIONS, 0, 0
     solved = False  # whether any factorisation succeeded
+    rejected = False  # whether any step was rejected
     chord = False  # whether the next step is a chord step
     current = False  # whether the tree is that of the best poses, without damping
     damping = 0.0
@@ -103,7 +104,7 @@ def minimize(head: tb.IntHead, chi2: float, config: SolverConfig) -> Minimum:
         length = _step(head, damping, right, chord=chord)
         if length < math.inf:
             solved = True
-            if damping == uphill == 0 and not chord and iterations > 0 and (
+            if rejected and damping == uphill == 0 and not chord and (
                     gn.product_with_step(head, right) < LEAST_DECREASE * max(chi2, 1.0)):
                 end = Termination.CONVERGED
                 break
@@ -142,6 +143,7 @@ def minimize(head: tb.IntHead, chi2: float, config: SolverConfig) -> Minimum:
         else:
             gn.put_poses(head, best)
             gn.evaluate(head, right)
+            rejected = True
             if not chord:
                 damping = max(FIRST_DAMPING, damping * DAMPING_GROWTH)
                 if damping > LARGEST_DAMPING:
