@@ -122,10 +122,14 @@ def optimize_from_linear_start(graph: Graph, config: SolverConfig) -> BatchResul
         except LinearSolveError:
             continue
         result = replace(_minimize(graph, few, cliques, chi2_of(graph)), start=start)
-        if result.status is not Status.FAILED and (
-                best.status is Status.FAILED or result.chi2 < best.chi2 * (1.0 - SAME_MINIMUM)):
+        better = result.status is not Status.FAILED and (
+            best.status is Status.FAILED or result.chi2 < best.chi2 * (1.0 - SAME_MINIMUM))
+        trusted = result.status is Status.CONVERGED and result.chi2 <= chi2
+        if better and trusted:
+            return result
+        if better:
             best, best_poses = result, graph.poses.copy()
-        if result.status is Status.CONVERGED and result.chi2 <= chi2:
+        if trusted:
             break
     if best is not result or best.status is Status.MAX_ITERATIONS:
         if best.status is Status.FAILED:
