@@ -5,8 +5,8 @@ Our engine on the same worlds, the one module that knows its interface.
 
 A step's time is all that a caller from Python pays: building the tables and the update, the call,
 and with its return an estimate of all nodes that is up to date (`poses` is a view). A step that
-brings no more than the edge from the node before, and perhaps a global pose of the new node, goes
-through `extend`.
+brings no more than the edge from the node before goes through `extend`; what else a step brings
+goes through `update`, as in the back end.
 """
 
 from collections.abc import Callable
@@ -32,7 +32,7 @@ from pose_graph_ros.core.graph.constraints import Edges
 from pose_graph_ros.core.graph.graph import Graph, GraphUpdate
 from pose_graph_ros.core.smoother.incremental import IncrementalSmoother, UpdateResult
 
-NAME = 'ours'
+NAME, REFINED = 'ours', 'ours, refined'
 BATCH = SolverConfig(max_iterations=100, step_tolerance=1e-5)
 SINGLE = SolverConfig(max_iterations=1)
 AfterStep = Callable[[IncrementalSmoother, int], None]
@@ -79,10 +79,52 @@ def run(world: World, plan: Plan, after_step: AfterStep | None = None) -> Run:
     return done
 
 
+def run_refined(world: World, plan: Plan) -> Run:
+    """
+    Run the smoother over a world, and refine each sample, as the node does between two updates.
+
+    Parameters
+    ----------
+    world : World
+    plan : Plan
+
+    """
+    seconds: list[float] = []
+
+    def refine(smoother: IncrementalSmoother, k: int) -> None:
+        finished = k not in plan.samples
+        while not finished:
+            begin = time.perf_counter()
+            finished = smoother.refine().finished
+            seconds.append(time.perf_counter() - begin)
+
+    done = run(world, plan, refine)
+    done.tool, done.refinement = REFINED, seconds
+    done.samples = {k: poses for k, poses in done.samples.items() if k in plan.samples}
+    return done
+
+
+def position_covariances(world: World, step: int, poses: FloatArray) -> FloatArray:
+    """
+    Return the covariances of the positions of all nodes after a step, shape (step + 1, 2, 2).
+
+    Parameters
+    ----------
+    world : World
+    step : int
+    poses : ndarray, shape (step + 1, 3), the optimum
+
+    """
+    edges, observed = world.part(step)
+    smoother = IncrementalSmoother()
+    smoother.update(GraphUpdate(hidden=poses, edges=edges, observed=observed, fix=(0,)))
+    return smoother.covariances()[:, :2, :2]
+
+
 def warm_up() -> None:
     """Run the smoother on small worlds, so that nothing is compiled while times are taken."""
     for world in _small_worlds():
-        run(world, Plan())
+        run_refined(world, Plan(frozenset({world.n_nodes - 1})))
 
 
 def warm_up_batch() -> None:
@@ -118,34 +160,24 @@ class _Steps:
     """What arrives in each step, as a caller has it: lists of arrays, nothing prepared."""
 
     def __init__(self, world: World) -> None:
-        edges, observed = world.edges, world.observed
+        edges = world.edges
         self.world = world
         self.edge_stops = [0, *world.edge_stops.tolist()]
         self.observed_stops = [0, *world.observed_stops.tolist()]
         self.i, self.j = edges.i.tolist(), edges.j.tolist()
         self.mean, self.information = list(edges.mean), list(edges.information)
-        self.observed_mean = list(observed.mean)
-        self.observed_information = list(observed.information)
-        nodes = observed.node.tolist()
-        without_offset = ~np.any(observed.offset, axis=1)
         self.ahead, self.plain = [], []
         for k in range(world.n_nodes):
             edge, edge_stop = self.edge_stops[k:k + 2]
             seen, seen_stop = self.observed_stops[k:k + 2]
             ahead = k > 0 and (self.i[edge], self.j[edge]) == (k - 1, k)
             self.ahead.append(ahead)
-            self.plain.append(
-                ahead and edge_stop == edge + 1
-                and (seen_stop == seen or (seen_stop == seen + 1 and nodes[seen] == k
-                                           and bool(without_offset[seen]))))
+            self.plain.append(ahead and edge_stop == edge + 1 and seen_stop == seen)
 
     def extending(self, smoother: IncrementalSmoother, k: int) -> UpdateResult:
         """Do a step that only adds a node to the end."""
-        edge, seen = self.edge_stops[k], self.observed_stops[k]
-        if self.observed_stops[k + 1] == seen:
-            return smoother.extend(self.mean[edge], self.information[edge])
-        return smoother.extend(self.mean[edge], self.information[edge],
-                               self.observed_mean[seen], self.observed_information[seen])
+        edge = self.edge_stops[k]
+        return smoother.extend(self.mean[edge], self.information[edge])
 
     def updating(self, smoother: IncrementalSmoother, k: int) -> UpdateResult:
         """Do any other step; a node that goes on from the last one is added along the chain."""

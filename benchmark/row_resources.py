@@ -45,7 +45,6 @@ smoother = IncrementalSmoother()
 smoother.update(GraphUpdate(hidden=np.zeros((1, 3)), fix=[0]))
 for _ in range(3):
     smoother.extend(mean, information)
-smoother.extend(mean, information, mean, information)
 smoother.update(GraphUpdate(edges=Edges([0], [3], mean[None], information[None], [1])))
 smoother.newest_covariance()
 print(imported - begin, warm - imported, time.perf_counter() - warm)

@@ -43,6 +43,8 @@ class Run:
     """Time of each step, shape (steps,) [s]; fewer than the world has nodes if it ended early."""
     samples: dict[int, FloatArray] = field(default_factory=dict)
     """Estimates, shape (step + 1, 3), after the steps of the plan and after the last one."""
+    refinement: list[float] = field(default_factory=list)
+    """Time of each iteration of the refinements at the samples [s]."""
     note: str = ''
     """What a reader of the figures must know."""
 

@@ -35,7 +35,8 @@ from pose_graph_ros.core.measurements import (
     rejected,
 )
 from pose_graph_ros.core.odometry.hidden_nodes import HiddenNodes
-from pose_graph_ros.core.smoother.incremental import IncrementalSmoother, UpdateResult
+from pose_graph_ros.core.refiner import Refiner
+from pose_graph_ros.core.smoother.incremental import IncrementalSmoother, Refinement
 from pose_graph_ros.core.sources import constraint_names
 from pose_graph_ros.core.sources.factor_builder import FactorBuilder, Queue
 from pose_graph_ros.core.sources.measurement_constraints import attach
@@ -46,7 +47,6 @@ from pose_graph_ros.core.transaction import Transaction
 
 # Sigmas of the edge to a pose that was set by `set_pose` [m, m, rad]: the motion is unknown.
 RELOCATION_SIGMA = (1000.0, 1000.0, 3.0)
-REWEIGHTINGS = 3  # maximum number of reweightings of robust losses in one update
 
 
 class PoseGraphBackend:
@@ -82,6 +82,7 @@ class PoseGraphBackend:
         self._newest_node_covariance = np.zeros((3, 3))
         """In map axes, shape (3, 3)."""
         self._reweighting = Reweighting()
+        self._refiner = Refiner(self._smoother, self._reweighting)
         self._factors = FactorBuilder(self._config, self._reweighting)
         self._pipeline = MeasurementPipeline(self._nodes, self._config)
         self._quarantine = Queue()
@@ -303,13 +304,26 @@ class PoseGraphBackend:
             return (UpdateReport(Status.FAILED, transaction.failure, 0, 0, self._chi2),
                     transaction.queue)
         self._factors.commit()
+        self._refiner.restart()
         self._alignment.add(queue.observed)
-        result = self._reweight(transaction.result)
+        result, self._settled = self._refiner.reweight(transaction.result, self._transaction)
         self._recheck_alignment()
         self._evaluate()
         return UpdateReport(
             result.status, '', len(queue), result.iterations, self._chi2, result.relinearized,
             result.eliminated, result.visited), Queue()
+
+    def refine(self) -> Refinement:
+        """Do an iteration from the estimate of an update to the optimum; `optimize` needs none."""
+        is_new = not self._refiner.finished
+        result = self._refiner.refine()
+        if is_new and result.finished:
+            self._evaluate()
+        return result
+
+    def interrupt_refinement(self) -> None:
+        """Let the running or the next `refine` end early, without effect; any thread may call."""
+        self._smoother.interrupt()
 
     def _transaction(self) -> Transaction:
         return Transaction(self.graph, self._alignment, self._factors)
@@ -319,22 +333,6 @@ class PoseGraphBackend:
         # the only part of an update that is linear in the graph: 0.03 ms per 1000 nodes
         self._chi2 = self._smoother.chi2()
         self._newest_node_covariance = self._smoother.newest_covariance()
-
-    def _reweight(self, result: UpdateResult) -> UpdateResult:
-        """Update the weights of robust losses and solve again, up to `REWEIGHTINGS` times."""
-        self._settled = result.status is Status.CONVERGED
-        for _ in range(REWEIGHTINGS if len(self._reweighting) > 0 else 0):
-            edges, observed = self._reweighting.changes(self.graph)
-            if len(edges) + len(observed) == 0:
-                return result
-            self._settled = False
-            change = GraphUpdate(weigh_edges=edges, weigh_observed=observed)
-            with self._transaction() as transaction:
-                transaction.solved(self._smoother.update(change))
-            if transaction.failure != '':
-                return result
-            result = transaction.result
-        return result
 
     def _recheck_alignment(self) -> None:
         """Rotate and optimise the graph anew if the angle between odometry and map is wrong."""
@@ -377,7 +375,7 @@ class PoseGraphBackend:
         if self.graph.has_touched:
             # the solver has not updated the factorisation of the smoother
             self._smoother.update(GraphUpdate())
-        self._settled = result.status is not Status.MAX_ITERATIONS
+        self._settled = self._refiner.finished = result.status is not Status.MAX_ITERATIONS
         self._chi2 = result.chi2
         self._newest_node_covariance = self._smoother.newest_covariance()
         return UpdateReport(result.status, '', 0, result.iterations, result.chi2)

@@ -4,7 +4,8 @@
 The thread that owns the engine: the single writer of the graph. Imports no ROS.
 
 Callbacks post measurements and request updates or jobs; they never wait for a solver. They read
-an immutable estimate that the thread replaces as a whole.
+an immutable estimate that the thread replaces as a whole. While there is nothing else to do after
+an update, the thread refines the estimate, and then waits.
 """
 
 from collections import Counter, deque
@@ -29,6 +30,7 @@ Job = Callable[[PoseGraphBackend], Result]
 """A function that is called in the worker's thread with the engine."""
 
 N_SET_ASIDE = 3  # number of constraints in the quarantine that the status names
+VISIBLE = 1e-3  # distance that nodes must have moved for an estimate between two updates [m]
 INBOX_LIMIT = 100_000  # measurements that wait for the thread; further ones are rejected
 # The thread takes what has come in this time together, as it costs as much to wake it as to add a
 # measurement: only an update makes a new estimate of them, and for that it takes all [s].
@@ -79,6 +81,7 @@ class Worker:
         self._update_wanted = False
         self._jobs: list[tuple[str, Job[object], Future[object]]] = []
         self._stopping = False
+        self._may_refine, self._refined = False, 0.0  # and the distance that nodes have moved [m]
         self._condition = threading.Condition()
         self._revision = backend.revision
         self._solves, self._solve_total, self._solve_max = 0, 0.0, 0.0
@@ -104,6 +107,7 @@ class Worker:
         """Make the thread end, wait for it at most a time [s], and return whether it has ended."""
         with self._condition:
             self._stopping = True
+            self._backend.interrupt_refinement()
             self._condition.notify()
         self._thread.join(timeout)
         return not self._thread.is_alive()
@@ -130,6 +134,7 @@ class Worker:
         """Request an update of the graph with all posted measurements."""
         with self._condition:
             self._update_wanted = True
+            self._backend.interrupt_refinement()
             self._condition.notify()
 
     def request_final_optimization(self) -> 'Future[UpdateReport]':
@@ -155,6 +160,7 @@ class Worker:
                 future.cancel()
             else:
                 self._jobs.append((what, job, future))  # type: ignore[arg-type]
+                self._backend.interrupt_refinement()
                 self._condition.notify()
         return future
 
@@ -168,8 +174,10 @@ class Worker:
         self.prepared = True
         while True:
             with self._condition:
-                self._condition.wait_for(lambda: len(self._inbox) > 0 or self._has_more_to_do())
-                if self.estimate is not None:  # until then no pose can be published
+                self._condition.wait_for(lambda: (
+                    self._may_refine or len(self._inbox) > 0 or self._has_more_to_do()))
+                # until there is an estimate no pose can be published
+                if self.estimate is not None and not self._may_refine:
                     self._condition.wait_for(self._has_more_to_do, GATHERING)
                 if self._stopping:
                     for *_, future in self._jobs:
@@ -178,11 +186,16 @@ class Worker:
                 batch, self._inbox = self._inbox, deque()
                 wanted, self._update_wanted = self._update_wanted, False
                 jobs, self._jobs = self._jobs, []
+            refines = not (wanted or len(batch) + len(jobs) > 0)
             # no error may end the thread, which is the only one that adds measurements
             try:
-                self._process(batch, wanted=wanted)
+                if refines:
+                    self._refine()
+                else:
+                    self._process(batch, wanted=wanted)
             except Exception as error:
-                self._count_failure('an update', error, len(batch))
+                self._may_refine = False
+                self._count_failure('a refinement' if refines else 'an update', error, len(batch))
             for what, job, future in jobs:
                 self._do(what, job, future)
 
@@ -204,6 +217,15 @@ class Worker:
         if report is not None or self.estimate is None or stale:
             self._publish()
         self._report(report, len(batch))
+        self._may_refine = self._may_refine or report is not None
+
+    def _refine(self) -> None:
+        """Refine a little, while there is nothing else to do; publish moves that can be seen."""
+        result = self._backend.refine()
+        self._may_refine = not result.finished
+        self._refined += result.moved
+        if self._refined > VISIBLE:
+            self._publish()
 
     def _do(self, what: str, job: Job[object], future: Future[object]) -> None:
         """Do a job and answer it, unless the thread is to end."""
@@ -264,7 +286,7 @@ class Worker:
         return report
 
     def _publish(self) -> None:
-        self._revision = self._backend.revision
+        self._revision, self._refined = self._backend.revision, 0.0
         self.estimate = self._backend.estimate(with_path=False)
         if self.estimate is not None and not self._stopping:
             self._on_estimate(self._backend)

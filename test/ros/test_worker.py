@@ -12,9 +12,11 @@ import pytest
 from pose_graph_ros.core.backend import PoseGraphBackend
 from pose_graph_ros.core.batch import optimizer
 from pose_graph_ros.core.batch.optimizer import Status
+from pose_graph_ros.core.config import BackendConfig, OdometrySource, SmootherConfig
 from pose_graph_ros.core.estimate import Estimate
 from pose_graph_ros.core.exceptions import FileFormatError
 from pose_graph_ros.core.measurements import Answer, GlobalPose, OdometrySample
+from pose_graph_ros.core.smoother.incremental import Refinement
 from pose_graph_ros.ros.worker import Worker
 
 PATIENCE = 10.0
@@ -91,17 +93,14 @@ def test_every_update_hands_out_a_path_that_is_current() -> None:
     wait_until(lambda: worker.status.processed == 5)
     for step in range(5, 40):
         worker.post('odom', sample(step))
-        already = len(estimates)
         worker.request_update()
-        wait_until(lambda already=already: len(estimates) > already)
+        wait_until(lambda stamp=step * 100_000_000: (
+            len(estimates) > 0 and estimates[-1].path.stamps_ns[-1] == stamp))
         path = estimates[-1].path
-        assert path.stamps_ns[-1] == step * 100_000_000
         np.testing.assert_allclose(path.poses[-1], [4.7 + 0.3 * step, 0.0, 0.0], atol=1e-9)
     # late by 3 s, and as certain as all the others together
     worker.post('pose', GlobalPose(900_000_000, np.array([7.4, 1.0, 0.0]), 0.01 * np.eye(3)))
-    already = len(estimates)
     worker.request_update()
-    wait_until(lambda: len(estimates) > already)
     # the status follows the estimate
     wait_until(lambda: worker.status.updates == 2)
     assert estimates[-1].path.poses[-1, 1] > 0.1
@@ -266,3 +265,66 @@ def test_nothing_is_begun_after_the_worker_was_stopped() -> None:
     assert worker.stop(PATIENCE)
     assert len(begun) == 1
     assert job.cancelled()
+
+
+class Endless(PoseGraphBackend):
+    """A back end whose refinement is never finished, with the number of its calls."""
+
+    calls = 0
+
+    def refine(self) -> Refinement:
+        self.calls += 1
+        time.sleep(1e-4)
+        return Refinement(finished=False, moved=0.0)
+
+
+def test_a_refinement_lets_everything_else_go_first() -> None:
+    backend = Endless()
+    worker = Worker(backend, lambda _: None)
+    worker.start()
+    worker.request_update()
+    wait_until(lambda: backend.calls > 10)
+    for step in range(1, 40):
+        assert worker.post('odom', sample(step))
+        wait_until(lambda step=step: worker.status.processed == step)
+        assert worker.call(lambda backend: backend.n_waiting).result(PATIENCE) == 0
+    already = backend.calls
+    wait_until(lambda: backend.calls > already)
+    assert worker.stop(PATIENCE)
+
+
+class Recording(PoseGraphBackend):
+    """A back end that keeps what its refinement has returned."""
+
+    def __init__(self, config: BackendConfig) -> None:
+        super().__init__(config)
+        self.refinements: list[Refinement] = []
+
+    def refine(self) -> Refinement:
+        self.refinements.append(super().refine())
+        return self.refinements[-1]
+
+
+def test_between_updates_the_estimate_is_refined_and_published_until_nothing_is_left() -> None:
+    rng, estimates = np.random.default_rng(1), []
+    backend = Recording(BackendConfig(
+        odometry={'odom': OdometrySource(reorder_window=0.0)},
+        smoother=SmootherConfig(alpha=1.0, budget=1.0, budget_share=1.0)))
+    worker = Worker(backend, lambda backend: estimates.append(backend.estimate()))
+    worker.start()
+    for step in range(1, 200):
+        worker.post('odom', sample(step))
+        if step % 10 == 0:
+            worker.post('pose', GlobalPose(step * 100_000_000, np.array(
+                [0.3 * step, 0.0, 0.0]) + 0.1 * rng.normal(size=3), 0.01 * np.eye(3)))
+    worker.request_update()
+    wait_until(lambda: len(backend.refinements) > 0 and backend.refinements[-1].finished)
+    path = worker.call(lambda backend: backend.estimate().path).result(PATIENCE)
+    assert sum(refinement.moved for refinement in backend.refinements) > 0.001
+    np.testing.assert_allclose(estimates[-1].path.poses, path.poses, atol=0.002)
+    n = len(backend.refinements)
+    time.sleep(0.05)
+    assert len(backend.refinements) == n    # the thread sleeps
+    worker.request_final_optimization().result(PATIENCE)
+    np.testing.assert_allclose(estimates[-1].path.poses, path.poses, atol=0.001)
+    assert worker.stop(PATIENCE)

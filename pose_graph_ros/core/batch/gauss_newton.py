@@ -302,7 +302,7 @@ def settle(head):  # type: ignore[no-untyped-def]
         error2 += observed_f[k, tb.OBS_ERROR2]
         observed_i[k, tb.OBS_WAITS] = 0
     scalars[tb.CHI2] = chi2
-    head[tb.N_WAITING] = head[tb.N_TURNED] = 0
+    head[tb.N_WAITING] = head[tb.N_TURNED] = head[tb.REFINED] = head[tb.LISTED] = 0
     if not 0.0 < scalars[tb.SETTING_BUDGET] < error2:
         return
     threshold = factors.LEAST_FRACTION * scalars[tb.SETTING_SHARE]

@@ -33,6 +33,8 @@ from pose_graph_ros.core.saved_columns import Choices, Integers, Numbers
 WINDOW = 200
 # Smallest relative change of a weight that is applied at an update.
 LEAST_CHANGE = 0.005
+# The same of a refinement: number of constraints at a time, and smallest change.
+PART, LEAST_REFINED = 2000, 1e-4
 
 _LOSSES = tuple(Loss)
 
@@ -199,6 +201,27 @@ class Reweighting:
         """
         return (self._edges.changes(graph, self._edges.some(), least=LEAST_CHANGE),
                 self._observed.changes(graph, self._observed.some(), least=LEAST_CHANGE))
+
+    def changes_of_part(
+        self, graph: Graph, begin: int,
+    ) -> tuple[Mapping[int, float], Mapping[int, float]]:
+        """
+        Return new weights of edges and of observed nodes, by row, for a refinement.
+
+        At most `PART` constraints of each kind are considered, those from an index on, and only
+        weights that change by more than the fraction `LEAST_REFINED` are returned.
+
+        Parameters
+        ----------
+        graph : Graph
+        begin : int
+
+        """
+        edges, observed = (
+            table.changes(graph, (begin + np.arange(min(PART, size))) % max(size, 1),
+                          least=LEAST_REFINED)
+            for table in (self._edges, self._observed) for size in (len(table.rows),))
+        return edges, observed
 
     def all_changes(
         self, graph: Graph, widened: float = 1.0,

@@ -113,7 +113,7 @@ OBS_NODE, OBS_NEXT, OBS_KIND, OBS_WAITS, OBS_LOGGED, OBS_I = range(6)
 #   VALUES: index in pool_f of its rows of R, with the update matrix behind them
 #   MARKED: stamp (FRONT_SERIAL) of the last marking for elimination; while marked cliques are
 #       eliminated, the number of marked children that are left
-#   BUILT: stamp (ITERATION) of the elimination
+#   BUILT: stamp (ITERATION) of the last elimination or solution
 #   BORN, VALUES_BORN, CLIQUE_LOGGED: stamps (UPDATE) of taking the row, of taking the values, and
 #       of the last log of the row
 #   ANCHORED: 1 if a node at or below it is fixed, observed or has an edge to a bias
@@ -164,11 +164,16 @@ NAMES: Final = (*FLOAT_TABLES, *INT_TABLES)
 #       by more than alpha sigmas, and of cliques whose frames turned; their lists are in work_i
 #   NODE_ROOM, EDGE_ROOM, OBSERVED_ROOM: capacity of all tables in nodes, edges and observed nodes
 #   NEWEST: newest node that is a pose, or -1
+#   SINCE: first stamp BUILT of the cliques that back-substitution has to solve for
+#   REFINED: first ITERATION after the last refinement; cliques BUILT before it are at the optimum
+#   LISTED: UPDATE that has listed all that the next iteration of a refinement linearizes again
+#   ROUND: number of iterations of the refinement so far
+#   INTERRUPT: set to 1 by another thread to end a refinement
 (N_NODES, N_EDGES, N_OBSERVED, N_CLIQUES, FREE_CLIQUE, POOL_F_END, POOL_I_END, N_TOUCHED, N_FREED,
  N_WAITING, LOG_F_END, LOG_I_END, UPDATE, ITERATION, FRONT_SERIAL, STRUCTURE, NEED_F,
  NEED_I, NEED_WORK, BAD_NODE, N_RELINEARIZED, N_ELIMINATED, N_VISITED, N_ITERATIONS, N_ROOTS,
- N_CHECKS, N_CHANGED, N_TURNED, NODE_ROOM, EDGE_ROOM, OBSERVED_ROOM, NEWEST, COUNTERS_END) = range(
-     2 * len(NAMES), 2 * len(NAMES) + 33)
+ N_CHECKS, N_CHANGED, N_TURNED, NODE_ROOM, EDGE_ROOM, OBSERVED_ROOM, NEWEST, SINCE, REFINED,
+ LISTED, ROUND, INTERRUPT, COUNTERS_END) = range(2 * len(NAMES), 2 * len(NAMES) + 38)
 # Sizes of the blocks of the pools: exact up to 64 numbers, then in steps of an eighth.
 SIZES: Final = [*range(65)]
 while SIZES[-1] < 2**31:
@@ -184,16 +189,17 @@ HEAD_SIZE: Final = COUNTERS_END + 2 * N_SIZES
 #   SETTING_ALPHA, SETTING_BUDGET, SETTING_SHARE: `alpha` [sigma], `budget` and `budget_share`
 #       [sigma^2] of `SmootherConfig`
 #   DAMPING: damping of Levenberg-Marquardt, as a factor on the squared diagonal scales
-#   ZEROS (3): zeros, an identity pose for kernels
 #   CHI2: energy of all constraints, weighted [sigma^2]
 #   ERROR2_BEFORE: ERROR2_SUM of the iteration before [sigma^2]
-(ERROR2_SUM, N_MOVED, SETTING_ALPHA, SETTING_BUDGET, SETTING_SHARE, DAMPING, ZEROS, CHI2,
- ERROR2_BEFORE, N_SCALARS) = (0, 1, 2, 3, 4, 5, 6, 9, 10, 11)
+#   LOWEST: lowest CHI2 of the refinement so far [sigma^2]
+#   LARGEST_MOVE: largest change of a coordinate of a position by the last iteration of it [m]
+(ERROR2_SUM, N_MOVED, SETTING_ALPHA, SETTING_BUDGET, SETTING_SHARE, DAMPING, CHI2, ERROR2_BEFORE,
+ LOWEST, LARGEST_MOVE, N_SCALARS) = range(11)
 
 # Largest counter value that rows keep as a stamp of 32 bits; `restart_stamps` is due beyond it.
 # FRONT_SERIAL reaches it after hours, UPDATE after some hundred days.
 LAST_STAMP: Final = 2**30
-COUNTERS_OF_STAMPS: Final = (UPDATE, ITERATION, FRONT_SERIAL)
+COUNTERS_OF_STAMPS: Final = (UPDATE, ITERATION, FRONT_SERIAL, SINCE, REFINED, LISTED)
 STAMPS: Final = {
     'node_i': (FRONT, CHANGED, NODE_LOGGED, SOLUTION_LOGGED),
     'edge_i': (EDGE_CHECKED, EDGE_LOGGED, ENERGY_LOGGED),

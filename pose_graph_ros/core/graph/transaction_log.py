@@ -15,6 +15,9 @@ from pose_graph_ros.core.graph import pools, tables as tb
 
 # Kinds of entries of the log; an entry ends with its row (but for START) and its kind in log_i.
 NODE, EDGE, OBSERVED, CLIQUE, TAKEN_CLIQUE, SOLUTION, EDGE_ENERGY, START = range(8)
+# Numbers of floats and of integers in the entries of each kind, but for START.
+_FLOATS = (tb.NODE_F, tb.EDGE_F, tb.OBS_F, tb.CLIQUE_F, 0, tb.SCALE_T, 2)
+_INTEGERS = (tb.NODE_I, tb.EDGE_I, tb.OBS_I, tb.CLIQUE_I, 0, 0, 1)
 # Counters in the first entry.
 STARTED_WITH = (
     tb.N_NODES, tb.N_EDGES, tb.N_OBSERVED, tb.STRUCTURE, tb.N_TOUCHED, tb.N_WAITING, tb.NEWEST)
@@ -300,21 +303,26 @@ def poses_before(head, poses):  # type: ignore[no-untyped-def]
     end_f, end_i = head[tb.LOG_F_END], head[tb.LOG_I_END]
     while end_i > 0 and log_i[end_i - 1] != START:
         row, code = log_i[end_i - 2], log_i[end_i - 1]
-        end_i -= 2
+        end_f -= _FLOATS[code]
+        end_i -= 2 + _INTEGERS[code]
         if code in (NODE, SOLUTION):
-            end_f -= tb.NODE_F if code == NODE else tb.SCALE_T
-            end_i -= tb.NODE_I if code == NODE else 0
             for k in range(3):
                 poses[row, k] = log_f[end_f + tb.POSE + k]
-        elif code == EDGE:
-            end_f -= tb.EDGE_F
-            end_i -= tb.EDGE_I
-        elif code == EDGE_ENERGY:
-            end_f -= 2
-            end_i -= 1
-        elif code == OBSERVED:
-            end_f -= tb.OBS_F
-            end_i -= tb.OBS_I
-        elif code == CLIQUE:
-            end_f -= tb.CLIQUE_F
-            end_i -= tb.CLIQUE_I
+
+
+@kernel
+def largest_move(head):  # type: ignore[no-untyped-def]
+    """Return by how much the update has moved poses: the largest change of a coordinate [m]."""
+    node_f, log_f, node_i = tb.node_f(head), tb.log_f(head), tb.node_i(head)
+    log_i = tb.log_i(head)
+    largest = 0.0
+    end_f, end_i = head[tb.LOG_F_END], head[tb.LOG_I_END]
+    while end_i > 0 and log_i[end_i - 1] != START:
+        row, code = log_i[end_i - 2], log_i[end_i - 1]
+        end_f -= _FLOATS[code]
+        end_i -= 2 + _INTEGERS[code]
+        if code in (NODE, SOLUTION) and node_i[row, tb.IS_BIAS] == 0:
+            for k in range(2):
+                move = abs(node_f[row, tb.POSE + k] - log_f[end_f + tb.POSE + k])
+                largest = max(largest, move)
+    return largest

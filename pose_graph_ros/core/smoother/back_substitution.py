@@ -48,15 +48,17 @@ def _move(head, v, dx, dy, dth, phi, alpha):  # type: ignore[no-untyped-def]
     f[tb.POSE + 2] = factors.wrap(f[tb.REF + 2] + dth)
     moved = max(abs(dx - f[tb.SEEN]), abs(dy - f[tb.SEEN + 1])) * f[tb.SCALE_T]
     turned = dth - f[tb.SEEN + 2]
-    if moved <= alpha and abs(turned) * f[tb.SCALE_R] <= alpha:
-        return
-    node_i[v, tb.CHANGED] = head[tb.ITERATION]
-    work_i[3 * room + head[tb.N_CHANGED]] = v
-    head[tb.N_CHANGED] += 1
+    if moved > alpha or abs(turned) * f[tb.SCALE_R] > alpha:
+        node_i[v, tb.CHANGED] = head[tb.ITERATION]
+        work_i[3 * room + head[tb.N_CHANGED]] = v
+        head[tb.N_CHANGED] += 1
+    elif head[tb.SINCE] == head[tb.ITERATION]:
+        return      # a refinement checks all nodes
     # approximate squared linearization error due to the turn since the last check
     turn2 = (dth - phi - f[tb.CHECKED_TURN]) ** 2
     error2 = turn2 * (turn2 * f[tb.SCALE_R] * f[tb.SCALE_R] + USUAL_ENERGY)
-    if error2 > scalars[tb.SETTING_SHARE] or moved > CHECK_MOVE * alpha:
+    if (error2 > scalars[tb.SETTING_SHARE] or moved > CHECK_MOVE * alpha
+            or head[tb.SINCE] < head[tb.ITERATION]):
         f[tb.CHECKED_TURN] = dth - phi
         work_i[room + head[tb.N_CHECKS]] = v
         head[tb.N_CHECKS] += 1
@@ -143,7 +145,7 @@ def _update_child(head, c, stack, depth):  # type: ignore[no-untyped-def]
     node_i, clique_i, pool_i = tb.node_i(head), tb.clique_i(head), tb.pool_i(head)
     clique_f = tb.clique_f(head)
     row, iteration = clique_i[c], head[tb.ITERATION]
-    if row[tb.BUILT] == iteration:
+    if row[tb.BUILT] >= head[tb.SINCE]:
         return SOLVED
     limit = FREE_FRACTION * tb.scalars(head)[tb.SETTING_ALPHA]
     begin = row[tb.NODES] + row[tb.N_FRONTAL]
@@ -180,16 +182,20 @@ def back_substitute(head):  # type: ignore[no-untyped-def]
     clique_i, clique_f, work_i = tb.clique_i(head), tb.clique_f(head), tb.work_i(head)
     node_f, scalars = tb.node_f(head), tb.scalars(head)
     stack, depth = work_i, head[tb.N_ROOTS]
+    refines = head[tb.SINCE] < head[tb.ITERATION]
     n_visited = 0
     for k in range(depth):
         clique_f[stack[k], tb.TURN] = 0.0
     head[tb.N_TURNED] = head[tb.N_CHECKS] = head[tb.N_CHANGED] = 0
     scalars[tb.N_MOVED] = 0.0
     while depth > 0:
+        if refines and head[tb.INTERRUPT] != 0:
+            break   # the caller rolls back
         depth -= 1
         c = stack[depth]
         while c >= 0:
             _visit(head, c)
+            clique_i[c, tb.BUILT] = head[tb.ITERATION]
             n_visited += 1
             turn = clique_f[c, tb.TURN]
             drift = clique_f[c, tb.DRIFT]
@@ -203,7 +209,7 @@ def back_substitute(head):  # type: ignore[no-untyped-def]
                     transaction_log.log_clique(head, child)
                     clique_f[child, tb.DRIFT] += drift
                 code = _update_child(head, child, stack, depth)
-                if code != LEFT:
+                if code != LEFT or refines:
                     _set_turn(head, child, turn)
                 if code == SOLVED:
                     _fetch_rows(head, child)

@@ -5,16 +5,16 @@ Extension of a chain by a node behind the newest pose, in constant time.
 
 The newest pose is alone in the root clique. Its rows of R give its equations `R^T R` and `R^T d`,
 which make a front of two nodes with the new edge. The old root is eliminated from it, and the new
-node becomes the root. Without an observed node the solution is known: the new node lies where
-odometry predicts it, and no other node moves.
+node becomes the root. The solution is known: the new node lies where odometry predicts it, and no
+other node moves.
 """
 
 import math
 
-from pose_graph_ros.core.compiled.jit import FLAG, kernel, NUMBERS, ROWS
+from pose_graph_ros.core.compiled.jit import kernel, NUMBERS, ROWS
 from pose_graph_ros.core.elimination.fronts import LEAST_PIVOT
 from pose_graph_ros.core.graph import factors, pools, rows, tables as tb, transaction_log
-from pose_graph_ros.core.graph.editing import scale_by_edge, scale_by_observed
+from pose_graph_ros.core.graph.editing import scale_by_edge
 
 # Return codes of `extend`.
 EXTENDED, NO_ROOM, NOT_A_CHAIN = range(3)
@@ -98,36 +98,28 @@ def _copy_rows(front, ld, begin, end, at, pool_f):  # type: ignore[no-untyped-de
             at += 1
 
 
-@kernel(signature=(tb.HEAD, NUMBERS, ROWS, NUMBERS, ROWS, FLAG))
-def extend(  # type: ignore[no-untyped-def]
-    head, mean, information, observed_mean, observed_information, with_observed,
-):
+@kernel(signature=(tb.HEAD, NUMBERS, ROWS))
+def extend(head, mean, information):  # type: ignore[no-untyped-def]
     """
     Return EXTENDED after appending a node to the newest pose by an edge, or why that failed.
 
-    If there is an observed node, the back-substitution is left to do, and the new root is on its
-    stack. NO_ROOM: a table is full. NOT_A_CHAIN: a general update is necessary. After these two
-    the graph is unchanged.
+    NO_ROOM: a table is full. NOT_A_CHAIN: a general update is necessary. After these two the graph
+    is unchanged.
 
     Parameters
     ----------
     mean, information : ndarray, shapes (3,) and (3, 3), of the edge
-    observed_mean, observed_information : ndarray, likewise, any numbers if there is none
-    with_observed : bool
 
     """
     clique_f, node_f, edge_f = tb.clique_f(head), tb.node_f(head), tb.edge_f(head)
-    observed_f, pool_f, work_f = tb.observed_f(head), tb.pool_f(head), tb.work_f(head)
-    scalars, node_i, edge_i = tb.scalars(head), tb.node_i(head), tb.edge_i(head)
-    observed_i, clique_i, pool_i = tb.observed_i(head), tb.clique_i(head), tb.pool_i(head)
-    work_i = tb.work_i(head)
-    v, e, k = head[tb.N_NODES], head[tb.N_EDGES], head[tb.N_OBSERVED]
-    if (v >= head[tb.NODE_ROOM] or e >= head[tb.EDGE_ROOM] or k >= head[tb.OBSERVED_ROOM]
+    pool_f, work_f, node_i = tb.pool_f(head), tb.work_f(head), tb.node_i(head)
+    edge_i, clique_i, pool_i = tb.edge_i(head), tb.clique_i(head), tb.pool_i(head)
+    v, e = head[tb.N_NODES], head[tb.N_EDGES]
+    if (v >= head[tb.NODE_ROOM] or e >= head[tb.EDGE_ROOM]
             or head[tb.POOL_F_END] + _PAIR + _ROOT > len(pool_f)
             or head[tb.POOL_I_END] + 3 > len(pool_i) or len(work_f) < 256):
         return NO_ROOM
-    if (len(mean) != 3 or information.shape != (3, 3) or len(observed_mean) != 3
-            or observed_information.shape != (3, 3)):
+    if len(mean) != 3 or information.shape != (3, 3):
         return NOT_A_CHAIN
     last = head[tb.NEWEST]
     if (last < 0 or head[tb.N_TOUCHED] > 0 or head[tb.UPDATE] > tb.LAST_STAMP
@@ -138,10 +130,6 @@ def extend(  # type: ignore[no-untyped-def]
     if old[tb.N_FRONTAL] != 1 or old[tb.N_SEPARATOR] != 0:
         return NOT_A_CHAIN
     if not rows.write_edge(head, e, last, v, mean, information, 0, 1.0):
-        return NOT_A_CHAIN
-    if with_observed and not rows.write_observed(
-            head, k, v, scalars[tb.ZEROS:tb.ZEROS + 3], observed_mean, observed_information, 0,
-            1.0):
         return NOT_A_CHAIN
     transaction_log.begin(head)
     _write_node(head, v, last, mean)
@@ -169,10 +157,6 @@ def extend(  # type: ignore[no-untyped-def]
     for m in range(3):
         for n in range(4):
             root[4 * m + n] = front[7 * (m + 3) + n + 3]
-    if with_observed:
-        factors.linearize_observed(head, k)
-        factors.add_observed(head, k, 0, root, 4)
-        scale_by_observed(head, k, 1.0)
     _set_least_pivots(head, v, least)
     if bad < 0:
         bad = _eliminate_3(root, 3, least)
@@ -187,7 +171,7 @@ def extend(  # type: ignore[no-untyped-def]
     pool_i[clique_i[r, tb.NODES]] = v
     _copy_rows(root, 4, 0, 3, clique_i[r, tb.VALUES], pool_f)
     clique_i[r, tb.CHILD] = c
-    clique_i[r, tb.ANCHORED] = 1 if with_observed else old[tb.ANCHORED]
+    clique_i[r, tb.ANCHORED] = old[tb.ANCHORED]
     for m in range(tb.CLIQUE_F):
         clique_f[r, m] = clique_f[c, m] = 0.0  # SLIP_SCALE is 0 with one separator node
     old[tb.PARENT], old[tb.SIBLING], old[tb.N_SEPARATOR] = r, -1, 1
@@ -198,17 +182,6 @@ def extend(  # type: ignore[no-untyped-def]
     edge_i[e, tb.NEXT_I], node_i[last, tb.EDGE_LIST] = node_i[last, tb.EDGE_LIST], 2 * e
     edge_i[e, tb.NEXT_J], node_i[v, tb.EDGE_LIST] = -1, 2 * e + 1
     head[tb.N_NODES], head[tb.N_EDGES], head[tb.NEWEST] = v + 1, e + 1, v
-    if with_observed:
-        observed_i[k, tb.OBS_NEXT], node_i[v, tb.OBSERVED_LIST] = -1, k
-        observed_i[k, tb.OBS_WAITS] = 0
-        observed_i[k, tb.OBS_LOGGED] = head[tb.UPDATE]
-        factors.check_observed(head, k)
-        scalars[tb.CHI2] += observed_f[k, tb.OBS_ENERGY]
-        head[tb.N_OBSERVED] = k + 1
-        head[tb.ITERATION] += 1
-        clique_i[r, tb.BUILT] = head[tb.ITERATION]
-        work_i[0] = r
-        head[tb.N_ROOTS] = 1
     return EXTENDED
 
 

@@ -12,9 +12,9 @@ from pose_graph_ros.core.exceptions import GraphUpdateError
 from pose_graph_ros.core.geometry import se2
 from pose_graph_ros.core.geometry.se2 import FloatArray
 from pose_graph_ros.core.graph import tables as tb
-from pose_graph_ros.core.graph.constraints import EdgeKind, Edges, ObservedKind, ObservedNodes
+from pose_graph_ros.core.graph.constraints import EdgeKind, Edges
 from pose_graph_ros.core.graph.graph import Graph, GraphUpdate
-from pose_graph_ros.core.smoother import batch_fallback, chain, covariances, step
+from pose_graph_ros.core.smoother import batch_fallback, chain, covariances, refinement, step
 from pose_graph_ros.core.smoother.sparse_inverse import all_covariances
 
 
@@ -27,10 +27,7 @@ class UpdateResult(NamedTuple):
     FAILED if the update was rolled back.
     """
     reason: str
-    """
-    Cause of a failure in one sentence, else empty. `IncrementalSmoother.extend` returns it with
-    MAX_ITERATIONS where only iterations after the first were rolled back.
-    """
+    """Cause of a failure in one sentence, else empty."""
     relinearized: int
     """Constraints and turned clique frames that were linearized again."""
     eliminated: int
@@ -41,9 +38,17 @@ class UpdateResult(NamedTuple):
     """Back-substitutions of the update."""
 
 
+class Refinement(NamedTuple):
+    """What a call of `IncrementalSmoother.refine` has done."""
+
+    finished: bool
+    """Whether there is nothing more to do before the next update."""
+    moved: float
+    """Largest change of a coordinate of a position [m]."""
+
+
+_NOT_REFINED = Refinement(finished=True, moved=0.0)
 _EXTENDED_RESULT = UpdateResult(Status.CONVERGED, '', 0, 1, 1, 1)
-_NO_POSE: FloatArray = np.zeros(3)
-_NO_MATRIX: FloatArray = np.zeros((3, 3))
 
 
 class IncrementalSmoother:
@@ -86,50 +91,77 @@ class IncrementalSmoother:
             raise
         return result
 
-    def extend(
-        self, mean: FloatArray, information: FloatArray,
-        observed_mean: FloatArray | None = None, observed_information: FloatArray | None = None,
-    ) -> UpdateResult:
+    def refine(self) -> Refinement:
+        """
+        Do one iteration from the estimate, which is within a budget of it, to the minimum of chi2.
+
+        The first call after an update solves for all that updates have changed; see `refinement`.
+        After a failure or an interruption the graph is as before, bit for bit. Raises ValueError
+        if edits of the graph wait for an update.
+        """
+        self._require_eliminated()
+        if self.graph.newest_pose < 0:
+            return _NOT_REFINED
+        code = refinement.MORE_MEMORY
+        while code == refinement.MORE_MEMORY:
+            head = self._memory.head
+            self.graph.begin()
+            try:
+                code = refinement.refine(head)
+            except BaseException:
+                self.graph.rollback()
+                raise
+            if code in (refinement.REFINED, refinement.UNFINISHED):
+                moved = float(self._memory['scalars'][tb.LARGEST_MOVE])
+                return Refinement(finished=code == refinement.REFINED, moved=moved)
+            self.graph.rollback()
+            if code == refinement.MORE_MEMORY:
+                self._make_room(*head[tb.NEED_F:tb.NEED_WORK + 1].tolist())
+        head[tb.INTERRUPT] = 0
+        return _NOT_REFINED._replace(finished=code == refinement.FAILED)
+
+    def interrupt(self) -> None:
+        """Let the running or the next `refine` end early, without effect; any thread may call."""
+        self._memory.head[tb.INTERRUPT] = 1
+
+    def extend(self, mean: FloatArray, information: FloatArray) -> UpdateResult:
         """
         Return the result of appending a hidden node to the newest pose by an odometry edge.
 
-        Equal to an update with one hidden node at the pose that odometry predicts, one edge and
-        at most one observed node, at a fraction of the cost. Raises GraphUpdateError as `update`
-        does, and if the graph has no hidden node.
+        Equal to an update with one hidden node at the pose that odometry predicts and one edge, at
+        a fraction of the cost. Raises GraphUpdateError as `update` does, and if the graph has no
+        hidden node.
 
         Parameters
         ----------
         mean : ndarray, shape (3,), pose of the new node in the newest one [m, m, rad]
         information : ndarray, shape (3, 3), in the frame of the new node
-        observed_mean : ndarray, shape (3,), optional, observed pose in the map [m, m, rad]
-        observed_information : ndarray, shape (3, 3), optional, in the frame of the observed pose
 
         """
         head = self._memory.head
-        with_observed = observed_mean is not None
-        if observed_mean is None or observed_information is None:
-            observed_mean, observed_information = _NO_POSE, _NO_MATRIX
         try:
-            code = chain.extend(
-                head, mean, information, observed_mean, observed_information, with_observed)
+            code = chain.extend(head, mean, information)
         except TypeError:
             # the kernel is compiled for contiguous arrays of float64 only
-            mean, information, observed_mean, observed_information = (
-                np.array(argument, dtype=np.float64, order='C')
-                for argument in (mean, information, observed_mean, observed_information))
+            mean, information = (np.array(argument, dtype=np.float64, order='C')
+                                 for argument in (mean, information))
             code = chain.NO_ROOM
         if code == chain.EXTENDED:
-            return self._solve_extended() if with_observed else _EXTENDED_RESULT
-        arguments = (mean, information, observed_mean, observed_information)
-        shapes = tuple(map(np.shape, arguments))
-        if shapes != ((3,), (3, 3), (3,), (3, 3)):
+            return _EXTENDED_RESULT
+        shapes = np.shape(mean), np.shape(information)
+        if shapes != ((3,), (3, 3)):
             raise GraphUpdateError(
                 f'extend: expected arrays of shapes (3,) and (3, 3), got {shapes}')
         if code == chain.NO_ROOM:
             self.graph.ensure(*(int(count) + 1 for count in head[tb.N_NODES:tb.N_OBSERVED + 1]))
             self._make_room(int(head[tb.POOL_F_END]) + 256, int(head[tb.POOL_I_END]) + 8, 256)
-            return self.extend(*(arguments if with_observed else arguments[:2]))
-        return self._extend_in_general(arguments, with_observed=with_observed)
+            return self.extend(mean, information)
+        node, last = self.graph.n_nodes, self.graph.newest_pose
+        if last < 0:
+            raise GraphUpdateError('extend: expected a graph with a hidden node to go on from')
+        return self.update(GraphUpdate(
+            hidden=se2.compose(self.graph.poses[last], mean)[None],
+            edges=Edges([last], [node], mean[None], information[None], [EdgeKind.ODOMETRY])))
 
     def newest_covariance(self) -> FloatArray:
         """Return the covariance of the newest pose in map axes, shape (3, 3)."""
@@ -186,31 +218,6 @@ class IncrementalSmoother:
     def chi2(self) -> float:
         """Return the energy of all constraints; see `chi2_of`."""
         return chi2_of(self.graph)
-
-    def _solve_extended(self) -> UpdateResult:
-        """Solve after a chain was extended by an observed node; a failure keeps the new node."""
-        try:
-            result = self._step(step.EXTENDED)
-        except BaseException:
-            self.graph.rollback()
-            raise
-        return result._replace(status=Status.MAX_ITERATIONS) if result.reason else result
-
-    def _extend_in_general(
-        self, arguments: tuple[FloatArray, ...], *, with_observed: bool,
-    ) -> UpdateResult:
-        mean, information, observed_mean, observed_information = arguments
-        node, last = self.graph.n_nodes, self.graph.newest_pose
-        if last < 0:
-            raise GraphUpdateError('extend: expected a graph with a hidden node to go on from')
-        observed = ObservedNodes()
-        if with_observed:
-            observed = ObservedNodes([node], None, observed_mean[None], observed_information[None],
-                                     [ObservedKind.GLOBAL_POSE])
-        return self.update(GraphUpdate(
-            hidden=se2.compose(self.graph.poses[last], mean)[None],
-            edges=Edges([last], [node], mean[None], information[None], [EdgeKind.ODOMETRY]),
-            observed=observed))
 
     def _step(self, entered: int) -> UpdateResult:
         """Bring the estimate up to date, growing the memory as needed, or roll the update back."""

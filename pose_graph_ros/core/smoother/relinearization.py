@@ -106,7 +106,7 @@ def _check_turned(head):  # type: ignore[no-untyped-def]
 
 
 @kernel
-def _forget_waiting(head):  # type: ignore[no-untyped-def]
+def forget_waiting(head):  # type: ignore[no-untyped-def]
     """Empty the lists of waiting constraints and turned frames without linearizing them again."""
     edge_i, observed_i, waiting = tb.edge_i(head), tb.observed_i(head), tb.waiting(head)
     for n in range(head[tb.N_WAITING]):
@@ -203,19 +203,28 @@ def _budget(head):  # type: ignore[no-untyped-def]
 
 
 @kernel
-def solve(head):  # type: ignore[no-untyped-def]
+def solve_and_check(head):  # type: ignore[no-untyped-def]
     """
-    Solve from the roots on the stack down; return whether the linearization errors are small.
+    Solve from the roots on the stack down; return the sum of the squared linearization errors.
 
-    If their sum exceeds the budget, the constraints with large errors wait to be linearized again.
+    The constraints with large errors wait to be linearized again.
     """
-    scalars = tb.scalars(head)
     back_substitute(head)
     _check(head)
     _check_turned(head)
     head[tb.N_ITERATIONS] += 1
-    if scalars[tb.ERROR2_SUM] <= _budget(head):
-        _forget_waiting(head)
+    return tb.scalars(head)[tb.ERROR2_SUM]
+
+
+@kernel
+def solve(head):  # type: ignore[no-untyped-def]
+    """
+    Solve from the roots on the stack down; return whether the linearization errors are small.
+
+    If they are, no constraint waits any more.
+    """
+    if solve_and_check(head) <= _budget(head):
+        forget_waiting(head)
         return True
     return False
 

@@ -12,8 +12,8 @@ from pose_graph_ros.core.graph import tables as tb, transaction_log
 from pose_graph_ros.core.smoother import relinearization, tree_update
 
 # How `run` is entered: after an edit; again, with the memory that it has asked for; after the
-# batch fallback, when there is no further fallback; after a chain was extended.
-FIRST, RESUMED, AFTER_BATCH, EXTENDED = range(4)
+# batch fallback, when there is no further fallback.
+FIRST, RESUMED, AFTER_BATCH = range(3)
 # Return codes of `run`.
 SETTLED, LEFT_OVER, MORE_MEMORY, BAD_PIVOT, DIVERGED = range(5)
 # A step has only diverged if its squared linearization error is above this [sigma^2] and above
@@ -61,34 +61,24 @@ def run(head, max_iterations, entered):  # type: ignore[no-untyped-def]
     Parameters
     ----------
     max_iterations : int
-    entered : int, FIRST, RESUMED, AFTER_BATCH or EXTENDED
+    entered : int, FIRST, RESUMED or AFTER_BATCH
 
     """
-    extended = entered == EXTENDED
-    if extended or entered == FIRST:
+    if entered == FIRST:
         _reset_counters(head)
     head[tb.N_TURNED] = 0   # cliques that were listed in the last update may have been replaced
     settled = True
     while True:
-        if extended:
-            head[tb.N_ELIMINATED] = 1
-        else:
-            # in the first iteration, the constraints that the last update has left over
-            relinearization.relinearize(head)
-            if head[tb.N_TOUCHED] == 0:
-                break
-            code = tree_update.eliminate(head)
-            if code != tree_update.DONE:
-                return MORE_MEMORY if code == tree_update.MORE_MEMORY else BAD_PIVOT
+        # in the first iteration, the constraints that the last update has left over
+        relinearization.relinearize(head)
+        if head[tb.N_TOUCHED] == 0:
+            break
+        code = tree_update.eliminate(head)
+        if code != tree_update.DONE:
+            return MORE_MEMORY if code == tree_update.MORE_MEMORY else BAD_PIVOT
         settled = relinearization.solve(head)
         if settled:
             break
-        if extended:
-            # a failure of the next iterations does not remove the new node
-            transaction_log.commit(head)
-            transaction_log.begin(head)
-            extended = False
-            continue
         out_of_iterations = head[tb.N_ITERATIONS] >= max_iterations
         if _has_diverged(head, out_of_iterations) and entered != AFTER_BATCH:
             return DIVERGED

@@ -18,7 +18,7 @@ from pose_graph_ros.core.elimination.quotient_graph import amalgamate, newest_la
 from pose_graph_ros.core.graph import pools, tables as tb, transaction_log
 
 # Return codes of the kernels.
-DONE, MORE_MEMORY, BAD_PIVOT = range(3)
+DONE, MORE_MEMORY, BAD_PIVOT, INTERRUPTED = range(4)
 # Limits of amalgamated cliques: stored zero blocks (3x3) and frontal nodes.
 RELAXED_ZEROS = 16
 RELAXED_FRONTAL = 16
@@ -169,8 +169,16 @@ def _attach_child(head, parent, child):  # type: ignore[no-untyped-def]
 
 
 @kernel(inline='always')
-def refresh(head, marked):  # type: ignore[no-untyped-def]
-    """Eliminate the marked cliques again with the same structure; return codes as `rebuild`."""
+def refresh(head, marked, interruptible):  # type: ignore[no-untyped-def]
+    """
+    Return codes as `rebuild` after eliminating the marked cliques with the same structure.
+
+    Parameters
+    ----------
+    marked : ndarray of int32, from `mark`
+    interruptible : bool, whether to end with INTERRUPTED once `INTERRUPT` of the head is set
+
+    """
     pool_f, work_f, clique_i = tb.pool_f(head), tb.work_f(head), tb.clique_i(head)
     work_i = tb.work_i(head)
     need, largest = np.int64(0), np.int64(0)
@@ -199,6 +207,8 @@ def refresh(head, marked):  # type: ignore[no-untyped-def]
     while k < n_ready:
         c = ready[k]
         k += 1
+        if interruptible and head[tb.INTERRUPT] != 0:
+            return INTERRUPTED
         transaction_log.renew_values(head, c)
         bad = eliminate_clique(head, c, True)
         if bad >= 0:
@@ -235,15 +245,22 @@ def eliminate(head):  # type: ignore[no-untyped-def]
     Return DONE: no node is touched any more, and the roots are on the stack for the
     back-substitution; or MORE_MEMORY or BAD_PIVOT as `rebuild` does.
     """
-    node_i, touched = tb.node_i(head), tb.touched(head)
     marked, affected = mark(head)
     head[tb.ITERATION] += 1
+    head[tb.SINCE] = head[tb.ITERATION]
     changed = head[tb.STRUCTURE] != 0
-    code = rebuild(head, marked, affected) if changed else refresh(head, marked)
+    code = rebuild(head, marked, affected) if changed else refresh(head, marked, False)
     if code == DONE:
         head[tb.STRUCTURE] = 0
-        for k in range(head[tb.N_TOUCHED]):
-            node_i[touched[k], tb.TOUCHED] = 0
-        head[tb.N_TOUCHED] = 0
+        forget_touched(head)
         head[tb.N_ELIMINATED] += len(affected)
     return code
+
+
+@kernel
+def forget_touched(head):  # type: ignore[no-untyped-def]
+    """Empty the list of the touched nodes, which have been eliminated."""
+    node_i, touched = tb.node_i(head), tb.touched(head)
+    for k in range(head[tb.N_TOUCHED]):
+        node_i[touched[k], tb.TOUCHED] = 0
+    head[tb.N_TOUCHED] = 0

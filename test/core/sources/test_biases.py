@@ -291,7 +291,9 @@ def test_a_chain_is_extended_behind_biases_in_constant_time() -> None:
     np.testing.assert_array_equal(smoother.poses[:16], before)
     np.testing.assert_allclose(
         smoother.poses[16], se2.compose(before[11], np.array([1.0, 0.0, 0.1])))
-    smoother.extend(np.array([1.0, 0.0, 0.1]), ODOMETRY, smoother.poses[16] + 0.5, ODOMETRY)
+    smoother.extend(np.array([1.0, 0.0, 0.1]), ODOMETRY)
+    smoother.update(GraphUpdate(observed=ObservedNodes(
+        [17], None, smoother.poses[16:17] + 0.5, ODOMETRY[None], [ObservedKind.GLOBAL_POSE])))
     graph = smoother.graph
     slow = SlowGraph(graph.poses.copy(), graph.fixed, graph.edges, graph.observed)
     assert np.max(np.abs(slow.step())) < 1e-6

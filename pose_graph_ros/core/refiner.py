@@ -1,0 +1,96 @@
+# Copyright 2026 The pose_graph_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""The weights of robust losses, and the refinement of the estimate between two updates."""
+
+from collections.abc import Callable
+
+import numpy as np
+
+from pose_graph_ros.core.batch.optimizer import Status
+from pose_graph_ros.core.graph.graph import GraphUpdate
+from pose_graph_ros.core.graph.reweighting import PART, Reweighting
+from pose_graph_ros.core.smoother.incremental import IncrementalSmoother, Refinement, UpdateResult
+from pose_graph_ros.core.transaction import Transaction
+
+# Maximum number of reweightings in an update.
+IN_UPDATE = 3
+# Limits after an update: of how often weights are changed, and of how many constraints with a loss
+# are looked at in turn without a change.
+REWEIGHTINGS = 100
+LOOKED_AT = 8 * PART
+
+
+class Refiner:
+    """
+    Takes the estimate from that of an update to the minimum, one bounded part at each call.
+
+    Parameters
+    ----------
+    smoother : IncrementalSmoother
+    reweighting : Reweighting
+        Constraints of its graph that have a robust loss.
+
+    """
+
+    def __init__(self, smoother: IncrementalSmoother, reweighting: Reweighting) -> None:
+        self._smoother, self._reweighting = smoother, reweighting
+        self.finished = True
+        """Whether there is nothing to refine until the next update."""
+        self._cursor = self._unchanged = self._reweightings = 0
+
+    def restart(self) -> None:
+        """Begin again, after an update."""
+        self.finished = False
+        self._unchanged = self._reweightings = 0
+
+    def reweight(
+        self, result: UpdateResult, begin: Callable[[], Transaction],
+    ) -> tuple[UpdateResult, bool]:
+        """
+        Return the last result after some reweightings, and whether none was necessary.
+
+        Parameters
+        ----------
+        result : UpdateResult, of the update
+        begin : callable, returns a transaction for one reweighting
+
+        """
+        settled = result.status is Status.CONVERGED
+        for _ in range(IN_UPDATE if len(self._reweighting) > 0 else 0):
+            edges, observed = self._reweighting.changes(self._smoother.graph)
+            if len(edges) + len(observed) == 0:
+                break
+            settled = False
+            with begin() as transaction:
+                transaction.solved(self._smoother.update(
+                    GraphUpdate(weigh_edges=edges, weigh_observed=observed)))
+            if transaction.failure != '':
+                break
+            result = transaction.result
+        return result, settled
+
+    def refine(self) -> Refinement:
+        """Do one iteration, or change weights where there is nothing to iterate any more."""
+        if self._smoother.graph.has_touched:
+            self.finished = True    # an update that failed; the next one eliminates all nodes
+        if self.finished:
+            return Refinement(finished=True, moved=0.0)
+        result = self._smoother.refine()
+        return self._reweight(result.moved) if result.finished else result
+
+    def _reweight(self, moved: float) -> Refinement:
+        graph, size = self._smoother.graph, len(self._reweighting)
+        while (self._unchanged < min(size, LOOKED_AT)
+               and self._reweightings < REWEIGHTINGS):
+            edges, observed = self._reweighting.changes_of_part(graph, self._cursor)
+            if len(edges) + len(observed) > 0:
+                self._unchanged, self._reweightings = 0, self._reweightings + 1
+                before = graph.poses.copy()
+                result = self._smoother.update(
+                    GraphUpdate(weigh_edges=edges, weigh_observed=observed))
+                self.finished = result.status is Status.FAILED
+                by_weights = np.max(np.abs(graph.poses - before)[~graph.is_bias, :2], initial=0.0)
+                return Refinement(finished=self.finished, moved=max(moved, float(by_weights)))
+            self._unchanged, self._cursor = self._unchanged + PART, (self._cursor + PART) % size
+        self.finished = True
+        return Refinement(finished=True, moved=moved)
