@@ -17,13 +17,23 @@ import sys
 import time
 import traceback
 
-from benchmark import metrics, ours, report, row_batch, row_chain, row_loops, row_resources
+from benchmark import (
+    metrics,
+    ours,
+    report,
+    row_back_end,
+    row_batch,
+    row_chain,
+    row_loops,
+    row_resources,
+)
 from benchmark.files import DEFAULT_FOLDER
 from benchmark.section import Options, say, Section
 
 ROWS: dict[str, Callable[[Options], Section]] = {
     'chain': row_chain.measure,
     'variants': row_chain.measure_variants,
+    'back_end': row_back_end.measure,
     'loops': row_loops.measure,
     'floppy': row_loops.measure_floppy,
     'batch': row_batch.measure,

@@ -5,13 +5,15 @@ How far estimates taken during a run are from the batch optimum of the graph as 
 
 The excess is half the chi2 above that optimum, found from the estimate itself, each tool under its
 own error model. So it tells how well the tool follows the minimum that it is in; whether that is
-the best one, the final chi2 tells. The excess hides soft modes, hence the position distance.
+the best one, the final chi2 tells. The excess hides soft modes, hence the position distance, in
+metres and in posterior sigmas.
 """
 
 from dataclasses import dataclass
 
 import numpy as np
 
+from benchmark import ours
 from benchmark.runs import Run
 from benchmark.worlds import World
 from pose_graph_ros.core.batch import optimizer
@@ -31,6 +33,8 @@ class Excess:
     """Half of chi2 above the optimum, shape (S,)."""
     worst: FloatArray
     """Largest distance of a node to its place in the optimum, shape (S,) [m]."""
+    sigmas: FloatArray
+    """Largest such distance in posterior sigmas of the position, shape (S,)."""
     final_chi2: float
     """chi2 of the last sample, without a factor 1/2."""
     optimum_chi2: float
@@ -47,29 +51,35 @@ def of_run(world: World, run: Run) -> Excess:
     judge = _by_gtsam if run.tool.startswith('GTSAM') else _by_ours
     steps = sorted(run.samples)
     rows = [judge(world, step, run.samples[step]) for step in steps]
-    table = np.array([(before, after, worst) for before, after, worst in rows])
+    table = np.array(rows)
     return Excess(
         np.array(steps, dtype=float), np.maximum(0.5 * (table[:, 0] - table[:, 1]), 0.0),
-        table[:, 2], float(table[-1, 0]), float(table[-1, 1]))
+        table[:, 2], table[:, 3], float(table[-1, 0]), float(table[-1, 1]))
 
 
-def _by_ours(world: World, step: int, poses: FloatArray) -> tuple[float, float, float]:
-    """Return chi2 of the estimate, chi2 of the optimum and the largest distance between them."""
+def _by_ours(world: World, step: int, poses: FloatArray) -> tuple[float, ...]:
+    """Return chi2 of the estimate and of the optimum, and the largest distances between them."""
     graph = world.graph(poses, step)
     before = graph.energies().chi2
     result = optimizer.optimize(graph, EXACT)
-    return before, result.chi2, _worst(poses, graph.poses)
+    return before, result.chi2, *_worst(world, step, poses, graph.poses)
 
 
-def _by_gtsam(world: World, step: int, poses: FloatArray) -> tuple[float, float, float]:
+def _by_gtsam(world: World, step: int, poses: FloatArray) -> tuple[float, ...]:
     # only here: the rest of the benchmark can be imported without GTSAM
     from benchmark import gtsam_peer  # noqa: PLC0415
 
     graph, start = gtsam_peer.whole_graph(world, step), gtsam_peer.values_of(poses)
     best = gtsam_peer.optimum(graph, start)
     return (2.0 * graph.error(start), 2.0 * graph.error(best),
-            _worst(poses, gtsam_peer.poses_of(best)))
+            *_worst(world, step, poses, gtsam_peer.poses_of(best)))
 
 
-def _worst(poses: FloatArray, others: FloatArray) -> float:
-    return float(np.max(np.hypot(*(poses - others)[:, :2].T)))
+def _worst(
+    world: World, step: int, poses: FloatArray, optimum: FloatArray,
+) -> tuple[float, float]:
+    off = (poses - optimum)[1:, :2]     # node 0 is fixed
+    weighted = np.linalg.solve(
+        ours.position_covariances(world, step, optimum)[1:], off[..., None])[..., 0]
+    return (float(np.max(np.hypot(*off.T))),
+            float(np.sqrt(np.max(np.sum(off * weighted, axis=1)))))

@@ -16,9 +16,12 @@ from benchmark.worlds import World
 TIME_HEADER = ('world', 'nodes', 'closures', 'tool', 'mean', 'p50', 'p99', 'max', 'total s',
                'ratio mean', 'p50', 'p99', 'runs', 'note')
 EXCESS_HEADER = ('world', 'samples', 'tool', 'median', 'p95', 'max', 'worst position mm: median',
-                 'max', 'final chi2', 'its optimum')
+                 'max', 'in sigmas: median', 'max', 'iteration ms: median', 'max',
+                 'final chi2', 'its optimum')
 EXCESS_FLOOR = 1e-6
 """Excess below this is none: rounding, where a graph is still a tree."""
+POSITION_FLOOR = 1.0
+"""Distances below this cannot be seen [mm]."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -37,6 +40,9 @@ class Comparison:
     world: World
     runs: dict[str, list[Run]]
     judged: dict[str, excess.Excess]
+    """Of ours also `ours.REFINED`, in a run of its own."""
+    refinement: list[float]
+    """Times of the iterations of that [s]."""
 
     def timing(self, tool: str) -> Timing:
         """Return the figures of a tool's steps."""
@@ -77,9 +83,15 @@ def compare(
     tools = {ours.NAME: ours.run} | (peers(options, careful=careful) if gtsam else {})
     steps = sample_steps(world.n_nodes, every) if judge else frozenset()
     runs = interleaved(world, tools, Plan(steps, options.limit), options.repeats)
-    judged = {name: excess.of_run(world, of_tool[0]) for name, of_tool in runs.items()
-              if judge}
-    return Comparison(world, runs, judged)
+    judged: dict[str, excess.Excess] = {}
+    refinement: list[float] = []
+    if judge:
+        refined = ours.run_refined(world, Plan(steps, options.limit))
+        refinement = refined.refinement
+        judged = {run.tool: excess.of_run(world, run)
+                  for run in (runs[ours.NAME][0], refined, *(
+                      of_tool[0] for name, of_tool in runs.items() if name != ours.NAME))}
+    return Comparison(world, runs, judged, refinement)
 
 
 def time_table(caption: str, comparisons: Iterable[Comparison]) -> Table:
@@ -109,8 +121,12 @@ def excess_table(caption: str, comparisons: Iterable[Comparison]) -> Table:
             median, p95, highest = judged.figures()
             table.add(first, str(len(judged.steps)), tool, f'{median:.2g}', f'{p95:.2g}',
                       f'{highest:.2g}', f'{1e3 * np.median(judged.worst):.2g}',
-                      f'{1e3 * np.max(judged.worst):.2g}', f'{judged.final_chi2:.6g}',
-                      f'{judged.optimum_chi2:.6g}')
+                      f'{1e3 * np.max(judged.worst):.2g}', f'{np.median(judged.sigmas):.1g}',
+                      f'{np.max(judged.sigmas):.1g}', *(
+                          (f'{1e3 * np.median(item.refinement):.2f}',
+                           f'{1e3 * np.max(item.refinement):.2f}')
+                          if tool == ours.REFINED else ('', '')),
+                      f'{judged.final_chi2:.6g}', f'{judged.optimum_chi2:.6g}')
             first = ''
     return table
 
@@ -154,9 +170,16 @@ def excess_metrics(
         median_target = max(theirs[0], EXCESS_FLOOR)
         highest_target = max(theirs[2], EXCESS_FLOOR, least_maximum)
     key = f'{row}/{item.world.name}'
-    return [
+    metrics = [
         Metric(f'{key}/excess, median', median, '', ACCURACY, median_target),
         Metric(f'{key}/excess, max', highest, '', ACCURACY, highest_target)]
+    refined = item.judged[ours.REFINED]
+    peer = item.judged[item.peers[0]] if asked and len(item.peers) > 0 else None
+    for name, figure in (('median', np.median), ('max', np.max)):
+        target = None if peer is None else max(1e3 * float(figure(peer.worst)), POSITION_FLOOR)
+        metrics.append(Metric(f'{key}/worst position when refined, {name}',
+                              1e3 * float(figure(refined.worst)), ' mm', ACCURACY, target))
+    return metrics
 
 
 def curves(item: Comparison) -> list[Curve]:

@@ -22,7 +22,8 @@ from benchmark.metrics import Metric
 from benchmark.online import EXCESS_FLOOR
 from benchmark.section import Curve, Section, Table
 
-COLOURS = {'ours': '#0072B2', 'GTSAM skip 10': '#E69F00', 'GTSAM skip 1': '#D55E00'}
+COLOURS = {'ours': '#0072B2', 'ours, refined': '#009E73', 'GTSAM skip 10': '#E69F00',
+           'GTSAM skip 1': '#D55E00'}
 INK, GREY, GRID = '#222222', '#666666', '#E2E2E2'
 PANEL, DPI = (5.3, 3.1), 100
 """Size of a panel [inch] and dots per inch."""
