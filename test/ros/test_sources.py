@@ -242,12 +242,12 @@ def test_the_lever_arm_comes_from_tf_static(node: NodeProcess) -> None:
             transform('mast', 'gps', (1.0, 0.25, 1.0))]))
         client.spin_for(0.3)
         lever_arm = (0.25, 1.0)
-        play(client, range(1, 150), every(1, client.odom, odometry_at),
+        play(client, range(150), every(1, client.odom, odometry_at),
              every(5, client.fix, lambda seconds: fix_at(seconds, lever_arm)))
         assert client.optimize().success
         assert client.values['fix.lever_arm'] == '[0.250, 1.000] from tf_static'
         assert client.values['fix.without_lever_arm'] == '1'
-        # the datum is where the antenna was at first
+        # the first fix, which had no lever arm, is the datum
         assert path_error(client) < EXACT
 
 
@@ -417,10 +417,15 @@ def test_the_datum_can_be_moved_as_long_as_no_fix_is_used(tmp_path: Path) -> Non
     with NodeProcess(tmp_path, ('-p', 'datum:=[10.0, 10.0]')) as node, connected(node) as client:
         assert client.set_datum().success
         client.fix.publish(fix_at(0.0))
+        client.spin_until(lambda: client.values['pending'] == '1', 'it waits for odometry')
+        assert client.values['datum'] == 'none'
+        assert client.set_datum().success
+        client.odom.publish(odometry_at(0.0))
+        client.odom.publish(odometry_at(1.0))
         client.spin_until(lambda: client.values['datum'].startswith('[48.1'), 'it has moved')
         answer = client.set_datum()
         assert not answer.success
-        assert 'wait for odometry' in answer.message
+        assert 'refer to the datum' in answer.message
 
 
 def test_the_frame_of_the_odometry_decides_on_the_transform(client: Client) -> None:

@@ -43,6 +43,19 @@ def put_poses(head, poses):  # type: ignore[no-untyped-def]
     _refer_to_poses(head)
 
 
+@kernel(signature=(tb.HEAD, ROWS))
+def halve_step(head, poses):  # type: ignore[no-untyped-def]
+    """Move all nodes half of the way back to earlier poses, shape (N, 3), as new references."""
+    node_f = tb.node_f(head)
+    for v in range(head[tb.N_NODES]):
+        row = node_f[v]
+        for k in range(2):
+            row[tb.POSE + k] = 0.5 * (row[tb.POSE + k] + poses[v, k])
+        turn = factors.wrap(row[tb.POSE + 2] - poses[v, 2])
+        row[tb.POSE + 2] = factors.wrap(poses[v, 2] + 0.5 * turn)
+    _refer_to_poses(head)
+
+
 @kernel
 def _refer_to_poses(head):  # type: ignore[no-untyped-def]
     """Make the poses the references of the unknowns."""

@@ -21,7 +21,6 @@ import numpy as np
 
 from pose_graph_ros.core.batch import gauss_newton as gn
 from pose_graph_ros.core.config import SolverConfig
-from pose_graph_ros.core.geometry import se2
 from pose_graph_ros.core.geometry.se2 import FloatArray
 from pose_graph_ros.core.graph import tables as tb
 
@@ -110,7 +109,8 @@ def minimize(head: tb.IntHead, chi2: float, config: SolverConfig) -> Minimum:
                 break
             trial, rounding = gn.evaluate(head, right)
             if damping > 0.0 and not trial <= chi2 + rounding < math.inf:
-                trial, rounding = _shortened(head, best, right)
+                gn.halve_step(head, best)
+                trial, rounding = gn.evaluate(head, right)
         lower = trial <= chi2 + rounding
         current = lower and damping == 0.0
         if lower:
@@ -158,15 +158,6 @@ def minimize(head: tb.IntHead, chi2: float, config: SolverConfig) -> Minimum:
     if end is not Termination.UNDETERMINED:
         gn.settle(head)
     return Minimum(end, iterations, chi2)
-
-
-def _shortened(head: tb.IntHead, best: FloatArray, right: FloatArray) -> tuple[float, float]:
-    """Move to half of the last step from the best poses; return chi2 there and its rounding."""
-    poses = np.empty_like(best)
-    gn.keep_poses(head, poses)
-    gn.put_poses(head, se2.wrapped(best + 0.5 * se2.wrapped(poses - best)))
-    chi2, rounding = gn.evaluate(head, right)
-    return float(chi2), float(rounding)
 
 
 def _step(head: tb.IntHead, damping: float, right: FloatArray, *, chord: bool) -> float:

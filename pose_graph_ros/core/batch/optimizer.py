@@ -8,7 +8,7 @@ these cliques (`levenberg_marquardt`). Afterwards the tables hold the cliques of
 poses, with which the incremental smoother can continue.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Collection
 from dataclasses import dataclass, replace
 from enum import Enum
 
@@ -93,18 +93,21 @@ def optimize(graph: Graph, config: SolverConfig) -> BatchResult:
     return _finished(graph, poses, chi2, _minimize(graph, config, _analysed(graph), chi2))
 
 
-def optimize_from_linear_start(graph: Graph, config: SolverConfig) -> BatchResult:
+def optimize_from_linear_start(
+    graph: Graph, config: SolverConfig, starts: Collection[Start] = tuple(Start),
+) -> BatchResult:
     """
     Return the result of moving the hidden nodes to a minimum from a start without initial poses.
 
-    Starts are tried in the order of `Start` until one converges in a few iterations, to a chi2 not
-    above that of the present poses, which are the last to be tried. The lowest minimum is kept,
+    Starts are tried in their order until one converges in a few iterations, to a chi2 not
+    above that of the present poses, which should be the last of them. The lowest minimum is kept,
     and the result says from which start it is. Failures are treated as in `optimize`.
 
     Parameters
     ----------
     graph : Graph
     config : SolverConfig
+    starts : collection of Start
 
     """
     chi2, answer = _check_before(graph)
@@ -115,7 +118,7 @@ def optimize_from_linear_start(graph: Graph, config: SolverConfig) -> BatchResul
     few = replace(config, max_iterations=min(config.max_iterations, TRUSTED_ITERATIONS))
     best, best_poses = _failed('', chi2), poses
     result = best
-    for start in Start:
+    for start in starts:
         gauss_newton.put_poses(head, poses)
         try:
             gauss_newton.put_poses(head, _start(graph, start, cliques))

@@ -13,12 +13,14 @@ finds is better than the result of a damped step, at the cost of a few steps.
 import numpy as np
 
 from pose_graph_ros.core.batch import optimizer
-from pose_graph_ros.core.batch.optimizer import Status
+from pose_graph_ros.core.batch.optimizer import Start, Status
 from pose_graph_ros.core.config import SolverConfig
 from pose_graph_ros.core.graph import transaction_log
 from pose_graph_ros.core.graph.graph import Graph
 
 _CONFIG = SolverConfig(max_iterations=50, step_tolerance=1e-6)
+# Unit headings take longer than an update may.
+_STARTS = (Start.CHORDAL, Start.JOINT, Start.PRESENT)
 
 
 def optimize_copy(graph: Graph, copy: Graph) -> bool:
@@ -35,7 +37,7 @@ def optimize_copy(graph: Graph, copy: Graph) -> bool:
     # the start if the linear start leads to a higher chi2
     transaction_log.poses_before(graph.memory.head, poses)
     copy.fill(graph.rows()._replace(poses=poses))
-    if optimizer.optimize_from_linear_start(copy, _CONFIG).status is Status.FAILED:
+    if optimizer.optimize_from_linear_start(copy, _CONFIG, _STARTS).status is Status.FAILED:
         return False
     copy.set_poses(copy.poses)
     return True
