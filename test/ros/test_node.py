@@ -14,6 +14,7 @@ import time
 from circle import (
     check_pose,
     drive,
+    fix_at,
     odometry_pose,
     path_error,
     PLANE,
@@ -34,6 +35,8 @@ from harness import (
 )
 import numpy as np
 import pytest
+from rcl_interfaces.msg import Log
+from rclpy.qos import QoSDurabilityPolicy, QoSProfile
 from rclpy.serialization import serialize_message
 
 from pose_graph_ros.core.geometry import se2
@@ -280,6 +283,21 @@ def test_a_signal_that_the_system_hands_to_another_thread_ends_the_node(
         if node.process.poll() is None:
             ctypes.CDLL(None).tgkill(process, thread, signal.SIGINT)
     assert node.process.wait(20.0) == 0
+
+
+def test_what_the_thread_of_the_engine_logs_reaches_rosout(
+    node: NodeProcess, client: Client,
+) -> None:
+    rosout: list[Log] = []
+    # what is logged before both sides match comes, too
+    client.node.create_subscription(Log, '/rosout', rosout.append, QoSProfile(
+        depth=100, durability=QoSDurabilityPolicy.TRANSIENT_LOCAL))
+    drive(client, 2.0)
+    client.fix.publish(fix_at(1.0))     # a second time
+    client.spin_until(lambda: any(line.msg.startswith('fix: duplicate') for line in rosout),
+                      'the warning comes')
+    [line] = [line for line in rosout if line.msg.startswith('fix: ')]
+    assert (line.name, line.level) == ('pose_graph', Log.WARN)
 
 
 BAD = (

@@ -194,8 +194,9 @@ def test_a_node_is_started_with_a_graph(tmp_path: Path) -> None:
     with NodeProcess(tmp_path, arguments[:2]) as node, \
             Client(int(node.env['ROS_DOMAIN_ID'])) as client:
         drive(client, 5.0)
-        assert client.trigger('save_graph').success
-        nodes = client.values['hidden_nodes']
+        answer = client.trigger('save_graph')
+        assert answer.success
+        nodes = answer.message.split()[0]
     with NodeProcess(tmp_path / 'b', arguments) as node, \
             Client(int(node.env['ROS_DOMAIN_ID'])) as client:
         client.spin_until(lambda: client.values.get('hidden_nodes') == nodes, 'it is there')

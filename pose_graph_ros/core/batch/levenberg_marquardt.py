@@ -151,7 +151,8 @@ def minimize(head: tb.IntHead, chi2: float, config: SolverConfig) -> Minimum:
                     break
             # a rejected chord step is repeated with a new factorisation before any damping
             chord, uphill = False, 0
-    at_best = current and end is not Termination.MAX_ITERATIONS
+    # after a rejected step short steps may mean that it is stuck where an error is at pi
+    at_best = current and not rejected and end is not Termination.MAX_ITERATIONS
     if not at_best and end is not Termination.UNDETERMINED:
         gn.put_poses(head, best)
         end = _refactorized(head, best, end, chi2)
@@ -177,17 +178,16 @@ def _refactorized(
     gn.linearize(head)
     if not gn.eliminate(head, 0.0):
         return Termination.UNDETERMINED
-    if end is not Termination.CONVERGED:
-        right = np.empty_like(best)
-        gn.evaluate(head, right)
-        gn.gauss_newton_step(head)
-        # b^T H^-1 b, the decrease of a quadratic chi2
-        predicted = gn.product_with_step(head, right)
-        gn.put_poses(head, best)
-        least = STALL if end is Termination.STALLED else AT_THE_END
-        if not predicted > least * max(chi2, 1.0):
-            return Termination.CONVERGED
-    return end
+    right = np.empty_like(best)
+    gn.evaluate(head, right)
+    gn.gauss_newton_step(head)
+    # b^T H^-1 b, the decrease of a quadratic chi2
+    predicted = gn.product_with_step(head, right)
+    gn.put_poses(head, best)
+    least = AT_THE_END if end is Termination.MAX_ITERATIONS else STALL
+    if not predicted > least * max(chi2, 1.0):
+        return Termination.CONVERGED
+    return Termination.STALLED if end is Termination.CONVERGED else end
 
 
 def _has_converged(length: float, previous: float, tolerance: float) -> bool:
