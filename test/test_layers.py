@@ -30,6 +30,9 @@ CORE = {
     'core.odometry': {'core.compiled', 'core.geometry', 'core.graph'},
     'core.sources': {'core.compiled', 'core.geometry', 'core.graph', 'core.odometry'},
     'core.alignment': {'core.geometry', 'core.graph', 'core.odometry', 'core.sources'},
+    'core.judgement': {
+        'core.compiled', 'core.geometry', 'core.graph', 'core.elimination', 'core.batch',
+        'core.smoother', 'core.odometry', 'core.sources'},
 }
 CORE['core.io'] = set(CORE)
 # The modules on top of the packages: the facade, what it hands out, and who drives it.

@@ -66,6 +66,17 @@ class Loss(Enum):
     CAUCHY = 'cauchy'
 
 
+class Robust(Enum):
+    """How a source is protected from its wrong measurements."""
+
+    JUDGED = 'judged'
+    """The back end decides which ones to believe (`core.judgement`); a loss applies to these."""
+    LOSS = 'loss'
+    """All are used, with the robust loss of the source."""
+    NONE = 'none'
+    """All are used, as if the source had no robust loss."""
+
+
 class Correlation(Enum):
     """Model of time-correlated errors of measurements."""
 
@@ -189,6 +200,7 @@ class MeasurementSource:
     """Settings of a source of global poses, positions, headings or loop closures."""
 
     covariance: CovariancePolicy = field(default_factory=CovariancePolicy)
+    robust: Robust = Robust.LOSS
     loss: Loss = Loss.NONE
     rejection_threshold: float = 3.0
     """Threshold k of the loss [sigma]."""
@@ -203,6 +215,7 @@ class MeasurementSource:
     def __post_init__(self) -> None:
         require(self, 'rejection_threshold', positive=True)
         require(self, 'minimum_period', 'correlation_time', 'white_share')
+        require_member(self, 'robust', Robust)
         require_member(self, 'loss', Loss)
         require_member(self, 'correlation', Correlation)
         if self.white_share > 1.0:

@@ -1,0 +1,78 @@
+# Copyright 2026 The pose_graph_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""What is decided on a constraint, and why."""
+
+from dataclasses import dataclass
+from enum import Enum
+
+from pose_graph_ros.core.geometry.se2 import FloatArray
+
+
+class State(Enum):
+    """Whether a constraint takes part in the estimate."""
+
+    WAITING = 'waiting'
+    """Weight 0: not enough is known yet to believe or to doubt it."""
+    BELIEVED = 'believed'
+    WEAKLY_BELIEVED = 'believed weakly'
+    """In the estimate, though little supports it: only the record of its source speaks for it."""
+    DOUBTED = 'doubted'
+    """Weight 0: it contradicts the estimate."""
+
+    @property
+    def in_graph(self) -> bool:
+        """Whether a constraint in this state has a weight above 0."""
+        return self in (State.BELIEVED, State.WEAKLY_BELIEVED)
+
+
+class Decision(Enum):
+    """What a person decides on a constraint."""
+
+    IN = 'in'
+    """It is believed, whatever contradicts it."""
+    OUT = 'out'
+    """It is doubted, whatever supports it."""
+    AUTO = 'auto'
+    """It is judged like all others; takes the other two back."""
+
+
+class Judged(Enum):
+    """Kind of a constraint that is judged."""
+
+    LOOP_CLOSURE = 'loop_closure'
+    FIX = 'fix'
+    """A position or a pose in the map."""
+    ODOMETRY = 'odometry'
+
+
+@dataclass(frozen=True, slots=True)
+class Verdict:
+    """The state of one constraint, with the reasons."""
+
+    id: str
+    """
+    `SOURCE/NUMBER`, such as `loop_closure/17`: the constraints of a source are counted from 0 in
+    the order of their addition. It never changes.
+    """
+    kind: Judged
+    source: str
+    stamp_ns: int
+    """Of the measurement [ns]; of an odometry edge, that of its end."""
+    reference_ns: int | None
+    """Of the other end of a loop closure or an odometry edge [ns]."""
+    state: State
+    since_ns: int
+    """Stamp of the newest odometry when the state was last changed [ns]."""
+    decision: Decision
+    residual: FloatArray
+    """Error at the present estimate, shape (3,) [m, m, rad]; nan where nothing is measured."""
+    distance: float
+    """Mahalanobis distance when it was last judged, before it took part [sigma]."""
+    supported_by: tuple[str, ...]
+    """Ids of what agrees with it, at most five."""
+    contradicted_by: tuple[str, ...]
+    """Ids of what contradicts it, at most five; `odometry` stands for the estimate without it."""
+    edge: bool
+    """Whether `row` is one of an edge; else of an observed node."""
+    row: int
+    """Its row in the graph."""
