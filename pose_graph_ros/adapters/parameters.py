@@ -129,6 +129,7 @@ _WHEELS = (Kind.ODOMETRY,)
 _OTHERS = tuple(kind for kind in Kind if kind is not Kind.ODOMETRY)
 _POSITIONS = (Kind.GLOBAL_POSE, Kind.FIX)
 _NOT_POSITIONS = tuple(kind for kind in Kind if kind not in _POSITIONS)
+_JUDGED = (*_POSITIONS, Kind.LOOP_CLOSURE)
 _NOT_CLOSURES = tuple(kind for kind in _OTHERS if kind is not Kind.LOOP_CLOSURE)
 
 SOURCE_PARAMETERS: tuple[Parameter, ...] = (
@@ -184,6 +185,17 @@ SOURCE_PARAMETERS: tuple[Parameter, ...] = (
               kinds=(Kind.FIX,)),
     Parameter('yaw_offset', 0.0, 'rad', 'Angle added to the yaw, such that zero is east.', -6.3,
               6.3, kinds=(Kind.IMU,)),
+    *(Parameter('robust', robust.value, '', text, choices=choices, kinds=kinds)
+      for kinds, robust, choices, text in (
+        (_JUDGED, config.POSITIONS.robust, _values(config.Robust), 'Protection from wrong '
+         'measurements: with `judged` each one takes part only while it is believed, and those '
+         'that do have the `robust_loss`; with `loss` all take part, with the `robust_loss`; '
+         'with `none` all take part, without it.'),
+        ((Kind.IMU,), config.HEADINGS.robust, _values(config.Robust)[1:], 'Whether the '
+         '`robust_loss` is used.'))),
+    Parameter('sigma_scale', _MEASUREMENT.sigma_scale, '', 'Factor on the standard deviations of '
+              'what is believed, if `robust` is `judged`. If 0, it is learnt from the residuals.',
+              0.0, 1e3, kinds=_JUDGED),
     *(Parameter('robust_loss', loss.value, '', 'Robust loss applied to the errors.',
                 choices=_values(config.Loss), kinds=kinds) for kinds, loss in (
         (_POSITIONS, config.POSITIONS.loss), (_NOT_POSITIONS, _MEASUREMENT.loss))),

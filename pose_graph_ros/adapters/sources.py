@@ -138,7 +138,9 @@ def _measurement_source(own: Mapping[str, Any]) -> config.MeasurementSource:
             position_floor=position_floor, heading_floor=heading_floor,
             position_ceiling=own['sigma_ceiling'], default_position=default_position,
             default_heading=default_heading, heading=config.Heading(own.get('heading', 'auto'))),
+        robust=config.Robust(own['robust']),
         loss=config.Loss(own['robust_loss']), rejection_threshold=own['rejection_threshold'],
+        sigma_scale=own.get('sigma_scale', 0.0),
         # sources of loop closures have neither a minimum period nor correlated errors
         **{} if 'correlation_time' not in own else {
             'minimum_period': own['minimum_period'], 'correlation_time': own['correlation_time'],

@@ -3,6 +3,7 @@
 """The facade of the engine, for the node, the offline tools and the tests."""
 
 from collections import Counter
+from collections.abc import Mapping
 from dataclasses import replace
 import math
 from typing import Self
@@ -26,6 +27,7 @@ from pose_graph_ros.core.graph.graph import Graph, GraphUpdate
 from pose_graph_ros.core.graph.reweighting import Reweighting
 from pose_graph_ros.core.io.capture import capture, Parts, restore
 from pose_graph_ros.core.io.saved_graph import SavedGraph
+from pose_graph_ros.core.judgement.verdicts import Change, Decision, SourceVerdicts, Verdict
 from pose_graph_ros.core.measurements import (
     ACCEPTED,
     Answer,
@@ -36,17 +38,13 @@ from pose_graph_ros.core.measurements import (
 )
 from pose_graph_ros.core.odometry.hidden_nodes import HiddenNodes
 from pose_graph_ros.core.refiner import Refiner
+from pose_graph_ros.core.relocation import relocate
 from pose_graph_ros.core.smoother.incremental import IncrementalSmoother, Refinement
 from pose_graph_ros.core.sources import constraint_names
 from pose_graph_ros.core.sources.factor_builder import FactorBuilder, Queue
-from pose_graph_ros.core.sources.measurement_constraints import attach
 from pose_graph_ros.core.sources.pipeline import MeasurementPipeline
 from pose_graph_ros.core.sources.source_report import SourceReport
-from pose_graph_ros.core.sources.validation import validate
 from pose_graph_ros.core.transaction import Transaction
-
-# Sigmas of the edge to a pose that was set by `set_pose` [m, m, rad]: the motion is unknown.
-RELOCATION_SIGMA = (1000.0, 1000.0, 3.0)
 
 
 class PoseGraphBackend:
@@ -156,6 +154,30 @@ class PoseGraphBackend:
         """Return the n constraints with the largest energies, with names, in descending order."""
         return constraint_names.largest(self.graph, self._nodes, self._factors, n)
 
+    def verdicts(self, most_believed: int | None = None) -> list[Verdict]:
+        """Return all verdicts, but of those that are believed only the newest of each source."""
+        return []
+
+    def verdict_changes(self) -> list[Change]:
+        """Return the changes of verdicts since the last call."""
+        return []
+
+    def verdict_totals(self) -> Mapping[str, SourceVerdicts]:
+        """Return what is believed of each source, as a whole."""
+        return {}
+
+    def decide(self, name: str, decision: Decision) -> Answer:
+        """
+        Return the answer to a person's decision, with a sentence; the next update applies it.
+
+        Parameters
+        ----------
+        name : str, `Verdict.id`
+        decision : Decision
+
+        """
+        return rejected('unknown_id', f'expected the id of a verdict, got {name!r}')
+
     def add_odometry(self, sample: OdometrySample, source: str = 'odom') -> Answer:
         """
         Return the answer to a sample that is added; `NodePolicy` may ask for a hidden node at it.
@@ -232,31 +254,15 @@ class PoseGraphBackend:
         pose = replace(pose, stamp_ns=min(max(pose.stamp_ns, first_ns), last_ns))
         if not self._alignment.is_aligned:
             return self.add_measurement(pose, source)
-        return self._pipeline.count(source, self._put_elsewhere(pose, source, last_ns))
-
-    def _put_elsewhere(self, pose: GlobalPose, source: str, last_ns: int) -> Answer:
-        """Create a node after the newest odometry, and attach the given pose to it."""
-        validated = validate(pose, self._config.measurement_source(source, GlobalPose).covariance)
-        if isinstance(validated, Answer):
-            return validated
-        measurement = validated.measurement
-        begin, end = attach(self._nodes, pose.stamp_ns), attach(self._nodes, last_ns)
-        if isinstance(begin, Answer) or isinstance(end, Answer) or not isinstance(
-                measurement, GlobalPose):
-            return rejected('no_odometry', 'none at that time')
-        poses = self.graph.poses
-        moved = se2.between(se2.compose(poses[begin.node], begin.motion),
-                            se2.compose(poses[end.node], end.motion))
-        now = se2.compose(measurement.pose, moved)
-        row = self._nodes.relocate(
-            se2.between(poses[self._nodes.rows[-1]], now), np.diag(RELOCATION_SIGMA) ** 2)
-        if row < 0:
-            return rejected('failed', 'the solver failed')
+        moved = relocate(pose, self._config.measurement_source(source, GlobalPose).covariance,
+                         self.graph, self._nodes)
+        if isinstance(moved, Answer):
+            return self._pipeline.count(source, moved)
         self._collect()
         self._alignment.stop_rechecking()
-        self._pipeline.attach_to_node(
-            replace(measurement, stamp_ns=last_ns + 1, pose=now), source, row)
-        return ACCEPTED
+        self._pipeline.attach_to_node(moved, source, int(self._nodes.rows[-1]))
+        return self._pipeline.count(source, ACCEPTED)
+
 
     def update(self) -> UpdateReport:
         """
@@ -411,15 +417,9 @@ class PoseGraphBackend:
             n_hidden=len(self._nodes), n_edges=graph.n_edges - self._factors.n_bias_edges,
             n_observed=self._factors.n_measurements, n_biases=graph.n_nodes - len(self._nodes),
             primary=primary, noise=self._config.odometry_source(primary).noise,
-            trajectory=self._path(stamp_ns, newest, shift) if with_path else None)
-
-    def _path(self, stamp_ns: int, newest: FloatArray, shift: FloatArray) -> Trajectory:
-        """Return the shifted poses of all hidden nodes, and last that of the newest odometry."""
-        stamps, poses = self.node_stamps_ns, self.graph.poses[self._nodes.rows]
-        poses += shift
-        if stamp_ns > stamps[-1]:
-            stamps, poses = np.append(stamps, stamp_ns), np.vstack((poses, newest))
-        return Trajectory(stamps, poses)
+            trajectory=None if not with_path else Trajectory(
+                self.node_stamps_ns, graph.poses[self._nodes.rows] + shift,
+            ).continued(stamp_ns, newest))
 
     def saved(self, datum: MapOrigin | None = None) -> SavedGraph:
         """Return the graph with its state since the last update; see `io.capture.capture`."""

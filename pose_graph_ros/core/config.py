@@ -202,8 +202,11 @@ class MeasurementSource:
     covariance: CovariancePolicy = field(default_factory=CovariancePolicy)
     robust: Robust = Robust.LOSS
     loss: Loss = Loss.NONE
+    """Of what is believed; see `applied_loss`."""
     rejection_threshold: float = 3.0
     """Threshold k of the loss [sigma]."""
+    sigma_scale: float = 0.0
+    """Factor on the sigmas of what is judged; 0 for one that its residuals show."""
     minimum_period: float = 0.0
     """Of measurements with stamps closer than this only the first to arrive is used [s]."""
     correlation_time: float = 0.0
@@ -214,7 +217,7 @@ class MeasurementSource:
 
     def __post_init__(self) -> None:
         require(self, 'rejection_threshold', positive=True)
-        require(self, 'minimum_period', 'correlation_time', 'white_share')
+        require(self, 'sigma_scale', 'minimum_period', 'correlation_time', 'white_share')
         require_member(self, 'robust', Robust)
         require_member(self, 'loss', Loss)
         require_member(self, 'correlation', Correlation)
@@ -222,14 +225,20 @@ class MeasurementSource:
             raise ConfigError('MeasurementSource.white_share: expected a number in [0, 1], '
                               f'got {self.white_share!r}')
 
+    @property
+    def applied_loss(self) -> Loss:
+        """The loss of its constraints in the graph."""
+        return Loss.NONE if self.robust is Robust.NONE else self.loss
 
-POSITIONS = MeasurementSource(loss=Loss.HUBER)
+
+POSITIONS = MeasurementSource(robust=Robust.JUDGED, loss=Loss.HUBER)
 """Defaults of a source of global poses or positions."""
 HEADINGS = MeasurementSource(minimum_period=0.5)
 """Defaults of a source of headings; thinned, as an IMU sends many redundant ones."""
-SET_POSES = MeasurementSource()
-"""Settings of poses that a user sets: without a robust loss, as the user is believed."""
-LOOP_CLOSURES = MeasurementSource(covariance=CovariancePolicy(repair=False))
+SET_POSES = MeasurementSource(robust=Robust.NONE)
+"""Settings of poses that a user sets: neither judged nor with a loss, as the user is believed."""
+LOOP_CLOSURES = MeasurementSource(
+    covariance=CovariancePolicy(repair=False), robust=Robust.JUDGED)
 """Defaults of a source of loop closures; those with an invalid covariance are rejected."""
 
 

@@ -28,7 +28,7 @@ NUMBERS = [(kind, item.name)
 MAY_BE_ZERO = {
     'minimum_travel_distance', 'minimum_travel_heading', 'minimum_interval', 'sigma_distance',
     'sigma_lateral', 'sigma_heading_distance', 'sigma_heading_turn',
-    'reorder_window', 'correlation_time', 'white_share', 'minimum_period',
+    'reorder_window', 'correlation_time', 'white_share', 'minimum_period', 'sigma_scale',
 }
 
 

@@ -39,6 +39,20 @@ class Trajectory:
         object.__setattr__(self, 'stamps_ns', stamps)
         object.__setattr__(self, 'poses', poses)
 
+    def continued(self, stamp_ns: int, pose: FloatArray) -> 'Trajectory':
+        """
+        Return the trajectory with one pose more, unless that is not later than the last one.
+
+        Parameters
+        ----------
+        stamp_ns : int, [ns]
+        pose : ndarray, shape (3,) [m, m, rad]
+
+        """
+        if len(self) > 0 and stamp_ns <= self.stamps_ns[-1]:
+            return self
+        return Trajectory(np.append(self.stamps_ns, stamp_ns), np.vstack((self.poses, pose)))
+
     def __len__(self) -> int:
         return len(self.stamps_ns)
 

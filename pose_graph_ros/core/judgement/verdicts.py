@@ -2,8 +2,10 @@
 # SPDX-License-Identifier: Apache-2.0
 """What is decided on a constraint, and why."""
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 from enum import Enum
+from typing import NamedTuple
 
 from pose_graph_ros.core.geometry.se2 import FloatArray
 
@@ -76,3 +78,29 @@ class Verdict:
     """Whether `row` is one of an edge; else of an observed node."""
     row: int
     """Its row in the graph."""
+
+
+class Change(NamedTuple):
+    """A change of the state of one constraint, to be announced once."""
+
+    id: str
+    kind: Judged
+    source: str
+    stamp_ns: int
+    """Of the measurement [ns]."""
+    before: State | None
+    """None for a new constraint; one that is believed at once is no change."""
+    after: State
+
+
+class SourceVerdicts(NamedTuple):
+    """What is believed of a source, as a whole."""
+
+    counts: Mapping[State, int]
+    """Number of its constraints by state; states without any may be missing."""
+    scale: float
+    """Learnt factor on its sigmas; 1 where they are right, or where too little is known."""
+    doubting: bool
+    """Whether its newest measurements are doubted or wait, while the estimate goes on."""
+    n_forgotten: int = 0
+    """Number of hopeless constraints that are not judged again."""

@@ -13,7 +13,6 @@ from pose_graph_ros.core.compiled.growing_array import GrowingArray
 from pose_graph_ros.core.config import (
     BackendConfig,
     Correlation,
-    MeasurementSource,
     OdometrySource,
 )
 from pose_graph_ros.core.graph import tables as tb
@@ -259,11 +258,11 @@ class FactorBuilder:
         """Record the constraints of the update that was built last."""
         self.n_bias_edges += self._n_new_bias_edges
         for is_edge, row, source, stamp_ns, kind in self._new:
-            settings: MeasurementSource | OdometrySource | None = (
-                self._config.odometry.get(source) if stamp_ns < 0 else None)
-            settings = settings or self._config.measurement_source(source, kind)
-            self._reweighting.add(
-                row, settings.loss, settings.rejection_threshold, edge=is_edge)
+            odometry = self._config.odometry.get(source) if stamp_ns < 0 else None
+            settings = odometry or self._config.measurement_source(source, kind)
+            loss = (settings.loss if isinstance(settings, OdometrySource)
+                    else settings.applied_loss)
+            self._reweighting.add(row, loss, settings.rejection_threshold, edge=is_edge)
             if stamp_ns >= 0:
                 constraints = self._constraints.setdefault(source, _SourceConstraints())
                 constraints.rows.append_one((stamp_ns, row))

@@ -83,3 +83,12 @@ def test_a_trajectory_is_frozen_and_its_own() -> None:
         trajectory.poses = poses
     trajectory.at([1])[0] = 5.0     # what is interpolated belongs to the caller
     Trajectory([1], np.zeros((1, 3))).at([1])[0] = 5.0
+
+
+def test_a_trajectory_continues_only_later() -> None:
+    begin = Trajectory(np.array([1, 3]), np.zeros((2, 3)))
+    longer = begin.continued(4, np.array([1.0, 2.0, 0.5]))
+    assert longer.stamps_ns.tolist() == [1, 3, 4]
+    assert longer.poses[-1].tolist() == [1.0, 2.0, 0.5]
+    assert begin.continued(3, np.ones(3)) is begin
+    assert len(Trajectory(np.empty(0), np.empty((0, 3))).continued(1, np.ones(3))) == 1
