@@ -138,7 +138,7 @@ def _solution(head, v, path, n_rows):  # type: ignore[no-untyped-def]
         nodes = pool_i[row[tb.NODES]:row[tb.NODES] + n_frontal + n_separator]
         first = 0
         if k == 0:
-            here = _cleared(here, n)
+            here = cleared(here, n)
             while nodes[first] != v:
                 first += 1
             turn = clique_frames.present_turn(head, path[k])
@@ -155,27 +155,53 @@ def _solution(head, v, path, n_rows):  # type: ignore[no-untyped-def]
                 _solve_block(values, 3 * f, n, here, y[:, end:])
         end += rows
         if n_separator > 0:
-            parent = clique_i[row[tb.PARENT]]
-            n_above = parent[tb.N_FRONTAL] + parent[tb.N_SEPARATOR]
-            above = _cleared(above, 3 * n_above)
-            for m in range(n_above):
-                node_i[pool_i[parent[tb.NODES] + m], tb.INDEX] = 3 * m
-            turn = (clique_frames.present_turn(head, path[k])
-                    - clique_frames.present_turn(head, row[tb.PARENT]))
-            cos, sin = math.cos(turn), math.sin(turn)
-            for s in range(n_frontal, n_frontal + n_separator):
-                at = node_i[nodes[s], tb.INDEX]
-                for m in range(3):
-                    p, q = here[m, 3 * s], here[m, 3 * s + 1]
-                    above[m, at], above[m, at + 1] = cos * p - sin * q, sin * p + cos * q
-                    above[m, at + 2] = here[m, 3 * s + 2]
+            above = pass_up(head, path[k], here, above)
             here, above = above, here
     return y
 
 
 @kernel(allocates=True)
-def _cleared(vectors, n):  # type: ignore[no-untyped-def]
-    """Return three vectors whose first n entries are zero; reuse `vectors` if long enough."""
+def pass_up(head, c, here, above):  # type: ignore[no-untyped-def]
+    """
+    Return the right-hand sides of a clique's separator as those of its parent, in its frame.
+
+    Parameters
+    ----------
+    c : int, clique with a parent
+    here : ndarray, three right-hand sides of the clique
+    above : ndarray, three vectors to be overwritten, if they are long enough
+
+    """
+    node_i, clique_i, pool_i = tb.node_i(head), tb.clique_i(head), tb.pool_i(head)
+    row = clique_i[c]
+    parent = clique_i[row[tb.PARENT]]
+    n_above = parent[tb.N_FRONTAL] + parent[tb.N_SEPARATOR]
+    above = cleared(above, 3 * n_above)
+    for m in range(n_above):
+        node_i[pool_i[parent[tb.NODES] + m], tb.INDEX] = 3 * m
+    turn = (clique_frames.present_turn(head, c)
+            - clique_frames.present_turn(head, row[tb.PARENT]))
+    cos, sin = math.cos(turn), math.sin(turn)
+    for s in range(row[tb.N_FRONTAL], row[tb.N_FRONTAL] + row[tb.N_SEPARATOR]):
+        at = node_i[pool_i[row[tb.NODES] + s], tb.INDEX]
+        for m in range(3):
+            p, q = here[m, 3 * s], here[m, 3 * s + 1]
+            above[m, at], above[m, at + 1] = cos * p - sin * q, sin * p + cos * q
+            above[m, at + 2] = here[m, 3 * s + 2]
+    return above
+
+
+@kernel(allocates=True)
+def cleared(vectors, n):  # type: ignore[no-untyped-def]
+    """
+    Return three vectors whose first n entries are zero; `vectors` themselves if long enough.
+
+    Parameters
+    ----------
+    vectors : ndarray, shape (3, M)
+    n : int
+
+    """
     if vectors.shape[1] < n:
         return np.zeros((3, 2 * n))
     vectors[:, :n] = 0.0

@@ -12,9 +12,17 @@ from pose_graph_ros.core.exceptions import GraphUpdateError
 from pose_graph_ros.core.geometry import se2
 from pose_graph_ros.core.geometry.se2 import FloatArray
 from pose_graph_ros.core.graph import tables as tb
-from pose_graph_ros.core.graph.constraints import EdgeKind, Edges
+from pose_graph_ros.core.graph.constraints import EdgeKind, Edges, ObservedNodes
 from pose_graph_ros.core.graph.graph import Graph, GraphUpdate
-from pose_graph_ros.core.smoother import batch_fallback, chain, covariances, refinement, step
+from pose_graph_ros.core.smoother import (
+    batch_fallback,
+    chain,
+    covariances,
+    innovations,
+    refinement,
+    step,
+)
+from pose_graph_ros.core.smoother.innovations import Innovations
 from pose_graph_ros.core.smoother.sparse_inverse import all_covariances
 
 
@@ -202,6 +210,28 @@ class IncrementalSmoother:
         out = np.zeros((self.graph.n_nodes, 3, 3))
         all_covariances(self._memory.head, out)
         return out
+
+    def edge_innovations(self, edges: Edges) -> Innovations:
+        """
+        Return by how much edges, not in the graph or with weight 0, disagree with the estimate.
+
+        Raises as `covariance` does.
+        """
+        self._require_eliminated(*edges.i, *edges.j)
+        result = Innovations(np.empty((len(edges), 3)), np.zeros((len(edges), 3, 3)))
+        columns = edges.i, edges.j, edges.mean, edges.kind, edges.bias
+        innovations.of_edges(
+            self._memory.head, *map(np.ascontiguousarray, columns), *result)
+        return result
+
+    def observed_innovations(self, observed: ObservedNodes) -> Innovations:
+        """Return the same of observed nodes."""
+        self._require_eliminated(*observed.node)
+        result = Innovations(np.empty((len(observed), 3)), np.zeros((len(observed), 3, 3)))
+        columns = observed.node, observed.offset, observed.mean
+        innovations.of_observed(
+            self._memory.head, *map(np.ascontiguousarray, columns), *result)
+        return result
 
     def _require_eliminated(self, *nodes: Any) -> None:
         waiting, n_nodes = int(self._memory.head[tb.N_TOUCHED]), self.graph.n_nodes

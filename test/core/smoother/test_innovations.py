@@ -1,0 +1,158 @@
+# Copyright 2026 The pose_graph_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""Innovation covariances are J P J^T with the dense inverse P of H."""
+
+from hypothesis import given, settings, strategies as st
+import jacobians
+import numpy as np
+import pytest
+from slow_smoother import EXACT, SlowGraph, world
+from test_covariances import chain, dense, driven, off, RELATIVE, seeds
+
+from pose_graph_ros.core.geometry import se2
+from pose_graph_ros.core.graph import error_functions
+from pose_graph_ros.core.graph.constraints import EdgeKind, Edges, ObservedKind, ObservedNodes
+from pose_graph_ros.core.graph.graph import GraphUpdate
+from pose_graph_ros.core.smoother.incremental import IncrementalSmoother
+
+
+def candidates(
+    smoother: IncrementalSmoother, rng: np.random.Generator, n: int,
+) -> tuple[Edges, ObservedNodes]:
+    """Return random edges, also to biases, and observed nodes with offsets, of any consistency."""
+    graph, sigma = smoother.graph, (2.0, 2.0, 1.0)
+    poses, biases = np.flatnonzero(~graph.is_bias), np.flatnonzero(graph.is_bias)
+    pairs = [rng.choice(poses, 2, replace=False) for _ in range(n if len(poses) > 1 else 0)]
+    kinds = [EdgeKind.LOOP_CLOSURE] * len(pairs)
+    if len(biases) > 0:
+        pairs += [(rng.choice(poses), rng.choice(biases)) for _ in range(n)]
+        kinds += [EdgeKind.BIAS] * n
+    i, j = np.reshape(pairs, (-1, 2)).T.astype(np.int64)
+    root = rng.normal(size=(len(i) + n, 3, 3))
+    information = root @ np.swapaxes(root, 1, 2)
+    edges = Edges(i, j, rng.normal(size=(len(i), 3)) * sigma, information[:len(i)], kinds,
+                  bias=rng.normal(size=(len(i), 4)))
+    node = rng.choice(poses, n)
+    return edges, ObservedNodes(
+        node, rng.normal(size=(n, 3)), graph.poses[node] + rng.normal(size=(n, 3)) * sigma,
+        information[len(i):], [ObservedKind.GLOBAL_POSE] * n)
+
+
+@given(seeds, st.integers(0, 25))
+@settings(max_examples=30)
+def test_they_are_those_of_the_dense_inverse(seed: int, steps: int) -> None:
+    smoother = driven(seed, steps)
+    poses, P = smoother.poses, dense(smoother).reshape(len(smoother.poses), 3, -1, 3)
+    edges, observed = candidates(smoother, np.random.default_rng(seed), 5)
+    linear = jacobians.linearize_edges(poses, edges)
+    errors, actual = smoother.edge_innovations(edges)
+    np.testing.assert_allclose(errors, error_functions.edge_errors(poses, edges), atol=1e-12)
+    for k, (i, j) in enumerate(zip(edges.i, edges.j, strict=True)):
+        J = np.hstack((linear.jacobian_i[k], linear.jacobian_j[k]))
+        joint = np.block([[P[i, :, i], P[i, :, j]], [P[j, :, i], P[j, :, j]]])
+        assert off(actual[k], J @ joint @ J.T) < RELATIVE
+        np.testing.assert_array_equal(actual[k], actual[k].T)
+    single = jacobians.linearize_observed(poses, observed)
+    errors, actual = smoother.observed_innovations(observed)
+    np.testing.assert_allclose(
+        errors, error_functions.observed_errors(poses, observed), atol=1e-12)
+    for k, i in enumerate(observed.node):
+        expected = single.jacobian[k] @ P[i, :, i] @ single.jacobian[k].T
+        assert off(actual[k], expected) < RELATIVE
+
+
+@given(seeds)
+@settings(max_examples=10)
+def test_they_are_those_of_joint_covariances_whatever_is_linearized_where(seed: int) -> None:
+    smoother, here = IncrementalSmoother(), world(seed, noise=(0.2, 0.2, 0.1))
+    smoother.update(GraphUpdate(hidden=np.array(here.truth), fix=[0]))
+    for _ in range(30):
+        smoother.update(here.new_nodes(2))
+    smoother.update(GraphUpdate(edges=here.edges(here.pairs(3))))
+    edges, observed = candidates(smoother, here.rng, 5)
+    linear = jacobians.linearize_edges(smoother.poses, edges)
+    for k, actual in enumerate(smoother.edge_innovations(edges).covariances):
+        J = np.hstack((linear.jacobian_i[k], linear.jacobian_j[k]))
+        joint = smoother.joint_covariance(edges.i[k], edges.j[k])
+        assert off(actual, J @ joint @ J.T) < 1e-8
+    single = jacobians.linearize_observed(smoother.poses, observed)
+    for k, actual in enumerate(smoother.observed_innovations(observed).covariances):
+        J = single.jacobian[k]
+        assert off(actual, J @ smoother.covariance(observed.node[k]) @ J.T) < RELATIVE
+
+
+@given(seeds)
+@settings(max_examples=10)
+def test_distances_are_those_by_the_inverse_also_without_information_on_the_heading(
+    seed: int,
+) -> None:
+    smoother = driven(seed, 10)
+    _, observed = candidates(smoother, np.random.default_rng(seed), 5)
+    found = smoother.observed_innovations(observed)
+    total = found.covariances + np.linalg.inv(observed.information)
+    np.testing.assert_allclose(
+        found.squared_distances(observed.information),
+        np.einsum('mi,mij,mj->m', found.errors, np.linalg.inv(total), found.errors), rtol=1e-7)
+    observed.information[:, 2, :] = observed.information[:, :, 2] = 0.0
+    position = np.linalg.inv(
+        found.covariances[:, :2, :2] + np.linalg.inv(observed.information[:, :2, :2]))
+    np.testing.assert_allclose(
+        found.squared_distances(observed.information),
+        np.einsum('mi,mij,mj->m', found.errors[:, :2], position, found.errors[:, :2]), rtol=1e-7)
+
+
+def test_neighbours_far_from_what_fixes_them_have_an_exact_relative_covariance() -> None:
+    smoother = IncrementalSmoother(EXACT)
+    smoother.update(chain(2000, bend=1e-3))
+    edges = smoother.graph.edges_at(np.array([1990]))
+    covariance = smoother.edge_innovations(edges).covariances[0]
+    np.testing.assert_allclose(covariance, np.linalg.inv(edges.information[0]), rtol=1e-12)
+
+
+def test_parts_of_the_graph_that_are_not_connected_are_independent() -> None:
+    smoother, here = IncrementalSmoother(EXACT), world(1)
+    smoother.update(GraphUpdate(hidden=np.array(here.truth), fix=[0]))
+    smoother.update(here.new_nodes(4))
+    smoother.update(here.new_part('pose'))
+    n = smoother.graph.n_nodes
+    edge = Edges([2], [n - 1], [[0.0, 0.0, 0.0]], [np.eye(3)], [EdgeKind.LOOP_CLOSURE])
+    _, covariance = smoother.edge_innovations(edge)
+    linear = jacobians.linearize_edges(smoother.poses, edge)
+    parts = [J[0] @ smoother.covariance(node) @ J[0].T for J, node in (
+        (linear.jacobian_i, 2), (linear.jacobian_j, n - 1))]
+    np.testing.assert_allclose(covariance[0], sum(parts), rtol=1e-12)
+
+
+def test_between_fixed_nodes_nothing_is_uncertain() -> None:
+    smoother = IncrementalSmoother(EXACT)
+    smoother.update(chain(6))
+    smoother.update(GraphUpdate(fix=[3]))
+    edges = Edges([0, 3], [3, 5], np.zeros((2, 3)), [np.eye(3)] * 2, [EdgeKind.LOOP_CLOSURE] * 2)
+    covariances = smoother.edge_innovations(edges).covariances
+    np.testing.assert_array_equal(covariances[0], np.zeros((3, 3)))
+    assert np.all(np.diag(covariances[1]) > 0.0)
+    slow = SlowGraph(smoother.poses, smoother.graph.fixed, smoother.graph.edges).covariance()
+    J = jacobians.linearize_edges(smoother.poses, edges).jacobian_j[1]
+    np.testing.assert_allclose(covariances[1], J @ slow[15:, 15:] @ J.T, rtol=1e-9)
+
+
+def test_a_closure_moves_nodes_by_less_than_its_innovation() -> None:
+    # the law of the Kalman filter: the error that is left is R S^-1 e
+    smoother = IncrementalSmoother(EXACT)
+    smoother.update(chain(40))
+    mean = se2.between(smoother.poses[3], smoother.poses[30]) + np.array([1e-4, -2e-4, 1e-5])
+    edge = Edges([3], [30], [mean], [np.diag([50.0, 60.0, 900.0])], [EdgeKind.LOOP_CLOSURE])
+    before, S = smoother.edge_innovations(edge)
+    R = np.linalg.inv(edge.information[0])
+    smoother.update(GraphUpdate(edges=edge))
+    after, left = smoother.edge_innovations(edge)
+    np.testing.assert_allclose(after[0], R @ np.linalg.solve(S[0] + R, before[0]), rtol=1e-2)
+    np.testing.assert_allclose(left[0], S[0] - S[0] @ np.linalg.solve(S[0] + R, S[0]), rtol=1e-3)
+
+
+def test_a_node_that_is_not_there_is_refused() -> None:
+    smoother = IncrementalSmoother(EXACT)
+    smoother.update(chain(3))
+    edge = Edges([0], [3], np.zeros((1, 3)), [np.eye(3)], [EdgeKind.LOOP_CLOSURE])
+    with pytest.raises(ValueError, match=r'expected a hidden node in 0\.\.2, got 3'):
+        smoother.edge_innovations(edge)
