@@ -196,12 +196,14 @@ SOURCE_PARAMETERS: tuple[Parameter, ...] = (
     Parameter('sigma_scale', _MEASUREMENT.sigma_scale, '', 'Factor on the standard deviations of '
               'what is believed, if `robust` is `judged`. If 0, it is learnt from the residuals.',
               0.0, 1e3, kinds=_JUDGED),
-    *(Parameter('robust_loss', loss.value, '', 'Robust loss applied to the errors.',
+    *(Parameter('robust_loss', loss.value, '', 'Robust loss applied to the errors. The last four '
+                'are bounded: very wrong measurements have no influence, and the start matters.',
                 choices=_values(config.Loss), kinds=kinds) for kinds, loss in (
         (_POSITIONS, config.POSITIONS.loss), (_NOT_POSITIONS, _MEASUREMENT.loss))),
     Parameter('rejection_threshold', _MEASUREMENT.rejection_threshold, '', 'Error in standard '
-              'deviations above which the robust loss reduces the weight of a measurement.', 0.1,
-              1e3, kinds=_ALL),
+              'deviations above which the robust loss reduces the weight of a measurement. If '
+              'none is wrong, 0.3 % of headings, 1.1 % of positions and 2.9 % of poses exceed 3. '
+              'For `tukey` take 5.', 0.1, 1e3, kinds=_ALL),
     *(Parameter('minimum_period', period, 's', 'Minimum time between the stamps of two '
                 'measurements; of closer ones the first to arrive is used. If 0, all are used.',
                 0.0, 3600.0, kinds=kinds) for kinds, period in (

@@ -59,11 +59,20 @@ def require_member(settings: object, name: str, kind: type[Enum]) -> None:
 
 
 class Loss(Enum):
-    """Loss of a constraint as a function of its energy; see `graph.losses`."""
+    """
+    Loss of a constraint as a function of its energy; see `graph.losses`.
+
+    A threshold of 3 sigma keeps 96 % (Cauchy), 89 % (truncated, Geman-McClure), 99 % (Huber, DCS)
+    of the accuracy of least squares where no measurement is wrong; Tukey needs 5 sigma for 95 %.
+    """
 
     NONE = 'none'
     HUBER = 'huber'
     CAUCHY = 'cauchy'
+    GEMAN_MCCLURE = 'geman_mcclure'
+    DCS = 'dcs'
+    TUKEY = 'tukey'
+    TRUNCATED = 'truncated'
 
 
 class Robust(Enum):

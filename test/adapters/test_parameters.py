@@ -260,7 +260,7 @@ def test_every_parameter_says_what_it_does() -> None:
 
 
 @pytest.mark.parametrize(('name', 'text'), [
-    ('fix.robust_loss', 'one of: none, huber, cauchy'),
+    ('fix.robust_loss', 'one of: none, huber, cauchy, geman_mcclure, dcs, tukey, truncated'),
     ('datum', '2 or 3 numbers, or unset; unit: deg, deg, rad; only while the node is not '
               'configured'),
     ('fix.sigma_floor', '2 numbers; unit: m, rad'), ('frequency', 'unit: Hz'), ('publish_tf', '')])

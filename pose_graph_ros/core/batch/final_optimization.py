@@ -84,10 +84,10 @@ def _optimize_robustly(
         result = optimize_from_two_starts(graph, config, solve)
         for factor in widened:
             if result.status is not Status.FAILED:
-                _set_weights(graph, *reweighting.all_changes(graph, factor))
-                result = solve(graph, config)
+                result = _solved_with(
+                    graph, reweighting.all_changes(graph, factor), config, solve) or result
         if result.status is not Status.FAILED:
-            result = _reweighted(graph, reweighting, config, solve)
+            result = _reweighted(graph, reweighting, result, config, solve)
         failed = result.status is Status.FAILED
         if best is None or best.status is Status.FAILED or (
                 not failed and result.chi2 < best.chi2 * (1.0 - SAME_MINIMUM)):
@@ -99,24 +99,52 @@ def _optimize_robustly(
 
 
 def _reweighted(
-    graph: Graph, reweighting: Reweighting, config: SolverConfig, solve: Solve,
+    graph: Graph, reweighting: Reweighting, result: BatchResult, config: SolverConfig,
+    solve: Solve,
 ) -> BatchResult:
-    """Reweight and solve until the weights converge; chi2 of the result is the robust cost."""
+    """
+    Reweight and solve until the weights converge; chi2 of the result is the robust cost.
+
+    A loss may give weight 0 to all that determines a node. The last weights with a solution are
+    kept then, and the status is MAX_ITERATIONS.
+    """
     iterations, largest = 0, 1.0
     for _ in range(REWEIGHTINGS):
         before = graph.weights
-        _set_weights(graph, *reweighting.all_changes(graph))
+        found = _solved_with(graph, reweighting.all_changes(graph), config, solve)
+        if found is None:
+            largest = 1.0
+            break
         largest = max(float(np.max(np.abs(new - old), initial=0.0))
                       for new, old in zip(graph.weights, before, strict=True))
-        result = solve(graph, config)
+        result = found
         iterations += result.iterations
-        if result.status is Status.FAILED or largest < SAME_WEIGHT:
+        if largest < SAME_WEIGHT:
             break
     if result.status is Status.FAILED:
         return result
     if largest >= SAME_WEIGHT:
         result = replace(result, status=Status.MAX_ITERATIONS)
     return replace(result, iterations=iterations, chi2=result.chi2 + reweighting.cost(graph))
+
+
+def _solved_with(
+    graph: Graph, changes: tuple[Mapping[int, float], Mapping[int, float]], config: SolverConfig,
+    solve: Solve,
+) -> BatchResult | None:
+    """
+    Return the result of solving with other weights.
+
+    It is None, with the old weights, if they leave too little to determine all nodes.
+    """
+    before = graph.weights
+    _set_weights(graph, *changes)
+    result = solve(graph, config)
+    smallest = min(min(new.values(), default=1.0) for new in changes)
+    if result.status is not Status.FAILED or smallest > SMALL_WEIGHT:
+        return result
+    _restore_weights(graph, before)
+    return None
 
 
 def _restore_weights(graph: Graph, weights: tuple[FloatArray, FloatArray]) -> None:
