@@ -44,8 +44,8 @@ LIBRARIES = {'numpy', 'scipy', 'numba', 'pyproj'}
 ROS = {'rclpy', 'rosidl_runtime_py', 'ament_index_python', 'launch', 'launch_ros'}
 
 # What the node decides without ROS, so that it can be tested without.
-LOGIC = ('input', 'liveness', 'log', 'memory', 'pose_continuity', 'refusals', 'set_pose_input',
-         'slew', 'time_jump', 'worker')
+LOGIC = ('announcements', 'decisions', 'input', 'liveness', 'log', 'memory', 'pose_continuity',
+         'refusals', 'set_pose_input', 'slew', 'time_jump', 'worker')
 
 MOST_LINES = 450
 

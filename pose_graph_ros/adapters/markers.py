@@ -4,12 +4,15 @@
 Serialise the graph as a visualization_msgs/MarkerArray, directly from arrays.
 
 One message object for every point would take seconds instead of milliseconds. The colour of a
-constraint shows its error in sigmas: green up to 1, yellow at 2, red from 3. No rclpy.
+constraint shows its error in sigmas: green up to 1, yellow at 2, red from 3. Dashed are loop
+closures that are believed weakly (coloured), that wait (blue) or that are doubted (grey). Grey,
+too, are measured positions that are not used. No rclpy.
 """
 
 import numpy as np
 import numpy.typing as npt
 
+from pose_graph_ros.adapters.cdr import CdrStream
 from pose_graph_ros.adapters.sources import NANOSECONDS
 from pose_graph_ros.core.geometry.se2 import FloatArray
 from pose_graph_ros.core.graph.graph_view import GraphView, Lines
@@ -21,10 +24,14 @@ LINE_LIST, POINTS, ADD, DELETEALL = 5, 8, 0, 3
 SIGMAS = (1.0, 2.0, 3.0)
 COLOURS = ((0.15, 0.7, 0.3, 1.0), (0.95, 0.8, 0.1, 1.0), (0.9, 0.1, 0.1, 1.0))
 NODE_COLOUR = (0.4, 0.6, 0.85, 1.0)  # colour of hidden nodes
+WAITING_COLOUR, DOUBTED_COLOUR = (0.3, 0.5, 0.95, 0.9), (0.55, 0.55, 0.55, 0.8)
+DASHES = 12  # of a dashed line; the gaps are as long
 # Sizes of points, and widths of lines [m].
 NODE_SIZE, OBSERVED_SIZE, EDGE_WIDTH, CLOSURE_WIDTH = 0.2, 0.25, 0.06, 0.1
 
-NAMESPACES = ('hidden_nodes', 'odometry', 'loop_closures', 'observed_errors', 'observed_nodes')
+NAMESPACES = (
+    'hidden_nodes', 'odometry', 'loop_closures', 'observed_errors', 'observed_nodes',
+    'weak_closures', 'waiting_closures', 'doubted', 'unused_errors', 'unused_nodes')
 """Namespaces of the markers by id."""
 
 _Colours = npt.NDArray[np.float32]
@@ -51,17 +58,22 @@ def markers_cdr(view: GraphView, stamp_ns: int, frame_id: str) -> bytes:
         (LINE_LIST, EDGE_WIDTH, *_lines(view.odometry)),
         (LINE_LIST, CLOSURE_WIDTH, *_lines(view.loop_closures)),
         (LINE_LIST, EDGE_WIDTH, *_lines(view.observed)),
-        (POINTS, OBSERVED_SIZE, view.observed.ends[:, 1], colours(view.observed.sigmas))]
+        (POINTS, OBSERVED_SIZE, view.observed.ends[:, 1], colours(view.observed.sigmas)),
+        (LINE_LIST, CLOSURE_WIDTH, *_lines(_dashed(view.weak))),
+        (LINE_LIST, CLOSURE_WIDTH, *_plain(_dashed(view.waiting).ends, WAITING_COLOUR)),
+        (LINE_LIST, CLOSURE_WIDTH, *_plain(_dashed(view.doubted).ends, DOUBTED_COLOUR)),
+        (LINE_LIST, EDGE_WIDTH, *_plain(view.unused.ends, DOUBTED_COLOUR)),
+        (POINTS, OBSERVED_SIZE, *_plain(view.unused.ends[:, 1], DOUBTED_COLOUR))]
     shown = [number for number, (_, _, points, _) in enumerate(drawn) if len(points) > 0]
     header = (*divmod(stamp_ns, NANOSECONDS), frame_id)
-    stream = _Stream()
+    stream = CdrStream()
     stream.add('<u4', 1 + len(shown))
     _add_marker(stream, header, '', (0, 0, DELETEALL), 0.0, np.empty((0, 2)), plain)
     for number in shown:
         kind, size, points, point_colours = drawn[number]
         _add_marker(
             stream, header, NAMESPACES[number], (number, kind, ADD), size, points, point_colours)
-    return b'\x00\x01\x00\x00' + bytes(stream.data)
+    return stream.message()
 
 
 def colours(sigmas: FloatArray) -> _Colours:
@@ -76,8 +88,24 @@ def _lines(lines: Lines) -> tuple[FloatArray, _Colours]:
     return lines.ends.reshape(-1, 2), np.repeat(colours(lines.sigmas), 2, axis=0)
 
 
+def _dashed(lines: Lines) -> Lines:
+    """Return the dashes of lines as lines."""
+    at = np.linspace(0.0, 1.0, 2 * DASHES)[:, None]
+    begin, end = lines.ends[:, 0, None], lines.ends[:, 1, None]
+    points = begin + at * (end - begin)
+    return Lines(points.reshape(-1, 2, 2), np.repeat(lines.sigmas, DASHES))
+
+
+def _plain(
+    points: FloatArray, colour: tuple[float, float, float, float],
+) -> tuple[FloatArray, _Colours]:
+    """Return points, shape (..., 2), as one array, and the same colour for each of them."""
+    points = points.reshape(-1, 2)
+    return points, np.tile(np.array(colour, dtype=np.float32), (len(points), 1))
+
+
 def _add_marker(  # noqa: PLR0917  fields of a marker
-    stream: '_Stream', header: tuple[int, int, str], namespace: str, what: tuple[int, int, int],
+    stream: CdrStream, header: tuple[int, int, str], namespace: str, what: tuple[int, int, int],
     size: float, points: FloatArray, point_colours: _Colours,
 ) -> None:
     """Add a visualization_msgs/Marker field by field."""
@@ -107,21 +135,3 @@ def _add_marker(  # noqa: PLR0917  fields of a marker
         stream.add_text('')     # text, mesh_resource and the name of mesh_file
     stream.add('<u4', 0)
     stream.add('u1', 0)         # mesh_use_embedded_materials
-
-
-class _Stream:
-    """A stream of CDR: the position of each number is a multiple of its size."""
-
-    def __init__(self) -> None:
-        self.data = bytearray()
-
-    def add(self, code: str, *numbers: npt.ArrayLike) -> None:
-        """Add numbers, or an array, as a type of NumPy."""
-        array = np.asarray(numbers, dtype=code)
-        self.data += bytes(-len(self.data) % array.itemsize) + array.tobytes()
-
-    def add_text(self, text: str) -> None:
-        """Add a string."""
-        name = text.encode() + b'\0'
-        self.add('<u4', len(name))
-        self.data += name

@@ -27,7 +27,7 @@ from pose_graph_ros.core.graph.graph import Graph, GraphUpdate
 from pose_graph_ros.core.graph.reweighting import Reweighting
 from pose_graph_ros.core.io.capture import capture, Parts, restore
 from pose_graph_ros.core.io.saved_graph import SavedGraph
-from pose_graph_ros.core.judgement.verdicts import Change, Decision, SourceVerdicts, Verdict
+from pose_graph_ros.core.judgement import verdicts as vd
 from pose_graph_ros.core.measurements import (
     ACCEPTED,
     Answer,
@@ -148,25 +148,25 @@ class PoseGraphBackend:
 
     def view(self) -> graph_view.GraphView | None:
         """Return a copy of the graph for display; None before the first odometry."""
-        return graph_view.view(self.graph)
+        return graph_view.view(self.graph, vd.drawn_rows(self.verdicts(most_believed=0)))
 
     def largest_energies(self, n: int) -> list[constraint_names.ConstraintEnergy]:
         """Return the n constraints with the largest energies, with names, in descending order."""
         return constraint_names.largest(self.graph, self._nodes, self._factors, n)
 
-    def verdicts(self, most_believed: int | None = None) -> list[Verdict]:
+    def verdicts(self, most_believed: int | None = None) -> list[vd.Verdict]:
         """Return all verdicts, but of those that are believed only the newest of each source."""
         return []
 
-    def verdict_changes(self) -> list[Change]:
+    def verdict_changes(self) -> list[vd.Change]:
         """Return the changes of verdicts since the last call."""
         return []
 
-    def verdict_totals(self) -> Mapping[str, SourceVerdicts]:
+    def verdict_totals(self) -> Mapping[str, vd.SourceVerdicts]:
         """Return what is believed of each source, as a whole."""
         return {}
 
-    def decide(self, name: str, decision: Decision) -> Answer:
+    def decide(self, name: str, decision: vd.Decision) -> Answer:
         """
         Return the answer to a person's decision, with a sentence; the next update applies it.
 

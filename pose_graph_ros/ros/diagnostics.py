@@ -2,7 +2,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """Values and summary of the node's status in /diagnostics; imports only messages of ROS."""
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
+from concurrent.futures import Future
 import math
 import os
 from pathlib import Path
@@ -11,17 +12,24 @@ from typing import TYPE_CHECKING
 
 from diagnostic_msgs.msg import DiagnosticStatus
 
+from pose_graph_ros.adapters.verdict_texts import total_values
 from pose_graph_ros.core.alignment.monitor import AlignmentState
 from pose_graph_ros.core.batch.optimizer import Status
+from pose_graph_ros.core.sources.constraint_names import ConstraintEnergy
 from pose_graph_ros.core.sources.source_report import LEAST_ENERGY
+from pose_graph_ros.ros.worker import Worker
 
 if TYPE_CHECKING:
     from pose_graph_ros.ros.session import Session
 
+# Period of the search for the constraints with the largest energies [s], and their number.
+ENERGY_PERIOD, N_ENERGIES = 5.0, 3
+
 
 def values(session: 'Session') -> dict[str, object]:
     """Return all values of the diagnostics by key."""
-    return {**_state(session), **_inputs(session), **_fits(session)}
+    return {**_state(session), **_inputs(session), **_fits(session),
+            **total_values(session.worker.status.verdicts)}
 
 
 def _state(session: 'Session') -> dict[str, object]:
@@ -52,11 +60,32 @@ def _state(session: 'Session') -> dict[str, object]:
             'hidden_nodes': estimate.n_hidden, 'edges': estimate.n_edges,
             'observed_nodes': estimate.n_observed, 'biases': estimate.n_biases,
             'chi2': f'{estimate.chi2:.6g}'})
-    for rank, largest in enumerate(session.largest_energies, 1):
+    for rank, largest in enumerate(session.energies.found, 1):
         found[f'largest_energy.{rank}'] = f'{largest.name}: {largest.energy:.4g}' + (
             '' if largest.unweighted == largest.energy else
             f', without its loss {largest.unweighted:.4g}')
     return found
+
+
+class LargestEnergies:
+    """The constraints with the largest energies, for which the worker is asked now and then."""
+
+    def __init__(self) -> None:
+        self.found: Sequence[ConstraintEnergy] = []
+        self._asked: Future[list[ConstraintEnergy]] | None = None
+        self._asked_at = -math.inf
+
+    def update(self, worker: Worker) -> None:
+        """Take the newest answer of the worker, and ask again after a while."""
+        now, asked = time.monotonic(), self._asked
+        if asked is not None and asked.done():
+            self._asked = None
+            if not asked.cancelled() and asked.exception() is None:
+                self.found = asked.result()
+        if self._asked is None and worker.prepared and now - self._asked_at > ENERGY_PERIOD:
+            self._asked_at = now
+            self._asked = worker.call(
+                lambda backend: backend.largest_energies(N_ENERGIES), 'the largest energies')
 
 
 def memory() -> int:
@@ -139,6 +168,7 @@ def _concerns(session: 'Session') -> Iterator[tuple[bytes, str]]:
     if estimate.alignment is AlignmentState.UNALIGNED:
         yield warn, ('Unaligned: the angle between odometry and map is not known yet. Drive some '
                      'metres while fixes come in.')
+    yield from _doubted_sources(session)
     yield from _doubts(session)
     if estimate.alignment is AlignmentState.LOCAL:
         yield good, ('Running without measurements in the map: its frame is that of the first '
@@ -168,6 +198,15 @@ def _missing_input(session: 'Session') -> Iterator[tuple[bytes, str]]:
     if len(refused) > 0:
         text = '; '.join(refused.values())
         yield warn, f'{text[0].upper()}{text[1:]}.'
+
+
+def _doubted_sources(session: 'Session') -> Iterator[tuple[bytes, str]]:
+    """Yield what is to be said while the newest measurements of sources are not believed."""
+    doubted = [name for name, each in session.worker.status.verdicts.items() if each.doubting]
+    if len(doubted) > 0:
+        yield DiagnosticStatus.WARN, (
+            f'The newest measurements of {" and ".join(doubted)} are doubted and not used, as '
+            'they contradict the others: see ~/verdicts.')
 
 
 def _doubts(session: 'Session') -> Iterator[tuple[bytes, str]]:

@@ -4,11 +4,11 @@
 The outputs of the node, with strictly increasing stamps.
 
 Pose, odometry, fix and transform are published with each odometry message, from the executor's
-thread; path and markers, which can be large, from the thread that owns the engine. All but the
-transform and the diagnostics are made only while there is a subscriber.
+thread; path, markers and verdicts, which can be large, from the thread that owns the engine. All
+but the transform and the diagnostics are made only while there is a subscriber.
 """
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from copy import copy
 import threading
 import time
@@ -29,10 +29,12 @@ from pose_graph_ros.adapters.conversions import frame, Message
 from pose_graph_ros.adapters.fixes import Datum
 from pose_graph_ros.adapters.markers import markers_cdr
 from pose_graph_ros.adapters.sources import NANOSECONDS
+from pose_graph_ros.adapters.verdict_messages import shown, verdicts_cdr
 from pose_graph_ros.core.alignment.monitor import AlignmentState
 from pose_graph_ros.core.estimate import Estimate
 from pose_graph_ros.core.geometry.trajectory import Trajectory
 from pose_graph_ros.core.graph.graph_view import GraphView
+from pose_graph_ros.core.judgement.verdicts import SourceVerdicts, Verdict
 from pose_graph_ros.core.measurements import OdometrySample
 from pose_graph_ros.core.prediction import predict
 from pose_graph_ros.ros import messages
@@ -49,6 +51,7 @@ OUTPUTS = {
     'gps/filtered': (NavSatFix, OUTPUT_QOS),
     'path': (Path, LATCHED_QOS),
     'graph': (MarkerArray, LATCHED_QOS),
+    '~/verdicts': (DiagnosticArray, LATCHED_QOS),
     '/diagnostics': (DiagnosticArray, OUTPUT_QOS)}
 """Messages and quality of service by topic, but for /tf."""
 
@@ -76,7 +79,7 @@ class Publishers:
         self.base_frame = frame(values['base_link_frame'])
         self._publishers = [self._publisher(message_type, topic, qos)
                             for topic, (message_type, qos) in OUTPUTS.items()]
-        (self._pose, self._odometry, self._fix, self._path, self._graph,
+        (self._pose, self._odometry, self._fix, self._path, self._graph, self._verdicts,
          self._diagnostics) = self._publishers
         self.transforms: TransformPublisher | None = None
         """None if `publish_tf` is false or tf2_msgs is not installed."""
@@ -92,8 +95,9 @@ class Publishers:
 
     def _forget_views(self) -> None:
         self._path_shown: Estimate | None = None
-        self._path_stamp_ns = self._graph_stamp_ns = 0
-        self._path_at = self._graph_at = -float('inf')
+        self._path_stamp_ns = self._graph_stamp_ns = self._verdicts_stamp_ns = 0
+        self._path_at = self._graph_at = self._verdicts_at = -float('inf')
+        self._verdicts_shown: object = None
 
     def _publisher(self, message_type: type, topic: str, qos: QoSProfile) -> Publisher:
         return self._node.create_publisher(
@@ -216,8 +220,40 @@ class Publishers:
             self._graph_stamp_ns = max(stamp_ns, self._graph_stamp_ns + 1)
             self._graph.publish(markers_cdr(view, self._graph_stamp_ns, self.map_frame))
 
+    def verdicts_are_due(self, state: object) -> bool:
+        """Tell whether to publish the verdicts: changed, wanted, and not too soon."""
+        return (state != self._verdicts_shown
+                and time.monotonic() - self._verdicts_at >= self._graph_period
+                and self._verdicts.get_subscription_count() > 0)
+
+    def publish_verdicts(
+        self, verdicts: Sequence[Verdict], totals: Mapping[str, SourceVerdicts], stamp_ns: int,
+        graph: int, *, state: object,
+    ) -> None:
+        """
+        Publish the verdicts on the constraints of a graph, if it is the present one.
+
+        Parameters
+        ----------
+        verdicts : sequence of Verdict
+        totals : mapping
+            What is believed of each source.
+        stamp_ns, graph : int
+            Stamp of the newest odometry in it [ns], and number of the graph.
+        state : object
+            What `verdicts_are_due` was asked for.
+
+        """
+        with self._lock:
+            if graph != self.graph:
+                return
+            self._verdicts_at, self._verdicts_shown = time.monotonic(), state
+            self._verdicts_stamp_ns = max(stamp_ns, self._verdicts_stamp_ns + 1)
+            self._verdicts.publish(verdicts_cdr(
+                shown(verdicts), totals, self._verdicts_stamp_ns, self.map_frame))
+
     def start_new_graph(self) -> None:
-        """Forget all stamps; take path and markers back if any were published."""
+        """Forget all stamps; take path, markers and verdicts back if any were published."""
         self._newest_ns, self._aligned = 0, False
         self._slew.forget()
         if self.transforms is not None:
@@ -225,12 +261,15 @@ class Publishers:
         with self._lock:
             self.graph += 1
             path_ns, graph_ns = self._path_stamp_ns, self._graph_stamp_ns
+            verdicts_ns = self._verdicts_stamp_ns
             self._forget_views()
             if path_ns > 0:
                 self._path.publish(Path(header=self._after(path_ns)))
             if graph_ns > 0:
                 self._graph.publish(MarkerArray(
                     markers=[Marker(header=self._after(graph_ns), action=Marker.DELETEALL)]))
+            if verdicts_ns > 0:
+                self._verdicts.publish(verdicts_cdr([], {}, verdicts_ns + 1, self.map_frame))
 
     def _after(self, stamp_ns: int) -> Header:
         return Header(stamp=messages.time_message(stamp_ns + 1), frame_id=self.map_frame)

@@ -12,10 +12,10 @@ from concurrent.futures import Future
 from copy import copy
 from functools import partial
 import logging
-import math
 import time
 from typing import Any
 
+from diagnostic_msgs.msg import KeyValue
 from geometry_msgs.msg import PoseWithCovarianceStamped
 from rclpy.clock import Clock, ClockType, JumpHandle, JumpThreshold, TimeJump
 from rclpy.duration import Duration
@@ -27,12 +27,13 @@ from rclpy.timer import Timer
 
 from pose_graph_ros.adapters.conversions import frame, Message
 from pose_graph_ros.adapters.sources import backend_config, Kind, SET_POSE, Source
+from pose_graph_ros.adapters.verdict_messages import JUDGE, MOST_BELIEVED
 from pose_graph_ros.core.backend import PoseGraphBackend
 from pose_graph_ros.core.estimate import UpdateReport
 from pose_graph_ros.core.io.saved_graph import SavedGraph
 from pose_graph_ros.core.measurements import AnswerStatus, GlobalPose, OdometrySample
-from pose_graph_ros.core.sources.constraint_names import ConstraintEnergy
 from pose_graph_ros.ros import diagnostics, memory
+from pose_graph_ros.ros.decisions import decide
 from pose_graph_ros.ros.graph_file import initial_graph, InitialGraph
 from pose_graph_ros.ros.input import Input, PAUSED
 from pose_graph_ros.ros.messages import CLASSES, odometry_message
@@ -42,6 +43,8 @@ from pose_graph_ros.ros.set_pose_input import SetPoseInput
 from pose_graph_ros.ros.spinning import guarded
 from pose_graph_ros.ros.time_jump import ReceivedMessage
 from pose_graph_ros.ros.topics import (
+    JUDGE_QOS,
+    JUDGE_TOPIC,
     LOOP_CLOSURE_QOS,
     SENSOR_QOS,
     SET_POSE_QOS,
@@ -55,8 +58,6 @@ logger = logging.getLogger(__name__)
 
 STOP_TIMEOUT = 0.5  # longest wait at the end for what the worker does [s]
 SILENCE_PERIOD = 0.2  # period of the check whether all sources are silent [s]
-# Period of the search for the constraints with the largest energies [s], and their number.
-ENERGY_PERIOD, N_ENERGIES = 5.0, 3
 
 
 class Session:
@@ -101,10 +102,8 @@ class Session:
             for name, source in self._config.odometry.items()}
         self.is_loaded = resumes  # whether the graph began as one that was loaded
         self.final: Future[UpdateReport] | None = None  # optimisation at the end of the stream
-        self.largest_energies: Sequence[ConstraintEnergy] = []
         # of this graph, so that the answer of an earlier worker is nobody's
-        self._energies: Future[list[ConstraintEnergy]] | None = None
-        self._energies_at = -math.inf
+        self.energies = diagnostics.LargestEnergies()
 
     def _start_worker(
         self, backend: PoseGraphBackend, *, prepared: bool = False,
@@ -151,6 +150,7 @@ class Session:
             self._subscribe(STATIC_TOPIC, TFMessage, self.input.reader.frames.receive, STATIC_QOS)
         for topic in SET_POSE_TOPICS:
             self._subscribe(topic, PoseWithCovarianceStamped, self._on_set_pose, SET_POSE_QOS)
+        self._subscribe(JUDGE_TOPIC, KeyValue, self._on_judge, JUDGE_QOS)
         for source in sources:
             qos = LOOP_CLOSURE_QOS if source.kind is Kind.LOOP_CLOSURE else SENSOR_QOS
             # rclpy takes longest to fill in the message, and odometry comes at a high rate
@@ -284,11 +284,10 @@ class Session:
         if estimate is None or (pose := self._set_pose_input.pop(estimate)) is None:
             return
         self.out.jump()
-        self.worker.call(partial(self._hand_over, pose), 'a pose that is set')
-        self.worker.request_update()
+        self.worker.call(partial(self._hand_over, pose, self.worker), 'a pose that is set')
 
-    def _hand_over(self, pose: GlobalPose, backend: PoseGraphBackend) -> None:
-        """Set the pose in the engine and log what it answers; for the worker's thread."""
+    def _hand_over(self, pose: GlobalPose, worker: Worker, backend: PoseGraphBackend) -> None:
+        """Set the pose in the engine and log what it answers; for the thread of the worker."""
         answer = backend.set_pose(pose, SET_POSE)
         x, y, yaw = pose.pose
         what = f'({x:.3f}, {y:.3f}, {yaw:.3f}) in {self.out.map_frame}'
@@ -296,6 +295,12 @@ class Session:
             logger.warning('the pose is not set to %s: %s: %s', what, answer.reason, answer.detail)
         else:
             logger.info('the pose is set to %s', what)
+        # asked for here, as jobs are done after an update that was asked for before
+        worker.request_update()
+
+    def _on_judge(self, message: Message) -> None:
+        """Receive what a person decides on a constraint."""
+        decide(message, self.worker)
 
     # ---- time
 
@@ -388,7 +393,7 @@ class Session:
         self, worker: Worker, graph: int, backend: PoseGraphBackend, *, at_once: bool = False,
     ) -> None:
         """
-        Publish path and markers that are due, the path also `at_once`.
+        Publish path, markers and verdicts that are due, the path also `at_once`.
 
         For the thread of the worker, which may no longer be the one of the present graph.
         """
@@ -401,6 +406,11 @@ class Session:
             self.out.publish_path(estimate, newest.path, graph)
         if self.out.graph_is_due() and (view := backend.view()) is not None:
             self.out.publish_graph(view, estimate.stamp_ns, graph)
+        status = worker.status
+        state = status.verdicts, status.n_changes, status.counts[JUDGE, 'accepted']
+        if self.out.verdicts_are_due(state):
+            self.out.publish_verdicts(backend.verdicts(MOST_BELIEVED), status.verdicts,
+                                      estimate.stamp_ns, graph, state=state)
 
     def optimize(self) -> 'Future[UpdateReport]':
         """Request a full optimisation, after which the path is published at once."""
@@ -421,24 +431,10 @@ class Session:
 
     def publish_diagnostics(self) -> None:
         """Publish the state of the node."""
-        now = time.monotonic()
         status = self.worker.status
         self.input.watch(status.counts, status.refusals, active=self.active)
         if self.out.transforms is not None and self.active:
             self.out.transforms.check_for_others()
-        self._update_largest_energies(now)
+        self.energies.update(self.worker)
         level, text = diagnostics.health(self)
         self.out.publish_diagnostics(level, text, diagnostics.values(self))
-
-    def _update_largest_energies(self, now: float) -> None:
-        """Take the newest answer of the worker, and ask again after a while."""
-        asked = self._energies
-        if asked is not None and asked.done():
-            self._energies = None
-            if not asked.cancelled() and asked.exception() is None:
-                self.largest_energies = asked.result()
-        if self._energies is None and self.worker.prepared and (
-                now - self._energies_at > ENERGY_PERIOD):
-            self._energies_at = now
-            self._energies = self.worker.call(
-                lambda backend: backend.largest_energies(N_ENERGIES), 'the largest energies')

@@ -10,6 +10,7 @@ little to find out which parameter to correct.
 from collections.abc import Iterable, Iterator, Mapping
 from typing import Any
 
+from diagnostic_msgs.msg import KeyValue
 from geometry_msgs.msg import PoseWithCovarianceStamped
 from rclpy.node import Node
 from rclpy.qos import (
@@ -33,8 +34,10 @@ LOOP_CLOSURE_QOS = QoSProfile(depth=100)  # a loop closure is rare and must not 
 # Late subscribers receive the newest message of every broadcaster.
 STATIC_QOS = QoSProfile(depth=100, durability=QoSDurabilityPolicy.TRANSIENT_LOCAL)
 SET_POSE_QOS = QoSProfile(depth=1)
+JUDGE_QOS = QoSProfile(depth=100)
 
 SET_POSE_TOPICS = ('initialpose', 'set_pose')
+JUDGE_TOPIC = '~/judge'
 OVERRIDES = 'qos_overrides.'  # prefix of the parameters for the quality of service
 CHOICES = {
     policy.__name__.removeprefix('QoS').removesuffix('Policy').lower():
@@ -85,6 +88,7 @@ def _endpoints(sources: Iterable[Source]) -> Iterator[tuple[str, str, type, bool
         yield f'the input {STATIC_TOPIC}', STATIC_TOPIC, TFMessage, False
     for topic in SET_POSE_TOPICS:
         yield f'the input {topic}', topic, PoseWithCovarianceStamped, False
+    yield f'the input {JUDGE_TOPIC}', JUDGE_TOPIC, KeyValue, False
     for source in sources:
         yield f'parameter {source.name}.topic', source.topic, CLASSES[source.kind], False
 

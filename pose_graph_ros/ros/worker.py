@@ -20,8 +20,10 @@ from typing import TypeVar
 from pose_graph_ros.core.backend import PoseGraphBackend
 from pose_graph_ros.core.estimate import Estimate, UpdateReport
 from pose_graph_ros.core.exceptions import PoseGraphError
+from pose_graph_ros.core.judgement.verdicts import SourceVerdicts
 from pose_graph_ros.core.measurements import AnswerStatus, Measurement, OdometrySample
 from pose_graph_ros.core.sources.source_report import SourceReport
+from pose_graph_ros.ros.announcements import Announcer
 
 logger = logging.getLogger(__name__)
 
@@ -55,6 +57,9 @@ class WorkerStatus:
     report: UpdateReport | None = None  # of the newest update
     sources: Mapping[str, SourceReport] = field(default_factory=dict)
     """How well the measurements of each source fit."""
+    verdicts: Mapping[str, SourceVerdicts] = field(default_factory=dict)
+    """How many constraints of each source are believed."""
+    n_changes: int = 0  # number of changes of verdicts
 
 
 class Worker:
@@ -86,6 +91,7 @@ class Worker:
         self._revision = backend.revision
         self._solves, self._solve_total, self._solve_max = 0, 0.0, 0.0
         self._warned: set[tuple[str, str]] = set()
+        self._announcer = Announcer()
         self.estimate: Estimate | None = None  # the newest, without its path; replaced as a whole
         self.status = WorkerStatus()  # the newest status; replaced as a whole
         self._thread = threading.Thread(target=self._run, name='pose graph', daemon=True)
@@ -245,7 +251,7 @@ class Worker:
         """Optimise the whole graph; a job for `call`."""
         report = self._update(backend.optimize)
         self._publish()
-        self._report(report, 0)
+        self._report(report, 0, ends=True)
         return report
 
     def _count_failure(self, what: str, error: Exception, processed: int = 0) -> None:
@@ -291,9 +297,15 @@ class Worker:
         if self.estimate is not None and not self._stopping:
             self._on_estimate(self._backend)
 
-    def _report(self, report: UpdateReport | None, processed: int) -> None:
+    def _report(
+        self, report: UpdateReport | None, processed: int, *, ends: bool = False,
+    ) -> None:
         """Replace the status; keep the report of the last update if there is no new one."""
         status, backend = self.status, self._backend
+        changes, verdicts = backend.verdict_changes(), backend.verdict_totals()
+        for level, text in self._announcer.lines(
+                changes, verdicts, time.monotonic(), flush=ends):
+            logger.log(level, '%s', text)
         self.status = WorkerStatus(
             processed=status.processed + processed, counts=Counter(backend.counts),
             refusals=dict(backend.refusals),
@@ -301,4 +313,5 @@ class Worker:
             set_aside=backend.set_aside(N_SET_ASIDE), updates=self._solves,
             solve_mean=self._solve_total / max(self._solves, 1), solve_max=self._solve_max,
             report=status.report if report is None else report,
-            sources=status.sources if report is None else backend.reports())
+            sources=status.sources if report is None else backend.reports(),
+            verdicts=verdicts, n_changes=status.n_changes + len(changes))

@@ -27,8 +27,8 @@ frames = st.text(st.characters(codec='utf-8', exclude_characters='\0'), max_size
 counts = st.integers(0, 4)
 
 
-def random_view(counts: tuple[int, int, int, int], seed: int = 0) -> GraphView:
-    """Return a view with so many nodes and lines of each kind."""
+def random_view(counts: tuple[int, ...], seed: int = 0) -> GraphView:
+    """Return a view with so many nodes and lines of each kind, in the order of its fields."""
     rng = np.random.default_rng(seed)
     lines = [Lines(rng.normal(0.0, 100.0, (n, 2, 2)), rng.uniform(0.0, 5.0, n))
              for n in counts[1:]]
@@ -59,14 +59,15 @@ def message(view: GraphView, frame: str) -> MarkerArray:
     first = marker(frame)
     first.action = Marker.DELETEALL
     array = [first]
-    nodes, odometry, closures, errors, observed = (marker(frame) for _ in range(5))
-    for each, namespace, number in (
-            (nodes, 'hidden_nodes', 0), (odometry, 'odometry', 1), (closures, 'loop_closures', 2),
-            (errors, 'observed_errors', 3), (observed, 'observed_nodes', 4)):
-        each.ns, each.id, each.action = namespace, number, Marker.ADD
-    nodes.type, observed.type = Marker.POINTS, Marker.POINTS
+    made = [marker(frame) for _ in markers.NAMESPACES]
+    for number, each in enumerate(made):
+        each.ns, each.id, each.action = markers.NAMESPACES[number], number, Marker.ADD
+    (nodes, odometry, closures, errors, observed, weak, waiting, doubted, unused_errors,
+     unused) = made
+    nodes.type = observed.type = unused.type = Marker.POINTS
     nodes.scale.x = nodes.scale.y = markers.NODE_SIZE
-    observed.scale.x = observed.scale.y = markers.OBSERVED_SIZE
+    for points in (observed, unused):
+        points.scale.x = points.scale.y = markers.OBSERVED_SIZE
     nodes.points = [point(position) for position in view.nodes]
     for line, lines, width in (
             (odometry, view.odometry, markers.EDGE_WIDTH),
@@ -80,8 +81,24 @@ def message(view: GraphView, frame: str) -> MarkerArray:
     for ends, sigmas in zip(view.observed.ends, view.observed.sigmas, strict=True):
         observed.points.append(point(ends[1]))
         observed.colors.append(colour(sigmas))
-    array += [each for each in (nodes, odometry, closures, errors, observed)
-              if len(each.points) > 0]
+    grey, blue = (ColorRGBA(**dict(zip('rgba', np.float32(each).tolist(), strict=True)))
+                  for each in (markers.DOUBTED_COLOUR, markers.WAITING_COLOUR))
+    for line, lines, plain in (
+            (weak, view.weak, None), (waiting, view.waiting, blue), (doubted, view.doubted, grey)):
+        line.type = Marker.LINE_LIST
+        line.scale.x = line.scale.y = markers.CLOSURE_WIDTH
+        for (begin, end), sigmas in zip(lines.ends, lines.sigmas, strict=True):
+            for part in np.linspace(0.0, 1.0, 2 * markers.DASHES):
+                line.points.append(point(begin + part * (end - begin)))
+                line.colors.append(plain or colour(sigmas))
+    unused_errors.type = Marker.LINE_LIST
+    unused_errors.scale.x = unused_errors.scale.y = markers.EDGE_WIDTH
+    for ends in view.unused.ends:
+        unused_errors.points += [point(ends[0]), point(ends[1])]
+        unused_errors.colors += [grey, grey]
+        unused.points.append(point(ends[1]))
+        unused.colors.append(grey)
+    array += [each for each in made if len(each.points) > 0]
     return MarkerArray(markers=array)
 
 
@@ -134,17 +151,18 @@ def assert_same(view: GraphView, frame: str) -> None:
 @pytest.mark.parametrize('frame', ['', 'm', 'ma', 'map', 'map1', 'world', 'robot1', 'robot/1',
                                    'robot/map', 'kürzel'])
 @pytest.mark.parametrize('counts', [
-    (0, 0, 0, 0), (1, 0, 0, 0), (2, 1, 0, 0), (3, 2, 1, 0), (3, 2, 0, 1), (9, 8, 3, 5)])
+    (0, 0, 0, 0), (1, 0, 0, 0), (2, 1, 0, 0), (3, 2, 1, 0), (3, 2, 0, 1), (9, 8, 3, 5),
+    (3, 2, 1, 2, 1, 0, 0, 0), (3, 2, 0, 0, 0, 2, 0, 1), (5, 4, 3, 2, 1, 2, 3, 4)])
 def test_markers_are_byte_for_byte_what_rclpy_makes(
-    frame: str, counts: tuple[int, int, int, int],
+    frame: str, counts: tuple[int, ...],
 ) -> None:
     assert_same(random_view(counts), frame)
 
 
 @settings(deadline=None, derandomize=True)
-@given(frames, st.tuples(counts, counts, counts, counts), st.integers(0, 100))
+@given(frames, st.tuples(*[counts] * 8), st.integers(0, 100))
 def test_the_same_for_any_frame_and_graph(
-    frame: str, counts: tuple[int, int, int, int], seed: int,
+    frame: str, counts: tuple[int, ...], seed: int,
 ) -> None:
     assert_same(random_view(counts, seed), frame)
 
@@ -164,7 +182,7 @@ def test_springs_go_from_green_over_yellow_to_red() -> None:
 
 
 def test_the_namespaces_and_ids_stay_whatever_there_is_to_draw() -> None:
-    for counts in ((1, 0, 0, 1), (3, 2, 1, 0), (9, 8, 3, 5)):
+    for counts in ((1, 0, 0, 1), (3, 2, 1, 0), (9, 8, 3, 5), (5, 4, 3, 2, 1, 2, 3, 4)):
         array = deserialize_message(
             markers.markers_cdr(random_view(counts), STAMP, 'map'), MarkerArray).markers
         assert array[0].action == Marker.DELETEALL
@@ -176,7 +194,7 @@ def test_the_namespaces_and_ids_stay_whatever_there_is_to_draw() -> None:
 
 
 def test_many_markers_are_quick() -> None:
-    view = random_view((100_000, 100_000, 1000, 20_000))
+    view = random_view((100_000, 100_000, 1000, 20_000, 1000, 1000, 1000, 1000))
     markers.markers_cdr(view, STAMP, 'map')
     start = time.process_time()
     markers.markers_cdr(view, STAMP, 'map')

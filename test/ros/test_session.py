@@ -33,6 +33,7 @@ from pose_graph_ros.core.estimate import UpdateReport
 from pose_graph_ros.core.measurements import Answer, rejected
 from pose_graph_ros.core.warm_up import warm_up
 from pose_graph_ros.ros import diagnostics, memory, session as session_module
+from pose_graph_ros.ros.diagnostics import LargestEnergies
 from pose_graph_ros.ros.session import Session
 from pose_graph_ros.ros.time_jump import EVIDENCE
 
@@ -95,7 +96,7 @@ def active(robot: Robot) -> Robot:
 def test_measurements_come_in_and_poses_path_and_diagnostics_go_out(
     active: Robot, monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    monkeypatch.setattr(session_module, 'ENERGY_PERIOD', 0.1)
+    monkeypatch.setattr(diagnostics, 'ENERGY_PERIOD', 0.1)
     poses = active.local.subscribe(PoseWithCovarianceStamped, 'pose')
     paths = active.local.subscribe(PathMessage, 'path', LATCHED)
     graphs = active.local.subscribe(MarkerArray, 'graph', LATCHED)
@@ -118,7 +119,7 @@ def test_measurements_come_in_and_poses_path_and_diagnostics_go_out(
     assert len(poses) > 80
     assert np.all(np.diff([stamp_ns(message) for message in poses]) > 0)
 
-    active.wait(lambda: len(active.session.largest_energies) == 3, 'energies are known')
+    active.wait(lambda: len(active.session.energies.found) == 3, 'energies are known')
     values = active.values()
     assert (values['received'], values['processed']) == ('120', '120')
     assert (values['odom.accepted'], values['fix.accepted']) == ('100', '20')
@@ -412,9 +413,9 @@ def test_an_earlier_worker_writes_nothing_into_a_new_graph(active: Robot) -> Non
     running, release = threading.Event(), threading.Event()
     old.call(lambda _: (running.set(), release.wait(10.0)))
     assert running.wait(10.0)
-    session._energies, session._energies_at = None, -np.inf
+    session.energies = LargestEnergies()
     session.publish_diagnostics()
-    asked, optimisation = session._energies, session.optimize()
+    asked, optimisation = session.energies._asked, session.optimize()
     session.reset()
     active.drive(2.0, fixes=False)
     release.set()

@@ -73,7 +73,7 @@ def test_rviz_topics_are_relative_so_that_namespaces_and_remaps_hold() -> None:
 
 
 def test_rviz_asks_for_what_is_latched_and_for_nothing_that_is_not_offered() -> None:
-    assert sorted(LATCHED) == ['graph', 'path']
+    assert sorted(LATCHED) == ['graph', 'path', '~/verdicts']
     for topic in rviz_topics():
         latched = topic['Value'] in LATCHED
         assert topic['Durability Policy'] == ('Transient Local' if latched else 'Volatile')

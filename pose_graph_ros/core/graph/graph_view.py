@@ -8,6 +8,7 @@ energy is unweighted, so that a wrong measurement shows its large error even if 
 it a small weight.
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import NamedTuple
 
@@ -38,6 +39,27 @@ class Lines:
         self.ends.flags.writeable = self.sigmas.flags.writeable = False
 
 
+NO_LINES = Lines(np.empty((0, 2, 2)), np.empty(0))
+
+
+class DrawnRows(NamedTuple):
+    """Rows of constraints that are drawn in another way, as they are not simply believed."""
+
+    weak: Sequence[int] = ()
+    """Edges between poses in the estimate that little speaks for."""
+    waiting: Sequence[int] = ()
+    """Edges between poses that are not in the estimate yet."""
+    doubted: Sequence[int] = ()
+    """Edges between poses that were left out."""
+    unused_edges: Sequence[int] = ()
+    """Edges to biases of measurements in the map that are not in the estimate."""
+    unused_observed: Sequence[int] = ()
+    """Observed nodes that are not in the estimate."""
+
+
+ALL_BELIEVED = DrawnRows()
+
+
 @dataclass(frozen=True, slots=True)
 class GraphView:
     """Immutable view of a graph for display."""
@@ -50,42 +72,82 @@ class GraphView:
     """Loop closures, from node to node."""
     observed: Lines
     """Measured positions (of an antenna, or the robot), from the predicted to the measured one."""
+    weak: Lines = NO_LINES
+    """Loop closures in the estimate that little speaks for."""
+    waiting: Lines = NO_LINES
+    """Loop closures that are not in the estimate yet."""
+    doubted: Lines = NO_LINES
+    """Loop closures and odometry that were left out."""
+    unused: Lines = NO_LINES
+    """Measured positions that are not in the estimate, as `observed`."""
 
     def __post_init__(self) -> None:
         self.nodes.flags.writeable = False
 
 
-def view(graph: Graph) -> GraphView | None:
-    """Return the view of a graph; None if the graph is empty."""
+def view(graph: Graph, drawn: DrawnRows = ALL_BELIEVED) -> GraphView | None:
+    """
+    Return the view of a graph; None if the graph is empty.
+
+    Parameters
+    ----------
+    graph : Graph
+    drawn : DrawnRows, rows of what is not simply believed
+
+    """
     if graph.n_nodes == 0:
         return None
     positions, is_bias = graph.poses[:, :2].copy(), graph.is_bias
-    (edges, edge_sigmas), (observed, observed_sigmas) = (
-        (table, np.sqrt(np.maximum(table.energies, 0.0) / np.maximum(table.freedom, 1)))
-        for table in constraint_tables(graph))
-    lines = []
-    for kind in (EdgeKind.ODOMETRY, EdgeKind.LOOP_CLOSURE):
-        rows = np.flatnonzero(
-            (edges.integers[:, tb.EDGE_KIND] == kind) & (edges.weights > 0.0))
-        ends = edges.integers[rows, tb.END_I:tb.END_J + 1]
+    tables = constraint_tables(graph)
+    edges, observed = tables
+    sigmas = edges.sigmas
+
+    def lines(rows: IntArray) -> Lines:
         # `take` is several times as fast as an index
-        lines.append(Lines(positions.take(ends, axis=0), edge_sigmas[rows]))
+        return Lines(positions.take(edges.integers[rows, tb.END_I:tb.END_J + 1], axis=0),
+                     sigmas[rows])
+
+    in_graph, kinds = edges.weights > 0.0, edges.integers[:, tb.EDGE_KIND]
+    in_graph[list(drawn.weak)] = False
     # a measurement with a time-correlated error is an edge to a bias
     biased = np.flatnonzero(
-        (edges.integers[:, tb.EDGE_KIND] == EdgeKind.BIAS) & edges.tells_position
-        & ~is_bias[edges.integers[:, tb.END_I]])
+        (kinds == EdgeKind.BIAS) & edges.tells_position & ~is_bias[edges.integers[:, tb.END_I]])
     seen = np.flatnonzero(
         observed.tells_position & ~is_bias[observed.integers[:, tb.OBS_NODE]])
+    return GraphView(
+        nodes=positions.take(np.flatnonzero(~is_bias), axis=0),
+        odometry=lines(np.flatnonzero(in_graph & (kinds == EdgeKind.ODOMETRY))),
+        loop_closures=lines(np.flatnonzero(in_graph & (kinds == EdgeKind.LOOP_CLOSURE))),
+        observed=_measured(graph, tables, biased, seen), weak=lines(_rows(drawn.weak)),
+        waiting=lines(_rows(drawn.waiting)), doubted=lines(_rows(drawn.doubted)),
+        unused=_measured(graph, tables, _positions_in(edges, drawn.unused_edges),
+                         _positions_in(observed, drawn.unused_observed)))
+
+
+def _rows(rows: Sequence[int]) -> IntArray:
+    return np.array(rows, dtype=np.int64)
+
+
+def _positions_in(table: 'ConstraintTable', rows: Sequence[int]) -> IntArray:
+    """Return those rows of a table that measure positions."""
+    found = _rows(rows)
+    return found[table.numbers[found, tb.INFO] > 0.0]
+
+
+def _measured(
+    graph: Graph, tables: 'tuple[ConstraintTable, ConstraintTable]', biased: IntArray,
+    seen: IntArray,
+) -> Lines:
+    """Return measured positions, given the rows of edges to biases and of observed nodes."""
+    edges, observed = tables
     nodes = np.concatenate((
         observed.integers[seen, tb.OBS_NODE], edges.integers[biased, tb.END_I]))
     offsets, measured = np.concatenate((
         observed.numbers[seen][:, _OFFSET_AND_MEAN], edges.numbers[biased][:, _ARM_AND_MEAN],
     )).reshape(-1, 2, 2).swapaxes(0, 1)
     predicted = se2.transform(graph.poses[nodes], offsets)
-    return GraphView(
-        positions.take(np.flatnonzero(~is_bias), axis=0), lines[0], lines[1],
-        Lines(np.stack((predicted, measured), axis=1),
-              np.concatenate((observed_sigmas[seen], edge_sigmas[biased]))))
+    return Lines(np.stack((predicted, measured), axis=1),
+                 np.concatenate((observed.sigmas[seen], edges.sigmas[biased])))
 
 
 class ConstraintTable(NamedTuple):
@@ -107,6 +169,11 @@ class ConstraintTable(NamedTuple):
     def tells_position(self) -> BoolArray:
         """Whether constraints measure a position and are not removed, shape (M,)."""
         return (self.numbers[:, tb.INFO] > 0.0) & (self.weights > 0.0)
+
+    @property
+    def sigmas(self) -> FloatArray:
+        """Roots of the unweighted energies per degree of freedom, shape (M,) [sigma]."""
+        return np.asarray(np.sqrt(np.maximum(self.energies, 0.0) / np.maximum(self.freedom, 1)))
 
     @property
     def freedom(self) -> IntArray:

@@ -14,7 +14,7 @@ from pose_graph_ros.core.geometry.se2 import FloatArray
 from pose_graph_ros.core.graph import factors, graph_view
 from pose_graph_ros.core.graph.constraints import EdgeKind, Edges
 from pose_graph_ros.core.graph.graph import Graph, GraphUpdate
-from pose_graph_ros.core.graph.graph_view import GraphView, Lines
+from pose_graph_ros.core.graph.graph_view import DrawnRows, GraphView, Lines
 from pose_graph_ros.core.measurements import (
     GlobalPose,
     HeadingOnly,
@@ -150,3 +150,46 @@ def test_the_view_of_a_large_graph_is_fast() -> None:
     graph_view.view(graph)
     # a hundred times the usual duration [s]
     assert time.process_time() - start < 1.0
+
+
+def test_what_is_not_simply_believed_is_drawn_apart_though_its_weight_is_0() -> None:
+    graph = random_graph(3, n_edges=10, n_observed=6, n_biases=0)
+    edges = graph.edges
+    closures = np.flatnonzero(edges.kind == EdgeKind.LOOP_CLOSURE)[:3].tolist()
+    positions = np.flatnonzero(graph.observed.information[:, 0, 0] > 0.0)[:2].tolist()
+    weak, waiting, doubted = closures
+    whole = graph_view.view(graph)
+    graph.apply(GraphUpdate(
+        weigh_edges={waiting: 0.0, doubted: 0.0},
+        weigh_observed=dict.fromkeys(positions, 0.0)))
+    view = graph_view.view(
+        graph, DrawnRows([weak], [waiting], [doubted], unused_observed=positions))
+    assert whole is not None
+    assert view is not None
+    assert len(view.loop_closures.ends) == len(whole.loop_closures.ends) - 3
+    assert len(view.observed.ends) == len(whole.observed.ends) - 2
+    for lines, row in ((view.weak, weak), (view.waiting, waiting), (view.doubted, doubted)):
+        ends = graph.poses[[edges.i[row], edges.j[row]], :2]
+        np.testing.assert_array_equal(lines.ends, ends[None])
+    np.testing.assert_array_equal(
+        in_any_order(np.concatenate([rows(lines) for lines in (
+            view.loop_closures, view.weak, view.waiting, view.doubted)])),
+        in_any_order(rows(whole.loop_closures)))
+    np.testing.assert_array_equal(
+        in_any_order(np.concatenate((rows(view.observed), rows(view.unused)))),
+        in_any_order(rows(whole.observed)))
+
+
+def test_a_measurement_with_a_bias_that_is_not_used_is_drawn_apart() -> None:
+    graph = random_graph(5, n_edges=10, n_observed=6, n_biases=3)
+    biased = np.flatnonzero(graph.edges.kind == EdgeKind.BIAS)
+    whole = graph_view.view(graph)
+    graph.apply(GraphUpdate(weigh_edges=dict.fromkeys(biased.tolist(), 0.0)))
+    view = graph_view.view(graph, DrawnRows(unused_edges=[
+        row for row in biased.tolist() if not graph.is_bias[graph.edges.i[row]]]))
+    assert view is not None
+    assert whole is not None
+    assert len(view.unused.ends) > 0
+    np.testing.assert_array_equal(
+        in_any_order(np.concatenate((rows(view.observed), rows(view.unused)))),
+        in_any_order(rows(whole.observed)))

@@ -1,0 +1,104 @@
+# Copyright 2026 The pose_graph_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""
+Verdicts as a diagnostic_msgs/DiagnosticArray, and decisions from a KeyValue; no rclpy.
+
+The message has one status for each constraint. The first status counts them all, also those that
+are not listed, so that the size of a message is bounded.
+"""
+
+from collections.abc import Mapping, Sequence
+
+from pose_graph_ros.adapters.cdr import CdrStream
+from pose_graph_ros.adapters.conversions import Message
+from pose_graph_ros.adapters.sources import NANOSECONDS
+from pose_graph_ros.adapters.verdict_texts import (
+    details,
+    sentence,
+    total_values,
+    totals_text,
+)
+from pose_graph_ros.core.judgement.verdicts import Decision, SourceVerdicts, State, Verdict
+from pose_graph_ros.core.measurements import Answer, rejected
+
+JUDGE = 'judge'  # name under which decisions are counted
+OK, WARN, STALE = 0, 1, 3  # levels of diagnostic_msgs/DiagnosticStatus
+LEVELS = {State.BELIEVED: OK, State.WEAKLY_BELIEVED: OK, State.DOUBTED: WARN,
+          State.WAITING: STALE}
+MOST_BELIEVED = 50  # of each source, the newest
+MOST_OTHERS = 1000  # of all that are not believed, or that a person has decided on
+
+
+def shown(verdicts: Sequence[Verdict]) -> list[Verdict]:
+    """
+    Return the verdicts that are listed, by stamp.
+
+    Of those that are not believed only the newest `MOST_OTHERS` are listed, after those that a
+    person has decided on. The believed ones are limited by who asks for the verdicts.
+    """
+    believed = [each for each in verdicts if _is_plain(each)]
+    others = [each for each in verdicts if not _is_plain(each)]
+    others.sort(key=lambda each: (each.decision is Decision.AUTO, -each.stamp_ns))
+    return sorted(believed + others[:MOST_OTHERS], key=lambda each: (each.stamp_ns, each.id))
+
+
+def _is_plain(verdict: Verdict) -> bool:
+    return verdict.state is State.BELIEVED and verdict.decision is Decision.AUTO
+
+
+def verdicts_cdr(
+    verdicts: Sequence[Verdict], totals: Mapping[str, SourceVerdicts], stamp_ns: int,
+    frame_id: str,
+) -> bytes:
+    """
+    Return verdicts as a diagnostic_msgs/DiagnosticArray in little-endian CDR.
+
+    Parameters
+    ----------
+    verdicts : sequence of Verdict
+        Those that are `shown`.
+    totals : mapping
+        What is believed of each source, as a whole.
+    stamp_ns : int
+        [ns].
+    frame_id : str
+        Frame of the map.
+
+    """
+    stream = CdrStream()
+    stream.add('<i4', stamp_ns // NANOSECONDS)
+    stream.add('<u4', stamp_ns % NANOSECONDS)
+    stream.add_text(frame_id)
+    stream.add('<u4', 1 + len(verdicts))
+    n_all = sum(sum(each.counts.values()) for each in totals.values())
+    of_sources = '; '.join(f'{source}: {totals_text(each)}' for source, each in totals.items())
+    summary = f'{len(verdicts)} of {n_all} are listed; {of_sources or "nothing is judged yet"}'
+    doubting = any(each.doubting for each in totals.values())
+    _add_status(stream, WARN if doubting else OK, ('summary', summary, ''), total_values(totals))
+    for each in verdicts:
+        _add_status(
+            stream, LEVELS[each.state], (each.id, sentence(each), each.source), details(each))
+    return stream.message()
+
+
+def _add_status(
+    stream: CdrStream, level: int, texts: tuple[str, str, str], values: Mapping[str, str],
+) -> None:
+    """Add a status, given the level, then name, message and hardware_id, then the values."""
+    stream.add('u1', level)
+    for text in texts:
+        stream.add_text(text)
+    stream.add('<u4', len(values))
+    for key, value in values.items():
+        stream.add_text(key)
+        stream.add_text(value)
+
+
+def read_decision(message: Message) -> tuple[str, Decision] | Answer:
+    """Return the id of a constraint and what is decided on it; else why it cannot be read."""
+    name, text = str(message.key).strip(), str(message.value).strip().lower()
+    try:
+        return name, Decision(text)
+    except ValueError:
+        choices = ', '.join(decision.value for decision in Decision)
+        return rejected('unknown_decision', f'{name}: expected one of {choices}, got {text!r}')

@@ -1,0 +1,134 @@
+# Copyright 2026 The pose_graph_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""What is believed, doubted or waits, in words that need no knowledge of the solver."""
+
+from collections.abc import Iterable, Mapping, Sequence
+import math
+
+from pose_graph_ros.core.judgement.verdicts import (
+    Decision,
+    Judged,
+    SourceVerdicts,
+    State,
+    Verdict,
+)
+
+NOUNS = {Judged.LOOP_CLOSURE: 'closure', Judged.FIX: 'fix', Judged.ODOMETRY: 'odometry edge'}
+PLURALS = {Judged.LOOP_CLOSURE: 'closures', Judged.FIX: 'fixes',
+           Judged.ODOMETRY: 'odometry edges'}
+ORDER = (State.DOUBTED, State.WAITING, State.WEAKLY_BELIEVED, State.BELIEVED)
+"""States in the order in which people want to read of them."""
+NAMED = 5  # number of ids that a sentence names
+
+
+def seconds(stamp_ns: int) -> str:
+    """Return a stamp in seconds, to the millisecond."""
+    whole, rest = divmod(stamp_ns, 1_000_000_000)
+    return f'{whole}.{rest // 1_000_000:03d}'
+
+
+def number_of(n: int, kind: Judged) -> str:
+    """
+    Return `1 closure` or `2 closures`.
+
+    Parameters
+    ----------
+    n : int
+    kind : Judged
+
+    """
+    return f'{n} {NOUNS[kind] if n == 1 else PLURALS[kind]}'
+
+
+def listed(names: Sequence[str], most: int = NAMED) -> str:
+    """
+    Return names separated by commas, and how many more there are.
+
+    Parameters
+    ----------
+    names : sequence of str
+    most : int, number of names
+
+    """
+    more = len(names) - most
+    return ', '.join(names[:most]) + (f' and {more} more' if more > 0 else '')
+
+
+def sentence(verdict: Verdict) -> str:
+    """Return state and reason of a verdict as a sentence."""
+    since, far = seconds(verdict.since_ns), _far(verdict.distance)
+    if verdict.decision is Decision.IN:
+        return f'Used since {since}, as a person has decided; {far}.'
+    if verdict.decision is Decision.OUT:
+        return f'Not used since {since}, as a person has decided; {far}.'
+    supported = '' if len(verdict.supported_by) == 0 else (
+        f'; {listed(verdict.supported_by)} {_agree(verdict.supported_by)} with it')
+    contradicted = '' if len(verdict.contradicted_by) == 0 else (
+        f'; it contradicts {listed(verdict.contradicted_by)}')
+    match verdict.state:
+        case State.BELIEVED:
+            return f'Believed and used since {since}: {far}{supported}{contradicted}.'
+        case State.WEAKLY_BELIEVED:
+            return (f'Believed weakly, but used since {since}: {far}, and little else speaks for '
+                    f'it{supported}{contradicted}.')
+        case State.WAITING:
+            return (f'Waits since {since} and is not used: too little is known yet to believe or '
+                    f'to doubt it; {far}{supported}{contradicted}.')
+        case State.DOUBTED:
+            return f'Doubted and not used since {since}: {far}{contradicted}{supported}.'
+
+
+def _agree(names: Sequence[str]) -> str:
+    return 'agrees' if len(names) == 1 else 'agree'
+
+
+def _far(distance: float) -> str:
+    return 'it has not been compared with the path yet' if math.isnan(distance) else (
+        f'it was {distance:.1f} sigma from the path without it')
+
+
+def details(verdict: Verdict) -> dict[str, str]:
+    """Return all that is known of a verdict, by key."""
+    reference = verdict.reference_ns
+    return {
+        'kind': verdict.kind.value, 'stamp': seconds(verdict.stamp_ns),
+        'reference_stamp': '' if reference is None else seconds(reference),
+        'state': verdict.state.value, 'since': seconds(verdict.since_ns),
+        'residual': '[' + ', '.join(f'{part:.3f}' for part in verdict.residual.tolist()) + ']',
+        'distance': f'{verdict.distance:.2f}', 'supported_by': ', '.join(verdict.supported_by),
+        'contradicted_by': ', '.join(verdict.contradicted_by),
+        'decision': verdict.decision.value}
+
+
+def totals_text(totals: SourceVerdicts) -> str:
+    """Return how many constraints of a source are in each state, such as `3 doubted`."""
+    parts = [f'{totals.counts[state]} {state.value}' for state in ORDER
+             if totals.counts.get(state, 0) > 0]
+    if totals.n_forgotten > 0:
+        parts.append(f'{totals.n_forgotten} forgotten')
+    if totals.scale != 1.0:
+        parts.append(f'sigmas times {totals.scale:.3g}')
+    return ', '.join(parts)
+
+
+def total_values(totals: Mapping[str, SourceVerdicts]) -> dict[str, str]:
+    """Return the counts of all sources by the keys that the diagnostics have for them."""
+    values: dict[str, str] = {}
+    for source, each in totals.items():
+        counts = each.counts
+        weakly = counts.get(State.WEAKLY_BELIEVED, 0)
+        values |= {
+            f'{source}.believed': str(counts.get(State.BELIEVED, 0) + weakly),
+            f'{source}.believed_weakly': str(weakly),
+            f'{source}.doubted': str(counts.get(State.DOUBTED, 0)),
+            f'{source}.waiting': str(counts.get(State.WAITING, 0)),
+            f'{source}.scale': f'{each.scale:.3g}'}
+        if each.n_forgotten > 0:
+            values[f'{source}.forgotten'] = str(each.n_forgotten)
+    return values
+
+
+def notable(verdicts: Iterable[Verdict]) -> list[Verdict]:
+    """Return those that a person wants to look at: not believed, weakly, or decided upon."""
+    return [verdict for verdict in verdicts
+            if verdict.state is not State.BELIEVED or verdict.decision is not Decision.AUTO]
