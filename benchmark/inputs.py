@@ -11,7 +11,6 @@ the covariance that was claimed for it: 1 in the mean if the claim is right.
 
 import argparse
 from pathlib import Path
-import shlex
 import sys
 import time
 
@@ -366,12 +365,8 @@ def main(arguments: list[str]) -> int:
     few = max(options.runs // 20, 1)
     sections = [uncertainty(options.runs), arrival(few), outliers(few), plaza(few), door(),
                 stamps(), cost()]
-    command = shlex.join(['python', '-m', 'benchmark.inputs', *arguments])
-    path = report.write(sections, options.out, command, title='Measurements as they come',
-                        remarks=(__doc__ or '').strip().split('\n\n')[-1].replace('\n', ' '))
-    metrics = [metric for section in sections for metric in section.metrics]
-    say(f'{report.summary(metrics)}; see {path}')
-    return 0 if all(metric.reached for metric in metrics) else 1
+    return report.conclude(sections, options.out, 'benchmark.inputs', arguments,
+                           title='Measurements as they come', about=__doc__)
 
 
 if __name__ == '__main__':

@@ -12,6 +12,7 @@ import json
 import os
 from pathlib import Path
 import platform
+import shlex
 
 from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
@@ -20,7 +21,7 @@ import numpy as np
 
 from benchmark.metrics import Metric
 from benchmark.online import EXCESS_FLOOR
-from benchmark.section import Curve, Section, Table
+from benchmark.section import Curve, say, Section, Table
 
 COLOURS = {'ours': '#0072B2', 'ours, refined': '#009E73', 'GTSAM skip 10': '#E69F00',
            'GTSAM skip 1': '#D55E00'}
@@ -77,6 +78,33 @@ def write(
                for section in sections for metric in section.metrics}
     (folder / 'metrics.json').write_text(json.dumps(figures, indent=1) + '\n', encoding='ascii')
     return path
+
+
+def conclude(
+    sections: list[Section], folder: Path, module: str, arguments: list[str], *, title: str,
+    about: str | None,
+) -> int:
+    """
+    Write the report of a benchmark of its own; return 1 if a figure is not what is asked for.
+
+    Parameters
+    ----------
+    sections : list of Section
+    folder : Path
+    module : str
+        With its arguments, the command.
+    arguments : list of str
+    title : str
+    about : str, optional
+        The module's docstring, whose last paragraph becomes the remarks.
+
+    """
+    command = shlex.join(['python', '-m', module, *arguments])
+    path = write(sections, folder, command, title=title,
+                 remarks=(about or '').strip().split('\n\n')[-1].replace('\n', ' '))
+    metrics = [metric for section in sections for metric in section.metrics]
+    say(f'{summary(metrics)}; see {path}')
+    return 0 if all(metric.reached for metric in metrics) else 1
 
 
 def _environment(command: str) -> list[str]:

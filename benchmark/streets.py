@@ -34,7 +34,7 @@ _DIRECTIONS = np.array([(1, 0), (0, 1), (-1, 0), (0, -1)])
 def grid(n: int = 3500, seed: int = SEED) -> World:
     """Return a walk like M3500, 3500 nodes."""
     rng = np.random.default_rng(seed)
-    truth = _street_path(rng, n, 1.0, np.full(12, 4.0), fresh=1.0)
+    truth = street_path(rng, n, 1.0, np.full(12, 4.0), fresh=1.0)
     i, j = _pairs(truth, rng, round(0.558 * n), radius=1.5, gap=4, per_node=5)
     sigma = (0.023, 0.023, 0.023)
     edges = Edges.joined((odometry(truth, sigma, rng, pessimism=6.5),
@@ -45,7 +45,7 @@ def grid(n: int = 3500, seed: int = SEED) -> World:
 def city(n: int = 10000, seed: int = SEED) -> World:
     """Return a drive like city10000, 10 000 nodes, with a position on every 20th node."""
     rng = np.random.default_rng(seed)
-    truth = _street_path(rng, n, 1.0, np.full(12, 10.0), fresh=3.0)
+    truth = street_path(rng, n, 1.0, np.full(12, 10.0), fresh=3.0)
     i, j = _pairs(truth, rng, round(1.069 * n), radius=1.6, gap=5, per_node=8)
     sigma = (0.018, 0.018, 0.0125)
     edges = Edges.joined((odometry(truth, sigma, rng, pessimism=8.0),
@@ -59,7 +59,7 @@ def corridor(n: int = 15000, seed: int = SEED) -> World:
     rng = np.random.default_rng(seed)
     # the size of the building goes with the length of the drive
     spacing = rng.uniform(12.0, 110.0, max(3, round(7 * np.sqrt(n / 15000))))
-    truth = _street_path(rng, n, 0.42, spacing, fresh=1.5, rounding=5)
+    truth = street_path(rng, n, 0.42, spacing, fresh=1.5, rounding=5)
     i, j = _bursts(truth, rng, round(0.107 * n), radius=1.0, gap=100, length=(15, 100))
     sigma, pessimism = (0.019, 0.018, 0.015), 5.3
     edges = Edges.joined((odometry(truth, sigma, rng, pessimism=pessimism),
@@ -70,7 +70,7 @@ def corridor(n: int = 15000, seed: int = SEED) -> World:
 def campus(n: int = 808, seed: int = SEED) -> World:
     """Return a walk like MIT Killian court, 808 nodes, 20 closures."""
     rng = np.random.default_rng(seed)
-    truth = _street_path(rng, n, 2.3, rng.uniform(50.0, 170.0, 3), fresh=1.0, rounding=3)
+    truth = street_path(rng, n, 2.3, rng.uniform(50.0, 170.0, 3), fresh=1.0, rounding=3)
     i, j = _bursts(truth, rng, 20, radius=2.5, gap=60, length=(3, 8))
     edges = Edges.joined((odometry(truth, (0.15, 0.1, 0.05), rng, pessimism=1.2),
                           closures(truth, i, j, (0.2, 0.2, 0.04), rng, pessimism=1.2)))
@@ -80,7 +80,7 @@ def campus(n: int = 808, seed: int = SEED) -> World:
 def drive(n: int = 4541, seed: int = SEED) -> World:
     """Return a drive like kitti_00, 4541 nodes, 137 closures."""
     rng = np.random.default_rng(seed)
-    truth = _street_path(rng, n, 0.82, rng.uniform(60.0, 160.0, 4), fresh=1.0, rounding=15)
+    truth = street_path(rng, n, 0.82, rng.uniform(60.0, 160.0, 4), fresh=1.0, rounding=15)
     i, j = _bursts(truth, rng, round(0.0302 * n), radius=4.0, gap=200, length=(6, 30), every=3)
     sigma, pessimism = (0.02, 0.022, 0.001), 2.0
     # as the set has it: the heading correlated with both coordinates
@@ -91,7 +91,7 @@ def drive(n: int = 4541, seed: int = SEED) -> World:
     return arranged('drive', truth, edges)
 
 
-def _street_path(
+def street_path(
     rng: np.random.Generator, n: int, step: float, spacing: FloatArray, *, fresh: float,
     rounding: int = 0,
 ) -> FloatArray:

@@ -1,0 +1,402 @@
+# Copyright 2026 The pose_graph_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""
+Measure what wrong loop closures and wrong fixes do to the path, with default settings.
+
+    .venv/bin/python -m benchmark.robust --out docs/benchmarks/robust
+    .venv/bin/python -m benchmark.robust --quick --only places
+    .venv/bin/python -m benchmark.robust --recording graph.g2o truth.g2o stamps.txt
+
+Paths with loop closures alone are compared with the truth after the best rigid motion. A closure
+is wrong if it is more than 3 m off; odometry has the noise of the default model, in M3500 and its
+kind that of the edges of the file. Of the settings, only `robust` is changed, where a column says
+so.
+"""
+
+import argparse
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from importlib.util import find_spec
+from pathlib import Path
+import sys
+
+import numpy as np
+
+from benchmark import report, robust_fixes, robust_picture, streets
+from benchmark.metrics import Metric
+from benchmark.robust_closures import (
+    FAR,
+    feed,
+    hidden_graph,
+    read_recording,
+    Recording,
+    rms,
+    Run,
+    TRUE,
+    worst_ratio,
+)
+from benchmark.robust_worlds import (
+    circumstances,
+    LOOSE,
+    MEDIUM,
+    of_world,
+    OFFICE,
+    OUTDOORS,
+    place_recognition,
+    STRICT,
+    wide_gates,
+    with_false,
+)
+from benchmark.section import say, Section, Table
+from pose_graph_ros.core.config import Robust
+from pose_graph_ros.core.geometry.trajectory import Trajectory
+
+DATA = Path(__file__).resolve().parents[2] / 'shared' / 'data'
+PLACES = ('false_loops/B25b_0.150.g2o', 'false_loops/Bicocca25b_GT_GPS.g2o',
+          'false_loops/B25b_timestamps.txt')
+M3500 = 'graphs/input_M3500_g2o.g2o', 'graphs/manhattanOlson3500_groundtruth.txt'
+MOWER = 'robot/plaza1'
+B25B_RMS, RECALL, WORST = 1.4, 0.8, 1.1
+"""What is asked for: rms [m], share of the right closures, ratio of the newest pose's error."""
+CLOSURES = ('closures, of which right', 'odometry', 'all', 'only right', 'judged', 'kept wrong',
+            'kept far off', 'recall', 'worst while driving', 'update mean / p99 / max [ms]',
+            'idle max [ms]', 'all calls [s]')
+
+
+@dataclass(frozen=True, slots=True)
+class Options:
+    """What the command line asks for."""
+
+    quick: bool
+    data: Path
+    recordings: tuple[tuple[Path, ...], ...]
+    gtsam: bool
+    out: Path
+
+
+@dataclass(frozen=True, slots=True)
+class Judged:
+    """A run with default settings, and its figures."""
+
+    run: Run
+    rms: float
+    odometry: float
+    right: float
+    """With only the right closures [m]."""
+    wrong_kept: int
+    far_kept: int
+    recall: float
+    worst: float
+
+    @property
+    def lost(self) -> int:
+        """Number of right closures that are not kept."""
+        return round((1.0 - self.recall) * self.n_right)
+
+    n_right: int = 0
+
+
+def judge(table: Table, recording: Recording, *, everything: bool = True) -> Judged:
+    """Run a recording with default settings and as comparisons, and add a row to a table."""
+    errors = recording.errors()
+    right = errors <= TRUE
+    run = feed(recording, recording.config(Robust.JUDGED))
+    truth = recording.truth
+    odometry = rms(Trajectory(recording.stamps_ns, recording.odometry), truth)
+    only_right = rms(feed(recording.only(right), recording.config(Robust.NONE)).path, truth)
+    used = run.kept
+    judged = Judged(
+        run, rms(run.path, truth), odometry, only_right, int(np.sum(used & ~right)),
+        int(np.sum(used & (errors > FAR))), float(np.mean(used[right])) if right.any() else 1.0,
+        worst_ratio(run, recording), int(np.sum(right)))
+    all_of_them = (f'{rms(feed(recording, recording.config(Robust.NONE)).path, truth):.2f}'
+                   if everything else '')
+    ms = 1e3 * run.updates
+    table.add(recording.name, f'{len(right)}, {judged.n_right}', f'{odometry:.2f}', all_of_them,
+              f'{only_right:.2f}', f'{judged.rms:.2f}', str(judged.wrong_kept),
+              str(judged.far_kept), f'{judged.recall:.3f}', f'{judged.worst:.2f}',
+              f'{ms.mean():.1f} / {np.percentile(ms, 99.0):.0f} / {ms.max():.0f}',
+              f'{1e3 * run.longest_idle:.0f}', f'{run.seconds:.1f}')
+    say('  ' + ' | '.join(table.rows[-1]))
+    return judged
+
+
+def places(options: Options) -> Section:
+    """Measure recordings of place recognition, where the files are there."""
+    section = Section(
+        'Place recognition', 'Recordings, fed online in order. Errors are rms of the path [m], '
+        'with no closure, with all, with only the right ones, and with default settings. *Worst '
+        "while driving* is the largest ratio of the newest pose's rms so far to that of odometry "
+        '(of 0.5 m at least).')
+    table = Table('', ('recording', *CLOSURES))
+    given = [tuple(options.data / name for name in PLACES), *options.recordings]
+    for files in given:
+        if not all(path.exists() for path in files):
+            section.notes.append(f'{files[0].name}: the data is not there, skipped.')
+            continue
+        recording = read_recording(*files)
+        judged = judge(table, recording)
+        if files == given[0]:
+            section.metrics += [
+                Metric(f'{recording.name}: rms', judged.rms, ' m', target=B25B_RMS),
+                *_asked(recording.name, judged)]
+            robust_picture.draw(recording, judged.run, options.out / 'place_recognition.png')
+            section.notes.append('![The path, and what was believed](place_recognition.png)')
+    section.tables.append(table)
+    return section
+
+
+def _asked(name: str, judged: Judged) -> list[Metric]:
+    """Return what is asked for of all recordings."""
+    return [Metric(f'{name}: kept far off', judged.far_kept, target=0.0),
+            Metric(f'{name}: recall', judged.recall, target=RECALL, higher_is_better=True),
+            Metric(f'{name}: worst while driving', judged.worst, target=WORST)]
+
+
+def worlds(options: Options) -> Section:
+    """Measure simulated place recognition."""
+    section = Section(
+        'Simulated place recognition', 'Drives through an office and a campus, from seeds, with '
+        'right closures (scattered like Student\'s t), single wrong ones and groups of 4 to 12 '
+        'wrong ones that agree, along parallel corridors. 1x, 2.5x, 5x: scatter of the right ones '
+        'in sigmas that come with them.')
+    table = Table('', ('world, seed', *CLOSURES))
+    kinds = [(place, recogniser, over) for place in (OFFICE, OUTDOORS)
+             for recogniser in (LOOSE, MEDIUM, STRICT) for over in (1.0, 2.5, 5.0)]
+    for place, recogniser, over in (
+            [(OFFICE, LOOSE, 2.5), (OUTDOORS, LOOSE, 5.0)] if options.quick else kinds):
+        for seed in range(1 if options.quick else 2):
+            recording = place_recognition(place, recogniser, over, seed)
+            name = f'{recording.name}, seed {seed}'
+            judged = judge(table, replace(recording, name=name), everything=seed == 0)
+            section.metrics += [
+                Metric(f'{name}: rms over that of only right ones', judged.rms / judged.right,
+                       target=1.25), *_asked(name, judged)]
+    section.tables.append(table)
+    return section
+
+
+def arrivals(options: Options) -> Section:
+    """Measure one simulated drive whose closures come in other ways."""
+    section = Section(
+        'Other circumstances', 'One drive through the office (loose, 2.5x), whose closures come '
+        'in other ways, or whose odometry is not as good as its noise model says.')
+    table = Table('', ('circumstances', *CLOSURES))
+    recording = place_recognition(OFFICE, LOOSE, 2.5, 10)
+    kept: dict[str, np.ndarray] = {}
+    for name, change in circumstances().items():
+        if options.quick and 'wrong' not in name and 'order' not in name:
+            continue
+        judged = judge(table, replace(
+            change(recording, np.random.default_rng(1)), name=name), everything=False)
+        kept[name] = np.unique(change(recording, np.random.default_rng(1)).ends[judged.run.kept],
+                               axis=0)
+        section.metrics += [
+            Metric(f'{name}: kept far off', judged.far_kept, target=0.0),
+            Metric(f'{name}: rms over that of odometry', judged.rms / judged.odometry,
+                   target=WORST)]
+    first = kept.get('as they come')
+    for name, ends in kept.items():
+        if first is not None and ('late' in name or 'order' in name):
+            section.metrics.append(Metric(
+                f'{name}: closures that are decided otherwise', len(
+                    set(map(tuple, first.tolist())) ^ set(map(tuple, ends.tolist()))),
+                target=0.0))
+    for factor in () if options.quick else (0.5, 2.0):
+        place = replace(OFFICE, noise=factor * OFFICE.noise)
+        name = f'odometry {factor:g} times as noisy as claimed'
+        judged = judge(table, replace(place_recognition(place, LOOSE, 2.5, 10), name=name),
+                       everything=False)
+        section.metrics.append(Metric(f'{name}: kept far off', judged.far_kept, target=0.0))
+    section.tables.append(table)
+    return section
+
+
+def gates(options: Options) -> Section:
+    """Measure a world in which wrong closures come first, where odometry could have drifted."""
+    section = Section(
+        'Wide gates', 'A way round of 960 m before anything is seen again: the sigma of odometry '
+        'is above 10 m. Five lone wrong closures, 10 to 25 m off, come first; 25 right ones on '
+        'the second lap.')
+    table = Table('', ('seed', *CLOSURES))
+    for seed in range(1 if options.quick else 5):
+        judged = judge(table, replace(wide_gates(seed), name=str(seed)))
+        section.metrics += [
+            Metric(f'wide gates, seed {seed}: worst while driving', judged.worst, target=WORST),
+            Metric(f'wide gates, seed {seed}: rms over that of only right ones',
+                   judged.rms / judged.right, target=1.25)]
+    section.tables.append(table)
+    return section
+
+
+def grids(options: Options) -> Section:
+    """Measure graphs with very many closures, to which wrong ones are added."""
+    section = Section(
+        'Graphs with very many closures', 'M3500 and a simulated grid of its kind, with wrong '
+        'closures anywhere; the share is that of all closures. *Groups*: ten at a time agree.')
+    table = Table('', ('graph', *CLOSURES))
+    bases: list[tuple[Recording, int]] = [(of_world(streets.grid()), 1 if options.quick else 2)]
+    files = [options.data / name for name in M3500]
+    if all(path.exists() for path in files):
+        bases.insert(0, (read_recording(*files), 1 if options.quick else 5))
+    else:
+        section.notes.append('M3500: the data is not there, skipped.')
+    for base, seeds in bases:
+        clean = judge(table, replace(base, name=f'{base.name}, none wrong'), everything=False)
+        section.metrics.append(Metric(
+            f'{base.name}: rms over that of what the file says', clean.rms / clean.right,
+            target=1.05))
+        mixes = ((0.1, 1), (0.3, 1), (0.5, 1), (0.1, 10), (0.3, 10), (0.5, 10))
+        for share, group in mixes[2:5:2] if options.quick else mixes:
+            runs = [judge(table, replace(
+                with_false(base, share, group, seed),
+                name=f'{base.name}, {100 * share:.0f} % {"groups" if group > 1 else "single"}, '
+                f'seed {seed}'), everything=False) for seed in range(seeds)]
+            name = f'{base.name}, {100 * share:.0f} % {"groups" if group > 1 else "single"}'
+            section.metrics += [
+                Metric(f'{name}: rms over that without', max(
+                    run.rms for run in runs) / clean.rms, target=1.05),
+                Metric(f'{name}: wrong ones kept', max(run.wrong_kept for run in runs),
+                       target=0.0),
+                Metric(f'{name}: right ones lost, of 500', max(
+                    500.0 * (1.0 - run.recall) for run in runs), target=1.0)]
+    section.tables.append(table)
+    return section
+
+
+def fixes(options: Options) -> Section:
+    """Measure drives with wrong fixes."""
+    section = Section(
+        'Fixes', 'Fixes of 1 m at 1 Hz; no rigid motion. *Wins*: time from when what is right '
+        'comes (again) until the newest pose stays within 3 m. *Doubt said*: share of the updates '
+        'in the fault at which the verdicts have some of its fixes waiting or doubted. Asked of '
+        'all: at most 1.15 times the clean rms (0.45 m after the outage), and 20 s.')
+    table = Table('', ('drive', 'fault', 'rms [m]', 'newest pose, rms [m]',
+                       'newest pose, worst from the fault on [m]', 'wins [s]', 'doubt said',
+                       'wrong believed', 'right doubted'))
+    makers: dict[str, Callable[[int], robust_fixes.Drive]] = {'simulated': robust_fixes.simulated}
+    folder = options.data / MOWER
+    if folder.is_dir():
+        makers = {'plaza 1': lambda seed: robust_fixes.plaza(folder, seed), **makers}
+    else:
+        section.notes.append('plaza 1: the data is not there, skipped.')
+    for place, make in makers.items():
+        clean = np.nan
+        for fault, change in robust_fixes.FAULTS.items():
+            if options.quick and place == 'plaza 1' and not fault.startswith(('clean', '60 s')):
+                continue
+            seeds = range(1 if options.quick or place == 'plaza 1' else 2)
+            runs = [robust_fixes.run(change(make(seed), np.random.default_rng(seed)))
+                    for seed in seeds]
+            error = float(np.sqrt(np.mean([run.rms**2 for run in runs])))
+            clean = error if fault == robust_fixes.CLEAN else clean
+            worst = max(run.worst for run in runs)
+            won, said = max(run.won for run in runs), min(run.said for run in runs)
+            table.add(
+                place, fault, f'{error:.2f}',
+                f'{np.sqrt(np.mean([run.newest**2 for run in runs])):.2f}',
+                _cell(worst), _cell(won), _cell(said, 2),
+                f'{sum(run.wrong_believed for run in runs)} of '
+                + str(sum(run.n_wrong for run in runs)),
+                str(sum(run.right_doubted for run in runs)))
+            say('  ' + ' | '.join(table.rows[-1]))
+            name, limit = f'{place}, {fault}', 0.45 if '30 s all' in fault else 1.15 * clean
+            section.metrics += [
+                Metric(f'{name}: {what}', value, unit, target=target)
+                for what, value, unit, target in (
+                    ('rms', error, ' m', np.nan if np.isnan(clean) else limit),
+                    ('wins', won, ' s', 20.0)) if np.isfinite(value) and np.isfinite(target)]
+            if np.isfinite(said):
+                section.metrics.append(Metric(f'{name}: doubt said', said, target=0.5,
+                                              higher_is_better=True))
+    section.tables.append(table)
+    return section
+
+
+def _cell(value: float, digits: int = 1) -> str:
+    return f'{value:.{digits}f}' if np.isfinite(value) else ''
+
+
+def peers(options: Options) -> Section:
+    """Compare with GTSAM on the same graphs."""
+    section = Section(
+        'Beside GTSAM', 'Graduated non-convexity (GncLMOptimizer, truncated least squares, '
+        '99 %) and robust losses over the whole graph, once, from odometry. *Floors*: closures '
+        'with at least 0.3 m and 0.05 rad. Ours online: all calls of the back end over '
+        'the whole drive; ours, batch: GNC over the same graph, once.')
+    if not options.gtsam or find_spec('gtsam') is None:
+        section.notes.append('gtsam is not installed (`make bench` does that), skipped.')
+        return section
+    # the rest of the benchmark can be used without GTSAM
+    from benchmark import robust_peer  # noqa: PLC0415
+
+    table = Table('', ('graph', 'tool', 'rms [m]', 'closures kept', 'time [s]'))
+    for recording in _for_peers(options):
+        run = feed(recording, recording.config(Robust.JUDGED))
+        ours = rms(run.path, recording.truth)
+        table.add(recording.name, 'ours, online', f'{ours:.2f}', str(int(np.sum(run.kept))),
+                  f'{run.seconds:.2f}')
+        stamps, *rest = hidden_graph(run)
+        problem = robust_peer.Problem(*rest)
+        quickest, best = np.inf, np.inf
+        for solved in robust_peer.solve(problem, losses=True):
+            error = rms(Trajectory(stamps, solved.poses), recording.truth)
+            table.add(recording.name, solved.name, f'{error:.2f}',
+                      str(solved.kept) if solved.kept >= 0 else '', f'{solved.seconds:.2f}')
+            say('  ' + ' | '.join(table.rows[-1]))
+            if 'GNC' in solved.name:
+                quickest, best = min(quickest, solved.seconds), min(best, error)
+        section.metrics += [
+            Metric(f'{recording.name}: rms, online, over that of GTSAM GNC', ours / best,
+                   target=1.0)]
+    section.tables.append(table)
+    return section
+
+
+def _for_peers(options: Options) -> list[Recording]:
+    found = []
+    files = [options.data / name for name in PLACES]
+    if all(path.exists() for path in files):
+        found.append(read_recording(*files))
+    files = [options.data / name for name in M3500]
+    base = (read_recording(*files) if all(path.exists() for path in files)
+            else of_world(streets.grid()))
+    mixes = [(0.3, 10)] if options.quick else [(0.1, 1), (0.5, 1), (0.3, 10)]
+    found += [replace(with_false(base, share, group, 0), name=f'{base.name}, {100 * share:.0f} % '
+                      f'{"groups" if group > 1 else "single"}') for share, group in mixes]
+    return [*found, place_recognition(OFFICE, LOOSE, 2.5, 0)]
+
+
+SECTIONS: dict[str, Callable[[Options], Section]] = {
+    'places': places, 'worlds': worlds, 'arrivals': arrivals, 'gates': gates, 'grids': grids,
+    'fixes': fixes, 'peers': peers}
+
+
+def main(arguments: list[str]) -> int:
+    """Run the sections and write the page; return 1 if a figure is not what is asked for."""
+    parser = argparse.ArgumentParser(prog='python -m benchmark.robust', description=__doc__,
+                                     formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument('--quick', action='store_true', help='few worlds, one seed: minutes')
+    parser.add_argument('--only', choices=SECTIONS, action='append', help='only these sections')
+    parser.add_argument('--data', type=Path, default=DATA, metavar='DIR',
+                        help='folder with public data; what is not there is skipped')
+    parser.add_argument('--recording', nargs=3, type=Path, action='append', default=[],
+                        metavar=('GRAPH', 'TRUTH', 'STAMPS'),
+                        help='a further recording of place recognition: two g2o files, and the '
+                        'stamps of the nodes')
+    parser.add_argument('--without-gtsam', action='store_true')
+    parser.add_argument('--out', type=Path, default=Path('build/benchmark/robust'), metavar='DIR')
+    chosen = parser.parse_args(arguments)
+    options = Options(chosen.quick, chosen.data, tuple(map(tuple, chosen.recording)),
+                      not chosen.without_gtsam, chosen.out)
+    chosen.out.mkdir(parents=True, exist_ok=True)
+    sections = []
+    for name in chosen.only or SECTIONS:
+        say(name)
+        sections.append(SECTIONS[name](options))
+    return report.conclude(sections, options.out, 'benchmark.robust', arguments,
+                           title='Wrong measurements', about=__doc__)
+
+
+if __name__ == '__main__':
+    sys.exit(main(sys.argv[1:]))

@@ -1,0 +1,323 @@
+# Copyright 2026 The pose_graph_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""
+Recordings of odometry and loop closures with a truth, fed online, and what became of them.
+
+A closure is right if it is at most 3 m off, and far off beyond 6 m: the distance between the end
+that it measures and the true one, seen from its true start. Errors of paths are those after the
+best rigid motion, as nothing ties them to the truth. The truth decides nothing but figures.
+"""
+
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+import time
+
+import numpy as np
+
+from benchmark.worlds import integrate
+from pose_graph_ros.core.backend import PoseGraphBackend
+from pose_graph_ros.core.config import (
+    BackendConfig,
+    LOOP_CLOSURES,
+    NoiseFrom,
+    OdometryNoise,
+    OdometrySource,
+    Robust,
+)
+from pose_graph_ros.core.geometry import covariance, se2
+from pose_graph_ros.core.geometry.se2 import BoolArray, FloatArray, IntArray
+from pose_graph_ros.core.geometry.trajectory import Trajectory
+from pose_graph_ros.core.graph.constraints import EdgeKind
+from pose_graph_ros.core.io.g2o import read_g2o
+from pose_graph_ros.core.measurements import LoopClosure, OdometrySample
+
+SECOND = 1_000_000_000
+TRUE, FAR = 3.0, 6.0
+"""Largest error of a true closure, and the one beyond which a closure is far off [m]."""
+UPDATE_EVERY = 10
+"""New hidden nodes after which the graph is updated, as `pose-graph replay` does."""
+SMALLEST_RMS = 0.5
+"""Of odometry: what the newest pose is compared with is at least this [m]."""
+CLOSURES = 'loop_closure'
+
+
+@dataclass(frozen=True, slots=True)
+class Recording:
+    """N poses of odometry, and M loop closures."""
+
+    name: str
+    stamps_ns: IntArray
+    """Shape (N,)."""
+    odometry: FloatArray
+    """`T_odom_base`, shape (N, 3)."""
+    truth: Trajectory
+    ends: IntArray
+    """Stamps of the reference and of the other end [ns], shape (M, 2)."""
+    poses: FloatArray
+    """`T_reference_base`, shape (M, 3)."""
+    covariances: FloatArray
+    """In the axes of the reference, shape (M, 3, 3)."""
+    arrival_ns: IntArray
+    """Shape (M,), not descending."""
+    twist_variance: FloatArray | None = None
+    """What the odometry itself claims, shape (3,) per second; None: the model is used."""
+
+    def errors(self) -> FloatArray:
+        """Return how far off the closures are, shape (M,) [m]."""
+        true = se2.between(*(self.truth.at(stamps) for stamps in self.ends.T))
+        return np.asarray(np.hypot(*(self.poses - true)[:, :2].T))
+
+    def only(self, chosen: BoolArray) -> 'Recording':
+        """Return the recording with some of its closures."""
+        return replace(self, ends=self.ends[chosen], poses=self.poses[chosen],
+                       covariances=self.covariances[chosen], arrival_ns=self.arrival_ns[chosen])
+
+    def ordered(self, arrival_ns: IntArray) -> 'Recording':
+        """Return the recording with other times of arrival, shape (M,)."""
+        order = np.argsort(arrival_ns, kind='stable')
+        return replace(self.only(order), arrival_ns=arrival_ns[order])
+
+    def config(self, robust: Robust, noise_factor: float = 1.0) -> BackendConfig:
+        """
+        Return the settings of a run: the defaults, but for these.
+
+        Parameters
+        ----------
+        robust : Robust
+        noise_factor : float, on all sigmas of the model of odometry
+
+        """
+        noise = OdometryNoise()
+        noise = replace(noise, **{
+            name: noise_factor * getattr(noise, name) for name in noise.__dataclass_fields__})
+        source = OdometrySource(noise, NoiseFrom.MODEL if self.twist_variance is None
+                                else NoiseFrom.TWIST)
+        return BackendConfig(odometry={'odom': source},
+                             measurements={CLOSURES: replace(LOOP_CLOSURES, robust=robust)})
+
+
+@dataclass(slots=True)
+class Run:
+    """What came of a recording."""
+
+    backend: PoseGraphBackend
+    path: Trajectory
+    kept: BoolArray
+    """Whether each closure takes part at the end, shape (M,)."""
+    live: dict[int, float]
+    """Error of the newest pose after each update, by stamp [m]."""
+    updates: FloatArray
+    """Times of the updates [s]."""
+    seconds: float
+    """Of all calls of the back end."""
+    longest_idle: float
+    """Longest slice of work between updates [s]."""
+    states: dict[str, int] = field(default_factory=dict)
+
+
+def feed(recording: Recording, config: BackendConfig) -> Run:
+    """Feed a recording online, in the order of arrival, and optimise at its end."""
+    backend = PoseGraphBackend(config)
+    live: dict[int, float] = {}
+    updates: list[float] = []
+    idle, due, closure = 0.0, UPDATE_EVERY, 0
+    begin = time.perf_counter()
+    for stamp, pose in zip(recording.stamps_ns.tolist(), recording.odometry, strict=True):
+        backend.add_odometry(OdometrySample(stamp, pose, twist_variance=recording.twist_variance))
+        while closure < len(recording.ends) and recording.arrival_ns[closure] <= stamp:
+            add(backend, recording, closure)
+            closure += 1
+        if backend.graph.n_nodes >= due:
+            due = backend.graph.n_nodes + UPDATE_EVERY
+            start = time.perf_counter()
+            backend.update()
+            updates.append(time.perf_counter() - start)
+            idle = max(idle, drain(backend))
+            looked = time.perf_counter()
+            estimate = backend.estimate()
+            assert estimate is not None
+            live[estimate.stamp_ns] = float(fits(estimate.path, recording.truth).last[-1])
+            begin += time.perf_counter() - looked
+    for late in range(closure, len(recording.ends)):
+        add(backend, recording, late)
+    backend.optimize()
+    seconds = time.perf_counter() - begin
+    estimate = backend.estimate()
+    assert estimate is not None
+    kept, states = kept_closures(backend, recording)
+    return Run(backend, estimate.path, kept, live, np.array(updates), seconds, idle, states)
+
+
+def add(backend: PoseGraphBackend, recording: Recording, k: int) -> None:
+    """Add closure k of a recording."""
+    reference, stamp = recording.ends[k].tolist()
+    backend.add_measurement(LoopClosure(
+        stamp, recording.poses[k], recording.covariances[k], reference_ns=reference), CLOSURES)
+
+
+def drain(backend: PoseGraphBackend) -> float:
+    """Do all work that waits between two updates; return the time of the longest slice [s]."""
+    longest = 0.0
+    while True:
+        start = time.perf_counter()
+        finished = backend.refine().finished
+        longest = max(longest, time.perf_counter() - start)
+        if finished:
+            return longest
+
+
+def kept_closures(
+    backend: PoseGraphBackend, recording: Recording,
+) -> tuple[BoolArray, dict[str, int]]:
+    """Return which closures take part, shape (M,), and the number of them by state."""
+    verdicts = {(verdict.reference_ns, verdict.stamp_ns): verdict
+                for verdict in backend.verdicts()
+                if verdict.source == CLOSURES} if hasattr(backend, 'verdicts') else {}
+    if len(verdicts) == 0:
+        return np.ones(len(recording.ends), dtype=bool), {}
+    kept, states = [], dict[str, int]()
+    for ends in recording.ends.tolist():
+        verdict = verdicts.get(tuple(ends))
+        kept.append(verdict is not None and verdict.state.in_graph)
+        state = 'forgotten' if verdict is None else verdict.state.value
+        states[state] = states.get(state, 0) + 1
+    return np.array(kept, dtype=bool), states
+
+
+@dataclass(frozen=True, slots=True)
+class Fit:
+    """How far points are from others after the best rigid motion."""
+
+    rms: FloatArray
+    """Of points 0 to k, shape (N,) [m]."""
+    last: FloatArray
+    """Of point k, shape (N,) [m]."""
+
+
+def fits(path: Trajectory, truth: Trajectory) -> Fit:
+    """
+    Fit every beginning of a path to the truth, each by a rigid motion of its own.
+
+    With p and q the points as complex numbers, from their means, the best motion turns p by the
+    angle of `p* q`, and leaves `|p|^2 + |q|^2 - 2 |p* q|`.
+    """
+    stamps = path.stamps_ns[truth.covers(path.stamps_ns)]
+    p, q = ((trajectory.at(stamps)[:, :2] - trajectory.at(stamps)[0, :2]) @ (1.0, 1.0j)
+            for trajectory in (path, truth))
+    n = np.arange(1, len(stamps) + 1)
+    mean_p, mean_q = np.cumsum(p) / n, np.cumsum(q) / n
+    squares = (np.cumsum(np.abs(p)**2 + np.abs(q)**2) / n
+               - np.abs(mean_p)**2 - np.abs(mean_q)**2)
+    cross = np.cumsum(np.conj(p) * q) / n - np.conj(mean_p) * mean_q
+    turn = np.exp(1j * np.angle(cross))
+    return Fit(np.sqrt(np.maximum(squares - 2.0 * np.abs(cross), 0.0)),
+               np.abs(q - mean_q - turn * (p - mean_p)))
+
+
+def rms(path: Trajectory, truth: Trajectory) -> float:
+    """Return the error of a path after the best rigid motion [m]."""
+    return float(fits(path, truth).rms[-1])
+
+
+def worst_ratio(run: Run, recording: Recording) -> float:
+    """
+    Return the largest ratio, over the drive, of the newest pose's rms to that of odometry.
+
+    The newest pose is seen in the map of that moment: the path is fitted to the truth, then.
+    """
+    odometry = fits(Trajectory(recording.stamps_ns, recording.odometry), recording.truth).last
+    at = np.searchsorted(recording.stamps_ns, list(run.live))
+    ours, theirs = (np.sqrt(np.cumsum(np.square(errors)) / np.arange(1, len(at) + 1))
+                    for errors in (list(run.live.values()), odometry[at]))
+    return float(np.max(ours / np.maximum(theirs, SMALLEST_RMS)))
+
+
+def hidden_graph(
+    run: Run,
+) -> tuple[IntArray, FloatArray, FloatArray, IntArray, IntArray, FloatArray, FloatArray]:
+    """Return what the peers get: stamps, and the odometry and the closures between the nodes."""
+    edges = run.backend.graph.edges
+    chain = edges.rows(edges.kind == EdgeKind.ODOMETRY)
+    loops = edges.rows(edges.kind == EdgeKind.LOOP_CLOSURE)
+    return (run.backend.node_stamps_ns, chain.mean, chain.information,
+            loops.i, loops.j, loops.mean, loops.information)
+
+
+def read_recording(graph: Path, truth: Path, stamps: Path | None = None) -> Recording:
+    """
+    Read a recording from files.
+
+    Parameters
+    ----------
+    graph : Path
+        g2o file with odometry between consecutive nodes, and loop closures between others.
+    truth : Path
+        g2o file with true poses, or with perfect edges from each node to the next. If it has
+        another number of nodes it has no stamps, and is matched by the share of the path driven.
+    stamps : Path, optional
+        Stamps of the nodes [s], one in a line; default: one second between two nodes, and the
+        odometry's noise is taken from its edges.
+
+    """
+    content = read_g2o(graph, 'toro')
+    edges, n = content.graph.edges, content.graph.n_nodes
+    chain = np.flatnonzero(edges.j == edges.i + 1)
+    chain = chain[np.unique(edges.i[chain], return_index=True)[1]]
+    if len(chain) != n - 1:
+        raise ValueError(f'{graph.name}: odometry between all consecutive nodes is expected')
+    odometry = integrate(np.zeros(3), edges.mean[chain])
+    time_ns = (SECOND * np.arange(1, n + 1) if stamps is None
+               else np.round(np.loadtxt(stamps)[:n] * SECOND).astype(np.int64))
+    loops = edges.rows(np.setdiff1d(np.arange(len(edges)), chain))
+    twist = np.diagonal(np.linalg.inv(edges.information[chain[0]])).copy()
+    return closing(Recording(
+        graph.stem, time_ns, odometry, _truth(truth, time_ns, odometry),
+        np.empty((0, 2), dtype=np.int64), np.empty((0, 3)), np.empty((0, 3, 3)),
+        np.empty(0, dtype=np.int64), twist if stamps is None else None),
+        loops.i, loops.j, loops.mean, np.linalg.inv(loops.information))
+
+
+def _truth(file: Path, stamps_ns: IntArray, odometry: FloatArray) -> Trajectory:
+    lines = [line.split() for line in file.read_text(encoding='utf-8').splitlines()]
+    poses = np.array([words[2:5] for words in lines if words[:1] == ['VERTEX_SE2']], dtype=float)
+    if len(poses) == 0:
+        steps = {int(words[1]): words[3:6] for words in lines
+                 if words[:1] in (['EDGE2'], ['EDGE_SE2']) and int(words[2]) == int(words[1]) + 1}
+        poses = integrate(np.zeros(3), np.array([steps[k] for k in sorted(steps)], dtype=float))
+    if len(poses) == len(stamps_ns):
+        return Trajectory(stamps_ns, poses)
+    shares = [np.concatenate(([0.0], np.cumsum(np.hypot(*np.diff(path[:, :2], axis=0).T))))
+              for path in (odometry, poses)]
+    shares = [share / share[-1] for share in shares]
+    heading = np.unwrap(poses[:, 2])
+    return Trajectory(stamps_ns, se2.wrapped(np.column_stack([
+        np.interp(shares[0], shares[1], column) for column in (*poses[:, :2].T, heading)])))
+
+
+def closing(
+    recording: Recording, i: IntArray, j: IntArray, means: FloatArray, covariances: FloatArray,
+) -> Recording:
+    """
+    Return a recording with further closures, which come when their later node has come.
+
+    Parameters
+    ----------
+    recording : Recording
+    i, j : ndarray, shape (M,)
+        Numbers of the poses of odometry.
+    means : ndarray, shape (M, 3)
+        Pose of j in i.
+    covariances : ndarray, shape (M, 3, 3)
+        In the axes of pose j, as in g2o files.
+
+    """
+    ends = np.column_stack((recording.stamps_ns[i], recording.stamps_ns[j]))
+    turned = np.array([covariance.turned(cov, -float(mean[2]))
+                       for cov, mean in zip(covariances, means, strict=True)]).reshape(-1, 3, 3)
+    arrival = np.concatenate((recording.arrival_ns, ends.max(axis=1)))
+    return replace(
+        recording, ends=np.concatenate((recording.ends, ends)),
+        poses=np.concatenate((recording.poses, means)), arrival_ns=arrival,
+        covariances=np.concatenate((recording.covariances, turned))).ordered(arrival)
+
+
