@@ -14,6 +14,8 @@ from pose_graph_ros.adapters.conversions import Message
 from pose_graph_ros.adapters.sources import NANOSECONDS
 from pose_graph_ros.adapters.verdict_texts import (
     details,
+    Key,
+    nanoseconds,
     sentence,
     total_values,
     totals_text,
@@ -92,6 +94,17 @@ def _add_status(
     for key, value in values.items():
         stream.add_text(key)
         stream.add_text(value)
+
+
+def states_in(message: Message) -> dict[Key, State]:
+    """Return the states of measurements in a message, by their sources and stamps."""
+    found: dict[Key, State] = {}
+    for status in message.status[1:]:
+        values = {item.key: item.value for item in status.values}
+        reference = values['reference_stamp']
+        found[status.hardware_id, nanoseconds(values['stamp']),
+              None if reference == '' else nanoseconds(reference)] = State(values['state'])
+    return found
 
 
 def read_decision(message: Message) -> tuple[str, Decision] | Answer:

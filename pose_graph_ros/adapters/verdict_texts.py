@@ -5,6 +5,7 @@
 from collections.abc import Iterable, Mapping, Sequence
 import math
 
+from pose_graph_ros.adapters.sources import NANOSECONDS
 from pose_graph_ros.core.judgement.verdicts import (
     Decision,
     Judged,
@@ -21,10 +22,24 @@ ORDER = (State.DOUBTED, State.WAITING, State.WEAKLY_BELIEVED, State.BELIEVED)
 NAMED = 5  # number of ids that a sentence names
 
 
-def seconds(stamp_ns: int) -> str:
-    """Return a stamp in seconds, to the millisecond."""
-    whole, rest = divmod(stamp_ns, 1_000_000_000)
-    return f'{whole}.{rest // 1_000_000:03d}'
+def seconds(stamp_ns: int, digits: int = 3) -> str:
+    """
+    Return a stamp in seconds, rounded down.
+
+    Parameters
+    ----------
+    stamp_ns : int
+    digits : int, after the point; all are 9
+
+    """
+    whole, rest = divmod(stamp_ns, NANOSECONDS)
+    return f'{whole}.{f"{rest:09d}"[:digits]}'
+
+
+def nanoseconds(text: str) -> int:
+    """Return the stamp that `seconds` was given, if it was asked for all digits [ns]."""
+    whole, _, rest = text.partition('.')
+    return int(whole) * NANOSECONDS + int(rest)
 
 
 def number_of(n: int, kind: Judged) -> str:
@@ -91,13 +106,24 @@ def details(verdict: Verdict) -> dict[str, str]:
     """Return all that is known of a verdict, by key."""
     reference = verdict.reference_ns
     return {
-        'kind': verdict.kind.value, 'stamp': seconds(verdict.stamp_ns),
-        'reference_stamp': '' if reference is None else seconds(reference),
+        'kind': verdict.kind.value, 'stamp': seconds(verdict.stamp_ns, 9),
+        'reference_stamp': '' if reference is None else seconds(reference, 9),
         'state': verdict.state.value, 'since': seconds(verdict.since_ns),
         'residual': '[' + ', '.join(f'{part:.3f}' for part in verdict.residual.tolist()) + ']',
         'distance': f'{verdict.distance:.2f}', 'supported_by': ', '.join(verdict.supported_by),
         'contradicted_by': ', '.join(verdict.contradicted_by),
         'decision': verdict.decision.value}
+
+
+def as_json(verdict: Verdict) -> dict[str, object]:
+    """Return all that is known of a verdict as plain values, stamps in seconds."""
+    far = verdict.distance
+    return {
+        'id': verdict.id, 'source': verdict.source, **details(verdict),
+        'residual': [part if math.isfinite(part) else None for part in verdict.residual.tolist()],
+        'distance': far if math.isfinite(far) else None,
+        'supported_by': list(verdict.supported_by),
+        'contradicted_by': list(verdict.contradicted_by), 'sentence': sentence(verdict)}
 
 
 def totals_text(totals: SourceVerdicts) -> str:
@@ -128,7 +154,10 @@ def total_values(totals: Mapping[str, SourceVerdicts]) -> dict[str, str]:
     return values
 
 
-def notable(verdicts: Iterable[Verdict]) -> list[Verdict]:
-    """Return those that a person wants to look at: not believed, weakly, or decided upon."""
-    return [verdict for verdict in verdicts
-            if verdict.state is not State.BELIEVED or verdict.decision is not Decision.AUTO]
+Key = tuple[str, int, int | None]
+"""Source, stamp and stamp of the other end of a measurement [ns]."""
+
+
+def states_by_stamps(verdicts: Iterable[Verdict]) -> dict[Key, State]:
+    """Return the states of measurements by their sources and stamps."""
+    return {(each.source, each.stamp_ns, each.reference_ns): each.state for each in verdicts}

@@ -29,6 +29,7 @@ from pose_graph_ros.adapters.bag_inputs import choose_inputs, Inputs
 from pose_graph_ros.adapters.bags import BagError, open_bag
 from pose_graph_ros.adapters.conversions import planar_pose, stamp_ns
 from pose_graph_ros.adapters.sources import source_list
+from pose_graph_ros.adapters.verdict_messages import states_in
 from pose_graph_ros.cli import options as shared
 from pose_graph_ros.cli.results import collect_drive, write_results
 from pose_graph_ros.cli.simulate import simulate_drive, write_drive
@@ -37,6 +38,7 @@ from pose_graph_ros.core.geometry.trajectory import Trajectory
 
 SIMULATED_TOPICS = {'odom': '/odom', 'fix': '/gps/fix', 'loop_closure': '/loop_closure'}
 SIMULATED_TRUTH = '/ground_truth'
+VERDICTS = '/pose_graph/verdicts'  # topic of the node in the recorded bag
 # Short periods [s]: the player reads from the diagnostics which messages the node has processed.
 DEMO_PARAMETERS = ('-p', 'diagnostics_period:=0.05', '-p', 'path_period:=0.5')
 # Time for a process to end after SIGINT, and period of checking on the processes [s].
@@ -85,8 +87,10 @@ def execute(options: argparse.Namespace) -> int:
     corrected = Trajectory(np.array(list(poses), dtype=np.int64),
                            np.array([pose for pose in poses.values() if pose is not None]))
     diagnostics = _last(options.out / 'corrected', '/diagnostics').status[0]
+    verdicts = _last(options.out / 'corrected', VERDICTS)
     with open_bag(bag_path) as bag:
-        drive = collect_drive(bag, inputs, values, corrected, truth)
+        drive = collect_drive(bag, inputs, values, corrected, truth,
+                              states={} if verdicts is None else states_in(verdicts))
     table = write_results(drive, options.out, title, {
         'bag': bag_path.name, 'topics': dict(inputs.topics), 'rate': options.rate,
         'seconds': seconds, 'node': {item.key: item.value for item in diagnostics.values}})
@@ -194,7 +198,7 @@ def _stop(node: 'subprocess.Popen[bytes]') -> int:
 
 
 def _last(folder: Path, topic: str) -> Any:
-    """Return the last message on a topic in the bag that the player has recorded."""
+    """Return the last message on a topic in the bag that the player has recorded; None if none."""
     with open_bag(folder) as bag:
-        (message,) = deque(bag.messages([topic]), maxlen=1)
-        return message.decode()
+        messages = deque(bag.messages([topic]) if topic in bag.topics else (), maxlen=1)
+        return messages[0].decode() if len(messages) > 0 else None

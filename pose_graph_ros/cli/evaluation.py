@@ -18,6 +18,7 @@ import numpy.typing as npt
 from pose_graph_ros.core.geometry import se2
 from pose_graph_ros.core.geometry.se2 import FloatArray, IntArray
 from pose_graph_ros.core.geometry.trajectory import Trajectory
+from pose_graph_ros.core.judgement.verdicts import State
 
 
 @dataclass(frozen=True, slots=True)
@@ -32,6 +33,22 @@ class Drive:
     truth: Trajectory | None  # true poses, `T_map_base`; None if unknown
     loop_stamps_ns: IntArray  # stamps of both ends of the loop closures, shape (L, 2) [ns]
     map_axes: tuple[str, str] = ('x', 'y')  # names of the axes of the map
+    fix_unused: npt.NDArray[np.bool_] | None = None
+    """Whether a fix is doubted or waits, shape (M,); None if all are believed."""
+    loop_states: Sequence[State] = ()
+    """Of the loop closures; none if all are believed."""
+
+    @property
+    def fix_kinds(self) -> dict[str, npt.NDArray[np.bool_]]:
+        """Which fixes are used, doubted and held out, shape (M,) each."""
+        unused = np.zeros_like(self.fix_held_out) if self.fix_unused is None else self.fix_unused
+        return {'used': ~self.fix_held_out & ~unused, 'doubted': ~self.fix_held_out & unused,
+                'held out': self.fix_held_out}
+
+    def loops(self, *states: State) -> npt.NDArray[np.bool_]:
+        """Return which loop closures are in one of some states, shape (L,)."""
+        known = self.loop_states or [State.BELIEVED] * len(self.loop_stamps_ns)
+        return np.array([state in states for state in known], dtype=bool)
 
     def __post_init__(self) -> None:
         count = len(self.fix_stamps_ns)
@@ -39,6 +56,9 @@ class Drive:
         if shapes != ((count, 2), (count,), (2,)):
             raise ValueError(f'expected {count} positions (M, 2) and flags (M,) of fixes, and '
                              f'stamps of loop closures (L, 2), got {shapes}')
+        if len(self.fix_held_out if self.fix_unused is None else self.fix_unused) != count or len(
+                self.loop_states) not in (0, len(self.loop_stamps_ns)):
+            raise ValueError('expected what is believed of all fixes (M,) and loop closures (L,)')
         paths = (self.odometry, self.corrected, *([] if self.truth is None else [self.truth]))
         values = (self.fix_positions, *(path.poses for path in paths))
         if not all(np.all(np.isfinite(array)) for array in values):
@@ -160,7 +180,7 @@ def evaluate(drive: Drive) -> list[ErrorRow]:
         turns = se2.wrap(
             drive.corrected.at(truth.stamps_ns[inside])[:, 2] - truth.poses[inside, 2])
         rows += error_rows('corrected heading to truth', np.rad2deg(np.abs(turns)), 'deg')
-    for kind, chosen in (('used', ~drive.fix_held_out), ('held out', drive.fix_held_out)):
+    for kind, chosen in drive.fix_kinds.items():
         for name, path in paths.items():
             _, errors = distances(path, stamps[chosen], positions[chosen])
             rows += error_rows(f'{name} to fixes {kind}', errors)
@@ -200,7 +220,7 @@ def summary(
         'duration_s': float(stamps[-1] - stamps[0]) * 1e-9 if len(stamps) else 0.0,
         'distance_m': float(np.sum(np.hypot(steps[:, 0], steps[:, 1]))),
         'odometry': len(drive.odometry), 'poses': len(drive.corrected),
-        'fixes_used': int(np.sum(~drive.fix_held_out)),
-        'fixes_held_out': int(np.sum(drive.fix_held_out)),
+        **{f'fixes_{kind.replace(" ", "_")}': int(np.sum(chosen))
+           for kind, chosen in drive.fix_kinds.items()},
         'loop_closures': len(drive.loop_stamps_ns), 'truth': drive.truth is not None,
         'errors': [asdict(row) for row in rows], **extra}

@@ -7,7 +7,6 @@ from typing import Any
 
 from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
-from matplotlib.collections import LineCollection
 from matplotlib.figure import Figure
 from matplotlib.patheffects import withStroke
 from matplotlib.ticker import FuncFormatter, MultipleLocator
@@ -16,6 +15,7 @@ import numpy as np
 from pose_graph_ros.cli.evaluation import distances, Drive, evaluate, place_odometry
 from pose_graph_ros.core.geometry.se2 import FloatArray, IntArray
 from pose_graph_ros.core.geometry.trajectory import Trajectory
+from pose_graph_ros.core.judgement.verdicts import State
 
 # After Okabe and Ito, so that people with any kind of colour vision can distinguish them.
 BLUE, ORANGE, VERMILION, GREEN, PURPLE = '#0072B2', '#E69F00', '#D55E00', '#009E73', '#B583A4'
@@ -32,6 +32,12 @@ SECOND = 10**9  # one second [ns]
 TICK_SPACING = 1.6  # largest spacing of the grid of the map [inch]
 TWO_DIGITS = 10.0  # errors below this are shown with two digits after the point [m]
 LOG_RATIO = 4.0  # if errors of odometry exceed others by this factor, the axis is logarithmic
+UNUSED = (State.DOUBTED, State.WAITING)
+LOOPS = (
+    ('loop closures', (State.BELIEVED,), GREEN, '-', 5),
+    ('loop closures\nbelieved weakly', (State.WEAKLY_BELIEVED,), GREEN, '--', 5),
+    ('loop closures\nthat are doubted', UNUSED, GREY, ':', 2))
+"""Names of loop closures in the legend, states, colours, lines, and their order in depth."""
 LOG_FLOOR = 0.05  # lower end of a logarithmic error axis [m]
 
 
@@ -116,9 +122,12 @@ def _facts(drive: Drive) -> str:
     """Return the subtitle: duration, length and numbers of measurements."""
     path = max(drive.corrected, drive.odometry, key=len)
     steps = np.diff(path.poses[:, :2], axis=0)
-    used, held_out = int(np.sum(~drive.fix_held_out)), int(np.sum(drive.fix_held_out))
-    parts = [f'{used} fixes used' + (f', {held_out} held out' if held_out else ''),
-             f'{len(drive.loop_stamps_ns)} loop closures']
+    numbers = {kind: int(np.sum(chosen)) for kind, chosen in drive.fix_kinds.items()}
+    left_out = int(np.sum(drive.loops(*UNUSED)))
+    parts = [f'{numbers.pop("used")} fixes used' + ''.join(
+        f', {number} {kind}' for kind, number in numbers.items() if number > 0),
+        f'{len(drive.loop_stamps_ns) - left_out} loop closures' + (
+            f', {left_out} doubted' if left_out > 0 else '')]
     if len(path) > 1:
         parts[:0] = (f'{(path.stamps_ns[-1] - path.stamps_ns[0]) / SECOND:.0f} s',
                      f'{np.sum(np.hypot(steps[:, 0], steps[:, 1])):.0f} m')
@@ -147,20 +156,26 @@ def _draw_map(axes: Axes, drive: Drive, odometry: Trajectory) -> None:
                   zorder=4, label='truth')
     axes.plot(*odometry.poses[:, :2].T, color=PURPLE, linewidth=1.3, zorder=1,
               label=label('odometry alone'))
-    used = drive.fix_positions[~drive.fix_held_out]
-    held_out = drive.fix_positions[drive.fix_held_out]
+    used, doubted, held_out = (
+        drive.fix_positions[chosen] for chosen in drive.fix_kinds.values())
     if len(used):
         axes.plot(*used.T, 'o', color=ORANGE, markersize=4.5, markeredgewidth=0, alpha=0.55,
                   zorder=2, label=label('fixes'))
+    if len(doubted):
+        axes.plot(*doubted.T, 'x', color=GREY, markersize=5.5, markeredgewidth=1.1, zorder=2,
+                  label='fixes that are doubted')
     if len(held_out):
         axes.plot(*held_out.T, 'D', color='none', markeredgecolor=VERMILION, markersize=4.5,
                   markeredgewidth=0.9, zorder=2, label='fixes held out')
     inside = np.all(path.covers(drive.loop_stamps_ns), axis=1)
-    if np.any(inside):
-        ends = path.at(drive.loop_stamps_ns[inside])[..., :2]
-        axes.add_collection(LineCollection(list(ends), colors=GREEN, linewidths=1.2, zorder=5))
-        axes.plot(*ends.reshape(-1, 2).T, 'o', color='none', markeredgecolor=GREEN, markersize=7,
-                  markeredgewidth=1.3, zorder=5, label='loop closures')
+    for name, states, colour, line, order in LOOPS:
+        shown = inside & drive.loops(*states)
+        if np.any(shown):
+            ends = path.at(drive.loop_stamps_ns[shown])[..., :2]
+            apart = np.full((len(ends), 1, 2), np.nan)
+            axes.plot(*np.concatenate((ends, apart), axis=1).reshape(-1, 2).T, linestyle=line,
+                      color=colour, linewidth=1.2, marker='o', markerfacecolor='none',
+                      markersize=7, markeredgewidth=1.3, zorder=order, label=name)
     if len(path):
         for name, pose, marker in (('start', path.poses[0], 'o'), ('end', path.poses[-1], 's')):
             axes.plot(*pose[:2], marker, color='white', markeredgecolor=INK, markersize=10,
@@ -229,7 +244,7 @@ def _draw_errors(axes: Axes, drive: Drive, odometry: Trajectory) -> None:
 
 def _outages(drive: Drive, begin: int, end: int) -> list[tuple[float, float]]:
     """Return begin and end of the outages of the fixes in the pose graph [s]."""
-    used = np.sort(drive.fix_stamps_ns[~drive.fix_held_out])
+    used = np.sort(drive.fix_stamps_ns[drive.fix_kinds['used']])
     used = used[(used > begin) & (used < end)]
     if len(used) < MIN_FIXES:
         return []

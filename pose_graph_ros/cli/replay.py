@@ -23,7 +23,9 @@ from pose_graph_ros.adapters.bag_inputs import (
 from pose_graph_ros.adapters.bags import BagError, BagReader, MessageError, open_bag
 from pose_graph_ros.adapters.message_reader import MessageReader
 from pose_graph_ros.adapters.sources import backend_config, Kind, source_list
+from pose_graph_ros.adapters.verdict_texts import states_by_stamps
 from pose_graph_ros.cli import options as shared
+from pose_graph_ros.cli.judgement import judgement, judgement_lines
 from pose_graph_ros.cli.results import collect_drive, write_results
 from pose_graph_ros.core.backend import PoseGraphBackend
 from pose_graph_ros.core.batch.optimizer import Status
@@ -106,15 +108,18 @@ def execute(options: argparse.Namespace) -> int:
         if estimate is None:
             topics = ' or '.join(inputs.topics[name] for name in inputs.of(Kind.ODOMETRY))
             raise BagError(f'{options.bag}: no usable odometry on {topics}')
+        verdicts, totals = backend.verdicts(), backend.verdict_totals()
         drive = collect_drive(
-            bag, inputs, values, estimate.path, options.truth, origin=origin)
+            bag, inputs, values, estimate.path, options.truth, origin=origin,
+            states=states_by_stamps(verdicts))
     counts = {f'{source}.{answer}': count for (source, answer), count
               in sorted((backend.counts + refused).items())}
     table = write_results(drive, options.out, options.bag.stem, {
         'seconds': seconds, 'alignment': estimate.alignment.value,
         'hidden_nodes': estimate.n_hidden, 'edges': estimate.n_edges,
         'observed_nodes': estimate.n_observed, 'biases': estimate.n_biases,
-        'chi2': estimate.chi2, 'status': report.status.value, 'counts': counts})
+        'chi2': estimate.chi2, 'status': report.status.value, 'counts': counts,
+        'judged': judgement(totals, verdicts)})
     write_g2o(backend.graph, options.out / 'graph.g2o')
     print(f'{estimate.n_hidden} hidden nodes, {estimate.n_edges} edges, {estimate.n_observed} '
           f'observed nodes in {seconds:.2f} s; {report.status.value}, chi2 {report.chi2:.6g}; '
@@ -127,6 +132,8 @@ def execute(options: argparse.Namespace) -> int:
         if fit.wrongly_white:
             text += f', but are treated as white: see {source}.correlation_time'
         print(text)
+    for line in judgement_lines(totals, verdicts):
+        print(line)
     print('counts: ' + ', '.join(f'{name} {count}' for name, count in counts.items()))
     print(f'\n{table}\n\nwritten: {options.out}/path.tum, drive.png, summary.json, graph.g2o')
     return 0 if report.status is Status.CONVERGED else 1

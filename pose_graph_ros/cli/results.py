@@ -6,6 +6,7 @@ from collections.abc import Mapping
 from contextlib import suppress
 import json
 from pathlib import Path
+from types import MappingProxyType
 from typing import Any
 
 import numpy as np
@@ -15,12 +16,14 @@ from pose_graph_ros.adapters.bags import BagError, BagReader, MessageError
 from pose_graph_ros.adapters.conversions import planar_pose, stamp_ns
 from pose_graph_ros.adapters.message_reader import MessageReader
 from pose_graph_ros.adapters.sources import Kind
+from pose_graph_ros.adapters.verdict_texts import Key
 from pose_graph_ros.cli.evaluation import Drive, evaluate, format_table, summary
 from pose_graph_ros.cli.picture import draw_drive
 from pose_graph_ros.core.geometry import se2
 from pose_graph_ros.core.geometry.geodesy import MapOrigin
 from pose_graph_ros.core.geometry.trajectory import Trajectory
 from pose_graph_ros.core.io.tum import write_tum
+from pose_graph_ros.core.judgement.verdicts import State
 from pose_graph_ros.core.measurements import Fix, GlobalPose, LoopClosure, OdometrySample
 
 TRUTH_TYPES = ('nav_msgs/msg/Odometry', 'geometry_msgs/msg/PoseStamped',
@@ -30,6 +33,7 @@ TRUTH_TYPES = ('nav_msgs/msg/Odometry', 'geometry_msgs/msg/PoseStamped',
 def collect_drive(
     bag: BagReader, inputs: Inputs, values: Mapping[str, Any], corrected: Trajectory,
     truth_topic: str | None, *, origin: MapOrigin | None = None,
+    states: Mapping[Key, State] = MappingProxyType({}),
 ) -> Drive:
     """
     Return the corrected path together with the measurements of the bag that went into the graph.
@@ -46,6 +50,8 @@ def collect_drive(
         Topic of true poses in the map.
     origin : MapOrigin, optional
         Datum of the graph.
+    states : mapping, optional
+        What is believed; all that is missing is.
 
     Raises
     ------
@@ -61,7 +67,9 @@ def collect_drive(
     preferred = inputs.of(Kind.ODOMETRY)[0]
     odometry: dict[int, np.ndarray] = {}
     observed: list[tuple[int, np.ndarray | Fix, np.ndarray, bool]] = []
+    unused: list[bool] = []
     loops: list[tuple[int, int]] = []
+    loop_states: list[State] = []
     for source, message, held_out in read_inputs(bag, inputs):
         try:
             measurement = reader.read(source, message.decode())
@@ -74,8 +82,12 @@ def collect_drive(
                 observed.append((stamp, pose[:2], np.zeros(2), held_out))
             case LoopClosure(stamp, _, _, int(reference)):
                 loops.append((reference, stamp))
+                loop_states.append(states.get((source, stamp, reference), State.BELIEVED))
             case OdometrySample(stamp, pose) if source == preferred:
                 odometry.setdefault(stamp, pose)
+        if len(observed) > len(unused):
+            stamp = observed[-1][0]
+            unused.append(not states.get((source, stamp, None), State.BELIEVED).in_graph)
     stamps = np.array([row[0] for row in observed], dtype=np.int64)
     inside = corrected.covers(stamps)
     # without the datum of the graph: the first fix that can have been used in it is placed first
@@ -92,7 +104,8 @@ def collect_drive(
         odometry=_trajectory(odometry), fix_stamps_ns=stamps, fix_positions=positions,
         fix_held_out=np.array([row[3] for row in observed], dtype=bool), corrected=corrected,
         truth=None if truth_topic is None else read_truth(bag, truth_topic),
-        loop_stamps_ns=np.array(loops, dtype=np.int64).reshape(-1, 2),
+        loop_stamps_ns=np.array(loops, dtype=np.int64).reshape(-1, 2), loop_states=loop_states,
+        fix_unused=np.array(unused, dtype=bool),
         map_axes=('east', 'north') if len(inputs.of(Kind.FIX)) > 0 and not any(values['datum'][2:])
         else ('x', 'y'))
 

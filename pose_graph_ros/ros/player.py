@@ -37,6 +37,7 @@ from pose_graph_ros.ros.messages import CLASSES
 from pose_graph_ros.ros.transforms import TFMessage
 
 NODE_NAME = 'pose_graph'  # name of the node, for its service and its diagnostics
+VERDICTS = f'{NODE_NAME}/verdicts'
 # Profiles are reliable if they do not say otherwise.
 RELIABLE = QoSProfile(depth=1000)
 LATCHED = QoSProfile(depth=1, durability=QoSDurabilityPolicy.TRANSIENT_LOCAL)
@@ -81,12 +82,14 @@ class Player(Node):
         self.path = b''  # the newest path
         self._path_at = -float('inf')
         self.diagnostics: dict[str, str] = {}  # the newest values of the node's diagnostics
-        self._diagnostics_raw = b''
+        self._diagnostics_raw = self._verdicts = b''
         self._record('pose', PoseWithCovarianceStamped, Kind.GLOBAL_POSE.message_type)
         self._record('odometry/filtered', Odometry, Kind.ODOMETRY.message_type)
         if TFMessage is not None:
             self._record('/tf', TFMessage, 'tf2_msgs/msg/TFMessage')
         self.create_subscription(PathMessage, 'path', self._on_path, LATCHED, raw=True)
+        self.create_subscription(
+            DiagnosticArray, VERDICTS, self._on_verdicts, LATCHED, raw=True)
         self.create_subscription(
             DiagnosticArray, '/diagnostics', self._on_diagnostics, RELIABLE, raw=True)
         self._optimize = self.create_client(Trigger, f'{NODE_NAME}/optimize')
@@ -100,6 +103,9 @@ class Player(Node):
 
     def _on_path(self, raw: bytes) -> None:
         self.path, self._path_at = raw, time.monotonic()
+
+    def _on_verdicts(self, raw: bytes) -> None:
+        self._verdicts = raw
 
     def _on_diagnostics(self, raw: bytes) -> None:
         for status in deserialize_message(raw, DiagnosticArray).status:
@@ -208,14 +214,17 @@ class Player(Node):
         return bool(response.success), str(response.message)
 
     def write(self, folder: Path) -> None:
-        """Write a rosbag2 of all that was recorded, of path and diagnostics the last message."""
-        path_topic = self.resolve_topic_name('path')
-        with BagWriter(folder, overwrite=True, latched=[path_topic]) as writer:
+        """Write a rosbag2 of all; of path, verdicts and diagnostics the last message."""
+        path_topic, verdicts_topic = map(self.resolve_topic_name, ('path', VERDICTS))
+        with BagWriter(folder, overwrite=True, latched=[path_topic, verdicts_topic]) as writer:
             for topic, type_name, arrived_ns, raw in self.recorded:
                 writer.write(topic, type_name, arrived_ns, raw)
             writer.write(path_topic, 'nav_msgs/msg/Path', time.time_ns(), self.path)
-            writer.write('/diagnostics', 'diagnostic_msgs/msg/DiagnosticArray', time.time_ns(),
-                         self._diagnostics_raw)
+            for topic, raw in ((verdicts_topic, self._verdicts),
+                               ('/diagnostics', self._diagnostics_raw)):
+                if raw != b'':
+                    writer.write(
+                        topic, 'diagnostic_msgs/msg/DiagnosticArray', time.time_ns(), raw)
 
 
 def _progress(done: int, total: int) -> None:

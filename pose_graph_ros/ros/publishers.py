@@ -220,10 +220,20 @@ class Publishers:
             self._graph_stamp_ns = max(stamp_ns, self._graph_stamp_ns + 1)
             self._graph.publish(markers_cdr(view, self._graph_stamp_ns, self.map_frame))
 
-    def verdicts_are_due(self, state: object) -> bool:
-        """Tell whether to publish the verdicts: changed, wanted, and not too soon."""
+    def verdicts_are_due(self, state: object, *, at_once: bool = False) -> bool:
+        """
+        Tell whether to publish the verdicts: changed, wanted, and not too soon.
+
+        Parameters
+        ----------
+        state : object
+            Equal to that of the verdicts published last if they have not changed.
+        at_once : bool
+            Whether it cannot be too soon.
+
+        """
         return (state != self._verdicts_shown
-                and time.monotonic() - self._verdicts_at >= self._graph_period
+                and (at_once or time.monotonic() - self._verdicts_at >= self._graph_period)
                 and self._verdicts.get_subscription_count() > 0)
 
     def publish_verdicts(

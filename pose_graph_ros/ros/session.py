@@ -393,7 +393,7 @@ class Session:
         self, worker: Worker, graph: int, backend: PoseGraphBackend, *, at_once: bool = False,
     ) -> None:
         """
-        Publish path, markers and verdicts that are due, the path also `at_once`.
+        Publish path, markers and verdicts that are due; the path and verdicts also `at_once`.
 
         For the thread of the worker, which may no longer be the one of the present graph.
         """
@@ -408,7 +408,7 @@ class Session:
             self.out.publish_graph(view, estimate.stamp_ns, graph)
         status = worker.status
         state = status.verdicts, status.n_changes, status.counts[JUDGE, 'accepted']
-        if self.out.verdicts_are_due(state):
+        if self.out.verdicts_are_due(state, at_once=at_once):
             self.out.publish_verdicts(backend.verdicts(MOST_BELIEVED), status.verdicts,
                                       estimate.stamp_ns, graph, state=state)
 

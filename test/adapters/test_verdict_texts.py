@@ -4,6 +4,7 @@
 
 from dataclasses import replace
 from itertools import product
+import json
 import math
 
 from hypothesis import given, strategies as st
@@ -11,12 +12,14 @@ import numpy as np
 import pytest
 
 from pose_graph_ros.adapters.verdict_texts import (
+    as_json,
     details,
     listed,
-    notable,
+    nanoseconds,
     number_of,
     seconds,
     sentence,
+    states_by_stamps,
     total_values,
     totals_text,
 )
@@ -62,7 +65,8 @@ def test_every_state_has_a_sentence_of_its_own(
 
 def test_details_have_all_that_is_known() -> None:
     assert details(CLOSURE) == {
-        'kind': 'loop_closure', 'stamp': '1695.250', 'reference_stamp': '1600.000',
+        'kind': 'loop_closure', 'stamp': '1695.250000000',
+        'reference_stamp': '1600.000000000',
         'state': 'doubted', 'since': '1700.500', 'residual': '[4.000, -3.000, 0.200]',
         'distance': '14.25', 'supported_by': '', 'contradicted_by': 'loop_closure/3, odometry',
         'decision': 'auto'}
@@ -74,6 +78,7 @@ def test_details_have_all_that_is_known() -> None:
 def test_a_stamp_in_seconds_is_rounded_down_to_the_millisecond(stamp_ns: int) -> None:
     whole, _, rest = seconds(stamp_ns).partition('.')
     assert len(rest) == 3
+    assert nanoseconds(seconds(stamp_ns, 9)) == stamp_ns
     assert 0 <= stamp_ns - int(whole) * 10**9 - int(rest) * 10**6 < 10**6
 
 
@@ -95,7 +100,17 @@ def test_lists_are_bounded_and_nouns_are_counted() -> None:
     assert number_of(2, Judged.FIX) == '2 fixes'
 
 
-def test_notable_is_what_is_not_simply_believed() -> None:
-    plain = replace(CLOSURE, state=State.BELIEVED)
-    forced = replace(plain, decision=Decision.IN)
-    assert notable([plain, CLOSURE, forced]) == [CLOSURE, forced]
+def test_states_are_found_by_source_and_stamps() -> None:
+    fix = replace(CLOSURE, source='fix', reference_ns=None, state=State.BELIEVED)
+    assert states_by_stamps([CLOSURE, fix]) == {
+        ('loop_closure', 1_695_250_000_000, 1_600_000_000_000): State.DOUBTED,
+        ('fix', 1_695_250_000_000, None): State.BELIEVED}
+
+
+def test_as_json_has_numbers_and_no_nan() -> None:
+    found = as_json(replace(CLOSURE, residual=np.array([1.0, 2.0, np.nan]), distance=math.inf))
+    assert found['residual'] == [1.0, 2.0, None]
+    assert found['distance'] is None
+    assert found['contradicted_by'] == ['loop_closure/3', 'odometry']
+    assert (found['id'], found['state']) == ('loop_closure/17', 'doubted')
+    json.dumps(found, allow_nan=False)

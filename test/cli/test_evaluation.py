@@ -26,6 +26,7 @@ from pose_graph_ros.cli.evaluation import (
 from pose_graph_ros.cli.picture import BLUE, draw_drive, GREEN, VERMILION
 from pose_graph_ros.core.geometry import se2
 from pose_graph_ros.core.geometry.trajectory import Trajectory
+from pose_graph_ros.core.judgement.verdicts import State
 
 NOTHING = Trajectory(np.zeros(0, dtype=np.int64), np.zeros((0, 3)))
 NO_LOOPS = np.zeros((0, 2), dtype=np.int64)
@@ -148,6 +149,32 @@ def test_rows_of_a_hand_made_drive() -> None:
     assert rows['corrected path to fixes held out'].maximum == pytest.approx(2.5)
 
 
+def test_what_is_doubted_is_no_reference_and_counted_apart() -> None:
+    drive = replace(
+        hand_made_drive(), fix_unused=np.array([False, True, False, True, False]),
+        loop_states=[State.DOUBTED])
+    rows = {row.name: row for row in evaluate(drive)}
+    assert rows['corrected path to fixes used'].count == 1
+    assert rows['corrected path to fixes doubted'].count == 1
+    assert rows['corrected path to fixes held out'].count == 2
+    result = summary(drive, [], {})
+    assert (result['fixes_used'], result['fixes_doubted'], result['fixes_held_out']) == (2, 1, 2)
+    assert drive.loops(State.DOUBTED).tolist() == [True]
+    assert hand_made_drive().loops(State.BELIEVED).tolist() == [True]
+
+
+def test_what_is_doubted_is_grey_in_the_picture(tmp_path: Path) -> None:
+    pixels = {}
+    for name, states in (('believed', [State.BELIEVED]), ('doubted', [State.DOUBTED])):
+        drive = replace(hand_made_drive(), loop_states=states)
+        draw_drive(drive, tmp_path / f'{name}.png', name)
+        found = np.round(imread(tmp_path / f'{name}.png')[..., :3] * 255.0)
+        green = [int(GREEN[k:k + 2], 16) for k in (1, 3, 5)]
+        pixels[name] = int(np.sum(np.all(np.abs(found - green) < 3.0, axis=-1)))
+    assert pixels['believed'] > 20
+    assert pixels['doubted'] == 0
+
+
 def test_headings_are_compared_around_the_circle() -> None:
     drive = hand_made_drive()
     stamps, poses = drive.corrected.stamps_ns, drive.corrected.poses
@@ -180,6 +207,8 @@ def test_a_drive_that_does_not_fit_together_is_refused() -> None:
         ({'fix_held_out': np.zeros(3, dtype=bool)}, 'of fixes'),
         ({'loop_stamps_ns': np.zeros(4, dtype=np.int64)}, 'loop closures'),
         ({'fix_positions': np.full((5, 2), np.nan)}, 'finite'),
+        ({'fix_unused': np.zeros(3, dtype=bool)}, 'believed of all'),
+        ({'loop_states': [State.DOUBTED] * 2}, 'believed of all'),
     ):
         with pytest.raises(ValueError, match=words):
             replace(drive, **wrong)

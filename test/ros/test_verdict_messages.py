@@ -17,9 +17,10 @@ from pose_graph_ros.adapters.verdict_messages import (
     MOST_OTHERS,
     read_decision,
     shown,
+    states_in,
     verdicts_cdr,
 )
-from pose_graph_ros.adapters.verdict_texts import details, sentence
+from pose_graph_ros.adapters.verdict_texts import details, sentence, states_by_stamps
 from pose_graph_ros.core.judgement.verdicts import (
     Decision,
     Judged,
@@ -56,6 +57,7 @@ def test_a_message_is_read_as_what_it_is() -> None:
         assert (status.name, status.hardware_id) == (each.id, 'loop')
         assert status.message == sentence(each)
         assert {item.key: item.value for item in status.values} == details(each)
+    assert states_in(message) == states_by_stamps(verdicts)
 
 
 def test_an_empty_message_says_so() -> None:
