@@ -67,11 +67,14 @@ def _refer_to_poses(head):  # type: ignore[no-untyped-def]
 @kernel(signature=(tb.HEAD,))
 def linearize(head):  # type: ignore[no-untyped-def]
     """Make the poses the references and linearize all constraints there."""
+    edge_f, observed_f = tb.edge_f(head), tb.observed_f(head)
     _refer_to_poses(head)
     for e in range(head[tb.N_EDGES]):
-        factors.linearize_edge(head, e)
+        if edge_f[e, tb.WEIGHT] > 0.0:
+            factors.linearize_edge(head, e)
     for k in range(head[tb.N_OBSERVED]):
-        factors.linearize_observed(head, k)
+        if observed_f[k, tb.WEIGHT] > 0.0:
+            factors.linearize_observed(head, k)
 
 
 @kernel(signature=(tb.HEAD, NUMBER))
@@ -305,15 +308,17 @@ def settle(head):  # type: ignore[no-untyped-def]
             f[tb.SEEN + k] = f[tb.DELTA + k]
     chi2 = error2 = 0.0
     for e in range(head[tb.N_EDGES]):
-        factors.check_edge(head, e, 0.0)
-        chi2 += edge_f[e, tb.ENERGY]
-        error2 += edge_f[e, tb.ERROR2]
         edge_i[e, tb.EDGE_WAITS] = 0
+        if edge_f[e, tb.WEIGHT] > 0.0:
+            factors.check_edge(head, e, 0.0)
+            chi2 += edge_f[e, tb.ENERGY]
+            error2 += edge_f[e, tb.ERROR2]
     for k in range(head[tb.N_OBSERVED]):
-        factors.check_observed(head, k)
-        chi2 += observed_f[k, tb.OBS_ENERGY]
-        error2 += observed_f[k, tb.OBS_ERROR2]
         observed_i[k, tb.OBS_WAITS] = 0
+        if observed_f[k, tb.WEIGHT] > 0.0:
+            factors.check_observed(head, k)
+            chi2 += observed_f[k, tb.OBS_ENERGY]
+            error2 += observed_f[k, tb.OBS_ERROR2]
     scalars[tb.CHI2] = chi2
     head[tb.N_WAITING] = head[tb.N_TURNED] = head[tb.REFINED] = head[tb.LISTED] = 0
     if not 0.0 < scalars[tb.SETTING_BUDGET] < error2:

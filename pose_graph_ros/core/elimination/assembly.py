@@ -43,7 +43,7 @@ def eliminate_clique(head, c, relinearize):  # type: ignore[no-untyped-def]
 @kernel
 def _eliminate(head, c, relinearize, by_weakest):  # type: ignore[no-untyped-def]
     """Eliminate a clique, with bounds of the pivots by the weakest direction if asked for."""
-    node_f, edge_f, observed_f = tb.node_f(head), tb.edge_f(head), tb.observed_f(head)
+    node_f = tb.node_f(head)
     pool_f, work_f, scalars = tb.pool_f(head), tb.work_f(head), tb.scalars(head)
     node_i, edge_i, observed_i = tb.node_i(head), tb.edge_i(head), tb.observed_i(head)
     clique_f, clique_i, pool_i = tb.clique_f(head), tb.clique_i(head), tb.pool_i(head)
@@ -68,7 +68,7 @@ def _eliminate(head, c, relinearize, by_weakest):  # type: ignore[no-untyped-def
         while entry >= 0:
             e, side = entry >> 1, entry & 1
             other = edge_i[e, tb.END_I if side == 1 else tb.END_J]
-            if node_i[other, tb.FRONT] == serial and edge_f[e, tb.WEIGHT] > 0.0:
+            if node_i[other, tb.FRONT] == serial:
                 at = node_i[other, tb.INDEX]
                 # an edge between two frontal nodes is in both lists: added from its start
                 if at >= rows or side == 0:
@@ -85,12 +85,11 @@ def _eliminate(head, c, relinearize, by_weakest):  # type: ignore[no-untyped-def
             entry = edge_i[e, tb.NEXT_J if side == 1 else tb.NEXT_I]
         entry = node_i[v, tb.OBSERVED_LIST]
         while entry >= 0:
-            if observed_f[entry, tb.WEIGHT] > 0.0:
-                anchored = 1
-                if relinearize:
-                    transaction_log.log_observed(head, entry)
-                    factors.linearize_observed(head, entry)
-                factors.add_observed(head, entry, 3 * k, front, ld)
+            anchored = 1
+            if relinearize:
+                transaction_log.log_observed(head, entry)
+                factors.linearize_observed(head, entry)
+            factors.add_observed(head, entry, 3 * k, front, ld)
             entry = observed_i[entry, tb.OBS_NEXT]
         scale_t = node_f[v, tb.SCALE_T] * node_f[v, tb.SCALE_T]
         scale_r = node_f[v, tb.SCALE_R] * node_f[v, tb.SCALE_R]

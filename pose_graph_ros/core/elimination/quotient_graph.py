@@ -53,7 +53,7 @@ def structure(head, marked, affected):  # type: ignore[no-untyped-def]
     affected : ndarray of int32, nodes to be ordered
 
     """
-    edge_f, node_i, edge_i = tb.edge_f(head), tb.node_i(head), tb.edge_i(head)
+    node_i, edge_i = tb.node_i(head), tb.edge_i(head)
     clique_i, pool_i = tb.clique_i(head), tb.pool_i(head)
     n = len(affected)
     serial = head[tb.FRONT_SERIAL] + 1
@@ -81,7 +81,7 @@ def structure(head, marked, affected):  # type: ignore[no-untyped-def]
         while entry >= 0:
             e, side = entry >> 1, entry & 1
             other = edge_i[e, tb.END_I if side == 1 else tb.END_J]
-            if node_i[other, tb.FRONT] == serial and edge_f[e, tb.WEIGHT] > 0.0:
+            if node_i[other, tb.FRONT] == serial:
                 count[k] += 1
             entry = edge_i[e, tb.NEXT_J if side == 1 else tb.NEXT_I]
     start = np.empty(n + n_orphans + 1, np.int32)
@@ -118,7 +118,7 @@ def structure(head, marked, affected):  # type: ignore[no-untyped-def]
         while entry >= 0:
             e, side = entry >> 1, entry & 1
             other = edge_i[e, tb.END_I if side == 1 else tb.END_J]
-            if node_i[other, tb.FRONT] == serial and edge_f[e, tb.WEIGHT] > 0.0:
+            if node_i[other, tb.FRONT] == serial:
                 i = node_i[other, tb.INDEX]
                 if last_seen[i] != k:
                     last_seen[i] = k

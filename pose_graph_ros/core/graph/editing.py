@@ -5,6 +5,9 @@ Edit the graph in its tables: new rows, new weights, fixed nodes.
 
 Each edit keeps the lists, the diagonal scales and chi2 up to date, and touches the nodes that have
 to be eliminated again. Edits of existing rows are not checked here; `graph.Graph` has done so.
+
+Only constraints with a weight above 0 are in the lists of their nodes. The others are rows that
+nothing looks at: adding one touches no node, and however many there are, solving takes no longer.
 """
 
 import math
@@ -12,11 +15,9 @@ import math
 from pose_graph_ros.core.compiled.jit import (
     BYTES,
     FLAG,
-    INTEGER,
     INTEGERS,
     kernel,
     MATRICES,
-    NUMBER,
     NUMBERS,
     ROWS,
 )
@@ -24,8 +25,6 @@ from pose_graph_ros.core.graph import factors, rows, tables as tb, transaction_l
 
 # Results of `add_rows`.
 ADDED, NO_ROOM, UNSOUND = range(3)
-# Kinds of edits of `edit`.
-WEIGH_EDGE, WEIGH_OBSERVED, FIX = range(3)
 
 
 @kernel
@@ -139,57 +138,69 @@ def _touch_edge(head, e):  # type: ignore[no-untyped-def]
 
 
 @kernel
-def _start_edges(head, first, last):  # type: ignore[no-untyped-def]
-    """Add the edges in new rows to the lists of their ends, and linearize them."""
-    edge_f, scalars, node_i = tb.edge_f(head), tb.scalars(head), tb.node_i(head)
-    edge_i = tb.edge_i(head)
-    for e in range(first, last):
-        f, row = edge_f[e], edge_i[e]
-        if row[tb.EDGE_KIND] != factors.BIAS:
-            c, s = math.cos(f[tb.MEAN + 2]), math.sin(f[tb.MEAN + 2])
-            f[tb.OWN_T] = c * f[tb.MEAN] + s * f[tb.MEAN + 1]
-            f[tb.OWN_T + 1] = c * f[tb.MEAN + 1] - s * f[tb.MEAN]
-        row[tb.EDGE_CHECKED] = row[tb.EDGE_WAITS] = 0
-        row[tb.EDGE_LOGGED] = head[tb.UPDATE]
-        _touch_edge(head, e)
-        i, j = row[tb.END_I], row[tb.END_J]
-        row[tb.NEXT_I], node_i[i, tb.EDGE_LIST] = node_i[i, tb.EDGE_LIST], 2 * e
-        row[tb.NEXT_J], node_i[j, tb.EDGE_LIST] = node_i[j, tb.EDGE_LIST], 2 * e + 1
-        scale_by_edge(head, e, f[tb.WEIGHT])
-        factors.linearize_edge(head, e)
-        factors.check_edge(head, e, 0.0)
-        scalars[tb.CHI2] += f[tb.ENERGY]
+def _link_edge(head, e):  # type: ignore[no-untyped-def]
+    """Put an edge at the heads of the lists of its ends; the caller has logged all three rows."""
+    node_i, edge_i = tb.node_i(head), tb.edge_i(head)
+    row = edge_i[e]
+    i, j = row[tb.END_I], row[tb.END_J]
+    row[tb.NEXT_I], node_i[i, tb.EDGE_LIST] = node_i[i, tb.EDGE_LIST], 2 * e
+    row[tb.NEXT_J], node_i[j, tb.EDGE_LIST] = node_i[j, tb.EDGE_LIST], 2 * e + 1
 
 
 @kernel
-def _start_observed(head, first, last):  # type: ignore[no-untyped-def]
-    """Add the observed nodes in new rows to the lists of their hidden nodes; linearize them."""
-    observed_f, scalars, node_i = tb.observed_f(head), tb.scalars(head), tb.node_i(head)
-    observed_i = tb.observed_i(head)
-    for k in range(first, last):
-        f, row = observed_f[k], observed_i[k]
-        v = row[tb.OBS_NODE]
-        transaction_log.log_node(head, v)
-        row[tb.OBS_NEXT], node_i[v, tb.OBSERVED_LIST] = node_i[v, tb.OBSERVED_LIST], k
-        row[tb.OBS_WAITS] = 0
-        row[tb.OBS_LOGGED] = head[tb.UPDATE]
-        scale_by_observed(head, k, f[tb.WEIGHT])
-        factors.linearize_observed(head, k)
-        factors.check_observed(head, k)
-        scalars[tb.CHI2] += f[tb.OBS_ENERGY]
-        touch(head, v)
+def _unlink_edge(head, e, side):  # type: ignore[no-untyped-def]
+    """Take an edge out of the list of its end I (side 0) or J (1), whose row has been logged."""
+    node_i, edge_i = tb.node_i(head), tb.edge_i(head)
+    v = edge_i[e, tb.END_J if side == 1 else tb.END_I]
+    after = edge_i[e, tb.NEXT_J if side == 1 else tb.NEXT_I]
+    entry = node_i[v, tb.EDGE_LIST]
+    if entry == 2 * e + side:
+        node_i[v, tb.EDGE_LIST] = after
+        return
+    while True:
+        before, column = entry >> 1, tb.NEXT_J if (entry & 1) == 1 else tb.NEXT_I
+        entry = edge_i[before, column]
+        if entry == 2 * e + side:
+            transaction_log.log_edge(head, before)
+            edge_i[before, column] = after
+            return
+
+
+@kernel
+def _unlink_observed(head, k):  # type: ignore[no-untyped-def]
+    """Take an observed node out of the list of its hidden node, whose row has been logged."""
+    node_i, observed_i = tb.node_i(head), tb.observed_i(head)
+    v, after = observed_i[k, tb.OBS_NODE], observed_i[k, tb.OBS_NEXT]
+    before = node_i[v, tb.OBSERVED_LIST]
+    if before == k:
+        node_i[v, tb.OBSERVED_LIST] = after
+        return
+    while observed_i[before, tb.OBS_NEXT] != k:
+        before = observed_i[before, tb.OBS_NEXT]
+    transaction_log.log_observed(head, before)
+    observed_i[before, tb.OBS_NEXT] = after
 
 
 @kernel
 def _weigh_edge(head, e, weight):  # type: ignore[no-untyped-def]
-    """Set the weight of an edge; 0 removes it."""
+    """Change the weight of an edge; at 0 it is in no list."""
     edge_f, scalars = tb.edge_f(head), tb.scalars(head)
     f = edge_f[e]
+    before = f[tb.WEIGHT]
+    if weight == before:
+        return
     transaction_log.log_edge(head, e)
     _touch_edge(head, e)
-    scale_by_edge(head, e, weight - f[tb.WEIGHT])
+    scale_by_edge(head, e, weight - before)
     scalars[tb.CHI2] -= f[tb.ENERGY]
     f[tb.WEIGHT] = weight
+    if weight == 0.0:
+        _unlink_edge(head, e, 0)
+        _unlink_edge(head, e, 1)
+        f[tb.ERROR2] = f[tb.ENERGY] = 0.0
+        return
+    if before == 0.0:
+        _link_edge(head, e)
     factors.linearize_edge(head, e)
     factors.check_edge(head, e, 0.0)
     scalars[tb.CHI2] += f[tb.ENERGY]
@@ -197,48 +208,105 @@ def _weigh_edge(head, e, weight):  # type: ignore[no-untyped-def]
 
 @kernel
 def _weigh_observed(head, k, weight):  # type: ignore[no-untyped-def]
-    """Set the weight of an observed node; 0 removes it."""
+    """Change the weight of an observed node; at 0 it is in no list."""
     observed_f, scalars, observed_i = tb.observed_f(head), tb.scalars(head), tb.observed_i(head)
+    node_i = tb.node_i(head)
     f, v = observed_f[k], observed_i[k, tb.OBS_NODE]
+    before = f[tb.WEIGHT]
+    if weight == before:
+        return
     transaction_log.log_observed(head, k)
     transaction_log.log_node(head, v)
-    scale_by_observed(head, k, weight - f[tb.WEIGHT])
+    touch(head, v)
+    scale_by_observed(head, k, weight - before)
     scalars[tb.CHI2] -= f[tb.OBS_ENERGY]
     f[tb.WEIGHT] = weight
+    if weight == 0.0:
+        _unlink_observed(head, k)
+        f[tb.OBS_ERROR2] = f[tb.OBS_ENERGY] = 0.0
+        return
+    if before == 0.0:
+        observed_i[k, tb.OBS_NEXT], node_i[v, tb.OBSERVED_LIST] = node_i[v, tb.OBSERVED_LIST], k
     factors.linearize_observed(head, k)
     factors.check_observed(head, k)
     scalars[tb.CHI2] += f[tb.OBS_ENERGY]
-    touch(head, v)
 
 
 @kernel
-def _set_fixed(head, v, fixed):  # type: ignore[no-untyped-def]
-    """Fix a hidden node at its present pose, or free it."""
-    node_i = tb.node_i(head)
-    if node_i[v, tb.FIXED] != fixed:
-        transaction_log.log_node(head, v)
-        node_i[v, tb.FIXED] = fixed
-        touch(head, v)
+def _start_edges(head, first, last):  # type: ignore[no-untyped-def]
+    """Initialise new rows of edges, and add those with a weight to the graph."""
+    edge_f, edge_i = tb.edge_f(head), tb.edge_i(head)
+    for e in range(first, last):
+        f, row = edge_f[e], edge_i[e]
+        if row[tb.EDGE_KIND] != factors.BIAS:
+            c, s = math.cos(f[tb.MEAN + 2]), math.sin(f[tb.MEAN + 2])
+            f[tb.OWN_T] = c * f[tb.MEAN] + s * f[tb.MEAN + 1]
+            f[tb.OWN_T + 1] = c * f[tb.MEAN + 1] - s * f[tb.MEAN]
+        f[tb.ERROR2] = f[tb.ENERGY] = 0.0
+        row[tb.EDGE_CHECKED] = row[tb.EDGE_WAITS] = 0
+        row[tb.EDGE_LOGGED] = head[tb.UPDATE]
+        weight, f[tb.WEIGHT] = f[tb.WEIGHT], 0.0
+        _weigh_edge(head, e, weight)
 
 
-@kernel(signature=(tb.HEAD, INTEGER, INTEGER, NUMBER))
-def edit(head, what, number, value):  # type: ignore[no-untyped-def]
+@kernel
+def _start_observed(head, first, last):  # type: ignore[no-untyped-def]
+    """Initialise new rows of observed nodes, and add those with a weight to the graph."""
+    observed_f, observed_i = tb.observed_f(head), tb.observed_i(head)
+    for k in range(first, last):
+        f, row = observed_f[k], observed_i[k]
+        f[tb.OBS_ERROR2] = f[tb.OBS_ENERGY] = 0.0
+        row[tb.OBS_WAITS] = 0
+        row[tb.OBS_LOGGED] = head[tb.UPDATE]
+        weight, f[tb.WEIGHT] = f[tb.WEIGHT], 0.0
+        _weigh_observed(head, k, weight)
+
+
+@kernel(signature=(tb.HEAD, INTEGERS, NUMBERS))
+def weigh_edges(head, edges, weights):  # type: ignore[no-untyped-def]
     """
-    Edit one row.
+    Set the weights of edges.
 
     Parameters
     ----------
-    what : int, WEIGH_EDGE, WEIGH_OBSERVED or FIX
-    number : int, row of the edge, the observed node or the hidden node
-    value : float, the weight, or 1 to fix and 0 to free a hidden node
+    edges, weights : ndarray, shape (M,), rows and weights; 0 removes an edge from the graph
 
     """
-    if what == WEIGH_EDGE:
-        _weigh_edge(head, number, value)
-    elif what == WEIGH_OBSERVED:
-        _weigh_observed(head, number, value)
-    else:
-        _set_fixed(head, number, value)
+    for m in range(len(edges)):
+        _weigh_edge(head, edges[m], weights[m])
+
+
+@kernel(signature=(tb.HEAD, INTEGERS, NUMBERS))
+def weigh_observed(head, observed, weights):  # type: ignore[no-untyped-def]
+    """
+    Set the weights of observed nodes.
+
+    Parameters
+    ----------
+    observed, weights : ndarray, shape (K,), as for `weigh_edges`
+
+    """
+    for m in range(len(observed)):
+        _weigh_observed(head, observed[m], weights[m])
+
+
+@kernel(signature=(tb.HEAD, INTEGERS, FLAG))
+def set_fixed(head, nodes, fixed):  # type: ignore[no-untyped-def]
+    """
+    Fix hidden nodes at their present poses, or free them.
+
+    Parameters
+    ----------
+    nodes : ndarray of int, shape (N,)
+    fixed : bool
+
+    """
+    node_i = tb.node_i(head)
+    for v in nodes:
+        if (node_i[v, tb.FIXED] != 0) != fixed:
+            transaction_log.log_node(head, v)
+            node_i[v, tb.FIXED] = 1 if fixed else 0
+            touch(head, v)
 
 
 @kernel
@@ -321,12 +389,14 @@ def restart(head):  # type: ignore[no-untyped-def]
         node_i[v, tb.TOUCHED] = 0
         touch(head, v)
     for e in range(head[tb.N_EDGES]):
-        factors.linearize_edge(head, e)
-        factors.check_edge(head, e, 0.0)
         edge_i[e, tb.EDGE_WAITS] = 0
-        scalars[tb.CHI2] += edge_f[e, tb.ENERGY]
+        if edge_f[e, tb.WEIGHT] > 0.0:
+            factors.linearize_edge(head, e)
+            factors.check_edge(head, e, 0.0)
+            scalars[tb.CHI2] += edge_f[e, tb.ENERGY]
     for k in range(head[tb.N_OBSERVED]):
-        factors.linearize_observed(head, k)
-        factors.check_observed(head, k)
         observed_i[k, tb.OBS_WAITS] = 0
-        scalars[tb.CHI2] += observed_f[k, tb.OBS_ENERGY]
+        if observed_f[k, tb.WEIGHT] > 0.0:
+            factors.linearize_observed(head, k)
+            factors.check_observed(head, k)
+            scalars[tb.CHI2] += observed_f[k, tb.OBS_ENERGY]

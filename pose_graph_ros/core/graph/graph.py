@@ -2,7 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """The pose graph: hidden nodes, edges and observed nodes, as struct of arrays."""
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from types import MappingProxyType
 from typing import Any, Final, NamedTuple
 
@@ -203,15 +203,17 @@ class Graph:
 
     def _edit(self, update: GraphUpdate) -> None:
         """Apply the edits of existing rows, which have been checked."""
-        for what, rows in (
-                (editing.WEIGH_EDGE, dict.fromkeys(update.remove_edges, 0.0)),
-                (editing.WEIGH_OBSERVED, dict.fromkeys(update.remove_observed, 0.0)),
-                (editing.WEIGH_EDGE, update.weigh_edges),
-                (editing.WEIGH_OBSERVED, update.weigh_observed),
-                (editing.FIX, dict.fromkeys(update.fix, 1.0)),
-                (editing.FIX, dict.fromkeys(update.free, 0.0))):
-            for number, value in rows.items():
-                editing.edit(self.memory.head, what, int(number), float(value))
+        head = self.memory.head
+        for weigh, removed, weights in (
+                (editing.weigh_edges, update.remove_edges, update.weigh_edges),
+                (editing.weigh_observed, update.remove_observed, update.weigh_observed)):
+            if len(removed) > 0:
+                weigh(head, _integers(removed), np.zeros(len(removed)))
+            if len(weights) > 0:
+                weigh(head, _integers(weights), _values(weights))
+        for nodes, fixed in ((update.fix, True), (update.free, False)):
+            if len(nodes) > 0:
+                editing.set_fixed(head, _integers(nodes), fixed)
 
     def _checked_columns(self, update: GraphUpdate) -> tuple[npt.NDArray[Any], ...]:
         """Return new rows as arrays for the kernel; raise GraphUpdateError if one is invalid."""
@@ -323,16 +325,30 @@ def _checked_poses(name: str, poses: FloatArray) -> FloatArray:
     return array
 
 
-def _check_numbers(name: str, numbers: Iterable[int], what: str, size: int) -> None:
-    for number in numbers:
-        if not (isinstance(number, int | np.integer) and 0 <= number < size):
-            raise GraphUpdateError(f'{name}: expected {what} in 0..{size - 1}, got {number}')
+def _integers(numbers: Collection[int]) -> IntArray:
+    return np.fromiter(numbers, np.int64, len(numbers))
+
+
+def _values(weights: Mapping[int, float]) -> FloatArray:
+    return np.fromiter(weights.values(), np.float64, len(weights))
+
+
+def _check_numbers(name: str, numbers: Collection[int], what: str, size: int) -> None:
+    if len(numbers) == 0:
+        return
+    array = np.array(list(numbers))
+    if array.dtype.kind not in 'iu' or not 0 <= array.min() <= array.max() < size:
+        # looks for the first one, and lets integers of other types pass
+        for number in numbers:
+            if not (isinstance(number, int | np.integer) and 0 <= number < size):
+                raise GraphUpdateError(f'{name}: expected {what} in 0..{size - 1}, got {number}')
 
 
 def _check_weights(name: str, weights: Mapping[int, float], what: str, size: int) -> None:
     _check_numbers(name, weights, what, size)
-    for number, weight in weights.items():
-        if not (np.isfinite(weight) and weight >= 0.0):
-            raise GraphUpdateError(
-                f'{name}: expected a finite weight that is not negative, got {weight} '
-                f'for number {number}')
+    values = _values(weights)
+    if not np.all(np.isfinite(values) & (values >= 0.0)):
+        number, weight = next(item for item in weights.items() if not 0.0 <= item[1] < np.inf)
+        raise GraphUpdateError(
+            f'{name}: expected a finite weight that is not negative, got {weight} '
+            f'for number {number}')

@@ -48,8 +48,9 @@ HEAD = INTEGERS     # the type of the head, in signatures of kernels
 POSE, DELTA, SEEN, CHECKED_TURN, SCALE_T, SCALE_R, REF, NODE_F = 0, 3, 6, 9, 10, 11, 12, 15
 # node_i
 #   CLIQUE: row of the clique that the node is frontal in
-#   EDGE_LIST: head of the list of its edges; an entry is 2 * edge + side (0: END_I, 1: END_J)
-#   OBSERVED_LIST: head of the list of its observed nodes
+#   EDGE_LIST: head of the list of its edges with a weight above 0; an entry is 2 * edge + side
+#       (0: END_I, 1: END_J)
+#   OBSERVED_LIST: head of the list of its observed nodes with a weight above 0
 #   FIXED: 1 if the node keeps its pose
 #   TOUCHED: 1 if the node is in the table `touched`
 #   INDEX: place of the node in the present front; work space

@@ -64,7 +64,7 @@ def _check_observed(head, k):  # type: ignore[no-untyped-def]
 @kernel
 def _check(head):  # type: ignore[no-untyped-def]
     """Check the constraints of all listed nodes, each constraint once."""
-    edge_f, observed_f, scalars = tb.edge_f(head), tb.observed_f(head), tb.scalars(head)
+    scalars = tb.scalars(head)
     node_i, edge_i, observed_i = tb.node_i(head), tb.edge_i(head), tb.observed_i(head)
     work_i = tb.work_i(head)
     iteration = head[tb.ITERATION]
@@ -77,13 +77,11 @@ def _check(head):  # type: ignore[no-untyped-def]
             e, side = entry >> 1, entry & 1
             if edge_i[e, tb.EDGE_CHECKED] != iteration:
                 edge_i[e, tb.EDGE_CHECKED] = iteration
-                if edge_f[e, tb.WEIGHT] > 0.0:
-                    _check_edge(head, e)
+                _check_edge(head, e)
             entry = edge_i[e, tb.NEXT_J if side == 1 else tb.NEXT_I]
         k = node_i[v, tb.OBSERVED_LIST]
         while k >= 0:
-            if observed_f[k, tb.WEIGHT] > 0.0:
-                _check_observed(head, k)
+            _check_observed(head, k)
             k = observed_i[k, tb.OBS_NEXT]
 
 

@@ -70,7 +70,7 @@ def test_after_any_edits_chi2_is_that_of_the_rows(
 
 @given(seeds, edits)
 @settings(max_examples=60)
-def test_each_constraint_is_once_in_the_lists_of_its_nodes(
+def test_each_constraint_with_a_weight_is_once_in_the_lists_of_its_nodes(
     seed: int, steps: list[tuple[str, int, float]],
 ) -> None:
     graph = random_graph(seed)
@@ -78,9 +78,9 @@ def test_each_constraint_is_once_in_the_lists_of_its_nodes(
     edges, observed = graph.edges, graph.observed
     for node in range(graph.n_nodes):
         assert sorted(edges_of(graph, node)) == np.flatnonzero(
-            (edges.i == node) | (edges.j == node)).tolist()
+            ((edges.i == node) | (edges.j == node)) & (edges.weight > 0.0)).tolist()
         assert sorted(observed_of(graph, node)) == np.flatnonzero(
-            observed.node == node).tolist()
+            (observed.node == node) & (observed.weight > 0.0)).tolist()
 
 
 @given(seeds, edits)
@@ -123,6 +123,29 @@ def test_an_edit_touches_the_nodes_of_its_constraint_alone() -> None:
     assert touched_by(untouched(5), GraphUpdate(free=(4,))) == []
     rng = np.random.default_rng(0)
     assert touched_by(untouched(5), GraphUpdate(edges=random_edges(rng, [6], [2]))) == [2, 6]
+
+
+def test_a_row_without_weight_touches_no_node_before_it_gets_one() -> None:
+    graph, rng = untouched(5), np.random.default_rng(5)
+    edges, observed = random_edges(rng, [0, 2], [6, 5]), random_observed(rng, [1, 3])
+    n, before, chi = graph.n_edges, graph.memory['node_i'].tobytes(), chi2(graph)
+    graph.memory.head[tb.STRUCTURE] = 0
+    edges.weight[:] = observed.weight[:] = 0.0
+    assert touched_by(graph, GraphUpdate(edges=edges, observed=observed)) == []
+    assert touched_by(graph, GraphUpdate(weigh_edges={n: 0.0}, remove_observed=(5, 6))) == []
+    assert graph.memory['node_i'].tobytes() == before
+    assert graph.memory.head[tb.STRUCTURE] == 0
+    assert graph.memory['scalars'][tb.CHI2] == pytest.approx(chi)
+    assert touched_by(graph, GraphUpdate(weigh_edges={n + 1: 0.5})) == [2, 5]
+    assert graph.memory.head[tb.STRUCTURE] == 1
+    assert touched_by(graph, GraphUpdate(weigh_observed={6: 1.0})) == [2, 3, 5]
+    assert graph.memory['scalars'][tb.CHI2] == pytest.approx(chi2(graph))
+
+
+def test_the_weight_that_a_constraint_has_already_changes_nothing() -> None:
+    graph = untouched(5)
+    weights = dict.fromkeys(range(5), 1.0)
+    assert touched_by(graph, GraphUpdate(weigh_edges=weights, weigh_observed=weights)) == []
 
 
 def test_a_weight_of_zero_removes_a_constraint_and_another_brings_it_back() -> None:

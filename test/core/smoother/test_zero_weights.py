@@ -1,0 +1,155 @@
+# Copyright 2026 The pose_graph_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""Rows with weight 0 are as if they were not there: to updates, refinements and the optimiser."""
+
+from hypothesis import given, settings, strategies as st
+import numpy as np
+import pytest
+from slow_smoother import differences, state, World, world
+
+from pose_graph_ros.core.batch import optimizer
+from pose_graph_ros.core.batch.optimizer import chi2_of
+from pose_graph_ros.core.config import SolverConfig
+from pose_graph_ros.core.graph import tables as tb
+from pose_graph_ros.core.graph.constraints import Edges, ObservedNodes
+from pose_graph_ros.core.graph.graph import GraphUpdate
+from pose_graph_ros.core.smoother.incremental import IncrementalSmoother
+
+seeds = st.integers(0, 2**32 - 1)
+
+
+class Twins:
+    """A smoother with rows of weight 0 between the others, and one without any."""
+
+    def __init__(self, seed: int) -> None:
+        self.here: World = world(seed, noise=(0.2, 0.2, 0.1))
+        self.full, self.bare = IncrementalSmoother(), IncrementalSmoother()
+        self.edges, self.observed = [], []
+        """Rows of the bare graph in the full one."""
+        self.idle_edges, self.idle_observed = [], []
+        """Rows of the full graph with weight 0."""
+        first = GraphUpdate(hidden=np.array(self.here.truth), fix=[0])
+        self.update(first)
+
+    def update(self, update: GraphUpdate) -> None:
+        """Do an update in both, in one of them with false constraints of weight 0."""
+        expected = self.bare.update(update)
+        n = self.full.graph.n_nodes + len(update.hidden)
+        edges, observed = self.here.edges([]), self.here.observed([])
+        if n > 2:
+            rng = self.here.rng
+            edges = self.here.edges([tuple(rng.choice(n, 2, replace=False)) for _ in range(2)])
+            observed = self.here.observed([int(rng.integers(n))])
+        edges.mean[:] += 30.0
+        observed.mean[:] -= 30.0
+        edges.weight[:] = observed.weight[:] = 0.0
+        at = self.full.graph.n_edges, self.full.graph.n_observed
+        self.idle_edges += range(at[0], at[0] + len(edges))
+        self.idle_observed += range(at[1], at[1] + len(observed))
+        self.edges += range(at[0] + len(edges), at[0] + len(edges) + len(update.edges))
+        self.observed += range(
+            at[1] + len(observed), at[1] + len(observed) + len(update.observed))
+        actual = self.full.update(update._replace(
+            edges=Edges.joined([edges, update.edges]),
+            observed=ObservedNodes.joined([observed, update.observed])))
+        assert actual == expected
+
+    def drive(self, steps: int) -> None:
+        for _ in range(steps):
+            update = self.here.new_nodes(int(self.here.rng.integers(1, 3)))
+            more = self.here.edges(self.here.pairs(int(self.here.rng.integers(0, 2))))
+            self.update(update._replace(edges=Edges.joined([update.edges, more])))
+
+    def check(self) -> None:
+        full, bare = self.full, self.bare
+        np.testing.assert_allclose(full.poses, bare.poses, rtol=0.0, atol=1e-12)
+        np.testing.assert_allclose(full.covariances(), bare.covariances(), rtol=1e-9, atol=1e-15)
+        assert chi2_of(full.graph) == pytest.approx(chi2_of(bare.graph), rel=1e-9, abs=1e-9)
+        assert full.graph.energies().chi2 == pytest.approx(chi2_of(full.graph), abs=1e-6)
+        energies = full.graph.energies()
+        assert not np.any(energies.edges[self.idle_edges])
+        assert not np.any(energies.observed[self.idle_observed])
+
+
+@given(seeds, st.integers(1, 20))
+@settings(max_examples=20)
+def test_a_drive_is_the_same_with_and_without_them(seed: int, steps: int) -> None:
+    twins = Twins(seed)
+    twins.drive(steps)
+    twins.check()
+    for smoother in (twins.full, twins.bare):
+        for _ in range(20):
+            if smoother.refine().finished:
+                break
+    twins.check()
+    results = [optimizer.optimize_from_linear_start(smoother.graph, SolverConfig())
+               for smoother in (twins.full, twins.bare)]
+    assert results[0].status is results[1].status
+    np.testing.assert_allclose(twins.full.poses, twins.bare.poses, rtol=0.0, atol=1e-9)
+
+
+@given(seeds, st.integers(2, 15))
+@settings(max_examples=20)
+def test_one_that_gets_a_weight_is_added_then(seed: int, steps: int) -> None:
+    twins = Twins(seed)
+    twins.drive(steps)
+    # the false ones as well
+    edges, observed = twins.idle_edges[-2:], twins.idle_observed[-1:]
+    late = (twins.full.graph.edges_at(np.array(edges)),
+            twins.full.graph.observed_at(np.array(observed)))
+    for table in late:
+        table.weight[:] = 0.5
+    results = (
+        twins.full.update(GraphUpdate(weigh_edges=dict.fromkeys(edges, 0.5),
+                                      weigh_observed=dict.fromkeys(observed, 0.5))),
+        twins.bare.update(GraphUpdate(edges=late[0], observed=late[1])))
+    assert results[0] == results[1]
+    twins.idle_edges, twins.idle_observed = twins.idle_edges[:-2], twins.idle_observed[:-1]
+    # where an update leaves errors within its budget, the order of sums may decide on a step more
+    np.testing.assert_allclose(twins.full.poses, twins.bare.poses, rtol=0.0, atol=1e-6)
+    for smoother in (twins.full, twins.bare):
+        smoother.graph.set_poses(smoother.poses.copy())
+        smoother.update(GraphUpdate())
+    np.testing.assert_allclose(twins.full.poses, twins.bare.poses, rtol=0.0, atol=1e-6)
+    n = twins.bare.graph.n_edges, twins.bare.graph.n_observed
+    twins.full.update(GraphUpdate(remove_edges=edges, remove_observed=observed))
+    twins.bare.update(GraphUpdate(
+        remove_edges=(n[0] - 2, n[0] - 1), remove_observed=(n[1] - 1,)))
+    np.testing.assert_allclose(twins.full.poses, twins.bare.poses, rtol=0.0, atol=1e-6)
+
+
+def test_adding_them_solves_nothing_and_a_rollback_restores_every_bit() -> None:
+    twins = Twins(3)
+    twins.drive(15)
+    graph = twins.full.graph
+    before, cliques = state(graph), graph.memory['clique_i'].copy()
+    edges, observed = twins.here.edges([(0, 9), (4, 12)]), twins.here.observed([7, 7])
+    edges.weight[:] = observed.weight[:] = 0.0
+    graph.begin()
+    graph.apply(GraphUpdate(edges=edges, observed=observed))
+    graph.rollback()
+    assert differences(before, state(graph)) == []
+    result = twins.full.update(GraphUpdate(edges=edges, observed=observed))
+    assert result[2:] == (0, 0, 0, 0)
+    np.testing.assert_array_equal(graph.memory['clique_i'], cliques)
+    after = state(graph)
+    assert set(differences(before, after)) == {'edge_f', 'edge_i', 'observed_f', 'observed_i'}
+    rows = dict.fromkeys(twins.idle_edges + twins.edges, 1.0)
+    graph.begin()
+    graph.apply(GraphUpdate(weigh_edges=rows, weigh_observed=dict.fromkeys(
+        range(graph.n_observed), 1.0)))
+    graph.apply(GraphUpdate(remove_edges=twins.edges[2:9], remove_observed=range(3)))
+    graph.rollback()
+    assert differences(after, state(graph)) == []
+
+
+def test_no_frame_turns_and_nothing_waits_for_them() -> None:
+    # a row with weight 0 has no linearization error, however far its ends have moved
+    twins = Twins(8)
+    twins.drive(10)
+    graph = twins.full.graph
+    graph.set_poses(graph.poses * np.array([40.0, -40.0, 1.0]))
+    optimizer.optimize(graph, SolverConfig())
+    waiting = graph.memory['waiting'][:graph.memory.head[tb.N_WAITING]]
+    assert not set(waiting.tolist()) & set(twins.idle_edges)
+    assert not np.any(graph.memory['edge_f'][twins.idle_edges, tb.ERROR2])
