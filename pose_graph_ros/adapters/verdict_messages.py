@@ -12,7 +12,7 @@ from collections.abc import Mapping, Sequence
 from pose_graph_ros.adapters.cdr import CdrStream
 from pose_graph_ros.adapters.conversions import Message
 from pose_graph_ros.adapters.sources import NANOSECONDS
-from pose_graph_ros.adapters.verdict_texts import (
+from pose_graph_ros.core.judgement.texts import (
     details,
     Key,
     nanoseconds,

@@ -4,7 +4,7 @@
 
 from collections.abc import Iterator, Mapping, Sequence
 
-from pose_graph_ros.adapters.verdict_texts import as_json, ORDER, sentence, totals_text
+from pose_graph_ros.core.judgement.texts import as_json, ORDER, sentence, totals_text
 from pose_graph_ros.core.judgement.verdicts import (
     Judged,
     SourceVerdicts,

@@ -23,7 +23,6 @@ from pose_graph_ros.adapters.bag_inputs import (
 from pose_graph_ros.adapters.bags import BagError, BagReader, MessageError, open_bag
 from pose_graph_ros.adapters.message_reader import MessageReader
 from pose_graph_ros.adapters.sources import backend_config, Kind, source_list
-from pose_graph_ros.adapters.verdict_texts import states_by_stamps
 from pose_graph_ros.cli import options as shared
 from pose_graph_ros.cli.judgement import judgement, judgement_lines
 from pose_graph_ros.cli.results import collect_drive, write_results
@@ -32,6 +31,7 @@ from pose_graph_ros.core.batch.optimizer import Status
 from pose_graph_ros.core.estimate import UpdateReport
 from pose_graph_ros.core.geometry.geodesy import MapOrigin
 from pose_graph_ros.core.io.g2o import write_g2o
+from pose_graph_ros.core.judgement.texts import states_by_stamps
 from pose_graph_ros.core.measurements import Answer, OdometrySample
 
 UPDATE_EVERY = 10  # new hidden nodes after which the graph is updated, to stay near the optimum

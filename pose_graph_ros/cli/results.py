@@ -16,13 +16,13 @@ from pose_graph_ros.adapters.bags import BagError, BagReader, MessageError
 from pose_graph_ros.adapters.conversions import planar_pose, stamp_ns
 from pose_graph_ros.adapters.message_reader import MessageReader
 from pose_graph_ros.adapters.sources import Kind
-from pose_graph_ros.adapters.verdict_texts import Key
 from pose_graph_ros.cli.evaluation import Drive, evaluate, format_table, summary
 from pose_graph_ros.cli.picture import draw_drive
 from pose_graph_ros.core.geometry import se2
 from pose_graph_ros.core.geometry.geodesy import MapOrigin
 from pose_graph_ros.core.geometry.trajectory import Trajectory
 from pose_graph_ros.core.io.tum import write_tum
+from pose_graph_ros.core.judgement.texts import Key
 from pose_graph_ros.core.judgement.verdicts import State
 from pose_graph_ros.core.measurements import Fix, GlobalPose, LoopClosure, OdometrySample
 

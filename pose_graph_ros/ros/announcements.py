@@ -13,7 +13,7 @@ from dataclasses import dataclass
 import logging
 import math
 
-from pose_graph_ros.adapters.verdict_texts import listed, number_of, seconds
+from pose_graph_ros.core.judgement.texts import listed, number_of, seconds
 from pose_graph_ros.core.judgement.verdicts import Change, Judged, SourceVerdicts, State
 
 # Time between two lines on changes of the same source [s]; the log repeats nothing within 10 s.

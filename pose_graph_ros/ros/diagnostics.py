@@ -12,9 +12,9 @@ from typing import TYPE_CHECKING
 
 from diagnostic_msgs.msg import DiagnosticStatus
 
-from pose_graph_ros.adapters.verdict_texts import total_values
 from pose_graph_ros.core.alignment.monitor import AlignmentState
 from pose_graph_ros.core.batch.optimizer import Status
+from pose_graph_ros.core.judgement.texts import total_values
 from pose_graph_ros.core.sources.constraint_names import ConstraintEnergy
 from pose_graph_ros.core.sources.source_report import LEAST_ENERGY
 from pose_graph_ros.ros.worker import Worker

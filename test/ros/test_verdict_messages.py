@@ -20,7 +20,7 @@ from pose_graph_ros.adapters.verdict_messages import (
     states_in,
     verdicts_cdr,
 )
-from pose_graph_ros.adapters.verdict_texts import details, sentence, states_by_stamps
+from pose_graph_ros.core.judgement.texts import details, sentence, states_by_stamps
 from pose_graph_ros.core.judgement.verdicts import (
     Decision,
     Judged,

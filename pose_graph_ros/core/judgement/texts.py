@@ -5,7 +5,6 @@
 from collections.abc import Iterable, Mapping, Sequence
 import math
 
-from pose_graph_ros.adapters.sources import NANOSECONDS
 from pose_graph_ros.core.judgement.verdicts import (
     Decision,
     Judged,
@@ -14,6 +13,7 @@ from pose_graph_ros.core.judgement.verdicts import (
     Verdict,
 )
 
+NANOSECONDS = 1_000_000_000
 NOUNS = {Judged.LOOP_CLOSURE: 'closure', Judged.FIX: 'fix', Judged.ODOMETRY: 'odometry edge'}
 PLURALS = {Judged.LOOP_CLOSURE: 'closures', Judged.FIX: 'fixes',
            Judged.ODOMETRY: 'odometry edges'}

@@ -11,7 +11,7 @@ from hypothesis import given, strategies as st
 import numpy as np
 import pytest
 
-from pose_graph_ros.adapters.verdict_texts import (
+from pose_graph_ros.core.judgement.texts import (
     as_json,
     details,
     listed,
