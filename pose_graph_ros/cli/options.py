@@ -5,6 +5,7 @@
 import argparse
 from collections.abc import Mapping
 from pathlib import Path
+from types import MappingProxyType
 from typing import Any
 
 import yaml
@@ -49,9 +50,20 @@ def wanted_topics(options: argparse.Namespace) -> dict[str, str | None]:
     return {source: getattr(options, source) for source in OPTIONS}
 
 
-def parameter_values(options: argparse.Namespace) -> dict[str, Any]:
-    """Return all parameters by the options, as the node reads them; raises `ConfigError`."""
-    given = {} if options.params_file is None else _read_file(options.params_file)
+def parameter_values(
+    options: argparse.Namespace, usual: Mapping[str, Any] = MappingProxyType({}),
+) -> dict[str, Any]:
+    """
+    Return all parameters by the options, as the node reads them; raises `ConfigError`.
+
+    Parameters
+    ----------
+    options : argparse.Namespace
+    usual : mapping
+        Values that replace the node's defaults.
+
+    """
+    given = {**usual, **({} if options.params_file is None else _read_file(options.params_file))}
     for text in options.param:
         name, separator, value = text.partition(':=')
         if separator == '':

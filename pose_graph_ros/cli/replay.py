@@ -1,18 +1,22 @@
 # Copyright 2026 The pose_graph_ros authors
 # SPDX-License-Identifier: Apache-2.0
 """
-Run a bag through the engine of the node, without ROS and as fast as possible.
+Run a bag or a g2o file through the engine of the node, without ROS and as fast as possible.
 
 Messages are read and added as in the node, but without threads, and the same full optimisation
-follows at the end. The path is the one of a node that receives the same messages.
+follows at the end. The path is the one of a node that receives the same messages. Of a g2o file,
+edges to the next vertex are odometry, with the noise of the file (odom.noise:=model takes that of
+the parameters); all others are loop closures, which come when their later end is reached.
 """
 
 import argparse
 from collections import Counter
-from collections.abc import Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from pathlib import Path
 import time
 from typing import Any, NamedTuple
+
+import numpy as np
 
 from pose_graph_ros.adapters.bag_inputs import (
     choose_inputs,
@@ -22,17 +26,21 @@ from pose_graph_ros.adapters.bag_inputs import (
 )
 from pose_graph_ros.adapters.bags import BagError, BagReader, MessageError, open_bag
 from pose_graph_ros.adapters.message_reader import MessageReader
-from pose_graph_ros.adapters.sources import backend_config, Kind, source_list
+from pose_graph_ros.adapters.sources import backend_config, CLOSURES, Kind, source_list
 from pose_graph_ros.cli import options as shared
+from pose_graph_ros.cli.evaluation import Drive
+from pose_graph_ros.cli.g2o_inputs import read_measurements
 from pose_graph_ros.cli.judgement import judgement, judgement_lines
 from pose_graph_ros.cli.results import collect_drive, write_results
 from pose_graph_ros.core.backend import PoseGraphBackend
 from pose_graph_ros.core.batch.optimizer import Status
-from pose_graph_ros.core.estimate import UpdateReport
+from pose_graph_ros.core.estimate import Estimate, UpdateReport
 from pose_graph_ros.core.geometry.geodesy import MapOrigin
-from pose_graph_ros.core.io.g2o import write_g2o
+from pose_graph_ros.core.geometry.trajectory import Trajectory
+from pose_graph_ros.core.io.g2o import EDGE2_ORDERS, write_g2o
 from pose_graph_ros.core.judgement.texts import states_by_stamps
-from pose_graph_ros.core.measurements import Answer, OdometrySample
+from pose_graph_ros.core.judgement.verdicts import State
+from pose_graph_ros.core.measurements import Answer, LoopClosure, Measurement, OdometrySample
 
 UPDATE_EVERY = 10  # new hidden nodes after which the graph is updated, to stay near the optimum
 
@@ -58,12 +66,19 @@ def run(bag: BagReader, inputs: Inputs, values: Mapping[str, Any]) -> Replayed:
         All parameters of the node.
 
     """
-    backend = PoseGraphBackend(backend_config(values))
     reader = MessageReader(values)
     for message in read_static_frames(bag):
         reader.frames.receive(message.decode())
     refused: Counter[tuple[str, str]] = Counter()
-    next_update = UPDATE_EVERY
+    backend, report = run_measurements(_read(bag, inputs, reader, refused), values)
+    plane = reader.datum.plane
+    return Replayed(backend, report, refused, None if plane is None else plane.origin)
+
+
+def _read(
+    bag: BagReader, inputs: Inputs, reader: MessageReader, refused: Counter[tuple[str, str]],
+) -> Iterator[tuple[str, OdometrySample | Measurement]]:
+    """Yield the valid measurements of a bag that are not held out; count the others."""
     for source, message, held_out in read_inputs(bag, inputs):
         if held_out:
             continue
@@ -74,46 +89,110 @@ def run(bag: BagReader, inputs: Inputs, values: Mapping[str, Any]) -> Replayed:
             continue
         if isinstance(measurement, Answer):
             refused[source, measurement.reason] += 1
-        elif isinstance(measurement, OdometrySample):
+        else:
+            yield source, measurement
+
+
+def run_measurements(
+    measurements: Iterable[tuple[str, OdometrySample | Measurement]], values: Mapping[str, Any],
+) -> tuple[PoseGraphBackend, UpdateReport]:
+    """
+    Return a new engine after adding measurements, and the report of the full optimisation.
+
+    Parameters
+    ----------
+    measurements : iterable
+        Sources and measurements, in the order of their arrival.
+    values : mapping
+        All parameters of the node.
+
+    """
+    backend = PoseGraphBackend(backend_config(values))
+    next_update = UPDATE_EVERY
+    for source, measurement in measurements:
+        if isinstance(measurement, OdometrySample):
             backend.add_odometry(measurement, source)
         else:
             backend.add_measurement(measurement, source)
         if backend.graph.n_nodes >= next_update:
             backend.update()
             next_update = backend.graph.n_nodes + UPDATE_EVERY
-    report, plane = backend.optimize(), reader.datum.plane
-    return Replayed(backend, report, refused, None if plane is None else plane.origin)
+    return backend, backend.optimize()
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Add the arguments of this tool."""
-    parser.add_argument('bag', type=Path, help='rosbag2 folder, .mcap or .db3')
+    parser.add_argument('bag', type=Path, help='rosbag2 folder, .mcap, .db3, or a .g2o file')
     parser.add_argument('-o', '--out', metavar='DIR', type=Path, default=Path('replay'),
                         help='folder for the results (default: %(default)s)')
+    parser.add_argument('--stamps', metavar='FILE', type=Path,
+                        help='text file with the stamps [s] of the vertices of a .g2o file '
+                             '(default: a second apart)')
+    parser.add_argument('--edge2', choices=EDGE2_ORDERS,
+                        help='format of the tag EDGE2 in a .g2o file')
     shared.add_inputs(parser)
     shared.add_parameters(parser)
 
 
 def execute(options: argparse.Namespace) -> int:
     """Run the tool; return the exit code."""
-    values, wanted = shared.parameter_values(options), shared.wanted_topics(options)
+    if options.bag.suffix == '.g2o':
+        return _execute_g2o(options)
+    values = shared.parameter_values(options)
+    wanted = shared.wanted_topics(options)
     with open_bag(options.bag) as bag:
         inputs = choose_inputs(bag, source_list(values), wanted, options.hold_out)
         for source, topic in inputs.topics.items():
             print(f'{source}: {topic}')
         start = time.monotonic()
-        backend, report, refused, origin = run(bag, inputs, values)
+        result = run(bag, inputs, values)
         seconds = time.monotonic() - start
-        estimate = backend.estimate()
+        estimate = result.backend.estimate()
         if estimate is None:
             topics = ' or '.join(inputs.topics[name] for name in inputs.of(Kind.ODOMETRY))
             raise BagError(f'{options.bag}: no usable odometry on {topics}')
-        verdicts, totals = backend.verdicts(), backend.verdict_totals()
         drive = collect_drive(
-            bag, inputs, values, estimate.path, options.truth, origin=origin,
-            states=states_by_stamps(verdicts))
+            bag, inputs, values, estimate.path, options.truth, origin=result.origin,
+            states=states_by_stamps(result.backend.verdicts()))
+    return _report(options, drive, result, estimate, seconds)
+
+
+def _execute_g2o(options: argparse.Namespace) -> int:
+    """Replay a g2o file."""
+    values = shared.parameter_values(options, {'odom.noise': 'twist'})
+    measurements = read_measurements(options.bag, options.stamps, options.edge2)
+    odometry_source = next(
+        source.name for source in source_list(values) if source.kind is Kind.ODOMETRY)
+    start = time.monotonic()
+    backend, report = run_measurements((
+        (odometry_source if isinstance(each, OdometrySample) else CLOSURES, each)
+        for each in measurements), values)
+    seconds = time.monotonic() - start
+    estimate = backend.estimate()
+    assert estimate is not None, 'a graph has vertices'
+    states = states_by_stamps(backend.verdicts())
+    samples = [each for each in measurements if isinstance(each, OdometrySample)]
+    loops = [(each.reference_ns or 0, each.stamp_ns) for each in measurements
+             if isinstance(each, LoopClosure)]
+    drive = Drive(
+        Trajectory(np.array([each.stamp_ns for each in samples]),
+                   np.array([each.pose for each in samples])),
+        np.empty(0, dtype=np.int64), np.empty((0, 2)), np.empty(0, dtype=bool), estimate.path,
+        None, np.array(loops, dtype=np.int64).reshape(-1, 2),
+        loop_states=[states.get((CLOSURES, stamp, reference), State.BELIEVED)
+                     for reference, stamp in loops])
+    return _report(options, drive, Replayed(backend, report, Counter()), estimate, seconds)
+
+
+def _report(
+    options: argparse.Namespace, drive: Drive, result: Replayed, estimate: Estimate,
+    seconds: float,
+) -> int:
+    """Write the results and print a summary; return the exit code."""
+    backend, report = result.backend, result.report
+    verdicts, totals = backend.verdicts(), backend.verdict_totals()
     counts = {f'{source}.{answer}': count for (source, answer), count
-              in sorted((backend.counts + refused).items())}
+              in sorted((backend.counts + result.refused).items())}
     table = write_results(drive, options.out, options.bag.stem, {
         'seconds': seconds, 'alignment': estimate.alignment.value,
         'hidden_nodes': estimate.n_hidden, 'edges': estimate.n_edges,
