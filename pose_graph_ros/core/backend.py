@@ -5,29 +5,25 @@
 from collections import Counter
 from collections.abc import Mapping
 from dataclasses import replace
-import math
 from typing import Self
 
 import numpy as np
 
-from pose_graph_ros.core import isolation
-from pose_graph_ros.core.alignment import estimator
-from pose_graph_ros.core.alignment.monitor import AlignmentMonitor, AlignmentState, placed
+from pose_graph_ros.core import isolation, newest_estimate
+from pose_graph_ros.core.alignment.monitor import AlignmentMonitor
 from pose_graph_ros.core.batch import final_optimization, optimizer
 from pose_graph_ros.core.batch.optimizer import Solve, Status
 from pose_graph_ros.core.config import BackendConfig
 from pose_graph_ros.core.estimate import Estimate, UpdateReport
-from pose_graph_ros.core.geometry import covariance, se2
 from pose_graph_ros.core.geometry.geodesy import MapOrigin
 from pose_graph_ros.core.geometry.se2 import FloatArray, IntArray
-from pose_graph_ros.core.geometry.trajectory import Trajectory
 from pose_graph_ros.core.graph import graph_view
-from pose_graph_ros.core.graph.constraints import ObservedNodes
 from pose_graph_ros.core.graph.graph import Graph, GraphUpdate
 from pose_graph_ros.core.graph.reweighting import Reweighting
 from pose_graph_ros.core.io.capture import capture, Parts, restore
 from pose_graph_ros.core.io.saved_graph import SavedGraph
 from pose_graph_ros.core.judgement import verdicts as vd
+from pose_graph_ros.core.judgement.judge import Judge
 from pose_graph_ros.core.measurements import (
     ACCEPTED,
     Answer,
@@ -41,7 +37,7 @@ from pose_graph_ros.core.refiner import Refiner
 from pose_graph_ros.core.relocation import relocate
 from pose_graph_ros.core.smoother.incremental import IncrementalSmoother, Refinement
 from pose_graph_ros.core.sources import constraint_names
-from pose_graph_ros.core.sources.factor_builder import FactorBuilder, Queue
+from pose_graph_ros.core.sources.factor_builder import FactorBuilder, Queue, QueuedEdge
 from pose_graph_ros.core.sources.pipeline import MeasurementPipeline
 from pose_graph_ros.core.sources.source_report import SourceReport
 from pose_graph_ros.core.transaction import Transaction
@@ -74,19 +70,18 @@ class PoseGraphBackend:
     ) -> None:
         self._config = BackendConfig() if config is None else config
         self._solve = solve
-        self._smoother = (
-            IncrementalSmoother(self._config.smoother) if smoother is None else smoother)
+        self._smoother = smoother or IncrementalSmoother(self._config.smoother)
         self._nodes = HiddenNodes(self._config, self._make_node)
         self._newest_node_covariance = np.zeros((3, 3))
         """In map axes, shape (3, 3)."""
         self._reweighting = Reweighting()
-        self._refiner = Refiner(self._smoother, self._reweighting)
+        self._judge = Judge(self._smoother, self._reweighting, self._config)
+        self._refiner = Refiner(self._smoother, self._reweighting, self._judge)
         self._factors = FactorBuilder(self._config, self._reweighting)
         self._pipeline = MeasurementPipeline(self._nodes, self._config)
         self._quarantine = Queue()
-        self._settled = True
         self._alignment = AlignmentMonitor(self._config)
-        self._chi2 = 0.0
+        self._settled, self._chi2 = True, 0.0
 
     def configure(self, config: BackendConfig) -> None:
         """
@@ -99,6 +94,7 @@ class PoseGraphBackend:
         self._nodes.configure(config)
         self._pipeline.configure(config)
         self._factors.configure(config)
+        self._judge.configure(config)
         self._alignment.configure(config)
 
     @property
@@ -156,15 +152,15 @@ class PoseGraphBackend:
 
     def verdicts(self, most_believed: int | None = None) -> list[vd.Verdict]:
         """Return all verdicts, but of those that are believed only the newest of each source."""
-        return []
+        return self._judge.verdicts(most_believed)
 
     def verdict_changes(self) -> list[vd.Change]:
         """Return the changes of verdicts since the last call."""
-        return []
+        return self._judge.changes()
 
     def verdict_totals(self) -> Mapping[str, vd.SourceVerdicts]:
         """Return what is believed of each source, as a whole."""
-        return {}
+        return self._judge.totals()
 
     def decide(self, name: str, decision: vd.Decision) -> Answer:
         """
@@ -176,7 +172,8 @@ class PoseGraphBackend:
         decision : Decision
 
         """
-        return rejected('unknown_id', f'expected the id of a verdict, got {name!r}')
+        self._refiner.restart()
+        return self._judge.decide(name, decision)
 
     def add_odometry(self, sample: OdometrySample, source: str = 'odom') -> Answer:
         """
@@ -194,7 +191,8 @@ class PoseGraphBackend:
 
     def _collect(self) -> None:
         """Collect secondary edges and counts of odometry; attach measurements that are due."""
-        self._pipeline.queue.edges += self._nodes.take_secondary_edges()
+        self._pipeline.queue.edges += [
+            QueuedEdge(*edge) for edge in self._nodes.take_secondary_edges()]
         for source, stream in self._nodes.streams.items():
             for reason, count in (('jump', stream.n_jumps), ('sorted', stream.n_sorted),
                                   ('stamp_ahead', stream.n_dropped)):
@@ -263,7 +261,6 @@ class PoseGraphBackend:
         self._pipeline.attach_to_node(moved, source, int(self._nodes.rows[-1]))
         return self._pipeline.count(source, ACCEPTED)
 
-
     def update(self) -> UpdateReport:
         """
         Add all new constraints to the graph and update the estimate; to be called by a timer.
@@ -304,12 +301,14 @@ class PoseGraphBackend:
             # once aligned, measurements fix the gauge, and the first node is no longer fixed
             freed = () if T_map_graph is None else (0,)
             change = self._factors.build(queue, self.graph)._replace(free=freed)
+            change = self._judge.before(self._factors.new, change, self._nodes.newest_ns)
             transaction.solved(self._smoother.update(change))
         if transaction.failure != '':
             self._settled = self._settled and not transaction.moved_back
             return (UpdateReport(Status.FAILED, transaction.failure, 0, 0, self._chi2),
                     transaction.queue)
         self._factors.commit()
+        self._judge.commit()
         self._refiner.restart()
         self._alignment.add(queue.observed)
         result, self._settled = self._refiner.reweight(transaction.result, self._transaction)
@@ -332,7 +331,7 @@ class PoseGraphBackend:
         self._smoother.interrupt()
 
     def _transaction(self) -> Transaction:
-        return Transaction(self.graph, self._alignment, self._factors)
+        return Transaction(self.graph, self._alignment, self._factors, self._judge)
 
     def _evaluate(self) -> None:
         """Update chi2 and the covariance of the newest node."""
@@ -342,19 +341,17 @@ class PoseGraphBackend:
 
     def _recheck_alignment(self) -> None:
         """Rotate and optimise the graph anew if the angle between odometry and map is wrong."""
-        T_map_odom = self._alignment.recheck(self.graph.poses, self._nodes)
-        if T_map_odom is None:
-            return
         before = self.graph.poses.copy()
-        poses = np.zeros_like(before)   # biases start at 0
-        poses[self._nodes.rows] = se2.compose(T_map_odom, self._nodes.odometry)
+        poses = self._alignment.recheck(before, self._nodes)
+        if poses is None:
+            return
         self.graph.set_poses(poses)
-        if self._optimize_whole().status is Status.FAILED:
-            self.graph.set_poses(before)
-            with self._transaction():
-                self._smoother.update(GraphUpdate())    # eliminates everything again
-        else:
+        if self._optimize_whole().status is not Status.FAILED:
             self.counts['alignment', 'done_over'] += 1
+            return
+        self.graph.set_poses(before)
+        with self._transaction():
+            self._smoother.update(GraphUpdate())    # eliminates everything again
 
     def finish(self) -> None:
         """Process all samples in the reorder windows, without waiting for older ones."""
@@ -368,6 +365,7 @@ class PoseGraphBackend:
         if self.graph.n_nodes == 0:
             return report
         self._settle()
+        self._judge.finish()
         return report.after(self._optimize_whole())
 
     def _optimize_whole(self) -> UpdateReport:
@@ -392,34 +390,11 @@ class PoseGraphBackend:
 
         Its path takes time and memory linear in the graph; `with_path=False` omits it.
         """
-        graph = self.graph
-        if graph.n_nodes == 0:
+        if self.graph.n_nodes == 0:
             return None
-        node = graph.poses[self._nodes.rows[-1]]
-        motion, noise, odometry = self._nodes.newest()
-        newest = se2.compose(node, motion)
-        cov = covariance.propagated(node, self._newest_node_covariance, motion, noise)
-        state, sigma = self._alignment.copy()
-        shift = np.zeros(3)
-        if state is AlignmentState.UNALIGNED:
-            # if the aligning update failed, its measurements are in the quarantine
-            shift, cov = estimator.guess(graph.poses, newest, ObservedNodes.joined(
-                [attached.observed for attached in placed(
-                    self._pipeline.queue.observed + self._quarantine.observed)]))
-            newest = newest + shift
-        stamp_ns = max(self._nodes.newest_ns, int(self.node_stamps_ns[-1]))
-        primary = self._nodes.primary
-        return Estimate(
-            stamp_ns=stamp_ns, T_odom_base=odometry, T_map_base=newest,
-            T_map_odom=se2.compose(newest, se2.inverse(odometry)), covariance=cov,
-            alignment=state, chi2=self._chi2, alignment_sigma=(
-                math.sqrt(cov[2, 2]) if state is AlignmentState.ALIGNED else sigma),
-            n_hidden=len(self._nodes), n_edges=graph.n_edges - self._factors.n_bias_edges,
-            n_observed=self._factors.n_measurements, n_biases=graph.n_nodes - len(self._nodes),
-            primary=primary, noise=self._config.odometry_source(primary).noise,
-            trajectory=None if not with_path else Trajectory(
-                self.node_stamps_ns, graph.poses[self._nodes.rows] + shift,
-            ).continued(stamp_ns, newest))
+        noise = self._config.odometry_source(self._nodes.primary).noise
+        return newest_estimate.estimate(
+            self._parts(), noise, self._newest_node_covariance, self._chi2, with_path=with_path)
 
     def saved(self, datum: MapOrigin | None = None) -> SavedGraph:
         """Return the graph with its state since the last update; see `io.capture.capture`."""
@@ -445,4 +420,4 @@ class PoseGraphBackend:
 
     def _parts(self) -> Parts:
         return Parts(self.graph, self._nodes, self._factors, self._reweighting, self._alignment,
-                     self._pipeline, self._quarantine)
+                     self._pipeline, self._quarantine, self._judge)

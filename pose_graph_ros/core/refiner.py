@@ -9,6 +9,7 @@ import numpy as np
 from pose_graph_ros.core.batch.optimizer import Status
 from pose_graph_ros.core.graph.graph import GraphUpdate
 from pose_graph_ros.core.graph.reweighting import PART, Reweighting
+from pose_graph_ros.core.judgement.judge import Judge
 from pose_graph_ros.core.smoother.incremental import IncrementalSmoother, Refinement, UpdateResult
 from pose_graph_ros.core.transaction import Transaction
 
@@ -29,11 +30,15 @@ class Refiner:
     smoother : IncrementalSmoother
     reweighting : Reweighting
         Constraints of its graph that have a robust loss.
+    judge : Judge
+        Decides which constraints of the graph are believed.
 
     """
 
-    def __init__(self, smoother: IncrementalSmoother, reweighting: Reweighting) -> None:
-        self._smoother, self._reweighting = smoother, reweighting
+    def __init__(
+        self, smoother: IncrementalSmoother, reweighting: Reweighting, judge: Judge,
+    ) -> None:
+        self._smoother, self._reweighting, self._judge = smoother, reweighting, judge
         self.finished = True
         """Whether there is nothing to refine until the next update."""
         self._cursor = self._unchanged = self._reweightings = 0
@@ -47,7 +52,7 @@ class Refiner:
         self, result: UpdateResult, begin: Callable[[], Transaction],
     ) -> tuple[UpdateResult, bool]:
         """
-        Return the last result after some reweightings, and whether none was necessary.
+        Return the last result after judging again and some reweightings, and if none was needed.
 
         Parameters
         ----------
@@ -55,6 +60,7 @@ class Refiner:
         begin : callable, returns a transaction for one reweighting
 
         """
+        self._judge.after()
         settled = result.status is Status.CONVERGED
         for _ in range(IN_UPDATE if len(self._reweighting) > 0 else 0):
             edges, observed = self._reweighting.changes(self._smoother.graph)
@@ -70,13 +76,18 @@ class Refiner:
         return result, settled
 
     def refine(self) -> Refinement:
-        """Do one iteration, or change weights where there is nothing to iterate any more."""
+        """Do one iteration; where there is nothing to iterate any more, weigh and judge again."""
         if self._smoother.graph.has_touched:
             self.finished = True    # an update that failed; the next one eliminates all nodes
         if self.finished:
             return Refinement(finished=True, moved=0.0)
         result = self._smoother.refine()
-        return self._reweight(result.moved) if result.finished else result
+        if result.finished:
+            result = self._reweight(result.moved)
+        if result.finished and self._judge.work():
+            self.restart()
+            return result._replace(finished=False)
+        return result
 
     def _reweight(self, moved: float) -> Refinement:
         graph, size = self._smoother.graph, len(self._reweighting)

@@ -11,6 +11,7 @@ from pose_graph_ros.core.exceptions import LinearSolveError
 from pose_graph_ros.core.geometry import se2
 from pose_graph_ros.core.geometry.se2 import FloatArray
 from pose_graph_ros.core.graph.graph import Graph
+from pose_graph_ros.core.judgement.judge import Judge
 from pose_graph_ros.core.smoother.incremental import UpdateResult
 from pose_graph_ros.core.sources.factor_builder import FactorBuilder, Queue
 
@@ -20,21 +21,24 @@ class Transaction:
     Context manager in which an update is built and solved.
 
     If the solver fails or the context raises an `Exception`, it restores the poses of the graph,
-    the state of the alignment and the records of the factor builder. It suppresses the exception
-    and stores its message in `failure`. The smoother rolls back its own changes, bit for bit.
+    the state of the alignment, and the records of factor builder and judge. It suppresses the
+    exception and stores its message in `failure`. The smoother rolls back its own changes, bit for
+    bit.
 
     Parameters
     ----------
     graph : Graph
     alignment : AlignmentMonitor
     factors : FactorBuilder
+    judge : Judge
 
     """
 
     def __init__(
-        self, graph: Graph, alignment: AlignmentMonitor, factors: FactorBuilder,
+        self, graph: Graph, alignment: AlignmentMonitor, factors: FactorBuilder, judge: Judge,
     ) -> None:
         self._graph, self._alignment, self._factors = graph, alignment, factors
+        self._judge = judge
         self._before = alignment.copy()
         self._poses: FloatArray | None = None
         self.queue = Queue()
@@ -75,6 +79,7 @@ class Transaction:
         if error is None:
             return False
         self._factors.rollback()
+        self._judge.rollback()
         if self._poses is not None:
             self._graph.set_poses(self._poses)
         self._alignment.restore(self._before)

@@ -123,13 +123,15 @@ def simulated(seed: int, *, outliers: bool) -> tuple[list[Event], list[Event]]:
             sorted(events))
 
 
-PLAIN = BackendConfig(odometry={'wheel': OdometrySource(), 'visual': OdometrySource()})
+PLAIN = BackendConfig(
+    odometry={'wheel': OdometrySource(), 'visual': OdometrySource()},
+    measurements={'scan': MeasurementSource(), 'walls': MeasurementSource()})
 ROBUST = BackendConfig(
     odometry={'wheel': OdometrySource(),
               'visual': OdometrySource(loss=Loss.HUBER, rejection_threshold=1.5)},
     measurements={'beacon': MeasurementSource(loss=Loss.CAUCHY),
                   'gps': MeasurementSource(loss=Loss.HUBER, rejection_threshold=1.5),
-                  'scan': MeasurementSource(loss=Loss.CAUCHY)})
+                  'scan': MeasurementSource(loss=Loss.CAUCHY), 'walls': MeasurementSource()})
 
 # For least squares without outliers, for robust losses with some.
 DRIVES = {(number, robust): simulated(number, outliers=robust)

@@ -17,7 +17,7 @@ from pose_graph_ros.core.graph.graph import GraphUpdate
 from pose_graph_ros.core.isolation import isolate
 from pose_graph_ros.core.measurements import GlobalPose, LoopClosure, OdometrySample, Position
 from pose_graph_ros.core.smoother.incremental import IncrementalSmoother, UpdateResult
-from pose_graph_ros.core.sources.factor_builder import Queue
+from pose_graph_ros.core.sources.factor_builder import Queue, QueuedEdge
 
 SECOND = 1_000_000_000
 # Mean of a constraint that the smoother of these tests cannot solve for [m].
@@ -38,11 +38,11 @@ class Picky(IncrementalSmoother):
 
 
 def queue_of(numbers: range) -> Queue:
-    return Queue([(str(k), Edges()) for k in numbers], [])
+    return Queue([QueuedEdge(str(k), Edges()) for k in numbers], [])
 
 
 def names(queue: Queue) -> list[int]:
-    return [int(name) for name, _ in queue.edges]
+    return [int(queued.source) for queued in queue.edges]
 
 
 @given(st.integers(1, 200), st.data())

@@ -18,9 +18,10 @@ from pose_graph_ros.core.config import BackendConfig, Loss, MeasurementSource, O
 from pose_graph_ros.core.geometry import se2
 from pose_graph_ros.core.graph.graph import GraphUpdate
 from pose_graph_ros.core.graph.reweighting import Reweighting
+from pose_graph_ros.core.judgement.judge import Judge
 from pose_graph_ros.core.measurements import LoopClosure, OdometrySample, Position
-from pose_graph_ros.core.smoother.incremental import UpdateResult
-from pose_graph_ros.core.sources.factor_builder import FactorBuilder, Queue
+from pose_graph_ros.core.smoother.incremental import IncrementalSmoother, UpdateResult
+from pose_graph_ros.core.sources.factor_builder import FactorBuilder, Queue, QueuedEdge
 from pose_graph_ros.core.transaction import Transaction
 
 SECOND = 1_000_000_000
@@ -161,10 +162,12 @@ def test_a_transaction_moves_the_graph_or_says_why_not(
     error: BaseException | None,
 ) -> None:
     graph = random_graph(1)
-    queue = Queue([('scan', graph.edges.rows(slice(0, 1)))], [])
+    queue = Queue([QueuedEdge('scan', graph.edges.rows(slice(0, 1)))], [])
     poses, T_map_graph = graph.poses.copy(), np.array([3.0, -2.0, 0.5])
+    reweighting = Reweighting()
     transaction = Transaction(
-        graph, AlignmentMonitor(CONFIG), FactorBuilder(CONFIG, Reweighting()))
+        graph, AlignmentMonitor(CONFIG), FactorBuilder(CONFIG, reweighting),
+        Judge(IncrementalSmoother(), reweighting, CONFIG))
     passed = contextlib.suppress(KeyboardInterrupt)     # the only one that goes through
     with passed, transaction:
         transaction.add(queue)

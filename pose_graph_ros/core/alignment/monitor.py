@@ -141,10 +141,11 @@ class AlignmentMonitor:
 
     def recheck(self, solved: FloatArray, nodes: HiddenNodes) -> FloatArray | None:
         """
-        Return the motion from the odometry frame into the map if the angle in use is wrong.
+        Return new poses of all rows of the graph if the angle in use is wrong.
 
         The check is only made when the number of measurements has doubled since the last one. The
-        motion has the shape (3,), and is None if the angle is not checked or not wrong.
+        poses are those of odometry, moved into the map, shape (N, 3), with biases of 0; None if
+        the angle is not checked or not wrong.
 
         Parameters
         ----------
@@ -163,10 +164,12 @@ class AlignmentMonitor:
             sigma=self.sigma)
         if self._next_recheck > LAST_RECHECK:
             self._evidence.clear()
-        if found is None:
+        if found is None or found.T_map_graph is None:
             return None
         self.sigma = found.sigma
-        return found.T_map_graph
+        poses = np.zeros_like(solved)
+        poses[nodes.rows] = se2.compose(found.T_map_graph, nodes.odometry)
+        return poses
 
     def _noise(self, primary: str) -> OdometryNoise:
         return self._config.odometry_source(primary).noise

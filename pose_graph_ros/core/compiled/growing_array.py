@@ -57,3 +57,7 @@ class GrowingArray:
         else:
             self._data[self._size] = row
             self._size += 1
+
+    def truncate(self, size: int) -> None:
+        """Remove all rows from an index on."""
+        self._size = min(self._size, size)

@@ -161,17 +161,18 @@ class Reweighting:
         found = at < len(table.rows) and table.rows.values[at] == row
         return float(table.base_weights.values[at]) if found else None
 
-    def set_base_weight(self, row: int, weight: float) -> None:
+    def set_base_weight(self, row: int, weight: float, *, edge: bool = False) -> None:
         """
-        Set the base weight of an observed node, if it was added.
+        Set the base weight of a constraint, if it was added.
 
         Parameters
         ----------
         row : int, row in the graph
         weight : float
+        edge : bool, whether it is an edge, else an observed node
 
         """
-        table = self._observed
+        table = self._edges if edge else self._observed
         at = int(np.searchsorted(table.rows.values, row))
         if at < len(table.rows) and table.rows.values[at] == row:
             table.base_weights.values[at] = weight

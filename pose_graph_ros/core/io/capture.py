@@ -22,11 +22,13 @@ from pose_graph_ros.core.graph.constraints import EdgeKind, Edges, full, upper
 from pose_graph_ros.core.graph.graph import Graph
 from pose_graph_ros.core.graph.reweighting import Reweighting
 from pose_graph_ros.core.io.saved_graph import SavedGraph
+from pose_graph_ros.core.judgement.judge import Judge
 from pose_graph_ros.core.odometry.hidden_nodes import HiddenNodes
 from pose_graph_ros.core.saved_columns import as_matrix
 from pose_graph_ros.core.sources.factor_builder import (
     FactorBuilder,
     Queue,
+    QueuedEdge,
     SavedEdges,
     SavedSource,
 )
@@ -47,6 +49,7 @@ class Parts(NamedTuple):
     pipeline: MeasurementPipeline
     quarantine: Queue
     """Constraints that were set aside after a failed update."""
+    judge: Judge
 
 
 def capture(
@@ -81,8 +84,9 @@ def capture(
         rows=parts.graph.rows(), nodes=parts.nodes.saved(), sources=sources,
         edge_losses=edge_losses, observed_losses=observed_losses,
         alignment=parts.alignment.saved(), waiting=_saved_edges(parts.pipeline.queue),
-        set_aside=_saved_edges(parts.quarantine), newest_covariance=as_matrix(newest_covariance),
-        chi2=chi2, n_left_out=len(left_out), datum=datum)
+        set_aside=_saved_edges(parts.quarantine), judgement=parts.judge.saved(),
+        newest_covariance=as_matrix(newest_covariance), chi2=chi2, n_left_out=len(left_out),
+        datum=datum)
 
 
 def restore(parts: Parts, saved: SavedGraph) -> None:
@@ -106,14 +110,19 @@ def restore(parts: Parts, saved: SavedGraph) -> None:
     parts.factors.n_bias_edges = int(np.sum(saved.rows.edges.kind == EdgeKind.BIAS))
     parts.reweighting.restore(saved.edge_losses, saved.observed_losses)
     parts.alignment.load(saved.alignment)
+    parts.judge.restore(saved.judgement)
     for queue, edges in (
             (parts.pipeline.queue, saved.waiting), (parts.quarantine, saved.set_aside)):
         table = Edges(edges.i, edges.j, edges.mean, full(edges.information), edges.kind)
-        queue.edges += [(name, table.rows(slice(k, k + 1)))
-                        for k, name in enumerate(edges.sources)]
+        queue.edges += [
+            QueuedEdge(name, table.rows(slice(k, k + 1)), *stamps)
+            for k, (name, stamps) in enumerate(zip(
+                edges.sources, edges.stamps_ns.tolist(), strict=True))]
 
 
 def _saved_edges(queue: Queue) -> SavedEdges:
-    table = Edges.joined([edge for _, edge in queue.edges])
-    return SavedEdges(tuple(name for name, _ in queue.edges), table.i, table.j, table.mean,
-                      upper(table.information), table.kind.astype(np.int64))
+    table = Edges.joined([queued.edge for queued in queue.edges])
+    stamps = np.array([(queued.stamp_ns, queued.reference_ns) for queued in queue.edges],
+                      dtype=np.int64).reshape(-1, 2)
+    return SavedEdges(tuple(queued.source for queued in queue.edges), table.i, table.j,
+                      table.mean, upper(table.information), table.kind.astype(np.int64), stamps)

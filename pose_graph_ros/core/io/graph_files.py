@@ -37,13 +37,13 @@ from pose_graph_ros.core.graph.graph import GraphRows
 from pose_graph_ros.core.io.atomic_files import write_files
 from pose_graph_ros.core.io.g2o import g2o_text, LAYOUT
 from pose_graph_ros.core.io.json_values import annotations, decoded, encoded
+from pose_graph_ros.core.io.old_versions import with_judgement, with_names
 from pose_graph_ros.core.io.saved_graph import SavedGraph
 from pose_graph_ros.core.io.tum import tum_text
-from pose_graph_ros.core.io.version_1 import with_names
 from pose_graph_ros.core.saved_columns import Integers, Numbers, Rows3, Rows4, Rows6
 
 FORMAT = 'pose_graph_ros graph'
-VERSION = 2
+VERSION = 3
 
 SUFFIXES = ('.g2o', '.json', '.tum')
 _OPENING, _MIDDLE = b'{\n"sha256": "', b'",\n'
@@ -206,11 +206,12 @@ def _checked_members(path: Path, content: bytes) -> dict[str, Any]:
     except (ValueError, RecursionError) as error:
         raise FileFormatError(f'{path}: expected JSON ({error})') from error
     version = members.pop('version', None)
-    if members.pop('format', None) != FORMAT or version not in (1, VERSION):
+    if members.pop('format', None) != FORMAT or version not in (1, 2, VERSION):
         raise FileFormatError(
-            f'{path}: expected a {FORMAT} of version 1 or {VERSION}, created by pose_graph_ros; '
+            f'{path}: expected a {FORMAT} of version 1 to {VERSION}, created by pose_graph_ros; '
             f'this one is of version {version!r}, created by {members.get("created_by")!r}')
-    return with_names(members) if version == 1 else dict(members)
+    members = with_names(members) if version == 1 else dict(members)
+    return with_judgement(members) if version < VERSION else members
 
 
 def _saved_rows(rows: GraphRows) -> SavedRows:

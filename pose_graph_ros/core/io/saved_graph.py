@@ -21,6 +21,9 @@ from pose_graph_ros.core.geometry.se2 import IntArray, wrap
 from pose_graph_ros.core.graph.constraints import check as check_table, EdgeKind
 from pose_graph_ros.core.graph.graph import GraphRows
 from pose_graph_ros.core.graph.reweighting import SavedLosses
+from pose_graph_ros.core.judgement.closure_states import SavedClosures
+from pose_graph_ros.core.judgement.judge import SavedJudgement
+from pose_graph_ros.core.judgement.verdicts import Decision, State
 from pose_graph_ros.core.odometry.hidden_nodes import SavedNodes
 from pose_graph_ros.core.saved_columns import Matrix
 from pose_graph_ros.core.sources.factor_builder import SavedEdges, SavedSource
@@ -47,6 +50,8 @@ class SavedGraph:
     """Edges for the next update."""
     set_aside: SavedEdges
     """Edges set aside after a failed solve, for the next full optimisation."""
+    judgement: SavedJudgement
+    """What is believed, and who has decided so."""
     newest_covariance: Matrix
     """Covariance of the newest hidden node, in map axes."""
     chi2: float
@@ -95,8 +100,10 @@ class SavedGraph:
         _require(np.isin(alignment.node, nodes.rows), 'alignment.node: expected hidden nodes')
         _require(alignment.state in STATES, f'alignment.state: expected one of {STATES}')
         _require(alignment.next_verdict > 0, 'alignment.next_verdict: expected a positive number')
+        self._check_judgement(self.judgement.closures, sizes['edges'])
         for name, edges in (('waiting', self.waiting), ('set_aside', self.set_aside)):
-            _same_length(name, edges, 'sources', 'i', 'j', 'mean', 'information', 'kind')
+            _same_length(name, edges, 'sources', 'i', 'j', 'mean', 'information', 'kind',
+                         'stamps_ns')
             _inside(name, edges.kind, EdgeKind.BIAS)
             _require(np.isin((edges.i, edges.j), nodes.rows),
                      f'{name}: expected edges between hidden nodes')
@@ -126,6 +133,19 @@ class SavedGraph:
         covered = nodes.streams[nodes.leads[-1]].stamps_ns
         _require(covered[0] <= nodes.base_ns <= covered[-1],
                  'nodes.base_ns: expected an instant that the primary odometry covers')
+
+    def _check_judgement(self, closures: SavedClosures, n_edges: int) -> None:
+        where = 'judgement.closures'
+        _same_length(where, closures, 'rows', 'source', 'stamps_ns', 'state', 'since_ns',
+                     'decision', 'distance')
+        _same_length(where, closures, 'sources', 'scales')
+        _inside(where, closures.rows, n_edges)
+        _inside(where, closures.source, len(closures.sources))
+        _inside(where, closures.state, len(State))
+        _inside(where, closures.decision, len(Decision))
+        _require(self.rows.edges.kind[closures.rows] == EdgeKind.LOOP_CLOSURE,
+                 f'{where}: expected rows of loop closures')
+        _require(closures.scales > 0.0, f'{where}: expected positive scales')
 
     def _check_source(self, where: str, source: SavedSource, sizes: Mapping[str, int]) -> None:
         _same_length(where, source, 'seen_ns', 'seen_references')

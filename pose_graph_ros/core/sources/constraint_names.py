@@ -75,7 +75,7 @@ def queued(queue: Queue, nodes: HiddenNodes) -> list[str]:
 
     """
     ends = [(source, np.searchsorted(nodes.rows, (edge.i[0], edge.j[0])).tolist())
-            for source, edge in queue.edges]
+            for source, edge, *_ in queue.edges]
     return [f'{source} x{i} - x{j}' for source, (i, j) in ends] + [
         f'{each.source} at {each.measurement.stamp_ns * 1e-9:.3f} s near '
         f'x{int(np.searchsorted(nodes.rows, each.attachment.node))}' for each in queue.observed]

@@ -67,6 +67,19 @@ class SavedEdges:
     mean: Rows3
     information: Rows6
     kind: EdgeKinds
+    stamps_ns: Pairs
+    """Of a loop closure and of its other end [ns]; -1 for odometry."""
+
+
+class QueuedEdge(NamedTuple):
+    """An edge between hidden nodes for the next update."""
+
+    source: str
+    edge: Edges
+    stamp_ns: int = -1
+    """Of the loop closure [ns]; -1 for an edge of odometry."""
+    reference_ns: int = -1
+    """Stamp of its other end [ns]."""
 
 
 class AttachedMeasurement(NamedTuple):
@@ -83,7 +96,7 @@ class AttachedMeasurement(NamedTuple):
 class Queue:
     """Constraints for the next update, with their sources."""
 
-    edges: list[tuple[str, Edges]] = field(default_factory=list)
+    edges: list[QueuedEdge] = field(default_factory=list)
     observed: list[AttachedMeasurement] = field(default_factory=list)
 
     def __len__(self) -> int:
@@ -127,7 +140,7 @@ class _SourceConstraints:
         """Constraints of a loaded graph that were added under other settings."""
 
 
-class _NewConstraint(NamedTuple):
+class NewConstraint(NamedTuple):
     """A constraint in the update that was built last."""
 
     is_edge: bool
@@ -135,8 +148,11 @@ class _NewConstraint(NamedTuple):
     """Its row in the graph once the update is applied."""
     source: str
     stamp_ns: int
-    """Of the measurement [ns]; -1 for an edge between poses."""
+    """Of the measurement [ns]; -1 for an edge of odometry."""
     kind: type[Measurement]
+    """`LoopClosure` for all edges between poses."""
+    reference_ns: int = -1
+    """Stamp of the other end of a loop closure [ns]; else -1."""
 
 
 class FactorBuilder:
@@ -163,7 +179,8 @@ class FactorBuilder:
         self._constraints: dict[str, _SourceConstraints] = {}
         self._pose_edges: dict[str, GrowingArray] = {}
         """Rows of the edges between poses, by source."""
-        self._new: list[_NewConstraint] = []
+        self.new: list[NewConstraint] = []
+        """Constraints of the update that was built last."""
         self._n_new_bias_edges = 0
         self._new_weights: dict[int, float] = {}
         """Weights of observed nodes, by row, that the update sets."""
@@ -195,8 +212,9 @@ class FactorBuilder:
         additions = Additions(GraphSizes(graph.n_nodes, graph.n_edges, graph.n_observed))
         for model in self._error_models.values():
             model.begin()
-        self._new = [_NewConstraint(True, additions.add_edge(edge), source, -1, LoopClosure)
-                     for source, edge in queue.edges]
+        self.new = [
+            NewConstraint(True, additions.add_edge(edge), source, stamp_ns, LoopClosure, reference)
+            for source, edge, stamp_ns, reference in queue.edges]
         for source, observed, measurement, attachment in sorted(
                 queue.observed, key=lambda attached: attached.measurement.stamp_ns):
             kind, stamp_ns = type(measurement), measurement.stamp_ns
@@ -207,7 +225,7 @@ class FactorBuilder:
                 row = error_model.add(stamp_ns, observed, additions)
             else:
                 row = additions.add_observed(observed)
-            self._new.append(_NewConstraint(
+            self.new.append(NewConstraint(
                 isinstance(error_model, GaussMarkovBias), row, source, stamp_ns, kind))
         self._n_new_bias_edges = len(additions.edges) - len(queue.edges)
         for model in self._error_models.values() if settle else ():
@@ -257,13 +275,13 @@ class FactorBuilder:
     def commit(self) -> None:
         """Record the constraints of the update that was built last."""
         self.n_bias_edges += self._n_new_bias_edges
-        for is_edge, row, source, stamp_ns, kind in self._new:
+        for is_edge, row, source, stamp_ns, kind, _ in self.new:
             odometry = self._config.odometry.get(source) if stamp_ns < 0 else None
             settings = odometry or self._config.measurement_source(source, kind)
             loss = (settings.loss if isinstance(settings, OdometrySource)
                     else settings.applied_loss)
             self._reweighting.add(row, loss, settings.rejection_threshold, edge=is_edge)
-            if stamp_ns >= 0:
+            if kind is not LoopClosure:
                 constraints = self._constraints.setdefault(source, _SourceConstraints())
                 constraints.rows.append_one((stamp_ns, row))
             else:

@@ -20,7 +20,7 @@ from pose_graph_ros.core.measurements import (
 )
 from pose_graph_ros.core.odometry.hidden_nodes import HiddenNodes
 from pose_graph_ros.core.odometry.motion import Attachment
-from pose_graph_ros.core.sources.factor_builder import AttachedMeasurement, Queue
+from pose_graph_ros.core.sources.factor_builder import AttachedMeasurement, Queue, QueuedEdge
 from pose_graph_ros.core.sources.measurement_constraints import (
     absolute_constraint,
     attach,
@@ -138,8 +138,12 @@ class MeasurementPipeline:
         if reference.node == attachment.node:
             return rejected(
                 'same_node', f'both ends are attached to hidden node {attachment.node}')
-        self.queue.edges.append(
-            (source, loop_closure_constraint(measurement, reference, attachment)))
+        reference_ns = measurement.reference_ns
+        if reference_ns is None:
+            reference_ns = int(self._nodes.stamps_ns[measurement.reference_node])
+        self.queue.edges.append(QueuedEdge(
+            source, loop_closure_constraint(measurement, reference, attachment),
+            measurement.stamp_ns, reference_ns))
         return ACCEPTED
 
     def attach_to_node(self, measurement: Absolute, source: str, node: int) -> None:

@@ -24,7 +24,7 @@ from pose_graph_ros.core.config import Loss
 from pose_graph_ros.core.exceptions import FileFormatError, FileWriteError
 from pose_graph_ros.core.geometry.geodesy import MapOrigin
 from pose_graph_ros.core.graph.constraints import EdgeKind, ObservedKind
-from pose_graph_ros.core.io import atomic_files, version_1
+from pose_graph_ros.core.io import atomic_files, old_versions
 from pose_graph_ros.core.io.g2o import read_g2o
 from pose_graph_ros.core.io.graph_files import graph_paths, read_datum, read_graph, write_graph
 from pose_graph_ros.core.io.saved_graph import SavedGraph
@@ -78,7 +78,7 @@ def test_other_programs_read_the_graph_and_the_path(tmp_path: Path) -> None:
     np.testing.assert_array_equal(path.stamps_ns, saved.nodes.stamps_ns)
     np.testing.assert_array_equal(path.poses[:, :2], rows.poses[saved.nodes.rows, :2])
     members = json.loads(side.read_text(encoding='ascii'))
-    assert members['version'] == 2
+    assert members['version'] == 3
     assert members['datum'] == {
         'latitude': 48.1, 'longitude': 11.6, 'altitude': 500.0, 'yaw': 0.25}
     assert members['nodes']['stamps_ns'] == saved.nodes.stamps_ns.tolist()
@@ -216,10 +216,10 @@ def test_another_version_is_refused_and_says_who_wrote_it(tmp_path: Path) -> Non
     assert_same_value(read_graph(side), small_graph())  # the layout of the text does not matter
 
     def renew(members: dict[str, Any]) -> None:
-        members['version'], members['created_by'] = 3, 'pose_graph_ros 9.9'
+        members['version'], members['created_by'] = 4, 'pose_graph_ros 9.9'
 
     rewrite(side, renew)
-    with pytest.raises(FileFormatError, match=r'version 1 or 2, .*version 3, .*9\.9'):
+    with pytest.raises(FileFormatError, match=r'version 1 to 3, .*version 4, .*9\.9'):
         read_graph(side)
 
 
@@ -239,7 +239,7 @@ def test_a_file_of_version_1_is_read() -> None:
 
 def number_as_version_1_does(members: dict[str, Any]) -> None:
     members['version'] = 1
-    for (member, field), names in version_1.NUMBERED.items():
+    for (member, field), names in old_versions.NUMBERED.items():
         chosen = members[member][field]
         members[member][field] = [names.index(chosen['names'][k]) for k in chosen['of']]
 

@@ -199,8 +199,8 @@ def test_edges_that_wait_and_those_set_aside_are_saved() -> None:
         if queue is backend._quarantine:
             queue.edges.append(backend._pipeline.queue.edges.pop())
     restored = PoseGraphBackend.restored(LINE_ODOMETRY, through_files(backend.saved()))
-    assert ([name for name, _ in restored._pipeline.queue.edges],
-            [name for name, _ in restored._quarantine.edges]) == (['waits'], ['failed'])
+    assert ([queued.source for queued in restored._pipeline.queue.edges],
+            [queued.source for queued in restored._quarantine.edges]) == (['waits'], ['failed'])
     assert_same_estimate(closed(restored), closed(backend), SAME_PATH)
     assert restored.graph.n_edges == backend.graph.n_edges == len(backend.node_stamps_ns) - 1 + 2
 
@@ -371,7 +371,7 @@ def test_a_closure_may_refer_to_a_saved_node_or_an_instant_between_saved_nodes()
         answer = restored.add_measurement(LoopClosure(
             int(stamps[-1]), np.zeros(3), np.eye(3), **name), f'closure {k}')
         assert answer.status is AnswerStatus.ACCEPTED
-    means = [edge.mean[0] for _, edge in restored._pipeline.queue.edges]
+    means = [queued.edge.mean[0] for queued in restored._pipeline.queue.edges]
     np.testing.assert_array_equal(means[0], means[1])
     # between saved nodes odometry is interpolated, and its noise covers the error
     farthest = 0.0

@@ -16,6 +16,7 @@ from pose_graph_ros.core.sources.factor_builder import (
     AttachedMeasurement,
     FactorBuilder,
     Queue,
+    QueuedEdge,
 )
 from pose_graph_ros.core.sources.measurement_constraints import absolute_constraint
 
@@ -51,7 +52,7 @@ def closure(i: int, j: int) -> Edges:
 
 
 def some(seconds: list[int]) -> Queue:
-    return Queue([('scan', closure(seconds[0], seconds[0] + 5))], [
+    return Queue([QueuedEdge('scan', closure(seconds[0], seconds[0] + 5))], [
         fix(source, k) for k in seconds for source in ('white', 'biased', 'inflated')])
 
 

@@ -1,6 +1,10 @@
 # Copyright 2026 The pose_graph_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""Saved graphs of version 1, which hold losses and kinds as numbers; version 2 holds names."""
+"""
+Saved graphs of older versions.
+
+Version 1 holds losses and kinds as numbers, version 2 holds names. Neither has judgements.
+"""
 
 from typing import Any
 
@@ -12,6 +16,22 @@ NUMBERED = {
     ('edge_losses', 'losses'): LOSSES, ('observed_losses', 'losses'): LOSSES,
     ('graph', 'edge_kind'): EDGES, ('graph', 'observed_kind'): OBSERVED,
     ('waiting', 'kind'): EDGES, ('set_aside', 'kind'): EDGES, ('alignment', 'kind'): OBSERVED}
+
+
+EMPTY_JUDGEMENT: dict[str, Any] = {'closures': {
+    'sources': [], 'scales': [], 'rows': [], 'source': [], 'stamps_ns': [],
+    'state': {'names': [], 'of': []}, 'since_ns': [], 'decision': {'names': [], 'of': []},
+    'distance': []}}
+
+
+def with_judgement(members: dict[str, Any]) -> dict[str, Any]:
+    """Return the members of a file of version 2 as those of version 3: nothing is judged."""
+    upgraded = {'judgement': EMPTY_JUDGEMENT, **members}
+    for name in ('waiting', 'set_aside'):
+        edges = upgraded.get(name)
+        if isinstance(edges, dict):
+            upgraded[name] = {'stamps_ns': [[-1, -1]] * len(edges.get('sources', [])), **edges}
+    return upgraded
 
 
 def with_names(members: dict[str, Any]) -> dict[str, Any]:

@@ -1,0 +1,362 @@
+# Copyright 2026 The pose_graph_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""
+Which loop closures to believe, decided as they come and again when the evidence changes.
+
+A closure passes the *gate* if its error at the estimate is plausible: `e^T (J P J^T + R)^-1 e` is
+below the 99 % quantile, with P the joint covariance of both nodes in the graph of what is believed
+and R the claimed covariance, floored. It is *believed* if it passes and a clique of closures that
+agree along the path supports it, or if a random one of its source would hardly pass: q p is small
+against 1 - q, with p the chance to pass and q the share of its source that is not believed. One
+that is believed and does not fit any more is thrown out: back to weight 0, from where it may come
+again. If p is large, only the record q of the source speaks for it: it is believed weakly.
+"""
+
+from collections.abc import Mapping, Sequence
+import math
+
+import numpy as np
+
+from pose_graph_ros.core.batch.optimizer import Status
+from pose_graph_ros.core.compiled.growing_array import GrowingArray
+from pose_graph_ros.core.config import BackendConfig
+from pose_graph_ros.core.geometry.se2 import FloatArray, IntArray
+from pose_graph_ros.core.graph.constraints import EdgeKind, Edges
+from pose_graph_ros.core.graph.graph import GraphUpdate
+from pose_graph_ros.core.graph.reweighting import Reweighting
+from pose_graph_ros.core.judgement import relative
+from pose_graph_ros.core.judgement.chain import OdometryChain
+from pose_graph_ros.core.judgement.closure_states import (
+    ClosureStates,
+    DECISIONS,
+    DOUBTED,
+    OUT,
+    SavedClosures,
+    STATES,
+    WAITING,
+)
+from pose_graph_ros.core.judgement.closures import claims, ClosureTable, GATE
+from pose_graph_ros.core.judgement.verdicts import (
+    Change,
+    Decision,
+    Judged,
+    SourceVerdicts,
+    State,
+    Verdict,
+)
+from pose_graph_ros.core.measurements import ACCEPTED, Answer, rejected
+from pose_graph_ros.core.smoother.incremental import IncrementalSmoother
+from pose_graph_ros.core.sources.factor_builder import NewConstraint
+
+# A clique supports a closure if it has so many members, over so long a way [m].
+CLIQUE, CLIQUE_TRAVEL = 3, 1.0
+# Largest odds that a closure is wrong which is believed alone.
+WRONG_ODDS = 0.02
+# Chance of a random closure to pass, above which a lone one is only believed weakly.
+WEAK = 0.02
+# The same, below which several are believed at once, as none changes the gates of others much.
+NARROW = 1e-3
+# Numbers of closures that are tested again in an update, and in a part of the work.
+IN_UPDATE, IN_PART = 16, 64
+
+
+class ClosureJudge:
+    """
+    Judges the loop closures of a graph.
+
+    Parameters
+    ----------
+    smoother : IncrementalSmoother
+    reweighting : Reweighting, of its constraints with a robust loss
+    config : BackendConfig
+
+    """
+
+    def __init__(
+        self, smoother: IncrementalSmoother, reweighting: Reweighting, config: BackendConfig,
+    ) -> None:
+        self._smoother, self._reweighting, self._config = smoother, reweighting, config
+        self._chain = OdometryChain()
+        self._table = ClosureTable(self._chain)
+        self._states = ClosureStates()
+        self._scales: list[float] = []
+        """Of each source, the factor on its sigmas in the graph."""
+        self._spread = GrowingArray((3, 3), np.float64)
+        """Covariance of the prediction when a closure was tested last; 0 if unknown."""
+        self._tested = GrowingArray((), np.int64)
+        """The round in which it was tested last."""
+        self._round = 0
+        """Increases when more or less is believed, so that those that wait are tested again."""
+        self._n_staged = 0
+        self._now_ns = 0
+
+    def configure(self, config: BackendConfig) -> None:
+        """Set the settings."""
+        self._config = config
+
+    @property
+    def n_edges_of_graph(self) -> int:
+        """Number of edges in the graph."""
+        return self._smoother.graph.n_edges
+
+    # --- arrival ---------------------------------------------------------------------------------
+
+    def before(
+        self, new: Sequence[NewConstraint], edges: Edges, now_ns: int,
+    ) -> FloatArray:
+        """
+        Return the weights with which closures are to be added, shape (M,).
+
+        Parameters
+        ----------
+        new : sequence of NewConstraint, M closures
+        edges : Edges, of the closures
+        now_ns : int, stamp of the newest odometry
+
+        """
+        begin, n = len(self._states), len(new)
+        self._now_ns, self._n_staged = now_ns, n
+        self._chain.extend(self._smoother.graph)
+        self._table.append(claims(edges))
+        self._states.append(new, now_ns)
+        self._scales += [1.0] * (len(self._states.sources) - len(self._scales))
+        self._spread.append(np.zeros((n, 3, 3)))
+        self._tested.append(np.full(n, -1))
+        numbers = np.arange(begin, begin + n)
+        if not self._smoother.graph.has_touched:
+            for number, state in self._choose(*self._test(numbers)).items():
+                self._states.state[number] = STATES.index(state)
+        return self._weights(numbers)
+
+    def rollback(self) -> None:
+        """Forget the closures of the last `before`."""
+        self._table.drop(self._n_staged)
+        self._states.drop(self._n_staged)
+        for array in (self._spread, self._tested):
+            array.truncate(len(self._states))
+        self._n_staged = 0
+
+    def commit(self) -> None:
+        """Keep the closures of the last `before`."""
+        begin, self._n_staged = len(self._states) - self._n_staged, 0
+        for number in range(begin, len(self._states)):
+            self._states.announce(number, -1, self._now_ns)
+        if np.any(self._states.in_graph[begin:]):
+            self._round += 1
+            self._set_base_weights(np.arange(begin, len(self._states)))
+
+    # --- tests -----------------------------------------------------------------------------------
+
+    def _test(self, numbers: IntArray) -> tuple[IntArray, FloatArray]:
+        """Test closures that are not in the graph; return those that pass, and their chances."""
+        some, n = self._table.claims_of(numbers), len(numbers)
+        errors, spread = self._smoother.edge_innovations(Edges(
+            some.first, some.second, some.mean, some.covariance,
+            np.full(n, int(EdgeKind.LOOP_CLOSURE))))
+        total, distance = spread + some.covariance, np.empty(n)
+        relative.distances(errors, total, distance)
+        self._spread.values[numbers] = spread
+        self._states.distance[numbers] = distance
+        self._tested.values[numbers] = self._round
+        passes = distance < GATE
+        for number, state in zip(
+                numbers.tolist(), np.where(passes, WAITING, DOUBTED).tolist(), strict=True):
+            before = int(self._states.state[number])
+            self._states.state[number] = state
+            if number < len(self._states) - self._n_staged:
+                self._states.announce(number, before, self._now_ns)
+        return numbers[passes], self._chances(total[passes])
+
+    def _chances(self, covariance: FloatArray) -> FloatArray:
+        """Return the chances of random closures to pass gates with these covariances, (M,)."""
+        width, height = np.ptp(self._smoother.poses[:, :2], axis=0)
+        area = max(float(width * height), 1.0)
+        ellipse = math.pi * GATE * np.sqrt(np.linalg.det(covariance[:, :2, :2]))
+        arc = np.sqrt(GATE * covariance[:, 2, 2]) / math.pi
+        return np.minimum(ellipse / area, 1.0) * np.minimum(arc, 1.0)
+
+    def _choose(self, passed: IntArray, chance: FloatArray) -> dict[int, State]:
+        """Return which closures that have passed are believed now; of wide gates only one."""
+        chosen: dict[int, State] = {}
+        for k in np.argsort(chance, kind='stable').tolist():
+            if chance[k] > NARROW and len(chosen) > 0:
+                break
+            state = self._belief(int(passed[k]), float(chance[k]))
+            if state.in_graph:
+                chosen[int(passed[k])] = state
+        return chosen
+
+    def _belief(self, number: int, chance: float) -> State:
+        """Return the state of a closure that has passed the gate."""
+        of_source = self._states.source == self._states.source[number]
+        n, good = int(np.sum(of_source)), int(np.sum(self._states.in_graph & of_source))
+        alone = (n - good + 1.0) * chance < WRONG_ODDS * (good + 1.0)
+        if (alone and chance <= WEAK) or self._is_corroborated(number):
+            return State.BELIEVED
+        return State.WEAKLY_BELIEVED if alone else State.WAITING
+
+    def _is_corroborated(self, number: int) -> bool:
+        support = self._table.support(number, self._states.decision != OUT)
+        return len(support.clique) >= CLIQUE and support.travel >= CLIQUE_TRAVEL
+
+    # --- changes ---------------------------------------------------------------------------------
+
+    def _weights(self, numbers: IntArray) -> FloatArray:
+        scales = np.array(self._scales)[self._states.source[numbers]]
+        return np.where(self._states.in_graph[numbers], 1.0 / np.square(scales), 0.0)
+
+    def _set_base_weights(self, numbers: IntArray) -> None:
+        for number, weight in zip(numbers.tolist(), self._weights(numbers).tolist(), strict=True):
+            self._reweighting.set_base_weight(int(self._states.row[number]), weight, edge=True)
+
+    def _apply(self, changes: Mapping[int, State]) -> bool:
+        """Change states and weights; tell whether the smoother could, else nothing has changed."""
+        numbers = np.array(sorted(changes), dtype=np.int64)
+        before = self._states.state[numbers].copy()
+        self._states.state[numbers] = [STATES.index(changes[k]) for k in numbers.tolist()]
+        result = self._smoother.update(GraphUpdate(weigh_edges=dict(zip(
+            self._states.row[numbers].tolist(), self._weights(numbers).tolist(), strict=True))))
+        if result.status is Status.FAILED:
+            self._states.state[numbers] = before
+            return False
+        for number, old in zip(numbers.tolist(), before.tolist(), strict=True):
+            self._states.announce(number, old, self._now_ns)
+        self._set_base_weights(numbers)
+        self._round += 1
+        return True
+
+    def after(self) -> None:
+        """Judge again, within bounds, after an update."""
+        self._part(IN_UPDATE)
+
+    def work(self) -> bool:
+        """Do a bounded part of what is left; tell whether there is more."""
+        return self._part(IN_PART)
+
+    def _part(self, most: int) -> bool:
+        if len(self._states) == 0 or self._smoother.graph.has_touched:
+            return False
+        return self._throw_out() or self._test_again(most)
+
+    def _throw_out(self) -> bool:
+        """Take out of the graph what does not fit any more; tell whether there was any."""
+        inside = np.flatnonzero(self._states.in_graph & self._states.judged)
+        bad = inside[self._residuals(inside) > GATE]
+        if len(bad) == 0 or not self._apply(dict.fromkeys(bad.tolist(), State.DOUBTED)):
+            return False
+        # without them the graph is less certain
+        self._spread.values[:] = 0.0
+        return True
+
+    def _residuals(self, numbers: IntArray) -> FloatArray:
+        """Return squared residuals at the estimate, by the floored covariances, shape (M,)."""
+        some, errors = self._table.claims_of(numbers), np.empty((len(numbers), 3))
+        relative.errors_at(self._smoother.graph.memory.head, some.first, some.second, some.mean,
+                           errors)
+        out = np.empty(len(numbers))
+        relative.distances(errors, some.covariance, out)
+        return out
+
+    def _test_again(self, most: int) -> bool:
+        """Test some closures that wait; tell whether some are left."""
+        waiting = np.flatnonzero(~self._states.in_graph & self._states.judged
+                                 & (self._tested.values < self._round))
+        if len(waiting) == 0:
+            return False
+        some, errors = self._table.claims_of(waiting), np.empty((len(waiting), 3))
+        relative.errors_at(self._smoother.graph.memory.head, some.first, some.second, some.mean,
+                           errors)
+        # covariances only shrink while more is believed, so this is a lower bound
+        spread, least = self._spread.values[waiting], np.empty(len(waiting))
+        relative.distances(errors, spread + some.covariance, least)
+        known = spread[:, 0, 0] > 0.0
+        hopeless = known & ~(least < GATE)
+        self._tested.values[waiting[hopeless]] = self._round
+        rest = waiting[~hopeless]
+        rest = rest[np.argsort(np.where(known, least, 0.0)[~hopeless], kind='stable')]
+        chosen = self._choose(*self._test(rest[:most]))
+        return (len(chosen) > 0 and self._apply(chosen)) or len(rest) > most
+
+    # --- reports ---------------------------------------------------------------------------------
+
+    def verdicts(self, most_believed: int | None = None) -> list[Verdict]:
+        """Return all verdicts, but of those that are believed only the newest of each source."""
+        states, numbers = self._states, np.arange(len(self._states))
+        if most_believed is not None:
+            believed = np.flatnonzero(states.in_graph)
+            newest = [believed[states.source[believed] == source][-most_believed:]
+                      for source in range(len(states.sources))] if most_believed > 0 else []
+            numbers = np.union1d(np.flatnonzero(~states.in_graph), np.concatenate(
+                [*newest, numbers[:0]]))
+        return [self._verdict(number) for number in numbers.tolist()]
+
+    def saved(self) -> SavedClosures:
+        """Return the state; what is left to be tested is not part of it."""
+        return self._states.saved(self._scales)
+
+    def restore(self, saved: SavedClosures) -> None:
+        """Restore what `saved` has returned, for a graph with the same rows."""
+        self._chain.extend(self._smoother.graph)
+        self._table.append(claims(self._smoother.graph.edges_at(saved.rows)))
+        self._states.restore(saved)
+        self._scales = saved.scales.tolist()
+        self._spread.append(np.zeros((len(saved.rows), 3, 3)))
+        self._tested.append(np.full(len(saved.rows), -1))
+
+    def _verdict(self, number: int) -> Verdict:
+        states = self._states
+        support = self._table.support(number, np.ones(len(states), dtype=bool))
+        against = [other for other in support.against.tolist() if states.in_graph[other]]
+        contradicted = [states.name(other) for other in against[:5]]
+        if states.state[number] == DOUBTED:
+            contradicted = ['odometry', *contradicted][:5]
+        stamp, reference = states.stamps_ns[number].tolist()
+        return Verdict(
+            id=states.name(number), kind=Judged.LOOP_CLOSURE,
+            source=states.sources[states.source[number]], stamp_ns=stamp,
+            reference_ns=reference, state=STATES[states.state[number]],
+            since_ns=int(states.since_ns[number]), decision=DECISIONS[states.decision[number]],
+            residual=self._smoother.edge_innovations(
+                self._smoother.graph.edges_at(states.row[number:number + 1])).errors[0],
+            distance=math.sqrt(states.distance[number]),
+            supported_by=tuple(states.name(other) for other in support.clique.tolist()
+                               if other != number)[:5],
+            contradicted_by=tuple(contradicted), edge=True, row=int(states.row[number]))
+
+    def take_changes(self) -> list[Change]:
+        """Return the changes of states since the last call."""
+        return self._states.take_changes()
+
+    def totals(self) -> dict[str, SourceVerdicts]:
+        """Return what is believed of each source."""
+        totals = {}
+        for k, source in enumerate(self._states.sources):
+            states = self._states.state[self._states.source == k]
+            newest = states[-5:]
+            totals[source] = SourceVerdicts(
+                {state: int(np.count_nonzero(states == m)) for m, state in enumerate(STATES)},
+                self._scales[k], bool(np.all((newest == WAITING) | (newest == DOUBTED))))
+        return totals
+
+    def decide(self, name: str, decision: Decision) -> Answer:
+        """
+        Return the answer to a person's decision on a closure, which is applied at once.
+
+        Parameters
+        ----------
+        name : str, `Verdict.id`
+        decision : Decision
+
+        """
+        number = self._states.find(name)
+        if number < 0:
+            return rejected('unknown_id', f'expected the id of a verdict, got {name!r}')
+        before = int(self._states.decision[number])
+        self._states.decision[number] = DECISIONS.index(decision)
+        if decision is Decision.AUTO:
+            self._round += 1
+        elif not self._apply(
+                {number: State.BELIEVED if decision is Decision.IN else State.DOUBTED}):
+            self._states.decision[number] = before
+            return rejected('failed', 'the solver failed with it')
+        return ACCEPTED

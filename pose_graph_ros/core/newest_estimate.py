@@ -1,0 +1,59 @@
+# Copyright 2026 The pose_graph_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""The estimate at the newest odometry, from the parts of the engine."""
+
+import math
+
+import numpy as np
+
+from pose_graph_ros.core.alignment import estimator
+from pose_graph_ros.core.alignment.monitor import AlignmentState, placed
+from pose_graph_ros.core.config import OdometryNoise
+from pose_graph_ros.core.estimate import Estimate
+from pose_graph_ros.core.geometry import covariance, se2
+from pose_graph_ros.core.geometry.se2 import FloatArray
+from pose_graph_ros.core.geometry.trajectory import Trajectory
+from pose_graph_ros.core.graph.constraints import ObservedNodes
+from pose_graph_ros.core.io.capture import Parts
+
+
+def estimate(
+    parts: Parts, noise: OdometryNoise, newest_covariance: FloatArray, chi2: float,
+    *, with_path: bool,
+) -> Estimate:
+    """
+    Return the present estimate.
+
+    Parameters
+    ----------
+    parts : Parts, with at least one hidden node
+    noise : OdometryNoise, of the primary odometry
+    newest_covariance : ndarray, shape (3, 3), of the newest hidden node, in map axes
+    chi2 : float
+    with_path : bool, whether with the path, which takes time and memory linear in the graph
+
+    """
+    graph, nodes, factors = parts.graph, parts.nodes, parts.factors
+    node = graph.poses[nodes.rows[-1]]
+    motion, motion_noise, odometry = nodes.newest()
+    newest = se2.compose(node, motion)
+    cov = covariance.propagated(node, newest_covariance, motion, motion_noise)
+    state, sigma = parts.alignment.copy()
+    shift = np.zeros(3)
+    if state is AlignmentState.UNALIGNED:
+        # if the aligning update failed, its measurements are in the quarantine
+        shift, cov = estimator.guess(graph.poses, newest, ObservedNodes.joined(
+            [attached.observed for attached in placed(
+                parts.pipeline.queue.observed + parts.quarantine.observed)]))
+        newest = newest + shift
+    stamp_ns = max(nodes.newest_ns, int(nodes.stamps_ns[-1]))
+    return Estimate(
+        stamp_ns=stamp_ns, T_odom_base=odometry, T_map_base=newest,
+        T_map_odom=se2.compose(newest, se2.inverse(odometry)), covariance=cov,
+        alignment=state, chi2=chi2, alignment_sigma=(
+            math.sqrt(cov[2, 2]) if state is AlignmentState.ALIGNED else sigma),
+        n_hidden=len(nodes), n_edges=graph.n_edges - factors.n_bias_edges,
+        n_observed=factors.n_measurements, n_biases=graph.n_nodes - len(nodes),
+        primary=nodes.primary, noise=noise,
+        trajectory=None if not with_path else Trajectory(
+            nodes.stamps_ns, graph.poses[nodes.rows] + shift).continued(stamp_ns, newest))
