@@ -25,7 +25,6 @@ from pose_graph_ros.core.graph.constraints import EdgeKind, Edges
 from pose_graph_ros.core.graph.graph import GraphUpdate
 from pose_graph_ros.core.graph.reweighting import Reweighting
 from pose_graph_ros.core.judgement import relative
-from pose_graph_ros.core.judgement.chain import OdometryChain
 from pose_graph_ros.core.judgement.closure_states import (
     ClosureStates,
     DECISIONS,
@@ -36,6 +35,7 @@ from pose_graph_ros.core.judgement.closure_states import (
     WAITING,
 )
 from pose_graph_ros.core.judgement.closures import claims, ClosureTable, GATE
+from pose_graph_ros.core.judgement.consistency import OdometryChain
 from pose_graph_ros.core.judgement.verdicts import (
     Change,
     Decision,
@@ -149,11 +149,11 @@ class ClosureJudge:
 
     def _test(self, numbers: IntArray) -> tuple[IntArray, FloatArray]:
         """Test closures that are not in the graph; return those that pass, and their chances."""
-        some, n = self._table.claims_of(numbers), len(numbers)
+        some, n = self._table.rows(numbers), len(numbers)
         errors, spread = self._smoother.edge_innovations(Edges(
-            some.first, some.second, some.mean, some.covariance,
+            some.i, some.j, some.mean, some.noise,
             np.full(n, int(EdgeKind.LOOP_CLOSURE))))
-        total, distance = spread + some.covariance, np.empty(n)
+        total, distance = spread + some.noise, np.empty(n)
         relative.distances(errors, total, distance)
         self._spread.values[numbers] = spread
         self._states.distance[numbers] = distance
@@ -250,11 +250,11 @@ class ClosureJudge:
 
     def _residuals(self, numbers: IntArray) -> FloatArray:
         """Return squared residuals at the estimate, by the floored covariances, shape (M,)."""
-        some, errors = self._table.claims_of(numbers), np.empty((len(numbers), 3))
-        relative.errors_at(self._smoother.graph.memory.head, some.first, some.second, some.mean,
+        some, errors = self._table.rows(numbers), np.empty((len(numbers), 3))
+        relative.errors_at(self._smoother.graph.memory.head, some.i, some.j, some.mean,
                            errors)
         out = np.empty(len(numbers))
-        relative.distances(errors, some.covariance, out)
+        relative.distances(errors, some.noise, out)
         return out
 
     def _test_again(self, most: int) -> bool:
@@ -263,12 +263,12 @@ class ClosureJudge:
                                  & (self._tested.values < self._round))
         if len(waiting) == 0:
             return False
-        some, errors = self._table.claims_of(waiting), np.empty((len(waiting), 3))
-        relative.errors_at(self._smoother.graph.memory.head, some.first, some.second, some.mean,
+        some, errors = self._table.rows(waiting), np.empty((len(waiting), 3))
+        relative.errors_at(self._smoother.graph.memory.head, some.i, some.j, some.mean,
                            errors)
         # covariances only shrink while more is believed, so this is a lower bound
         spread, least = self._spread.values[waiting], np.empty(len(waiting))
-        relative.distances(errors, spread + some.covariance, least)
+        relative.distances(errors, spread + some.noise, least)
         known = spread[:, 0, 0] > 0.0
         hopeless = known & ~(least < GATE)
         self._tested.values[waiting[hopeless]] = self._round

@@ -195,4 +195,4 @@ def test_queues_are_joined_in_their_order() -> None:
     one.extend(other)
     assert len(one) == 1 + 3 + 1 + 6
     assert [int(each.observed.node[0]) for each in one.observed] == [1] * 3 + [2] * 3 + [3] * 3
-    assert [int(edge.i[0]) for _, edge in one.edges] == [1, 2]
+    assert [int(queued.edge.i[0]) for queued in one.edges] == [1, 2]
