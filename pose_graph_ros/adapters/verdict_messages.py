@@ -28,24 +28,6 @@ OK, WARN, STALE = 0, 1, 3  # levels of diagnostic_msgs/DiagnosticStatus
 LEVELS = {State.BELIEVED: OK, State.WEAKLY_BELIEVED: OK, State.DOUBTED: WARN,
           State.WAITING: STALE}
 MOST_BELIEVED = 50  # of each source, the newest
-MOST_OTHERS = 1000  # of all that are not believed, or that a person has decided on
-
-
-def shown(verdicts: Sequence[Verdict]) -> list[Verdict]:
-    """
-    Return the verdicts that are listed, by stamp.
-
-    Of those that are not believed only the newest `MOST_OTHERS` are listed, after those that a
-    person has decided on. The believed ones are limited by who asks for the verdicts.
-    """
-    believed = [each for each in verdicts if _is_plain(each)]
-    others = [each for each in verdicts if not _is_plain(each)]
-    others.sort(key=lambda each: (each.decision is Decision.AUTO, -each.stamp_ns))
-    return sorted(believed + others[:MOST_OTHERS], key=lambda each: (each.stamp_ns, each.id))
-
-
-def _is_plain(verdict: Verdict) -> bool:
-    return verdict.state is State.BELIEVED and verdict.decision is Decision.AUTO
 
 
 def verdicts_cdr(
@@ -58,7 +40,7 @@ def verdicts_cdr(
     Parameters
     ----------
     verdicts : sequence of Verdict
-        Those that are `shown`.
+        Those that are listed.
     totals : mapping
         What is believed of each source, as a whole.
     stamp_ns : int

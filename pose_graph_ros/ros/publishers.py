@@ -29,7 +29,7 @@ from pose_graph_ros.adapters.conversions import frame, Message
 from pose_graph_ros.adapters.fixes import Datum
 from pose_graph_ros.adapters.markers import markers_cdr
 from pose_graph_ros.adapters.sources import NANOSECONDS
-from pose_graph_ros.adapters.verdict_messages import shown, verdicts_cdr
+from pose_graph_ros.adapters.verdict_messages import verdicts_cdr
 from pose_graph_ros.core.alignment.monitor import AlignmentState
 from pose_graph_ros.core.estimate import Estimate
 from pose_graph_ros.core.geometry.trajectory import Trajectory
@@ -260,7 +260,7 @@ class Publishers:
             self._verdicts_at, self._verdicts_shown = time.monotonic(), state
             self._verdicts_stamp_ns = max(stamp_ns, self._verdicts_stamp_ns + 1)
             self._verdicts.publish(verdicts_cdr(
-                shown(verdicts), totals, self._verdicts_stamp_ns, self.map_frame))
+                verdicts, totals, self._verdicts_stamp_ns, self.map_frame))
 
     def start_new_graph(self) -> None:
         """Forget all stamps; take path, markers and verdicts back if any were published."""

@@ -230,7 +230,9 @@ class Worker:
         result = self._backend.refine()
         self._may_refine = not result.finished
         self._refined += result.moved
-        if self._refined > VISIBLE:
+        # it judges again, too
+        has_judged = result.finished and self._report(None, 0) > 0
+        if has_judged or self._refined > VISIBLE:
             self._publish()
 
     def _do(self, what: str, job: Job[object], future: Future[object]) -> None:
@@ -299,8 +301,12 @@ class Worker:
 
     def _report(
         self, report: UpdateReport | None, processed: int, *, ends: bool = False,
-    ) -> None:
-        """Replace the status; keep the report of the last update if there is no new one."""
+    ) -> int:
+        """
+        Replace the status; return the number of changes of verdicts, which are announced.
+
+        It keeps the report of the last update if there is no new one.
+        """
         status, backend = self.status, self._backend
         changes, verdicts = backend.verdict_changes(), backend.verdict_totals()
         for level, text in self._announcer.lines(
@@ -315,3 +321,4 @@ class Worker:
             report=status.report if report is None else report,
             sources=status.sources if report is None else backend.reports(),
             verdicts=verdicts, n_changes=status.n_changes + len(changes))
+        return len(changes)

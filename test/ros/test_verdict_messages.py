@@ -2,7 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Verdicts as messages: held to rclpy's own reading, and bounded."""
 
-from dataclasses import replace
 from types import SimpleNamespace as Space
 
 import pytest
@@ -14,9 +13,7 @@ import numpy as np
 from rclpy.serialization import deserialize_message
 
 from pose_graph_ros.adapters.verdict_messages import (
-    MOST_OTHERS,
     read_decision,
-    shown,
     states_in,
     verdicts_cdr,
 )
@@ -64,16 +61,6 @@ def test_an_empty_message_says_so() -> None:
     message = deserialize_message(verdicts_cdr([], {}, STAMP, 'kürzel'), DiagnosticArray)
     assert [status.message for status in message.status] == [
         '0 of 0 are listed; nothing is judged yet']
-
-
-def test_what_is_listed_is_bounded_and_what_a_person_decided_on_is_always_there() -> None:
-    n = MOST_OTHERS + 100
-    verdicts = [verdict(k, State.DOUBTED) for k in range(n)]
-    verdicts[3] = replace(verdicts[3], decision=Decision.OUT)
-    verdicts += [verdict(n + k, State.BELIEVED) for k in range(3)]
-    found = shown(verdicts)
-    assert [each.id for each in found] == [
-        'loop/3', *(f'loop/{k}' for k in range(101, n + 3))]
 
 
 @pytest.mark.parametrize(('value', 'expected'), [
