@@ -87,23 +87,31 @@ class Judged:
     far_kept: int
     recall: float
     worst: float
-
-    @property
-    def lost(self) -> int:
-        """Number of right closures that are not kept."""
-        return round((1.0 - self.recall) * self.n_right)
-
-    n_right: int = 0
+    n_right: int
 
 
-def judge(table: Table, recording: Recording, *, everything: bool = True) -> Judged:
-    """Run a recording with default settings and as comparisons, and add a row to a table."""
+def judge(
+    table: Table, recording: Recording, *, everything: bool = True, clean: float | None = None,
+) -> Judged:
+    """
+    Run a recording with default settings and as comparisons, and add a row to a table.
+
+    Parameters
+    ----------
+    table : Table
+    recording : Recording
+    everything : bool, whether to run it with all closures believed as well
+    clean : float, optional
+        The error with only the right closures, if it is known [m].
+
+    """
     errors = recording.errors()
     right = errors <= TRUE
     run = feed(recording, recording.config(Robust.JUDGED))
     truth = recording.truth
     odometry = rms(Trajectory(recording.stamps_ns, recording.odometry), truth)
-    only_right = rms(feed(recording.only(right), recording.config(Robust.NONE)).path, truth)
+    only_right = clean or rms(
+        feed(recording.only(right), recording.config(Robust.NONE)).path, truth)
     used = run.kept
     judged = Judged(
         run, rms(run.path, truth), odometry, only_right, int(np.sum(used & ~right)),
@@ -251,7 +259,7 @@ def grids(options: Options) -> Section:
             runs = [judge(table, replace(
                 with_false(base, share, group, seed),
                 name=f'{base.name}, {100 * share:.0f} % {"groups" if group > 1 else "single"}, '
-                f'seed {seed}'), everything=False) for seed in range(seeds)]
+                f'seed {seed}'), everything=False, clean=clean.right) for seed in range(seeds)]
             name = f'{base.name}, {100 * share:.0f} % {"groups" if group > 1 else "single"}'
             section.metrics += [
                 Metric(f'{name}: rms over that without', max(
@@ -361,7 +369,8 @@ def _for_peers(options: Options) -> list[Recording]:
     files = [options.data / name for name in M3500]
     base = (read_recording(*files) if all(path.exists() for path in files)
             else of_world(streets.grid()))
-    mixes = [(0.3, 10)] if options.quick else [(0.1, 1), (0.5, 1), (0.3, 10)]
+    # with more wrong ones GTSAM takes many minutes
+    mixes = [] if options.quick else [(0.1, 1), (0.1, 10)]
     found += [replace(with_false(base, share, group, 0), name=f'{base.name}, {100 * share:.0f} % '
                       f'{"groups" if group > 1 else "single"}') for share, group in mixes]
     return [*found, place_recognition(OFFICE, LOOSE, 2.5, 0)]
