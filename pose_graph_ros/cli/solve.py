@@ -1,9 +1,14 @@
 # Copyright 2026 The pose_graph_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""Optimise a g2o file, and print the constraints with the largest energies."""
+"""
+Optimise a g2o file, and print the constraints with the largest energies.
+
+With `--robust` wrong loop closures are found first. A file that is written then has them as
+comments, so that other programs read the graph without them.
+"""
 
 import argparse
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
 import re
@@ -12,14 +17,17 @@ import time
 
 import numpy as np
 
+from pose_graph_ros.cli.believe import believe
 from pose_graph_ros.core.batch import optimizer
 from pose_graph_ros.core.batch.optimizer import BatchResult, Status
 from pose_graph_ros.core.config import SolverConfig
 from pose_graph_ros.core.elimination import symbolic
-from pose_graph_ros.core.geometry.se2 import IntArray
+from pose_graph_ros.core.geometry.se2 import FloatArray, IntArray
 from pose_graph_ros.core.graph.constraints import ObservedKind, ObservedNodes
+from pose_graph_ros.core.graph.error_functions import edge_errors, energies as energies_of
 from pose_graph_ros.core.graph.graph import Graph, GraphUpdate
 from pose_graph_ros.core.io.g2o import EDGE2_ORDERS, GraphFile, read_g2o, write_g2o
+from pose_graph_ros.core.judgement import selection
 
 N_LARGEST = 5  # number of edges, of observed nodes, and of names, that are printed
 N_TAGS = 10  # number of warnings of tags
@@ -34,6 +42,13 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument('--start', choices=('chordal', 'file'), default='chordal',
                         help='start from the constraints or from the poses in the file '
                              '(default: %(default)s)')
+    parser.add_argument('--robust', action='store_true',
+                        help='decide which loop closures (edges between ids that are no '
+                             'neighbours) to believe, and leave the others out')
+    parser.add_argument('--closure-sigma', nargs=2, type=float, metavar=('M', 'RAD'),
+                        default=(float(selection.FLOORS[0]), float(selection.FLOORS[2])),
+                        help='least standard deviations of loop closures for this decision '
+                             '(default: %(default)s); the result has those of the file')
     parser.add_argument('--edge2', choices=EDGE2_ORDERS,
                         help='format of the tag EDGE2 in this file')
 
@@ -53,7 +68,8 @@ def execute(options: argparse.Namespace) -> int:
         print(f'nothing held {len(held)} more parts of the graph; now their first nodes are '
               f'fixed: {_listed(file.ids[held])}')
     start = time.monotonic()
-    result = _solve(graph, optimizer.optimize if options.start == 'file'
+    doubted = _doubt(file, options.closure_sigma) if options.robust else np.empty(0, np.int64)
+    result = _solve(graph, optimizer.optimize if options.start == 'file' or options.robust
                     else optimizer.optimize_from_linear_start)
     reason = re.sub(r'hidden node (\d+)', lambda node: f'hidden node {file.ids[int(node[1])]}',
                     result.reason)
@@ -61,15 +77,48 @@ def execute(options: argparse.Namespace) -> int:
           f'from the {result.start.value}, {time.monotonic() - start:.3f} s'
           f'{": " if reason else ""}{reason}')
     energies = graph.energies()
-    for k in np.argsort(energies.edges)[::-1][:N_LARGEST]:
+    for k in _largest(energies.edges, doubted):
         print(f'  edge {file.ids[graph.edges.i[k]]} -> {file.ids[graph.edges.j[k]]}: '
               f'energy {energies.edges[k]:.4g}')
     for k in np.argsort(energies.observed)[::-1][:N_LARGEST]:
         print(f'  observed node on {file.ids[graph.observed.node[k]]}: '
               f'energy {energies.observed[k]:.4g}')
     if options.out is not None:
-        write_g2o(graph, options.out, file.ids)
+        write_g2o(graph, options.out, file.ids, doubted)
     return 0 if result.status is Status.CONVERGED else 1
+
+
+def _doubt(file: GraphFile, sigma: Sequence[float]) -> IntArray:
+    """Give the closures that are not believed the weight 0; print and return their rows."""
+    graph = file.graph
+    beliefs = believe(graph, np.array([sigma[0], sigma[0], sigma[1]]))
+    if beliefs is None:
+        print('warning: there is no set of loop closures with a solution; all are believed',
+              file=sys.stderr)
+        return np.empty(0, np.int64)
+    if beliefs.n_parts > 1:
+        print(f'odometry, edges between neighbouring ids, leaves {beliefs.n_parts} parts; loop '
+              f'closures that join them are believed')
+    doubted = beliefs.closures[~beliefs.believed]
+    print(f'{len(beliefs.closures)} loop closures: {int(np.sum(beliefs.believed))} believed, '
+          f'{len(doubted)} doubted')
+    graph.set_poses(beliefs.poses)
+    graph.apply(GraphUpdate(remove_edges=doubted.tolist()))
+    edges = graph.edges_at(doubted)
+    errors = edge_errors(graph.poses, edges)
+    squares = energies_of(errors, edges.information)
+    for k in np.argsort(-squares, kind='stable')[:N_LARGEST]:
+        x, y, theta = errors[k]
+        print(f'  doubted edge {file.ids[edges.i[k]]} -> {file.ids[edges.j[k]]}: '
+              f'{np.hypot(x, y):.3g} m and {abs(theta):.3g} rad off, {np.sqrt(squares[k]):.3g} '
+              f'sigma')
+    return doubted
+
+
+def _largest(energies: FloatArray, left_out: IntArray) -> IntArray:
+    """Return the rows with the largest energies, without some of them."""
+    order = np.argsort(energies)[::-1]
+    return np.asarray(order[~np.isin(order, left_out)][:N_LARGEST])
 
 
 def _skipped(path: Path, file: GraphFile) -> list[str]:

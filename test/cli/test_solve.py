@@ -7,11 +7,13 @@ import json
 from pathlib import Path
 import re
 
+from false_loops import laps
 import numpy as np
 import pytest
 from random_graphs import corridor_graph
 
 from pose_graph_ros.cli.main import main
+from pose_graph_ros.core.graph.graph import Graph
 from pose_graph_ros.core.io.g2o import read_g2o, write_g2o
 
 DATA = Path(__file__).resolve().parents[1] / 'data'
@@ -243,6 +245,102 @@ def test_at_most_five_of_each_are_named(capsys: pytest.CaptureFixture[str]) -> N
     lines = capsys.readouterr().out.splitlines()
     assert sum(line.startswith('  edge ') for line in lines) == 5
     assert sum(line.startswith('  observed node ') for line in lines) == 5
+
+
+# --- Wrong loop closures ---------------------------------------------------------------------
+
+def shuffled(path: Path, seed: int) -> None:
+    """Write the lines of a file in another order."""
+    lines = path.read_text(encoding='ascii').splitlines()
+    np.random.default_rng(seed).shuffle(lines)
+    path.write_text('\n'.join(lines) + '\n', encoding='ascii')
+
+
+@pytest.mark.parametrize('order', ['as it was', 'shuffled'])
+def test_wrong_closures_are_found_and_left_out(
+    order: str, tmp_path: Path, capsys: pytest.CaptureFixture[str],
+) -> None:
+    drive = laps(1, n_wrong=5, groups=(6,))
+    path, out = tmp_path / 'laps.g2o', tmp_path / 'out.g2o'
+    names = 10 * np.arange(drive.graph.n_nodes) + 7
+    write_g2o(drive.graph, path, names)
+    if order == 'shuffled':
+        shuffled(path, 3)
+    assert main(['solve', str(path), '--robust', '-o', str(out)]) == 0
+    lines = capsys.readouterr().out.splitlines()
+    assert lines[1] == '31 loop closures: 20 believed, 11 doubted'
+    wrong = drive.graph.edges_at(drive.closures[~drive.right])
+    ends = {(7 + 10 * i, 7 + 10 * j) for i, j in zip(wrong.i, wrong.j, strict=True)}
+    named = re.findall(
+        r'(?m)^  doubted edge (\d+) -> (\d+): (\S+) m and (\S+) rad off, (\S+) sigma$',
+        '\n'.join(lines))
+    assert len(named) == 5
+    assert {(int(i), int(j)) for i, j, *_ in named} <= ends
+    sigmas = [float(one[-1]) for one in named]
+    assert sigmas == sorted(sigmas, reverse=True)
+    # other programs read a graph without them
+    file = read_g2o(out)
+    assert len(file.graph.edges) == len(drive.graph.edges) - 11
+    assert drive.error(file.graph.poses) < 0.5
+    comments = re.findall(r'(?m)^# doubted EDGE_SE2 (\d+) (\d+) ', out.read_text(encoding='ascii'))
+    assert {(int(i), int(j)) for i, j in comments} == ends
+    # the optimum is that of the file's own numbers
+    assert main(['solve', str(out)]) == 0
+    again = printed_chi2(capsys.readouterr().out.splitlines())
+    assert printed_chi2(lines) == pytest.approx(again, rel=1e-6)
+
+
+def test_closures_join_what_odometry_does_not(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str],
+) -> None:
+    drive = laps(2, n_laps=4, n_wrong=6)
+    graph, cut = drive.graph, 60
+    gone = np.flatnonzero((graph.edges.i == cut) & (graph.edges.j == cut + 1))
+    path, out = tmp_path / 'parts.g2o', tmp_path / 'out.g2o'
+    rows, parts = graph.rows(), Graph()
+    parts.fill(rows._replace(edges=rows.edges.rows(
+        np.setdiff1d(np.arange(len(rows.edges)), gone))))
+    write_g2o(parts, path)
+    assert main(['solve', str(path), '--robust', '-o', str(out)]) == 0
+    printed = capsys.readouterr().out
+    assert 'leaves 2 parts; loop closures that join them are believed' in printed
+    assert '36 loop closures: 30 believed, 6 doubted' in printed
+    assert drive.error(read_g2o(out).graph.poses) < 1.0
+
+
+def test_nothing_is_doubted_where_nothing_contradicts(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str],
+) -> None:
+    for name in ('manhattan.g2o', 'ring.g2o'):
+        out = tmp_path / name
+        assert main(['solve', str(DATA / name), '--robust', '-o', str(out)]) == 0
+        printed = capsys.readouterr().out
+        assert re.search(r'(\d+) loop closures: \1 believed, 0 doubted', printed)
+        assert printed_chi2(printed.splitlines()) == pytest.approx(
+            GOLDEN[name]['chi2'], rel=SAME_CHI2)
+        assert 'doubted' not in out.read_text(encoding='ascii')
+
+
+def test_the_least_sigma_of_a_closure_can_be_chosen(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str],
+) -> None:
+    path = tmp_path / 'laps.g2o'
+    write_g2o(laps(1, n_wrong=5).graph, path)
+    doubted = []
+    for option in ([], ['--closure-sigma', '0', '0'], ['--closure-sigma', '50', '3']):
+        assert main(['solve', str(path), '--robust', *option]) == 0
+        printed = capsys.readouterr().out
+        doubted.append(int(re.search(r'(\d+) doubted', printed)[1]))
+    assert doubted == [5, 5, 0]
+
+
+@pytest.mark.parametrize('name', LOOSE)
+def test_there_is_a_robust_answer_wherever_there_is_a_graph(
+    name: str, tmp_path: Path, capsys: pytest.CaptureFixture[str],
+) -> None:
+    path = write(tmp_path / 'graph.g2o', LOOSE[name][0])
+    assert main(['solve', str(path), '--robust']) == 0
+    assert 'converged' in capsys.readouterr().out
 
 
 @pytest.mark.parametrize(('text', 'said'), [

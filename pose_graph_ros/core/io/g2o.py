@@ -32,6 +32,7 @@ sensors, constraints in space. So are the lines `EQUIV i j` of TORO: they allow 
 nodes that an edge of the file connects, and add nothing to that edge.
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import NoReturn
@@ -320,7 +321,9 @@ def _refused_line(
     return str(path)
 
 
-def write_g2o(graph: Graph, path: Path, ids: IntArray | None = None) -> None:
+def write_g2o(
+    graph: Graph, path: Path, ids: IntArray | None = None, doubted: Sequence[int] | IntArray = (),
+) -> None:
     """
     Write a graph so that its numbers read back bit for bit.
 
@@ -329,9 +332,16 @@ def write_g2o(graph: Graph, path: Path, ids: IntArray | None = None) -> None:
     graph : Graph
     path : Path
     ids : ndarray, shape (N,), optional, id of each hidden node; by default its row in the graph
+    doubted : sequence of int, rows of edges that become comments, `# doubted EDGE_SE2 ...`
 
     """
-    path.write_text(g2o_text(graph.rows(), ids), encoding='ascii')
+    rows = graph.rows()
+    ids = np.arange(len(rows.poses)) if ids is None else ids
+    kept = np.ones(len(rows.edges), dtype=bool)
+    kept[np.asarray(doubted, dtype=np.int64)] = False
+    comments = [f'# doubted {line}\n' for line in _edge_lines(rows.edges.rows(~kept), ids)]
+    path.write_text(g2o_text(rows._replace(edges=rows.edges.rows(kept)), ids) + ''.join(comments),
+                    encoding='ascii')
 
 
 def g2o_text(rows: GraphRows, ids: IntArray | None = None) -> str:
@@ -355,10 +365,13 @@ def g2o_text(rows: GraphRows, ids: IntArray | None = None) -> str:
     lines += [f'VERTEX_SE2 {name} {numbers}' for name, numbers in zip(
         ids[is_pose].tolist(), _texts(rows.poses[is_pose]), strict=True)]
     lines += [f'FIX {name}' for name in ids[rows.fixed & is_pose].tolist()]
-    lines += [f'EDGE_SE2 {i} {j} {numbers}' for i, j, numbers in zip(
+    return '\n'.join([*lines, *_edge_lines(edges, ids), *_observed_lines(observed, ids)]) + '\n'
+
+
+def _edge_lines(edges: Edges, ids: IntArray) -> list[str]:
+    return [f'EDGE_SE2 {i} {j} {numbers}' for i, j, numbers in zip(
         ids[edges.i].tolist(), ids[edges.j].tolist(),
         _texts(np.hstack((edges.mean, upper(edges.information)))), strict=True)]
-    return '\n'.join([*lines, *_observed_lines(observed, ids)]) + '\n'
 
 
 def _observed_lines(observed: ObservedNodes, ids: IntArray) -> list[str]:

@@ -1,0 +1,177 @@
+# Copyright 2026 The pose_graph_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""
+Least squares with some constraints that may be wrong: which of them to believe.
+
+The *truncated cost* of a set of believed constraints is
+
+    chi2 of all that is known to be right  +  sum over the others of min(r^2, c^2)
+
+at the poses that minimise chi2 of what is known and of the set. r^2 is the energy of a constraint,
+c^2 the value that 99 % of the energies of right ones are below. It compares sets of any size: one
+more believed constraint pays if all together bend by less than c^2 for it.
+
+Each set is solved for from the same start, because the minimum that Gauss-Newton ends in after
+wrong constraints have bent the graph may be a tangle even where they are all gone again.
+"""
+
+from dataclasses import dataclass
+from typing import Final
+
+import numpy as np
+
+from pose_graph_ros.core.batch.optimizer import chi2_of, optimize, Status
+from pose_graph_ros.core.config import SolverConfig
+from pose_graph_ros.core.geometry.se2 import BoolArray, FloatArray, IntArray
+from pose_graph_ros.core.graph.error_functions import edge_errors, energies, observed_errors
+from pose_graph_ros.core.graph.graph import Graph, GraphUpdate
+
+# Value that 99 % of the energies of right constraints are below, by the rank of the information.
+LIMITS: Final = np.array([0.0, 6.635, 9.210, 11.345])
+# Of a set that is compared, and of a step on the way to one.
+CONFIG = SolverConfig(max_iterations=60, step_tolerance=1e-6)
+ROUGH = SolverConfig(max_iterations=15, step_tolerance=1e-4)
+# Eigenvalue of an information matrix with unit diagonal above which it counts for the rank.
+_RANK = 1e-9
+
+# Maximum number of sets that a retest leads to.
+RETESTS = 20
+
+_NONE: Final[IntArray] = np.empty(0, dtype=np.int64)
+
+
+@dataclass(frozen=True, slots=True)
+class Choice:
+    """A set of believed constraints."""
+
+    believed: BoolArray
+    """Of the constraints that may be wrong, shape (M,)."""
+    energies: FloatArray
+    """r^2 of the same at the poses, shape (M,) [sigma^2]."""
+    cost: float
+    """The truncated cost [sigma^2]."""
+    poses: FloatArray
+    """Those that minimise chi2 of what is believed, shape (N, 3) [m, m, rad]."""
+
+
+class TruncatedProblem:
+    """
+    A graph with constraints that may be wrong. Their weights and its poses are for trying.
+
+    Parameters
+    ----------
+    graph : Graph
+        It is changed. The information of what may be wrong is that to decide by.
+    edges, observed : ndarray of int, shape (K,), rows of what may be wrong, without repetition
+    start : ndarray, shape (N, 3), optional
+        Where each solution starts; by default the minimum of chi2 of all that is right, from the
+        poses of the graph.
+
+    """
+
+    def __init__(
+        self, graph: Graph, edges: IntArray, observed: IntArray = _NONE,
+        start: FloatArray | None = None,
+    ) -> None:
+        self.graph = graph
+        self._edge_rows, self._observed_rows = edges, observed
+        self.edges, self.observed = graph.edges_at(edges), graph.observed_at(observed)
+        """What may be wrong; their weights have no meaning."""
+        self.limits = LIMITS[_ranks(np.concatenate(
+            (self.edges.information, self.observed.information)))]
+        """c^2 of each constraint, edges first, shape (M,)."""
+        self._weights = np.concatenate((self.edges.weight, self.observed.weight))
+        self._start = graph.poses.copy() if start is None else start
+        if start is None and self.solve(np.zeros(len(self)), CONFIG):
+            self._start = graph.poses.copy()
+
+    def __len__(self) -> int:
+        return len(self.limits)
+
+    def solve(
+        self, weights: FloatArray, config: SolverConfig = ROUGH, *, go_on: bool = False,
+    ) -> bool:
+        """
+        Return whether the graph could be moved from the start to the minimum for some weights.
+
+        Parameters
+        ----------
+        weights : ndarray, shape (M,), of what may be wrong
+        config : SolverConfig
+        go_on : bool, whether to start from the present poses instead
+
+        """
+        self._weigh(weights)
+        if not go_on:
+            self.graph.set_poses(self._start)
+        return optimize(self.graph, config).status is not Status.FAILED
+
+    def energies(self) -> FloatArray:
+        """Return r^2 at the present poses, shape (M,)."""
+        poses = self.graph.poses
+        return np.concatenate((
+            energies(edge_errors(poses, self.edges), self.edges.information),
+            energies(observed_errors(poses, self.observed), self.observed.information)))
+
+    def errors(self, numbers: IntArray) -> FloatArray:
+        """Return the errors of some constraints at the present poses, shape (K, 3)."""
+        poses, n = self.graph.poses, len(self.edges)
+        is_edge, errors = numbers < n, np.empty((len(numbers), 3))
+        errors[is_edge] = edge_errors(poses, self.edges.rows(numbers[is_edge]))
+        errors[~is_edge] = observed_errors(poses, self.observed.rows(numbers[~is_edge] - n))
+        return errors
+
+    def choice(self, believed: BoolArray, config: SolverConfig = CONFIG) -> Choice | None:
+        """
+        Return a set with its cost; None if it leaves a node undetermined.
+
+        Parameters
+        ----------
+        believed : ndarray of bool, shape (M,)
+        config : SolverConfig
+
+        """
+        if not self.solve(believed.astype(np.float64), config):
+            return None
+        squares = self.energies()
+        known = chi2_of(self.graph) - float(np.sum(squares[believed]))
+        cost = known + float(np.sum(np.minimum(squares, self.limits)))
+        return Choice(believed.copy(), squares, cost, self.graph.poses.copy())
+
+    def improved(self, choice: Choice) -> Choice:
+        """
+        Return a set that no retest lowers the cost of.
+
+        All that is within its limit at the poses of the set is believed, and nothing else, as long
+        as that lowers the cost.
+        """
+        for _ in range(RETESTS):
+            believed = choice.energies <= self.limits
+            if np.array_equal(believed, choice.believed):
+                break
+            other = self.choice(believed)
+            if other is None or other.cost >= choice.cost:
+                break
+            choice = other
+        return choice
+
+    def _weigh(self, weights: FloatArray) -> None:
+        changed = np.flatnonzero(weights != self._weights)
+        n = len(self._edge_rows)
+        edges, observed = changed[changed < n], changed[changed >= n]
+        self.graph.apply(GraphUpdate(
+            weigh_edges=dict(zip(
+                self._edge_rows[edges].tolist(), weights[edges].tolist(), strict=True)),
+            weigh_observed=dict(zip(
+                self._observed_rows[observed - n].tolist(), weights[observed].tolist(),
+                strict=True))))
+        self._weights = weights.copy()
+
+
+def _ranks(information: FloatArray) -> IntArray:
+    """Return the ranks of information matrices, shape (M,), whatever units they have."""
+    diagonal = np.einsum('mii->mi', information)
+    root = np.sqrt(np.where(diagonal > 0.0, diagonal, 1.0))
+    scaled = information / root[:, :, None] / root[:, None, :]
+    ranks: IntArray = np.sum(np.linalg.eigvalsh(scaled) > _RANK, axis=1)
+    return ranks

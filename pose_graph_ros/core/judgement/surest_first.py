@@ -1,0 +1,185 @@
+# Copyright 2026 The pose_graph_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""
+A set of believed constraints of a whole graph: the surest ones first.
+
+With S the covariance of the error that a constraint would have by what is believed already, it
+passes the gate if `e^T S^-1 e` is small. A wrong one, whose error could be anything, passes with a
+chance that is proportional to the volume of the gate, and so to sqrt(det S). So constraints are
+believed in the order of this volume: first those that span little odometry, then those that these
+make sure. Wrong ones meet a narrow gate in the end, also where many of them agree with each other.
+Closures that no neighbour agrees with come later than others of the same volume.
+
+What is believed also shows how large errors really are. Where covariances are far too large, the
+limits are lowered; else a wrong constraint would fit wherever the graph is claimed to be soft.
+"""
+
+import numpy as np
+
+from pose_graph_ros.core.batch.truncated import LIMITS, TruncatedProblem
+from pose_graph_ros.core.geometry.se2 import BoolArray, FloatArray, IntArray
+from pose_graph_ros.core.graph.constraints import EdgeKind
+from pose_graph_ros.core.judgement.consistency import Closures, OdometryChain
+from pose_graph_ros.core.smoother import innovations
+from pose_graph_ros.core.smoother.innovations import Innovations
+
+# Factor on the volume of the surest constraint that passes, up to which others count as equal.
+ROUND = 4.0
+# Maximum number of rounds.
+ROUNDS = 200
+# Factor on the volume by the number of neighbours that agree: none, one, more.
+ALONE = (1000.0, 30.0, 1.0)
+# Closures are neighbours if both ends are within this of each other, along the path [m].
+NEAR = 10.0
+# Maximum number of closures that one is compared with, in one direction.
+MOST_COMPARED = 200
+# A constraint that was thrown out this often is doubted.
+THROWN_OUT = 2
+# Number of believed constraints that lower the limits, share of them and its chi2 with three
+# degrees of freedom, the factor that the limits keep above what they show, and the least limits.
+ENOUGH, SHARE, SHARE_LIMIT = 50, 0.9, 6.25
+MARGIN, LEAST_SCALE = 3.0, 0.02
+# Volumes shrink: those above this times the volume of the round are not looked at in it.
+REACH = 20.0
+# Number of those with the smallest volumes, at least, that are looked at before all others.
+SOME = 200
+# What is not measured of an error could be anything within this [m, m, rad].
+EXTENT = np.array([100.0, 100.0, 2.0 * np.pi])
+
+
+def select(problem: TruncatedProblem) -> BoolArray | None:
+    """
+    Return a set of believed constraints, shape (M,), and lower the limits of the problem.
+
+    None if the graph cannot be solved without any of them.
+    """
+    believed = np.zeros(len(problem), dtype=bool)
+    if not problem.solve(believed.astype(np.float64)):
+        return None
+    gates = _Gates(problem)
+    thrown = np.zeros(len(problem), dtype=np.int64)
+    seen, scale, level = np.zeros(len(problem)), 1.0, 0.0
+    for _ in range(ROUNDS):
+        waiting = np.flatnonzero(~believed & (thrown < THROWN_OUT))
+        passing = gates.passing(waiting, scale, REACH * level)
+        if not np.any(gates.volume[passing] <= level):
+            some = np.sort(gates.volume[waiting])[:max(SOME, len(waiting) // 4)]
+            passing = gates.passing(waiting, scale, float(some[-1]) if len(some) > 0 else 0.0)
+            if len(passing) == 0:
+                passing = gates.passing(waiting, scale, np.inf)
+            if len(passing) == 0:
+                break
+            level = max(level, ROUND * float(np.min(gates.volume[passing])))
+        new = passing[gates.volume[passing] <= level]
+        seen[new] = gates.share[new]
+        believed[new] = True
+        if np.sum(believed) >= ENOUGH:
+            shown = float(np.quantile(seen[believed], SHARE)) * LIMITS[3] / SHARE_LIMIT
+            scale = min(max(MARGIN * shown, LEAST_SCALE), 1.0)
+        if not problem.solve(believed.astype(np.float64), go_on=True):
+            return None
+        wrong = believed & (problem.energies() > problem.limits)
+        if np.any(wrong):
+            thrown[wrong] += 1
+            believed[wrong] = False
+            if not problem.solve(believed.astype(np.float64), go_on=True):
+                return None
+    problem.limits = scale * problem.limits
+    return believed
+
+
+class _Gates:
+    """The gates of all constraints of a problem, as they were when each was last computed."""
+
+    def __init__(self, problem: TruncatedProblem) -> None:
+        self._problem = problem
+        self._information = np.concatenate(
+            (problem.edges.information, problem.observed.information))
+        measured = np.einsum('mii->mi', self._information) > 0.0
+        filled = self._information + np.einsum('mi,ij->mij', ~measured, np.eye(3))
+        with np.errstate(divide='ignore'):
+            own = np.prod(np.where(measured, 1.0, EXTENT), axis=1) / np.sqrt(
+                np.abs(np.linalg.det(filled)))
+        self._own = own * np.asarray(ALONE)[np.minimum(_agreeing(problem), 2)]
+        self._covariances = np.full((len(problem), 3, 3), np.nan)
+        """J P J^T of each; they never grow while more is believed."""
+        self.volume = np.zeros(len(problem))
+        self.share = np.zeros(len(problem))
+        """Squared Mahalanobis distance, in limits."""
+
+    def passing(self, waiting: IntArray, scale: float, reach: float) -> IntArray:
+        """
+        Return those that pass their gates.
+
+        Parameters
+        ----------
+        waiting : ndarray of int, shape (K,), numbers of constraints
+        scale : float, factor on the limits
+        reach : float, volume that was computed last above which one is not looked at
+
+        """
+        near = waiting[self.volume[waiting] <= reach]
+        if len(near) == 0:
+            return near
+        # as S only shrinks, what is outside of an old gate is outside of the present one
+        old = np.nan_to_num(self._squared(near, self._problem.errors(near)), nan=0.0)
+        limits = scale * self._problem.limits
+        near = near[old <= limits[near]]
+        self._compute(near)
+        return near[self.share[near] <= scale]
+
+    def _squared(self, numbers: IntArray, errors: FloatArray) -> FloatArray:
+        return Innovations(errors, self._covariances[numbers]).squared_distances(
+            self._information[numbers])
+
+    def _compute(self, numbers: IntArray) -> None:
+        """Compute gates by the present cliques."""
+        problem, n_edges = self._problem, len(self._problem.edges)
+        head = problem.graph.memory.head
+        errors, covariances = np.empty((len(numbers), 3)), np.zeros((len(numbers), 3, 3))
+        is_edge = numbers < n_edges
+        edges = problem.edges.rows(numbers[is_edge])
+        part = np.empty((len(edges), 3)), np.zeros((len(edges), 3, 3))
+        innovations.of_edges(head, *map(np.ascontiguousarray, (
+            edges.i, edges.j, edges.mean, edges.kind, edges.bias)), *part)
+        errors[is_edge], covariances[is_edge] = part
+        observed = problem.observed.rows(numbers[~is_edge] - n_edges)
+        part = np.empty((len(observed), 3)), np.zeros((len(observed), 3, 3))
+        innovations.of_observed(head, *map(np.ascontiguousarray, (
+            observed.node, observed.offset, observed.mean)), *part)
+        errors[~is_edge], covariances[~is_edge] = part
+        self._covariances[numbers] = covariances
+        self.share[numbers] = self._squared(numbers, errors) / problem.limits[numbers]
+        grown = np.linalg.det(np.eye(3) + covariances @ self._information[numbers])
+        self.volume[numbers] = self._own[numbers] * np.sqrt(np.maximum(grown, 1.0))
+
+
+def _agreeing(problem: TruncatedProblem) -> IntArray:
+    """Return for each constraint the number of neighbouring closures that agree with it."""
+    closures, chain = problem.edges, OdometryChain()
+    count = np.zeros(len(problem), dtype=np.int64)
+    usable = np.flatnonzero((closures.kind == EdgeKind.LOOP_CLOSURE)
+                            & np.all(np.einsum('mii->mi', closures.information) > 0.0, axis=1))
+    chain.extend(problem.graph)
+    if len(usable) == 0 or len(chain) < 2:
+        return count
+    ends = chain.travel(np.concatenate((closures.i[usable], closures.j[usable]))).reshape(2, -1)
+    first, second = np.min(ends, axis=0), np.max(ends, axis=0)
+    order = np.argsort(first, kind='stable')
+    first, second, usable = first[order], second[order], usable[order]
+    pairs = []
+    for shift in range(1, min(len(usable), MOST_COMPARED)):
+        close = np.flatnonzero(first[shift:] - first[:-shift] <= NEAR)
+        if len(close) == 0:
+            break
+        close = close[np.abs(second[close + shift] - second[close]) <= NEAR]
+        pairs.append(np.column_stack((close, close + shift)))
+    if len(pairs) == 0:
+        return count
+    a, b = np.concatenate(pairs).T
+    noise = np.asarray(np.linalg.inv(closures.information[usable]), dtype=np.float64)
+    table = Closures(closures.i[usable], closures.j[usable], closures.mean[usable], noise)
+    agree = chain.squared_distances(table, a, b) <= LIMITS[3]
+    np.add.at(count, usable[a[agree]], 1)
+    np.add.at(count, usable[b[agree]], 1)
+    return count

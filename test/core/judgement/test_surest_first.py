@@ -1,0 +1,147 @@
+# Copyright 2026 The pose_graph_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""Which constraints of a whole graph are believed when the surest ones come first."""
+
+from false_loops import Drive, laps
+import numpy as np
+import pytest
+
+from pose_graph_ros.core.batch.truncated import TruncatedProblem
+from pose_graph_ros.core.geometry import se2
+from pose_graph_ros.core.graph.constraints import Edges, ObservedKind, ObservedNodes
+from pose_graph_ros.core.graph.error_functions import edge_errors, energies
+from pose_graph_ros.core.graph.graph import Graph, GraphUpdate
+from pose_graph_ros.core.judgement import selection, surest_first
+from pose_graph_ros.core.smoother.incremental import IncrementalSmoother
+
+
+def believed(drive: Drive) -> list[bool]:
+    problem = TruncatedProblem(drive.graph, drive.closures)
+    return list(surest_first.select(problem))
+
+
+@pytest.mark.parametrize('seed', range(4))
+@pytest.mark.parametrize(('n_wrong', 'groups'), [(0, ()), (20, ()), (0, (6, 6, 6)), (6, (10,))])
+def test_the_right_closures_are_found(seed: int, n_wrong: int, groups: tuple[int, ...]) -> None:
+    drive = laps(seed, n_wrong=n_wrong, groups=groups)
+    found = np.array(believed(drive))
+    assert not np.any(found & ~drive.right)
+    assert np.sum(found) >= 0.9 * np.sum(drive.right)
+    problem = TruncatedProblem(drive.graph, drive.closures)
+    choice = selection.best(problem)
+    assert not np.any(choice.believed & ~drive.right)
+    assert drive.error(choice.poses) < 1.0
+
+
+@pytest.mark.parametrize('seed', range(3))
+def test_the_order_of_the_rows_does_not_matter(seed: int) -> None:
+    drive = laps(seed, n_wrong=10, groups=(5,))
+    order = np.random.default_rng(seed).permutation(len(drive.graph.edges))
+    rows, shuffled = drive.graph.rows(), Graph()
+    shuffled.fill(rows._replace(edges=rows.edges.rows(order)))
+    place = np.argsort(order)
+    problem = TruncatedProblem(shuffled, place[drive.closures])
+    assert list(surest_first.select(problem)) == believed(drive)
+
+
+def test_wrong_fixes_are_found_as_well() -> None:
+    drive = laps(2, n_laps=2, n_wrong=4)
+    n = drive.graph.n_nodes
+    nodes = np.arange(0, n, 3)
+    mean = drive.truth[nodes] + np.random.default_rng(2).normal(
+        0.0, [0.3, 0.3, 0.0], (len(nodes), 3))
+    wrong = np.arange(len(nodes)) % 4 == 1
+    mean[wrong, 0] += 12.0
+    mean[:, 2] = 0.0
+    drive.graph.apply(GraphUpdate(observed=ObservedNodes(
+        nodes, None, mean, np.tile(np.diag([11.0, 11.0, 0.0]), (len(nodes), 1, 1)),
+        [ObservedKind.POSITION] * len(nodes))))
+    problem = TruncatedProblem(drive.graph, drive.closures, np.arange(len(nodes)))
+    choice = selection.best(problem)
+    found = choice.believed[len(drive.closures):]
+    assert not np.any(found & wrong)
+    assert np.mean(found[~wrong]) > 0.9
+    np.testing.assert_array_equal(choice.believed[:len(drive.closures)], drive.right)
+
+
+def test_a_gate_is_that_of_the_smoother() -> None:
+    drive = laps(1, n_wrong=3)
+    problem = TruncatedProblem(drive.graph, drive.closures)
+    none = np.zeros(len(problem))
+    problem.solve(none)
+    gates = surest_first._Gates(problem)
+    everything = np.arange(len(problem))
+    gates.passing(everything, 1e9, np.inf)
+    smoother = IncrementalSmoother()
+    smoother.graph.fill(problem.graph.rows())
+    smoother.update(GraphUpdate())
+    edges = problem.edges
+    for k, (i, j) in enumerate(zip(edges.i, edges.j, strict=True)):
+        joint = smoother.joint_covariance(i, j)
+        jacobian = _jacobian(problem.graph.poses, edges.rows(slice(k, k + 1)))
+        S = jacobian @ joint @ jacobian.T + np.linalg.inv(edges.information[k])
+        error = edge_errors(problem.graph.poses, edges.rows(slice(k, k + 1)))[0]
+        assert gates.share[k] * problem.limits[k] == pytest.approx(
+            error @ np.linalg.solve(S, error), rel=1e-5)
+        # apart from the factor for those without neighbours
+        ratio = gates.volume[k] / np.sqrt(np.linalg.det(S))
+        assert min(abs(ratio / factor - 1.0) for factor in surest_first.ALONE) < 1e-5
+
+
+def _jacobian(poses: np.ndarray, edge: Edges) -> np.ndarray:
+    """Return the Jacobian of an edge's error by both ends, by differences, shape (3, 6)."""
+    columns = []
+    for node in (edge.i[0], edge.j[0]):
+        for k in range(3):
+            moved = [poses.copy(), poses.copy()]
+            for sign, each in zip((-1.0, 1.0), moved, strict=True):
+                each[node, k] += sign * 1e-6
+            low, high = (edge_errors(each, edge)[0] for each in moved)
+            columns.append((high - low) / 2e-6)
+    return np.array(columns).T
+
+
+def test_limits_fall_where_covariances_are_far_too_large() -> None:
+    drive = laps(0, n_laps=8, every=2)
+    rows, loose = drive.graph.rows(), Graph()
+    edges = rows.edges
+    loose.fill(rows._replace(edges=Edges(
+        edges.i, edges.j, edges.mean, 0.01 * edges.information, edges.kind)))
+    for graph, low, high in ((drive.graph, 0.5, 1.0), (loose, 0.01, 0.1)):
+        problem = TruncatedProblem(graph, drive.closures)
+        before = problem.limits.copy()
+        assert np.mean(surest_first.select(problem)) > 0.95
+        assert low <= np.max(problem.limits / before) <= high
+
+
+# --- Information for decisions ---------------------------------------------------------------
+
+def test_floors_raise_variances_and_leave_what_is_not_measured() -> None:
+    rng = np.random.default_rng(0)
+    root = rng.normal(0.0, 1.0, (20, 3, 3)) * 0.3
+    covariance = root @ root.transpose(0, 2, 1) + 1e-4 * np.eye(3)
+    edges = Edges(np.zeros(20, int), np.ones(20, int), np.zeros((20, 3)),
+                  np.linalg.inv(covariance), [1] * 20)
+    expected = covariance.copy()
+    diagonal = np.einsum('mii->mi', expected)
+    np.maximum(diagonal, selection.FLOORS**2, out=diagonal)
+    softened = selection.floored(edges)
+    np.testing.assert_allclose(np.linalg.inv(softened.information), expected, rtol=1e-6, atol=1e-9)
+    heading = Edges([0], [1], np.zeros((1, 3)), [np.diag([0.0, 0.0, 1e6])], [1])
+    np.testing.assert_allclose(
+        selection.floored(heading).information[0], np.diag([0.0, 0.0, 400.0]), rtol=1e-3)
+
+
+def test_an_edge_that_is_turned_round_has_the_same_energy() -> None:
+    rng = np.random.default_rng(1)
+    poses = rng.normal(0.0, 3.0, (2, 3))
+    mean = se2.between(poses[1], poses[0]) + rng.normal(0.0, 1e-5, 3)
+    root = rng.normal(0.0, 1.0, (3, 3))
+    edge = Edges([1], [0], mean[None], (root @ root.T)[None], [1])
+    turned = selection.forward(edge)
+    assert (turned.i[0], turned.j[0]) == (0, 1)
+    before, after = (energies(edge_errors(poses, each), each.information)
+                     for each in (edge, turned))
+    assert after[0] == pytest.approx(before[0], rel=1e-3)
+    forward = selection.forward(turned)
+    assert forward is turned
