@@ -13,6 +13,7 @@ best poses are restored and lambda grows until a step, or half of it, lowers chi
 lowers chi2 reduces lambda, which is set to 0 below `LEAST_DAMPING` and after `DAMPED_STEPS`.
 """
 
+from collections.abc import Generator
 from enum import Enum
 import math
 from typing import NamedTuple
@@ -73,9 +74,11 @@ class Minimum(NamedTuple):
     chi2: float
 
 
-def minimize(head: tb.IntHead, chi2: float, config: SolverConfig) -> Minimum:
+def minimize(
+    head: tb.IntHead, chi2: float, config: SolverConfig,
+) -> Generator[None, None, Minimum]:
     """
-    Return the result of moving all nodes to a local minimum of chi2.
+    Return the result of moving all nodes to a local minimum of chi2, after a pause at each step.
 
     Unless the result is UNDETERMINED, the poses are those of the lowest chi2 found and the tables
     are in the state after a step of the smoother.
@@ -99,6 +102,7 @@ def minimize(head: tb.IntHead, chi2: float, config: SolverConfig) -> Minimum:
     n_damped = n_level = 0
     rounding, shortest, previous, last_damping = 0.0, math.inf, math.inf, 0.0
     while iterations < config.max_iterations:
+        yield
         trial = math.inf
         length = _step(head, damping, right, chord=chord)
         if length < math.inf:

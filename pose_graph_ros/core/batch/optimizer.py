@@ -8,7 +8,7 @@ these cliques (`levenberg_marquardt`). Afterwards the tables hold the cliques of
 poses, with which the incremental smoother can continue.
 """
 
-from collections.abc import Callable, Collection
+from collections.abc import Callable, Collection, Generator
 from dataclasses import dataclass, replace
 from enum import Enum
 
@@ -60,6 +60,8 @@ class BatchResult:
     start: Start = Start.PRESENT
 
 
+Parts = Generator[None, None, BatchResult]
+"""An optimisation that pauses after parts of at most an iteration; it returns the result."""
 Solve = Callable[[Graph, SolverConfig], BatchResult]
 """Function that optimises a graph in place, such as `optimize`."""
 
@@ -90,12 +92,39 @@ def optimize(graph: Graph, config: SolverConfig) -> BatchResult:
     if answer is not None:
         return answer
     poses = graph.poses.copy()
-    return _finished(graph, poses, chi2, _minimize(graph, config, _analysed(graph), chi2))
+    return _finished(graph, poses, chi2, to_the_end(
+        _minimize(graph, config, _analysed(graph), chi2)))
+
+
+def to_the_end(parts: Parts) -> BatchResult:
+    """Return the result of an optimisation after doing all of its parts."""
+    while True:
+        try:
+            next(parts)
+        except StopIteration as end:
+            result: BatchResult = end.value
+            return result
 
 
 def optimize_from_linear_start(
     graph: Graph, config: SolverConfig, starts: Collection[Start] = tuple(Start),
 ) -> BatchResult:
+    """
+    Return the result of `from_linear_start` without pauses.
+
+    Parameters
+    ----------
+    graph : Graph
+    config : SolverConfig
+    starts : collection of Start
+
+    """
+    return to_the_end(from_linear_start(graph, config, starts))
+
+
+def from_linear_start(
+    graph: Graph, config: SolverConfig, starts: Collection[Start] = tuple(Start),
+) -> Parts:
     """
     Return the result of moving the hidden nodes to a minimum from a start without initial poses.
 
@@ -116,6 +145,7 @@ def optimize_from_linear_start(
     poses, cliques = graph.poses.copy(), _analysed(graph)
     head = graph.memory.head
     few = replace(config, max_iterations=min(config.max_iterations, TRUSTED_ITERATIONS))
+    yield
     best, best_poses = _failed('', chi2), poses
     result = best
     for start in starts:
@@ -124,7 +154,9 @@ def optimize_from_linear_start(
             gauss_newton.put_poses(head, _start(graph, start, cliques))
         except LinearSolveError:
             continue
-        result = replace(_minimize(graph, few, cliques, chi2_of(graph)), start=start)
+        yield
+        result = replace(
+            (yield from _minimize(graph, few, cliques, chi2_of(graph))), start=start)
         better = result.status is not Status.FAILED and (
             best.status is Status.FAILED or result.chi2 < best.chi2 * (1.0 - SAME_MINIMUM))
         trusted = result.status is Status.CONVERGED and result.chi2 <= chi2
@@ -139,7 +171,7 @@ def optimize_from_linear_start(
             return _finished(graph, poses, chi2, result)
         gauss_newton.put_poses(head, best_poses)
         rest = replace(config, max_iterations=max(config.max_iterations - best.iterations, 1))
-        result = _minimize(graph, rest, cliques, best.chi2)
+        result = yield from _minimize(graph, rest, cliques, best.chi2)
         result = replace(result, start=best.start, iterations=best.iterations + result.iterations)
     return _finished(graph, poses, chi2, result)
 
@@ -235,11 +267,11 @@ def _analysed(graph: Graph) -> symbolic.Cliques:
 
 def _minimize(
     graph: Graph, config: SolverConfig, cliques: symbolic.Cliques, chi2: float,
-) -> BatchResult:
+) -> Parts:
     """Optimise from the present poses; the poses after a failure have no meaning."""
     head = graph.memory.head
     symbolic.plant(head, cliques)
-    termination, iterations, after = minimize(head, chi2, config)
+    termination, iterations, after = yield from minimize(head, chi2, config)
     if termination is Termination.UNDETERMINED:
         return _failed(f'hidden node {head[tb.BAD_NODE]} is not determined', chi2)
     return BatchResult(_STATUS[termination], '', iterations, after)

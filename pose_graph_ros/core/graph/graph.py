@@ -89,6 +89,8 @@ class Graph:
 
     def __init__(self) -> None:
         self.memory = Memory()
+        self.n_moves = 0
+        """How often `set_poses` has moved the nodes."""
 
     @property
     def n_nodes(self) -> int:
@@ -277,6 +279,7 @@ class Graph:
                 f'expected finite poses, shape {(self.n_nodes, 3)}, got shape {poses.shape}')
         rows = self.memory['node_f'][:self.n_nodes]
         rows[:, tb.POSE:tb.POSE + 3] = se2.wrapped(poses)
+        self.n_moves += 1
         editing.restart(self.memory.head)
 
     def rows(self) -> GraphRows:
@@ -289,12 +292,25 @@ class Graph:
     def fill(self, rows: GraphRows) -> None:
         """Add all rows of another graph to this empty one; GraphUpdateError if one is invalid."""
         poses, is_bias, fixed, edges, observed = rows
-        self.apply(GraphUpdate(hidden=poses))
-        memory, head = self.memory, self.memory.head
-        memory['node_i'][:len(poses), tb.IS_BIAS] = is_bias
-        head[tb.NEWEST] = np.flatnonzero(~is_bias)[-1] if not np.all(is_bias) else -1
+        self.append_nodes(poses, is_bias)
         self.apply(GraphUpdate(
             edges=edges, observed=observed, fix=np.flatnonzero(fixed).tolist()))
+
+    def append_nodes(self, poses: FloatArray, is_bias: BoolArray) -> None:
+        """
+        Add hidden nodes, poses and biases in any order.
+
+        Parameters
+        ----------
+        poses : ndarray, shape (N, 3), poses and values of biases
+        is_bias : ndarray of bool, shape (N,)
+
+        """
+        begin, newest = self.n_nodes, self.newest_pose
+        self.apply(GraphUpdate(hidden=poses))
+        self.memory['node_i'][begin:begin + len(poses), tb.IS_BIAS] = is_bias
+        rows = np.flatnonzero(~is_bias)
+        self.memory.head[tb.NEWEST] = begin + rows[-1] if len(rows) > 0 else newest
 
     def energies(self, poses: FloatArray | None = None) -> Energies:
         """Return the energies of all constraints, at other poses, shape (N, 3), if given."""
