@@ -4,7 +4,7 @@
 
 from collections.abc import Iterator, Mapping, Sequence
 
-from pose_graph_ros.core.judgement.texts import as_json, ORDER, sentence, totals_text
+from pose_graph_ros.core.judgement.texts import as_json, is_notable, ORDER, sentence, totals_text
 from pose_graph_ros.core.judgement.verdicts import (
     Judged,
     SourceVerdicts,
@@ -33,7 +33,7 @@ def judgement(
             'scale': each.scale, 'forgotten': each.n_forgotten}
             for source, each in totals.items()},
         'constraints': [as_json(each) for each in verdicts
-                        if each.kind is Judged.LOOP_CLOSURE or not each.state.in_graph]}
+                        if each.kind is Judged.LOOP_CLOSURE or is_notable(each)]}
 
 
 def judgement_lines(

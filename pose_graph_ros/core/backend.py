@@ -144,7 +144,7 @@ class PoseGraphBackend:
 
     def view(self) -> graph_view.GraphView | None:
         """Return a copy of the graph for display; None before the first odometry."""
-        return graph_view.view(self.graph, vd.drawn_rows(self.verdicts(most_believed=0)))
+        return graph_view.view(self.graph, self._judge.drawn_rows())
 
     def largest_energies(self, n: int) -> list[constraint_names.ConstraintEnergy]:
         """Return the n constraints with the largest energies, with names, in descending order."""

@@ -1,40 +1,183 @@
 # Copyright 2026 The pose_graph_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""What the node tells of closures and fixes that it does not believe, and takes from a person."""
+"""What the node tells of closures that it does not believe, and takes from a person, over DDS."""
 
-from circle import drive
-from diagnostic_msgs.msg import DiagnosticArray, KeyValue
-from harness import Client, LATCHED, RELIABLE
+from collections.abc import Iterator
+import math
+from pathlib import Path
+
+from circle import drive, START, true_pose
+from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
+from harness import Client, LATCHED, pose, RELIABLE
+import numpy as np
 import pytest
+from rcl_interfaces.msg import Log
+from rclpy.publisher import Publisher
+from visualization_msgs.msg import MarkerArray
+
+from pose_graph_ros.adapters.verdict_messages import states_in
+from pose_graph_ros.core.geometry import se2
+from pose_graph_ros.core.judgement.verdicts import State
+
+LAP = 20.0 * math.pi
+"""Duration of a round of the circle [s]."""
+VARIANCES = (0.01, 0.01, 0.0025)
+
+
+class Verdicts:
+    """Decides on closures, and keeps the newest verdicts."""
+
+    def __init__(self, client: Client) -> None:
+        self.client = client
+        self.messages: list[DiagnosticArray] = []
+        self._judge: Publisher = client.node.create_publisher(
+            KeyValue, 'pose_graph/judge', RELIABLE)
+        client.spin_until(lambda: self._judge.get_subscription_count() > 0, 'decisions are heard')
+        client.node.create_subscription(
+            DiagnosticArray, 'pose_graph/verdicts', self.messages.append, LATCHED)
+
+    @property
+    def statuses(self) -> dict[str, DiagnosticStatus]:
+        """Statuses of the newest message by their names."""
+        return {status.name: status for status in self.messages[-1].status}
+
+    def state(self, number: int) -> str:
+        """Return the state of a closure; an empty text if it is not listed."""
+        if len(self.messages) == 0:
+            return ''
+        status = self.statuses.get(f'loop_closure/{number}')
+        return '' if status is None else self.values(number)['state']
+
+    def values(self, number: int) -> dict[str, str]:
+        return {item.key: item.value for item in self.statuses[f'loop_closure/{number}'].values}
+
+    def decide(self, number: int, decision: str, state: str) -> None:
+        """Decide on a closure, and wait until it is in a state."""
+        self._judge.publish(KeyValue(key=f'loop_closure/{number}', value=decision))
+        self.wait(number, state, decision)
+
+    def wait(self, number: int, state: str, decision: str = 'auto') -> None:
+        self.client.spin_until(
+            lambda: self.state(number) == state and self.values(number)['decision'] == decision,
+            f'closure {number} is {state}')
+
+    def send(self, key: str, value: str) -> None:
+        self._judge.publish(KeyValue(key=key, value=value))
 
 
 @pytest.fixture
-def judge(client: Client) -> object:
-    """Return a publisher of decisions that the node hears."""
-    publisher = client.node.create_publisher(KeyValue, 'pose_graph/judge', RELIABLE)
-    client.spin_until(lambda: publisher.get_subscription_count() > 0, 'the node hears decisions')
-    return publisher
+def verdicts(client: Client) -> Iterator[Verdicts]:
+    """Drive a round and a bit, with three true closures and two false ones."""
+    before = client.set_parameter('graph_period', 0.1)
+    assert before[0], before[1]
+    found = Verdicts(client)
+    drive(client, 70.0, fixes=False)
+    processed = int(client.values['processed'])
+    for at, wrong in ((64.0, 0.0), (65.0, 0.0), (66.0, 0.0), (64.5, 8.0), (65.5, -9.0)):
+        x, y, yaw = se2.between(true_pose(at - LAP), true_pose(at))
+        client.loop_closure.publish(pose(
+            START + at, x, y + wrong, yaw, f'@{START + at - LAP:.9f}', variances=VARIANCES))
+        processed += 1
+        client.wait_processed(processed)
+    yield found
+    assert client.set_parameter('graph_period', 2.0)[0]
+    assert client.set_parameter('graph_file', '')[0]
 
 
-def test_a_decision_that_cannot_be_is_counted(client: Client, judge: object) -> None:
+def test_each_closure_is_told_of_with_state_and_reason(verdicts: Verdicts) -> None:
+    client = verdicts.client
+    for number in range(3):
+        verdicts.wait(number, 'believed')
+    for number in (3, 4):
+        verdicts.client.spin_until(
+            lambda number=number: verdicts.state(number) in {'doubted', 'waiting'}, 'it is told')
+        status, values = verdicts.statuses[f'loop_closure/{number}'], verdicts.values(number)
+        assert status.level in (DiagnosticStatus.WARN, DiagnosticStatus.STALE)
+        assert status.hardware_id == 'loop_closure'
+        assert 'not used' in status.message
+        assert float(values['distance']) > 4.0
+        assert abs(float(values['residual'].strip('[]').split(',')[1])) > 7.0
+    assert float(verdicts.values(3)['stamp']) == pytest.approx(START + 64.5)
+    assert float(verdicts.values(3)['reference_stamp']) == pytest.approx(START + 64.5 - LAP)
+    assert verdicts.statuses['loop_closure/0'].level == DiagnosticStatus.OK
+    assert sum(state is State.BELIEVED for state in states_in(verdicts.messages[-1]).values()) == 3
+    client.spin_until(lambda: client.values['loop_closure.believed'] == '3' and int(
+        client.values['loop_closure.doubted']) + int(client.values['loop_closure.waiting']) == 2,
+        'the diagnostics count them')
+
+    markers: list[MarkerArray] = []
+    client.node.create_subscription(MarkerArray, 'graph', markers.append, LATCHED)
+    client.spin_until(lambda: len(markers) > 0, 'markers come')
+    namespaces = {marker.ns for marker in markers[-1].markers}
+    assert 'loop_closures' in namespaces
+    assert namespaces & {'doubted', 'waiting_closures'}
+    answer = client.optimize()
+    assert answer.success, answer.message
+    assert path_error_of_shape(client) < 0.2
+
+    # who comes late gets the newest one
+    late: list[DiagnosticArray] = []
+    client.node.create_subscription(DiagnosticArray, 'pose_graph/verdicts', late.append, LATCHED)
+    client.spin_until(lambda: len(late) > 0, 'they are latched')
+    assert late[0].status[0].name == 'summary'
+    count = len(verdicts.messages)
+    assert client.trigger('reset').success
+    client.spin_until(lambda: len(verdicts.messages) > count
+                      and list(verdicts.statuses) == ['summary'], 'they are taken back')
+
+
+def path_error_of_shape(client: Client) -> float:
+    """Return the largest error of the distances from the first pose of the path [m]."""
+    points = np.array([(item.pose.position.x, item.pose.position.y)
+                       for item in client.paths[-1].poses])
+    truth = np.array([true_pose(item.header.stamp.sec + item.header.stamp.nanosec * 1e-9 - START)
+                      for item in client.paths[-1].poses])[:, :2]
+    return float(np.max(np.abs(np.hypot(*(points - points[0]).T) - np.hypot(
+        *(truth - truth[0]).T))))
+
+
+def test_a_person_forces_closures_in_or_out_and_it_survives_a_file(
+    verdicts: Verdicts, tmp_path: Path,
+) -> None:
+    client = verdicts.client
+    said: list[str] = []
+    client.node.create_subscription(
+        Log, '/rosout', lambda message: said.append(message.msg), RELIABLE)
+    verdicts.wait(2, 'believed')
+    verdicts.decide(2, 'out', 'doubted')
+    assert 'a person' in verdicts.statuses['loop_closure/2'].message
+    verdicts.decide(3, 'in', 'believed')
+    client.spin_until(lambda: any('loop_closure/3: Used' in text for text in said), 'it is said')
+    assert client.optimize().success
+    assert path_error_of_shape(client) > 1.0
+
+    assert client.set_parameter('graph_file', str(tmp_path / 'map.g2o'))[0]
+    answer = client.trigger('save_graph')
+    assert answer.success, answer.message
+    assert '"loop_closure/3": "Used since' in (tmp_path / 'map.json').read_text()
+    assert client.trigger('reset').success
+    client.spin_until(lambda: list(verdicts.statuses) == ['summary'], 'they are taken back')
+    answer = client.trigger('load_graph')
+    assert answer.success, answer.message
+    verdicts.wait(2, 'doubted', 'out')
+    verdicts.wait(3, 'believed', 'in')
+
+    # the true ones contradict the one that is forced in: first it must go
+    verdicts.send('loop_closure/2', 'auto')
+    verdicts.send('loop_closure/3', 'auto')
+    client.spin_until(lambda: verdicts.state(3) in {'doubted', 'waiting'}, 'it is judged again')
+    for number in range(3):
+        verdicts.wait(number, 'believed')
+    assert client.optimize().success
+    assert path_error_of_shape(client) < 0.2
+
+
+def test_a_decision_that_cannot_be_is_counted(client: Client) -> None:
+    verdicts = Verdicts(client)
     drive(client, 2.0)
-    for key, value in (('loop_closure/99', 'out'), ('loop_closure/99', 'perhaps')):
-        judge.publish(KeyValue(key=key, value=value))
+    verdicts.send('loop_closure/99', 'out')
+    verdicts.send('loop_closure/99', 'perhaps')
     client.spin_until(
         lambda: 'judge.unknown_id' in client.values and 'judge.unknown_decision' in client.values,
         'both are counted')
     assert client.values['received'] == client.values['processed']
-
-
-def test_verdicts_come_to_who_asks_late_and_are_taken_back_with_the_graph(client: Client) -> None:
-    drive(client, 2.0)
-    found: list[DiagnosticArray] = []
-    client.node.create_subscription(
-        DiagnosticArray, 'pose_graph/verdicts', found.append, LATCHED)
-    client.spin_until(lambda: len(found) > 0, 'verdicts come')
-    assert found[-1].header.frame_id == 'map'
-    assert found[-1].status[0].name == 'summary'
-    count = len(found)
-    assert client.trigger('reset').success
-    client.spin_until(lambda: len(found) > count, 'they are taken back')
-    assert [status.name for status in found[-1].status] == ['summary']

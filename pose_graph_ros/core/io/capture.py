@@ -23,6 +23,8 @@ from pose_graph_ros.core.graph.graph import Graph
 from pose_graph_ros.core.graph.reweighting import Reweighting
 from pose_graph_ros.core.io.saved_graph import SavedGraph
 from pose_graph_ros.core.judgement.judge import Judge
+from pose_graph_ros.core.judgement.texts import is_notable, sentence
+from pose_graph_ros.core.judgement.verdicts import Judged
 from pose_graph_ros.core.odometry.hidden_nodes import HiddenNodes
 from pose_graph_ros.core.saved_columns import as_matrix
 from pose_graph_ros.core.sources.factor_builder import (
@@ -35,6 +37,8 @@ from pose_graph_ros.core.sources.factor_builder import (
 from pose_graph_ros.core.sources.pipeline import MeasurementPipeline
 
 _NONE: IntArray = np.empty(0, dtype=np.int64)
+# Of each source, the number of believed closures whose verdicts are saved as sentences.
+MOST_BELIEVED = 2000
 _NO_CONSTRAINTS = SavedSource(_NONE, _NONE, _NONE.reshape(0, 2), 0, _NONE, None)
 
 
@@ -85,6 +89,8 @@ def capture(
         edge_losses=edge_losses, observed_losses=observed_losses,
         alignment=parts.alignment.saved(), waiting=_saved_edges(parts.pipeline.queue),
         set_aside=_saved_edges(parts.quarantine), judgement=parts.judge.saved(),
+        verdicts={each.id: sentence(each) for each in parts.judge.verdicts(MOST_BELIEVED)
+                  if each.kind is Judged.LOOP_CLOSURE or is_notable(each)},
         newest_covariance=as_matrix(newest_covariance), chi2=chi2, n_left_out=len(left_out),
         datum=datum)
 

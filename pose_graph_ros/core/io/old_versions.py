@@ -26,7 +26,7 @@ EMPTY_JUDGEMENT: dict[str, Any] = {'closures': {
 
 def with_judgement(members: dict[str, Any]) -> dict[str, Any]:
     """Return the members of a file of version 2 as those of version 3: nothing is judged."""
-    upgraded = {'judgement': EMPTY_JUDGEMENT, **members}
+    upgraded = {'judgement': EMPTY_JUDGEMENT, 'verdicts': {}, **members}
     for name in ('waiting', 'set_aside'):
         edges = upgraded.get(name)
         if isinstance(edges, dict):

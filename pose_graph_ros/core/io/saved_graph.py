@@ -52,6 +52,8 @@ class SavedGraph:
     """Edges set aside after a failed solve, for the next full optimisation."""
     judgement: SavedJudgement
     """What is believed, and who has decided so."""
+    verdicts: Mapping[str, str]
+    """The same for people, of all closures and all that is not believed: a sentence by id."""
     newest_covariance: Matrix
     """Covariance of the newest hidden node, in map axes."""
     chi2: float

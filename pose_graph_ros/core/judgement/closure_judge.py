@@ -25,7 +25,9 @@ from pose_graph_ros.core.graph.constraints import EdgeKind, Edges
 from pose_graph_ros.core.graph.graph import GraphUpdate
 from pose_graph_ros.core.graph.reweighting import Reweighting
 from pose_graph_ros.core.judgement import relative
+from pose_graph_ros.core.judgement.closure_reports import ClosureReports
 from pose_graph_ros.core.judgement.closure_states import (
+    AUTO,
     ClosureStates,
     DECISIONS,
     DOUBTED,
@@ -36,15 +38,15 @@ from pose_graph_ros.core.judgement.closure_states import (
 )
 from pose_graph_ros.core.judgement.closures import claims, ClosureTable, GATE
 from pose_graph_ros.core.judgement.consistency import OdometryChain
+from pose_graph_ros.core.judgement.texts import sentence
 from pose_graph_ros.core.judgement.verdicts import (
     Change,
     Decision,
-    Judged,
     SourceVerdicts,
     State,
     Verdict,
 )
-from pose_graph_ros.core.measurements import ACCEPTED, Answer, rejected
+from pose_graph_ros.core.measurements import Answer, AnswerStatus, rejected
 from pose_graph_ros.core.smoother.incremental import IncrementalSmoother
 from pose_graph_ros.core.sources.factor_builder import NewConstraint
 
@@ -79,6 +81,7 @@ class ClosureJudge:
         self._chain = OdometryChain()
         self._table = ClosureTable(self._chain)
         self._states = ClosureStates()
+        self.reports = ClosureReports(self._states, self._table)
         self._scales: list[float] = []
         """Of each source, the factor on its sigmas in the graph."""
         self._spread = GrowingArray((3, 3), np.float64)
@@ -130,6 +133,7 @@ class ClosureJudge:
 
     def rollback(self) -> None:
         """Forget the closures of the last `before`."""
+        self.reports.forget()
         self._table.drop(self._n_staged)
         self._states.drop(self._n_staged)
         for array in (self._spread, self._tested):
@@ -281,14 +285,7 @@ class ClosureJudge:
 
     def verdicts(self, most_believed: int | None = None) -> list[Verdict]:
         """Return all verdicts, but of those that are believed only the newest of each source."""
-        states, numbers = self._states, np.arange(len(self._states))
-        if most_believed is not None:
-            believed = np.flatnonzero(states.in_graph)
-            newest = [believed[states.source[believed] == source][-most_believed:]
-                      for source in range(len(states.sources))] if most_believed > 0 else []
-            numbers = np.union1d(np.flatnonzero(~states.in_graph), np.concatenate(
-                [*newest, numbers[:0]]))
-        return [self._verdict(number) for number in numbers.tolist()]
+        return self.reports.verdicts(self._smoother.graph, most_believed)
 
     def saved(self) -> SavedClosures:
         """Return the state; what is left to be tested is not part of it."""
@@ -303,44 +300,20 @@ class ClosureJudge:
         self._spread.append(np.zeros((len(saved.rows), 3, 3)))
         self._tested.append(np.full(len(saved.rows), -1))
 
-    def _verdict(self, number: int) -> Verdict:
-        states = self._states
-        support = self._table.support(number, np.ones(len(states), dtype=bool))
-        against = [other for other in support.against.tolist() if states.in_graph[other]]
-        contradicted = [states.name(other) for other in against[:5]]
-        if states.state[number] == DOUBTED:
-            contradicted = ['odometry', *contradicted][:5]
-        stamp, reference = states.stamps_ns[number].tolist()
-        return Verdict(
-            id=states.name(number), kind=Judged.LOOP_CLOSURE,
-            source=states.sources[states.source[number]], stamp_ns=stamp,
-            reference_ns=reference, state=STATES[states.state[number]],
-            since_ns=int(states.since_ns[number]), decision=DECISIONS[states.decision[number]],
-            residual=self._smoother.edge_innovations(
-                self._smoother.graph.edges_at(states.row[number:number + 1])).errors[0],
-            distance=math.sqrt(states.distance[number]),
-            supported_by=tuple(states.name(other) for other in support.clique.tolist()
-                               if other != number)[:5],
-            contradicted_by=tuple(contradicted), edge=True, row=int(states.row[number]))
-
     def take_changes(self) -> list[Change]:
         """Return the changes of states since the last call."""
         return self._states.take_changes()
 
     def totals(self) -> dict[str, SourceVerdicts]:
         """Return what is believed of each source."""
-        totals = {}
-        for k, source in enumerate(self._states.sources):
-            states = self._states.state[self._states.source == k]
-            newest = states[-5:]
-            totals[source] = SourceVerdicts(
-                {state: int(np.count_nonzero(states == m)) for m, state in enumerate(STATES)},
-                self._scales[k], bool(np.all((newest == WAITING) | (newest == DOUBTED))))
-        return totals
+        return self.reports.totals(self._scales)
 
     def decide(self, name: str, decision: Decision) -> Answer:
         """
         Return the answer to a person's decision on a closure, which is applied at once.
+
+        A closure that had been forced in waits when that is taken back, as the graph it is judged
+        by must be one without it.
 
         Parameters
         ----------
@@ -352,11 +325,13 @@ class ClosureJudge:
         if number < 0:
             return rejected('unknown_id', f'expected the id of a verdict, got {name!r}')
         before = int(self._states.decision[number])
+        state = {Decision.IN: State.BELIEVED, Decision.OUT: State.DOUBTED,
+                 Decision.AUTO: State.WAITING}[decision]
+        forced = decision is not Decision.AUTO or before != AUTO
         self._states.decision[number] = DECISIONS.index(decision)
-        if decision is Decision.AUTO:
-            self._round += 1
-        elif not self._apply(
-                {number: State.BELIEVED if decision is Decision.IN else State.DOUBTED}):
+        if forced and not self._apply({number: state}):
             self._states.decision[number] = before
             return rejected('failed', 'the solver failed with it')
-        return ACCEPTED
+        self._round += 1
+        verdict, = self.reports.of(self._smoother.graph, [number])
+        return Answer(AnswerStatus.ACCEPTED, detail=f'{name}: {sentence(verdict)}')

@@ -99,6 +99,10 @@ class ClosureStates:
         """Whether they have a weight above 0."""
         return _IN_GRAPH[self.state]
 
+    def in_graph_at(self, number: int) -> bool:
+        """Return whether one of them has a weight above 0."""
+        return bool(_IN_GRAPH[self.state[number]])
+
     @property
     def judged(self) -> BoolArray:
         """Whether no person has decided on them."""

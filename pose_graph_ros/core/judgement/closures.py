@@ -3,6 +3,7 @@
 """The loop closures that are judged, and which of them support or contradict one another."""
 
 from collections import defaultdict
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -96,17 +97,30 @@ class ClosureTable:
         for array in (self._i, self._j, self._mean, self._noise, self._travel):
             array.truncate(size)
 
+    def _cells_around(self, number: int) -> list[Sequence[int]]:
+        (a, b), = _cells(self._travel.values[number:number + 1])
+        return [self._cells.get((i, j), ()) for i in (a - 1, a, a + 1) for j in (b - 1, b, b + 1)]
+
+    def crowd(self, number: int) -> int:
+        """Return how many closures are around one: more than `near`, but it grows with these."""
+        return sum(map(len, self._cells_around(number)))
+
     def near(self, number: int) -> IntArray:
         """Return closures whose ends are both near those of one, at most `MOST_COMPARED`."""
         travel = self._travel.values
-        (a, b), = _cells(travel[number:number + 1])
-        found = [other for i in (a - 1, a, a + 1) for j in (b - 1, b, b + 1)
-                 for other in self._cells.get((i, j), ())[-2 * MOST_COMPARED:] if other != number]
+        found = [other for cell in self._cells_around(number)
+                 for other in cell[-2 * MOST_COMPARED:] if other != number]
         numbers = np.array(found, dtype=np.int64)
         apart = np.max(np.abs(travel[numbers] - travel[number]), axis=1, initial=0.0)
         close = apart <= NEAR
         order = np.argsort(apart[close], kind='stable')[:MOST_COMPARED]
         return numbers[close][order]
+
+    def neighbours(self, number: int) -> tuple[IntArray, IntArray]:
+        """Return which closures near one agree with it, and which do not."""
+        near = self.near(number)
+        distance = self._chain.squared_distances(self._all, np.full(len(near), number), near)
+        return near[distance < GATE], near[distance >= GATE]
 
     def support(self, number: int, usable: BoolArray) -> Support:
         """

@@ -17,6 +17,7 @@ import numpy as np
 from pose_graph_ros.core.config import BackendConfig, Robust
 from pose_graph_ros.core.graph.constraints import EdgeKind
 from pose_graph_ros.core.graph.graph import GraphUpdate
+from pose_graph_ros.core.graph.graph_view import DrawnRows
 from pose_graph_ros.core.graph.reweighting import Reweighting
 from pose_graph_ros.core.judgement.closure_judge import ClosureJudge
 from pose_graph_ros.core.judgement.closure_states import SavedClosures
@@ -106,6 +107,10 @@ class Judge:
     def verdicts(self, most_believed: int | None = None) -> list[Verdict]:
         """Return all verdicts, but of those that are believed only the newest of each source."""
         return self._closures.verdicts(most_believed)
+
+    def drawn_rows(self) -> DrawnRows:
+        """Return the rows of constraints that are drawn in another way than believed ones."""
+        return self._closures.reports.drawn_rows()
 
     def changes(self) -> list[Change]:
         """Return the changes of verdicts since the last call."""

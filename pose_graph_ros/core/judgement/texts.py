@@ -115,6 +115,11 @@ def details(verdict: Verdict) -> dict[str, str]:
         'decision': verdict.decision.value}
 
 
+def is_notable(verdict: Verdict) -> bool:
+    """Return whether a person has decided on a constraint, or it is not in the estimate."""
+    return verdict.decision is not Decision.AUTO or not verdict.state.in_graph
+
+
 def as_json(verdict: Verdict) -> dict[str, object]:
     """Return all that is known of a verdict as plain values, stamps in seconds."""
     far = verdict.distance

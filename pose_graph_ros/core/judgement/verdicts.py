@@ -2,13 +2,12 @@
 # SPDX-License-Identifier: Apache-2.0
 """What is decided on a constraint, and why."""
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass
 from enum import Enum
 from typing import NamedTuple
 
 from pose_graph_ros.core.geometry.se2 import FloatArray
-from pose_graph_ros.core.graph.graph_view import DrawnRows
 
 
 class State(Enum):
@@ -105,16 +104,3 @@ class SourceVerdicts(NamedTuple):
     """Whether its newest measurements are doubted or wait, while the estimate goes on."""
     n_forgotten: int = 0
     """Number of hopeless constraints that are not judged again."""
-
-
-def drawn_rows(verdicts: Iterable[Verdict]) -> DrawnRows:
-    """Return the rows of constraints that are drawn in another way than believed ones."""
-    found: dict[str, list[int]] = {name: [] for name in DrawnRows._fields}
-    for each in verdicts:
-        if each.kind is not Judged.FIX and each.state is not State.BELIEVED:
-            name = {State.WEAKLY_BELIEVED: 'weak', State.WAITING: 'waiting',
-                    State.DOUBTED: 'doubted'}[each.state]
-            found[name].append(each.row)
-        elif not each.state.in_graph:
-            found['unused_edges' if each.edge else 'unused_observed'].append(each.row)
-    return DrawnRows(**found)
