@@ -1,0 +1,167 @@
+# Copyright 2026 The pose_graph_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""What is told of closures: quick ways against slow ones, and decisions of a person."""
+
+from dataclasses import replace
+import math
+
+import numpy as np
+import pytest
+
+from pose_graph_ros.core.backend import PoseGraphBackend
+from pose_graph_ros.core.config import BackendConfig, LOOP_CLOSURES, Loss, Robust
+from pose_graph_ros.core.geometry import se2
+from pose_graph_ros.core.graph.graph_view import DrawnRows
+from pose_graph_ros.core.judgement.verdicts import Change, Decision, State
+from pose_graph_ros.core.measurements import AnswerStatus, LoopClosure, OdometrySample
+
+SECOND = 10**9
+LAP = 60  # duration of a round [s]
+
+
+def true_pose(seconds: float) -> np.ndarray:
+    """A circle of 20 m radius."""
+    angle = 2.0 * math.pi * seconds / LAP
+    return se2.wrapped(np.array(
+        [20.0 * math.sin(angle), 20.0 * (1.0 - math.cos(angle)), angle]))
+
+
+def driven(*wrong: float, last: int = LAP + 20) -> PoseGraphBackend:
+    """Return an engine after a round and a bit, with closures that are wrong by so much [m]."""
+    backend = PoseGraphBackend()
+    for second in range(1, last + 1):
+        backend.add_odometry(OdometrySample(second * SECOND, true_pose(second)))
+    backend.finish()
+    backend.update()
+    for number, error in enumerate(wrong):
+        at = LAP + 2 + number
+        z = se2.between(true_pose(at - LAP), true_pose(at)) + np.array((0.0, error, 0.0))
+        backend.add_measurement(LoopClosure(
+            at * SECOND, z, np.diag((0.01, 0.01, 0.0025)), (at - LAP) * SECOND), 'loop')
+        backend.update()
+        while not backend.refine().finished:
+            pass
+    return backend
+
+
+def states(backend: PoseGraphBackend) -> list[bool]:
+    return [verdict.state.in_graph for verdict in backend.verdicts()]
+
+
+def settle(backend: PoseGraphBackend) -> None:
+    backend.update()
+    while not backend.refine().finished:
+        pass
+
+
+def test_verdicts_tell_origin_reason_and_error() -> None:
+    backend = driven(0.0, 0.0, 0.0, 8.0)
+    verdicts = backend.verdicts()
+    assert [verdict.id for verdict in verdicts] == [f'loop/{k}' for k in range(4)]
+    assert states(backend) == [True, True, True, False]
+    assert [verdict.stamp_ns // SECOND for verdict in verdicts] == [62, 63, 64, 65]
+    assert [verdict.reference_ns // SECOND for verdict in verdicts] == [2, 3, 4, 5]
+    assert set(verdicts[0].supported_by) == {'loop/1', 'loop/2'}
+    assert set(verdicts[3].contradicted_by) >= {'loop/0', 'loop/1', 'loop/2'}
+    assert verdicts[3].distance > 4.0
+    np.testing.assert_allclose(np.abs(verdicts[3].residual[1]), 8.0, atol=0.2)
+
+
+def test_reasons_are_those_of_an_engine_that_keeps_none() -> None:
+    backend = PoseGraphBackend()
+    errors = (0.0, 8.0, 0.0, 0.1, 8.1, -7.0)
+    backend = driven(*errors)
+    asked_once = backend.verdicts()
+    fresh = PoseGraphBackend.restored(None, backend.saved())
+    for one, other in zip(asked_once, fresh.verdicts(), strict=True):
+        assert (one.supported_by, one.contradicted_by, one.state) == (
+            other.supported_by, other.contradicted_by, other.state)
+        assert one.distance == pytest.approx(other.distance)
+    # one that asks after each closure keeps reasons that grow old
+    asking = driven(*errors[:2])
+    asking.verdicts()
+    for at, error in zip(range(LAP + 4, LAP + 8), errors[2:], strict=True):
+        z = se2.between(true_pose(at - LAP), true_pose(at)) + np.array((0.0, error, 0.0))
+        asking.add_measurement(LoopClosure(
+            at * SECOND, z, np.diag((0.01, 0.01, 0.0025)), (at - LAP) * SECOND), 'loop')
+        settle(asking)
+        asking.verdicts()
+    assert [(each.id, each.supported_by) for each in asking.verdicts()] == [
+        (each.id, each.supported_by) for each in asked_once]
+
+
+def test_what_is_drawn_apart_is_what_the_verdicts_say() -> None:
+    backend = driven(0.0, 0.0, 0.0, 8.0, -7.0)
+    by_state = {state: [each.row for each in backend.verdicts() if each.state is state]
+                for state in State}
+    assert backend._judge.drawn_rows() == DrawnRows(
+        by_state[State.WEAKLY_BELIEVED], by_state[State.WAITING], by_state[State.DOUBTED])
+    view = backend.view()
+    assert view is not None
+    assert len(view.waiting.ends) + len(view.doubted.ends) == 2
+    totals = backend.verdict_totals()['loop']
+    assert {state: len(rows) for state, rows in by_state.items()} == totals.counts
+
+
+def test_a_person_overrules_and_takes_it_back() -> None:
+    backend = driven(0.0, 0.0, 0.0, 8.0)
+    backend.verdict_changes()
+    answer = backend.decide('loop/3', Decision.IN)
+    assert answer.status is AnswerStatus.ACCEPTED
+    assert answer.detail.startswith('loop/3: Used')
+    settle(backend)
+    assert states(backend)[3]
+    assert backend.decide('loop/1', Decision.OUT).status is AnswerStatus.ACCEPTED
+    settle(backend)
+    assert not states(backend)[1]
+    for name in ('loop/1', 'loop/3'):
+        assert backend.decide(name, Decision.AUTO).status is AnswerStatus.ACCEPTED
+    settle(backend)
+    assert states(backend) == [True, True, True, False]
+    assert all(each.decision is Decision.AUTO for each in backend.verdicts())
+    changed = {change.id for change in backend.verdict_changes()}
+    assert {'loop/1', 'loop/3'} <= changed
+    assert backend.verdict_changes() == []
+
+
+def test_a_false_one_that_was_forced_in_where_nothing_contradicts_it_goes_again() -> None:
+    backend = driven(30.0)
+    assert states(backend) == [False]
+    backend.decide('loop/0', Decision.IN)
+    settle(backend)
+    assert states(backend) == [True]
+    backend.decide('loop/0', Decision.AUTO)
+    settle(backend)
+    assert states(backend) == [False]
+
+
+@pytest.mark.parametrize('name', ['loop/9', 'loop', 'loop/', 'loop/-1', 'other/0', ''])
+def test_an_unknown_id_is_refused(name: str) -> None:
+    answer = driven(0.0).decide(name, Decision.OUT)
+    assert (answer.status, answer.reason) == (AnswerStatus.REJECTED, 'unknown_id')
+    assert repr(name) in answer.detail
+
+
+def test_changes_name_the_state_before() -> None:
+    backend = driven(0.0, 0.0, 0.0)
+    backend.verdict_changes()
+    backend.decide('loop/2', Decision.OUT)
+    (change,) = [each for each in backend.verdict_changes() if each.id == 'loop/2']
+    assert isinstance(change, Change)
+    assert change.before is not None
+    assert (change.before.in_graph, change.after) == (True, State.DOUBTED)
+
+
+@pytest.mark.parametrize('robust', [Robust.LOSS, Robust.NONE])
+def test_a_source_that_is_no_longer_judged_keeps_the_verdicts_so_far(robust: Robust) -> None:
+    backend = driven(0.0, 8.0)
+    before = states(backend)
+    backend.configure(BackendConfig(measurements={'loop': replace(
+        LOOP_CLOSURES, robust=robust, loss=Loss.HUBER)}))
+    z = se2.between(true_pose(10), true_pose(LAP + 10)) + np.array((0.0, 3.0, 0.0))
+    backend.add_measurement(LoopClosure(
+        (LAP + 10) * SECOND, z, np.diag((0.01, 0.01, 0.0025)), 10 * SECOND), 'loop')
+    settle(backend)
+    assert len(backend.verdicts()) == len(before)
+    assert backend.graph.edges.weight[-1] > 0.0
+    assert len(backend._reweighting) == (1 if robust is Robust.LOSS else 0)
