@@ -37,7 +37,7 @@ TRUE, FAR = 3.0, 6.0
 UPDATE_EVERY = 10
 """New hidden nodes after which the graph is updated, as `pose-graph replay` does."""
 SMALLEST_RMS = 0.5
-"""Of odometry: what the newest pose is compared with is at least this [m]."""
+"""Of odometry: what the path is compared with while driving is at least this [m]."""
 CLOSURES = 'loop_closure'
 
 
@@ -104,8 +104,8 @@ class Run:
     path: Trajectory
     kept: BoolArray
     """Whether each closure takes part at the end, shape (M,)."""
-    live: dict[int, float]
-    """Error of the newest pose after each update, by stamp [m]."""
+    live: dict[int, tuple[float, float]]
+    """Error of the newest pose, and rms of the path, after each update, by stamp [m]."""
     updates: FloatArray
     """Times of the updates [s]."""
     seconds: float
@@ -118,7 +118,7 @@ class Run:
 def feed(recording: Recording, config: BackendConfig) -> Run:
     """Feed a recording online, in the order of arrival, and optimise at its end."""
     backend = PoseGraphBackend(config)
-    live: dict[int, float] = {}
+    live: dict[int, tuple[float, float]] = {}
     updates: list[float] = []
     idle, due, closure = 0.0, UPDATE_EVERY, 0
     begin = time.perf_counter()
@@ -136,7 +136,8 @@ def feed(recording: Recording, config: BackendConfig) -> Run:
             looked = time.perf_counter()
             estimate = backend.estimate()
             assert estimate is not None
-            live[estimate.stamp_ns] = float(fits(estimate.path, recording.truth).last[-1])
+            fit = fits(estimate.path, recording.truth)
+            live[estimate.stamp_ns] = float(fit.last[-1]), float(fit.rms[-1])
             begin += time.perf_counter() - looked
     for late in range(closure, len(recording.ends)):
         add(backend, recording, late)
@@ -219,17 +220,26 @@ def rms(path: Trajectory, truth: Trajectory) -> float:
     return float(fits(path, truth).rms[-1])
 
 
-def worst_ratio(run: Run, recording: Recording) -> float:
+def while_driving(run: Run, recording: Recording) -> tuple[float, float]:
     """
-    Return the largest ratio, over the drive, of the newest pose's rms to that of odometry.
+    Compare what is known while driving with odometry alone.
 
-    The newest pose is seen in the map of that moment: the path is fitted to the truth, then.
+    At each update, path and newest pose are seen in the map of that moment: the path so far is
+    fitted to the truth.
+
+    Returns
+    -------
+    newest : float
+        Ratio of the newest pose's rms, over the drive, to that of odometry.
+    path : float
+        Largest ratio of the rms of the path so far to that of odometry, or to `SMALLEST_RMS`.
+
     """
-    odometry = fits(Trajectory(recording.stamps_ns, recording.odometry), recording.truth).last
+    odometry = fits(Trajectory(recording.stamps_ns, recording.odometry), recording.truth)
     at = np.searchsorted(recording.stamps_ns, list(run.live))
-    ours, theirs = (np.sqrt(np.cumsum(np.square(errors)) / np.arange(1, len(at) + 1))
-                    for errors in (list(run.live.values()), odometry[at]))
-    return float(np.max(ours / np.maximum(theirs, SMALLEST_RMS)))
+    newest, path = np.array(list(run.live.values())).T
+    return (float(np.sqrt(np.mean(newest**2) / np.mean(odometry.last[at]**2))),
+            float(np.max(path / np.maximum(odometry.rms[at], SMALLEST_RMS))))
 
 
 def hidden_graph(
