@@ -30,6 +30,7 @@ from pose_graph_ros.core.alignment.monitor import AlignmentState
 from pose_graph_ros.core.backend import PoseGraphBackend
 from pose_graph_ros.core.batch.optimizer import Status
 from pose_graph_ros.core.estimate import UpdateReport
+from pose_graph_ros.core.judgement.verdicts import SourceVerdicts, State
 from pose_graph_ros.core.measurements import Answer, rejected
 from pose_graph_ros.core.warm_up import warm_up
 from pose_graph_ros.ros import diagnostics, memory, session as session_module
@@ -581,6 +582,13 @@ def test_errors_that_are_correlated_but_treated_as_white_are_warned_of(
             alive=True, prepared=True, estimate=active.session.worker.estimate,
             status=replace(status, sources={'fix': correlated})))
         values, (level, text) = active.values(), active.health()
+        # what is doubted now is more urgent
+        active.session.worker.status = replace(active.session.worker.status, verdicts={
+            'fix': SourceVerdicts({State.DOUBTED: 3}, 1.0, doubting=True)})
+        assert active.values()['fix.doubted'] == '3'
+        assert active.health() == (WARN, (
+            'The newest measurements of fix are doubted and not used, as they contradict the '
+            'others: see ~/verdicts.'))
     assert values['fix.errors_live'] == (
         '12 s, with a sigma of 0.8 m; treated as white: set fix.correlation_time')
     assert level == WARN
