@@ -11,7 +11,7 @@ the parameters); all others are loop closures, which come when their later end i
 
 import argparse
 from collections import Counter
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 import time
 from typing import Any, NamedTuple
@@ -34,12 +34,12 @@ from pose_graph_ros.cli.judgement import judgement, judgement_lines
 from pose_graph_ros.cli.results import collect_drive, write_results
 from pose_graph_ros.core.backend import PoseGraphBackend
 from pose_graph_ros.core.batch.optimizer import Status
-from pose_graph_ros.core.estimate import Estimate, UpdateReport
+from pose_graph_ros.core.estimate import UpdateReport
 from pose_graph_ros.core.geometry.geodesy import MapOrigin
 from pose_graph_ros.core.geometry.trajectory import Trajectory
 from pose_graph_ros.core.io.g2o import EDGE2_ORDERS, write_g2o
 from pose_graph_ros.core.judgement.texts import states_by_stamps
-from pose_graph_ros.core.judgement.verdicts import State
+from pose_graph_ros.core.judgement.verdicts import State, Verdict
 from pose_graph_ros.core.measurements import Answer, LoopClosure, Measurement, OdometrySample
 
 UPDATE_EVERY = 10  # new hidden nodes after which the graph is updated, to stay near the optimum
@@ -151,10 +151,11 @@ def execute(options: argparse.Namespace) -> int:
         if estimate is None:
             topics = ' or '.join(inputs.topics[name] for name in inputs.of(Kind.ODOMETRY))
             raise BagError(f'{options.bag}: no usable odometry on {topics}')
+        verdicts = result.backend.verdicts()
         drive = collect_drive(
             bag, inputs, values, estimate.path, options.truth, origin=result.origin,
-            states=states_by_stamps(result.backend.verdicts()))
-    return _report(options, drive, result, estimate, seconds)
+            states=states_by_stamps(verdicts))
+    return _report(options, drive, result, verdicts, seconds)
 
 
 def _execute_g2o(options: argparse.Namespace) -> int:
@@ -170,7 +171,8 @@ def _execute_g2o(options: argparse.Namespace) -> int:
     seconds = time.monotonic() - start
     estimate = backend.estimate()
     assert estimate is not None, 'a graph has vertices'
-    states = states_by_stamps(backend.verdicts())
+    verdicts = backend.verdicts()
+    states = states_by_stamps(verdicts)
     samples = [each for each in measurements if isinstance(each, OdometrySample)]
     loops = [(each.reference_ns or 0, each.stamp_ns) for each in measurements
              if isinstance(each, LoopClosure)]
@@ -181,16 +183,17 @@ def _execute_g2o(options: argparse.Namespace) -> int:
         None, np.array(loops, dtype=np.int64).reshape(-1, 2),
         loop_states=[states.get((CLOSURES, stamp, reference), State.BELIEVED)
                      for reference, stamp in loops])
-    return _report(options, drive, Replayed(backend, report, Counter()), estimate, seconds)
+    return _report(options, drive, Replayed(backend, report, Counter()), verdicts, seconds)
 
 
 def _report(
-    options: argparse.Namespace, drive: Drive, result: Replayed, estimate: Estimate,
+    options: argparse.Namespace, drive: Drive, result: Replayed, verdicts: Sequence[Verdict],
     seconds: float,
 ) -> int:
     """Write the results and print a summary; return the exit code."""
     backend, report = result.backend, result.report
-    verdicts, totals = backend.verdicts(), backend.verdict_totals()
+    estimate, totals = backend.estimate(), backend.verdict_totals()
+    assert estimate is not None
     counts = {f'{source}.{answer}': count for (source, answer), count
               in sorted((backend.counts + result.refused).items())}
     table = write_results(drive, options.out, options.bag.stem, {
