@@ -150,6 +150,9 @@ def test_a_person_forces_closures_in_or_out_and_it_survives_a_file(
     client.spin_until(lambda: any('loop_closure/3: Used' in text for text in said), 'it is said')
     assert client.optimize().success
     assert path_error_of_shape(client) > 1.0
+    client.spin_until(lambda: any('loop_closure/2' in text for text in said
+                                  if 'thrown out' in text), 'it is announced')
+    assert sum('thrown out' in text and 'loop_closure/2' in text for text in said) == 1
 
     assert client.set_parameter('graph_file', str(tmp_path / 'map.g2o'))[0]
     answer = client.trigger('save_graph')

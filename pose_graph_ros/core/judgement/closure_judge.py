@@ -323,7 +323,8 @@ class ClosureJudge:
         """
         number = self._states.find(name)
         if number < 0:
-            return rejected('unknown_id', f'expected the id of a verdict, got {name!r}')
+            return rejected('unknown_id', 'expected the id of a verdict, such as loop_closure/17, '
+                                          f'got {name!r}')
         before = int(self._states.decision[number])
         state = {Decision.IN: State.BELIEVED, Decision.OUT: State.DOUBTED,
                  Decision.AUTO: State.WAITING}[decision]
