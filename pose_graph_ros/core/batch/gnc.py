@@ -81,21 +81,21 @@ def select(problem: TruncatedProblem, surrogate: Surrogate) -> Choice | None:
     surrogate : Surrogate
 
     """
-    if not problem.solve(np.ones(len(problem)), SolverConfig(max_iterations=1)):
+    if not problem.solve(problem.allowed.astype(np.float64), SolverConfig(max_iterations=1)):
         return None
     if problem.graph.memory.head[tb.POOL_F_END] > MOST_NUMBERS * problem.graph.n_nodes:
         return None
     if not problem.solve(np.zeros(len(problem))):
         return None
-    share = problem.energies() / problem.limits
-    largest = float(np.max(share, initial=0.0))
+    share = problem.shares()
+    largest = float(np.max(share, initial=0.0, where=np.isfinite(share)))
     if largest > 1.0:
         mu = surrogate.first(largest)
         for _ in range(STEPS):
             weights = surrogate.weights(share, mu)
             if not problem.solve(weights):
                 break
-            share = problem.energies() / problem.limits
+            share = problem.shares()
             undecided = np.minimum(weights, 1.0 - weights)
             if surrogate is Surrogate.GEMAN_MCCLURE:
                 if mu == 1.0:

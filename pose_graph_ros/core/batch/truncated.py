@@ -80,6 +80,8 @@ class TruncatedProblem:
         self.limits = LIMITS[_ranks(np.concatenate(
             (self.edges.information, self.observed.information)))]
         """c^2 of each constraint, edges first, shape (M,)."""
+        self.allowed = np.ones(len(self.limits), dtype=bool)
+        """Which of them a set may believe, shape (M,)."""
         self._weights = np.concatenate((self.edges.weight, self.observed.weight))
         self._start = graph.poses.copy() if start is None else start
         if start is None and self.solve(np.zeros(len(self)), CONFIG):
@@ -112,6 +114,10 @@ class TruncatedProblem:
         return np.concatenate((
             energies(edge_errors(poses, self.edges), self.edges.information),
             energies(observed_errors(poses, self.observed), self.observed.information)))
+
+    def shares(self) -> FloatArray:
+        """Return r^2 / c^2 at the present poses, infinite for those that may not be believed."""
+        return np.where(self.allowed, self.energies() / self.limits, np.inf)
 
     def errors(self, numbers: IntArray) -> FloatArray:
         """Return the errors of some constraints at the present poses, shape (K, 3)."""
@@ -146,7 +152,7 @@ class TruncatedProblem:
         as that lowers the cost.
         """
         for _ in range(RETESTS):
-            believed = choice.energies <= self.limits
+            believed = self.allowed & (choice.energies <= self.limits)
             if np.array_equal(believed, choice.believed):
                 break
             other = self.choice(believed)

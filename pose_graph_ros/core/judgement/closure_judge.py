@@ -24,7 +24,7 @@ from pose_graph_ros.core.geometry.se2 import FloatArray, IntArray
 from pose_graph_ros.core.graph.constraints import EdgeKind, Edges
 from pose_graph_ros.core.graph.graph import GraphUpdate
 from pose_graph_ros.core.graph.reweighting import Reweighting
-from pose_graph_ros.core.judgement import relative
+from pose_graph_ros.core.judgement import final, relative
 from pose_graph_ros.core.judgement.closure_reports import ClosureReports
 from pose_graph_ros.core.judgement.closure_states import (
     AUTO,
@@ -90,6 +90,8 @@ class ClosureJudge:
         """The round in which it was tested last."""
         self._round = 0
         """Increases when more or less is believed, so that those that wait are tested again."""
+        self._final = (0, 0, 0, -1)
+        """Sizes of the graph and round at the last final decision."""
         self._n_staged = 0
         self._now_ns = 0
 
@@ -280,6 +282,33 @@ class ClosureJudge:
         rest = rest[np.argsort(np.where(known, least, 0.0)[~hopeless], kind='stable')]
         chosen = self._choose(*self._test(rest[:most]))
         return (len(chosen) > 0 and self._apply(chosen)) or len(rest) > most
+
+    def decide_finally(self) -> None:
+        """
+        Decide on all closures anew, by the graph alone; see `final`.
+
+        Without a solution, or if nothing has changed since the last time, nothing is done.
+        """
+        smoother, states = self._smoother, self._states
+        graph, judged = smoother.graph, np.flatnonzero(states.judged)
+        present = graph.n_nodes, graph.n_edges, graph.n_observed, self._round
+        if len(judged) == 0 or present == self._final:
+            return
+        before, forced = graph.poses.copy(), states.row[states.in_graph & ~states.judged]
+        choice = final.decide(graph, self._reweighting, states.row[judged], forced)
+        if choice is None:
+            return
+        different = judged[states.in_graph[judged] != choice.believed]
+        inside = np.isin(different, judged[choice.believed])
+        graph.set_poses(choice.poses)
+        if not self._apply({number: State.BELIEVED if believed else State.DOUBTED
+                            for number, believed in zip(different.tolist(), inside, strict=True)}):
+            graph.set_poses(before)
+            smoother.update(GraphUpdate())
+            return
+        # nothing is to be tested again until something changes
+        self._tested.values[:] = self._round
+        self._final = *present[:-1], self._round
 
     # --- reports ---------------------------------------------------------------------------------
 

@@ -141,6 +141,7 @@ class Judge:
         self._closures.restore(saved.closures)
 
     def finish(self) -> None:
-        """Do all the work that is left."""
+        """Do all the work that is left, then decide on all by the graph alone."""
         while self.work():
             pass
+        self._closures.decide_finally()

@@ -8,34 +8,37 @@ from pose_graph_ros.core.batch import gnc
 from pose_graph_ros.core.batch.gnc import Surrogate
 from pose_graph_ros.core.batch.truncated import Choice, TruncatedProblem
 from pose_graph_ros.core.geometry import se2
-from pose_graph_ros.core.geometry.se2 import BoolArray, FloatArray
+from pose_graph_ros.core.geometry.se2 import FloatArray
 from pose_graph_ros.core.graph.constraints import Edges
 from pose_graph_ros.core.judgement import surest_first
 
 # Least sigmas of loop closures for decisions: front ends claim too small ones [m, m, rad].
 FLOORS = np.array([0.3, 0.3, 0.05])
+# Number of closures with neighbours that agree, from which on the record speaks for the others.
+SUPPORTED = 50
 # Added to an information, relative to its largest entry, before it is inverted.
 _SINGULAR = 1e-12
 
 
-def best(problem: TruncatedProblem, *candidates: BoolArray) -> Choice | None:
+def best(problem: TruncatedProblem, *, insured: bool = False) -> Choice | None:
     """
     Return the set with the lowest truncated cost; None if the graph cannot be solved.
 
-    All constraints are believed if they contradict nothing. Otherwise the sets compared are those
-    of `surest_first` and of graduated non-convexity, and the given ones, each after retests.
+    All constraints are believed if they contradict nothing. Otherwise the sets compared are none,
+    and those of `surest_first` and of graduated non-convexity, each after retests.
 
     Parameters
     ----------
     problem : TruncatedProblem, its limits may be lowered
-    *candidates : ndarray of bool, shape (M,), further sets
+    insured : bool, whether more is asked of those without support; see `surest_first.select`
 
     """
-    everything = problem.choice(np.ones(len(problem), dtype=bool))
-    if everything is not None and np.all(everything.energies <= problem.limits):
-        return everything
-    first = surest_first.select(problem)
-    sets = [*([] if first is None else [first]), *candidates, np.zeros(len(problem), dtype=bool)]
+    if not insured or surest_first.n_supported(problem) >= SUPPORTED:
+        everything = problem.choice(np.ones(len(problem), dtype=bool))
+        if everything is not None and np.all(everything.energies <= problem.limits):
+            return everything
+    first = surest_first.select(problem, insured=insured)
+    sets = [*([] if first is None else [first]), np.zeros(len(problem), dtype=bool)]
     choices = [problem.choice(believed) for believed in sets]
     choices.append(gnc.select(problem, Surrogate.TRUNCATED))
     solved = [problem.improved(choice) for choice in choices if choice is not None]

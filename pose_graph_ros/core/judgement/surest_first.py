@@ -43,15 +43,25 @@ MARGIN, LEAST_SCALE = 3.0, 0.02
 REACH = 20.0
 # Number of those with the smallest volumes, at least, that are looked at before all others.
 SOME = 200
+# Largest odds that a constraint is wrong which no neighbours support, where these are counted.
+WRONG_ODDS = 0.02
 # What is not measured of an error could be anything within this [m, m, rad].
 EXTENT = np.array([100.0, 100.0, 2.0 * np.pi])
 
 
-def select(problem: TruncatedProblem) -> BoolArray | None:
+def select(problem: TruncatedProblem, *, insured: bool = False) -> BoolArray | None:
     """
     Return a set of believed constraints, shape (M,), and lower the limits of the problem.
 
     None if the graph cannot be solved without any of them.
+
+    Parameters
+    ----------
+    problem : TruncatedProblem
+    insured : bool
+        Whether a constraint that no two neighbours agree with must be one that a wrong one would
+        hardly pass the gate of. Those that could not show it are not allowed any more.
+
     """
     believed = np.zeros(len(problem), dtype=bool)
     if not problem.solve(believed.astype(np.float64)):
@@ -59,14 +69,22 @@ def select(problem: TruncatedProblem) -> BoolArray | None:
     gates = _Gates(problem)
     thrown = np.zeros(len(problem), dtype=np.int64)
     seen, scale, level = np.zeros(len(problem)), 1.0, 0.0
+    kept_out = np.zeros(len(problem), dtype=bool)
     for _ in range(ROUNDS):
         waiting = np.flatnonzero(~believed & (thrown < THROWN_OUT))
         passing = gates.passing(waiting, scale, REACH * level)
+        if insured:
+            passing = passing[gates.is_sure(passing, believed)]
         if not np.any(gates.volume[passing] <= level):
             some = np.sort(gates.volume[waiting])[:max(SOME, len(waiting) // 4)]
             passing = gates.passing(waiting, scale, float(some[-1]) if len(some) > 0 else 0.0)
-            if len(passing) == 0:
+            if len(passing) == 0 or insured:
                 passing = gates.passing(waiting, scale, np.inf)
+            if insured:
+                sure = gates.is_sure(passing, believed)
+                kept_out[:] = False
+                kept_out[passing[~sure]] = True
+                passing = passing[sure]
             if len(passing) == 0:
                 break
             level = max(level, ROUND * float(np.min(gates.volume[passing])))
@@ -85,7 +103,13 @@ def select(problem: TruncatedProblem) -> BoolArray | None:
             if not problem.solve(believed.astype(np.float64), go_on=True):
                 return None
     problem.limits = scale * problem.limits
+    problem.allowed &= ~kept_out
     return believed
+
+
+def n_supported(problem: TruncatedProblem) -> int:
+    """Return the number of closures that at least two neighbours agree with."""
+    return int(np.sum(_agreeing(problem) >= 2))
 
 
 class _Gates:
@@ -100,7 +124,8 @@ class _Gates:
         with np.errstate(divide='ignore'):
             own = np.prod(np.where(measured, 1.0, EXTENT), axis=1) / np.sqrt(
                 np.abs(np.linalg.det(filled)))
-        self._own = own * np.asarray(ALONE)[np.minimum(_agreeing(problem), 2)]
+        self._agreeing = np.minimum(_agreeing(problem), 2)
+        self._own = own * np.asarray(ALONE)[self._agreeing]
         self._covariances = np.full((len(problem), 3, 3), np.nan)
         """J P J^T of each; they never grow while more is believed."""
         self.volume = np.zeros(len(problem))
@@ -127,6 +152,28 @@ class _Gates:
         near = near[old <= limits[near]]
         self._compute(near)
         return near[self.share[near] <= scale]
+
+    def is_sure(self, numbers: IntArray, believed: BoolArray) -> BoolArray:
+        """
+        Return whether neighbours or the odds are for constraints that pass their gates.
+
+        The chance of a wrong one to pass is the part of all errors that its gate lets through; the
+        share of wrong ones is that of those that are not believed.
+
+        Parameters
+        ----------
+        numbers : ndarray of int, shape (K,)
+        believed : ndarray of bool, shape (M,)
+
+        """
+        alone = np.asarray(ALONE)[self._agreeing[numbers]]
+        extent = np.maximum(np.ptp(self._problem.graph.poses[:, :2], axis=0), 1.0)
+        ball = 4.0 / 3.0 * np.pi * self._problem.limits[numbers] ** 1.5
+        chance = np.minimum(
+            ball * self.volume[numbers] / alone / (np.prod(extent) * 2.0 * np.pi), 1.0)
+        n_believed = np.sum(believed)
+        return (self._agreeing[numbers] >= 2) | (
+            (len(believed) - n_believed + 1.0) * chance < WRONG_ODDS * (n_believed + 1.0))
 
     def _squared(self, numbers: IntArray, errors: FloatArray) -> FloatArray:
         return Innovations(errors, self._covariances[numbers]).squared_distances(
