@@ -18,6 +18,7 @@ from pose_graph_ros.core.judgement.verdicts import Change, Judged, SourceVerdict
 
 # Time between two lines on changes of the same source [s]; the log repeats nothing within 10 s.
 PERIOD = 10.0
+MOST_FOLLOWED = 100  # measurements that are doubted before their source is
 
 Line = tuple[int, str]
 """Level of Python's logging, and text."""
@@ -27,9 +28,10 @@ Line = tuple[int, str]
 class _Doubt:
     """A time in which the newest measurements of a source are doubted."""
 
-    begin_ns: int
     end_ns: int
-    n: int = 0
+    """Stamp of the newest of these [ns]."""
+    n: int
+    """How many there are."""
 
 
 class Announcer:
@@ -41,6 +43,8 @@ class Announcer:
         self._at: dict[str, float] = {}
         """When the last line of each source was made [s]."""
         self._doubts: dict[str, _Doubt] = {}
+        self._newest: dict[str, list[Change]] = {}
+        """New measurements that are doubted and follow one another, by source."""
 
     def lines(
         self, changes: Sequence[Change], totals: Mapping[str, SourceVerdicts], now: float,
@@ -63,6 +67,8 @@ class Announcer:
             earlier = gathered.get(change.id)
             gathered[change.id] = (
                 change if earlier is None else change._replace(before=earlier.before))
+            if _is_new_doubt(change):
+                self._follow(change)
         for source, each in totals.items():
             lines += self._doubt(source, doubting=each.doubting)
         for source, gathered in self._gathered.items():
@@ -76,23 +82,34 @@ class Announcer:
                 lines += found
         return lines
 
+    def _follow(self, change: Change) -> None:
+        """Note a new measurement that is doubted; begin again if one before it is not."""
+        newest = self._newest.setdefault(change.source, [])
+        if len(newest) > 0 and _number(newest[-1]) + 1 != _number(change):
+            newest.clear()
+        newest.append(change)
+        del newest[:-MOST_FOLLOWED]
+
     def _doubt(self, source: str, *, doubting: bool) -> Iterator[Line]:
         """Yield a line where a time begins or ends in which a source is doubted."""
         doubt, gathered = self._doubts.get(source), self._gathered.get(source, {})
-        new = [change for change in gathered.values()
-               if change.before in (None, State.WAITING) and not change.after.in_graph]
-        stamps = [change.stamp_ns for change in new]
+        new = [change for change in gathered.values() if _is_new_doubt(change)]
         if doubting and doubt is None:
-            doubt = self._doubts[source] = _Doubt(min(stamps, default=0), 0)
-            since = '' if len(stamps) == 0 else f' since {seconds(doubt.begin_ns)}'
+            # some of these may not be gathered any more
+            begin = self._newest.get(source, [])
+            stamps = [change.stamp_ns for change in begin]
+            doubt = self._doubts[source] = _Doubt(
+                max(stamps, default=0), sum(change.id not in gathered for change in begin))
+            since = '' if len(stamps) == 0 else f' since {seconds(min(stamps))}'
             yield logging.WARNING, (f'{source}: its newest measurements are doubted{since}; the '
                                     'path goes on without them')
         if doubt is None:
             return
-        doubt.n += sum(change.before is None for change in new)
-        doubt.end_ns = max([doubt.end_ns, *stamps])
-        for change in new:
-            del gathered[change.id]
+        doubt.n += len(new)
+        doubt.end_ns = max([doubt.end_ns, *(change.stamp_ns for change in new)])
+        for change in list(gathered.values()):
+            if change.before in (None, State.WAITING) and not change.after.in_graph:
+                del gathered[change.id]
         if not doubting:
             del self._doubts[source]
             yield logging.INFO, (
@@ -121,6 +138,15 @@ def _lines(source: str, changes: Sequence[Change]) -> Iterator[Line]:
             yield logging.INFO, (
                 f'{source}: {number_of(len(back), kind)} that had been doubted {_are(back)} now '
                 f'believed: {_which(back)}')
+
+
+def _is_new_doubt(change: Change) -> bool:
+    return change.kind is Judged.FIX and change.before is None and not change.after.in_graph
+
+
+def _number(change: Change) -> int:
+    """Return which constraint of its source it is."""
+    return int(change.id.rpartition('/')[2])
 
 
 def _was_in(change: Change) -> bool:

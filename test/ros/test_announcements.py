@@ -75,6 +75,17 @@ def test_a_run_of_doubted_fixes_is_one_line_at_its_begin_and_one_at_its_end() ->
     assert announcer.lines([], totals(doubting=False), 100.0) == []
 
 
+def test_a_run_begins_with_the_first_that_is_doubted_though_the_source_is_doubted_later() -> None:
+    announcer = Announcer()
+    assert announcer.lines([fix(1, None, DOUBTED)], totals(doubting=False), 1.0) == []
+    for k in (5, 6):
+        assert announcer.lines([fix(k, None, DOUBTED)], totals(doubting=False), float(k)) == []
+    ((_, text),) = announcer.lines([fix(7, None, DOUBTED)], totals(doubting=True), 7.0)
+    assert 'since 5.000;' in text
+    ((_, text),) = announcer.lines([fix(8, None, DOUBTED)], totals(doubting=False), 8.0)
+    assert '; 4 of them, until 8.000, were' in text
+
+
 def test_fixes_that_come_back_are_a_span_of_time() -> None:
     announcer = Announcer()
     assert announcer.lines([fix(k, DOUBTED, BELIEVED) for k in (30, 9, 20)],
