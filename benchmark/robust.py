@@ -22,7 +22,7 @@ import sys
 
 import numpy as np
 
-from benchmark import report, robust_fixes, robust_picture, streets
+from benchmark import report, robust_fixes, robust_picture, robust_timing, streets
 from benchmark.metrics import Metric
 from benchmark.robust_closures import (
     FAR,
@@ -381,6 +381,7 @@ def _for_peers(options: Options) -> list[Recording]:
 
 SECTIONS: dict[str, Callable[[Options], Section]] = {
     'places': places, 'worlds': worlds, 'arrivals': arrivals, 'gates': gates, 'grids': grids,
+    'timing': lambda options: robust_timing.timing(quick=options.quick),
     'fixes': fixes, 'peers': peers}
 
 

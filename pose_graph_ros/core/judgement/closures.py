@@ -45,6 +45,8 @@ def claims(edges: Edges) -> Closures:
     np.maximum(diagonal, np.square(FLOORS), out=diagonal)
     first, second, mean = edges.i.copy(), edges.j.copy(), edges.mean.copy()
     back = np.flatnonzero(first > second)
+    if len(back) == 0:
+        return Closures(first, second, mean, covariance)
     first[back], second[back] = edges.j[back], edges.i[back]
     # the error at the end of z moves to its start
     turn = se2.adjoint(mean[back])
