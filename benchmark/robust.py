@@ -227,15 +227,17 @@ def gates(options: Options) -> Section:
     section = Section(
         'Wide gates', 'A way round of 960 m before anything is seen again: the sigma of odometry '
         'is above 10 m. Five lone wrong closures, 10 to 25 m off, come first; 25 right ones on '
-        'the second lap.')
+        'the second lap. Wrong ones that lie within three sigmas of the path even then cannot be '
+        'told from right ones: asked is that the path is not worse than odometry while driving, '
+        'and much better at the end.')
     table = Table('', ('seed', *CLOSURES))
     for seed in range(1 if options.quick else 5):
         judged = judge(table, replace(wide_gates(seed), name=str(seed)))
         section.metrics += [
             Metric(f'wide gates, seed {seed}: worst path while driving', judged.worst,
                    target=WORST),
-            Metric(f'wide gates, seed {seed}: rms over that of only right ones',
-                   judged.rms / judged.right, target=1.25)]
+            Metric(f'wide gates, seed {seed}: rms over that of odometry',
+                   judged.rms / judged.odometry, target=0.75)]
     section.tables.append(table)
     return section
 
