@@ -25,17 +25,15 @@ from enum import Enum
 import numpy as np
 
 from pose_graph_ros.core.batch.truncated import Choice, TruncatedProblem
-from pose_graph_ros.core.config import SolverConfig
 from pose_graph_ros.core.geometry.se2 import FloatArray
-from pose_graph_ros.core.graph import tables as tb
 
 # Factor on mu from step to step, and their maximum number.
 FACTOR = 1.4
 STEPS = 100
 # A weight that is closer than this to 0 or 1 is final.
 FINAL = 1e-3
-# Numbers of the factorisation with all constraints, per node, above which it is not tried.
-MOST_NUMBERS = 600
+# Entries of the factorisation with all constraints, above which it is not tried.
+MOST_NUMBERS = 500_000
 # Smallest and largest mu to begin with.
 _LEAST, _MOST = 1e-6, 1e12
 
@@ -81,9 +79,7 @@ def select(problem: TruncatedProblem, surrogate: Surrogate) -> Choice | None:
     surrogate : Surrogate
 
     """
-    if not problem.solve(problem.allowed.astype(np.float64), SolverConfig(max_iterations=1)):
-        return None
-    if problem.graph.memory.head[tb.POOL_F_END] > MOST_NUMBERS * problem.graph.n_nodes:
+    if problem.factorisation(problem.allowed.astype(np.float64)) > MOST_NUMBERS:
         return None
     if not problem.solve(np.zeros(len(problem))):
         return None

@@ -22,6 +22,7 @@ import numpy as np
 
 from pose_graph_ros.core.batch.optimizer import chi2_of, optimize, Status
 from pose_graph_ros.core.config import SolverConfig
+from pose_graph_ros.core.elimination import symbolic
 from pose_graph_ros.core.geometry.se2 import BoolArray, FloatArray, IntArray
 from pose_graph_ros.core.graph.error_functions import edge_errors, energies, observed_errors
 from pose_graph_ros.core.graph.graph import Graph, GraphUpdate
@@ -107,6 +108,11 @@ class TruncatedProblem:
         if not go_on:
             self.graph.set_poses(self._start)
         return optimize(self.graph, config).status is not Status.FAILED
+
+    def factorisation(self, weights: FloatArray) -> int:
+        """Return the number of entries of a factorisation with these weights, shape (M,)."""
+        self._weigh(weights)
+        return int(symbolic.analyse(self.graph.memory.head).need_f)
 
     def energies(self) -> FloatArray:
         """Return r^2 at the present poses, shape (M,)."""

@@ -6,7 +6,7 @@ import numpy as np
 
 from pose_graph_ros.core.batch import gnc
 from pose_graph_ros.core.batch.gnc import Surrogate
-from pose_graph_ros.core.batch.truncated import Choice, TruncatedProblem
+from pose_graph_ros.core.batch.truncated import Choice, ROUGH, TruncatedProblem
 from pose_graph_ros.core.geometry import se2
 from pose_graph_ros.core.geometry.se2 import FloatArray
 from pose_graph_ros.core.graph.constraints import Edges
@@ -16,6 +16,8 @@ from pose_graph_ros.core.judgement import surest_first
 FLOORS = np.array([0.3, 0.3, 0.05])
 # Number of closures with neighbours that agree, from which on the record speaks for the others.
 SUPPORTED = 50
+# Entries of the factorisation with all of them, per node, above which some must be wrong.
+MOST_NUMBERS = 400
 # Added to an information, relative to its largest entry, before it is inverted.
 _SINGULAR = 1e-12
 
@@ -33,10 +35,13 @@ def best(problem: TruncatedProblem, *, insured: bool = False) -> Choice | None:
     insured : bool, whether more is asked of those without support; see `surest_first.select`
 
     """
-    if not insured or surest_first.n_supported(problem) >= SUPPORTED:
-        everything = problem.choice(np.ones(len(problem), dtype=bool))
-        if everything is not None and np.all(everything.energies <= problem.limits):
-            return everything
+    everything = np.ones(len(problem), dtype=bool)
+    dense = problem.factorisation(everything.astype(np.float64)) > MOST_NUMBERS * (
+        problem.graph.n_nodes)
+    if not dense and (not insured or surest_first.n_supported(problem) >= SUPPORTED):
+        choice = problem.choice(everything, ROUGH)
+        if choice is not None and np.all(choice.energies <= problem.limits):
+            return problem.choice(everything)
     first = surest_first.select(problem, insured=insured)
     sets = [*([] if first is None else [first]), np.zeros(len(problem), dtype=bool)]
     choices = [problem.choice(believed) for believed in sets]

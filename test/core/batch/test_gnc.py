@@ -192,5 +192,5 @@ def test_observed_nodes_may_be_wrong_with_limits_by_what_they_measure() -> None:
 def test_a_graph_whose_factorisation_is_nearly_dense_is_left_alone(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    monkeypatch.setattr(gnc, 'MOST_NUMBERS', 1)
+    monkeypatch.setattr(gnc, 'MOST_NUMBERS', 100)
     assert gnc.select(small(0), Surrogate.TRUNCATED) is None
