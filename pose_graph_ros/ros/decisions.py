@@ -37,6 +37,6 @@ def _hand_over(message: Message, worker: Worker, backend: PoseGraphBackend) -> N
         logger.warning('nothing is decided: %s: %s', answer.reason, answer.detail)
     else:
         backend.counts[JUDGE, 'accepted'] += 1
-        logger.info('%s', answer.detail)
+        logger.info('%s', answer.detail or f'{message.key}: {message.value}')
     # asked for here, as jobs are done after an update that was asked for before
     worker.request_update()
