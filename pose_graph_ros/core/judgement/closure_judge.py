@@ -20,6 +20,7 @@ import numpy as np
 from pose_graph_ros.core.batch.optimizer import Status
 from pose_graph_ros.core.compiled.growing_array import GrowingArray
 from pose_graph_ros.core.config import BackendConfig
+from pose_graph_ros.core.geometry import se2
 from pose_graph_ros.core.geometry.se2 import BoolArray, FloatArray, IntArray
 from pose_graph_ros.core.graph import tables as tb
 from pose_graph_ros.core.graph.constraints import EdgeKind, Edges
@@ -37,17 +38,18 @@ from pose_graph_ros.core.judgement.closure_states import (
     STATES,
     WAITING,
 )
-from pose_graph_ros.core.judgement.closures import claims, ClosureTable, GATE
+from pose_graph_ros.core.judgement.closures import chances, claims, ClosureTable, GATE
 from pose_graph_ros.core.judgement.consistency import OdometryChain
+from pose_graph_ros.core.judgement.residual_scale import MOST, residual_scale
+from pose_graph_ros.core.judgement.swaps import Swap
 from pose_graph_ros.core.judgement.texts import sentence
 from pose_graph_ros.core.judgement.verdicts import (
-    Change,
     Decision,
     SourceVerdicts,
     State,
     Verdict,
 )
-from pose_graph_ros.core.measurements import Answer, AnswerStatus, rejected
+from pose_graph_ros.core.measurements import Answer, AnswerStatus, LoopClosure, rejected
 from pose_graph_ros.core.smoother.incremental import IncrementalSmoother
 from pose_graph_ros.core.sources.factor_builder import NewConstraint
 
@@ -61,6 +63,10 @@ WEAK = 0.02
 NARROW = 1e-3
 # Numbers of closures that are tested again in an update, and in a part of the work.
 IN_UPDATE, IN_PART = 16, 64
+# Another set is tried when so many more closures speak for one than the last time, and half more.
+MORE_CORROBORATED = 5
+# Most closures from which the clique is grown that is forced in.
+MOST_SEEDS = 50
 
 
 class ClosureJudge:
@@ -81,7 +87,7 @@ class ClosureJudge:
         self._smoother, self._reweighting, self._config = smoother, reweighting, config
         self._chain = OdometryChain()
         self._table = ClosureTable(self._chain)
-        self._states = ClosureStates()
+        self.states = self._states = ClosureStates()
         self.reports = ClosureReports(self._states, self._table)
         self._scales: list[float] = []
         """Of each source, the factor on its sigmas in the graph."""
@@ -95,6 +101,13 @@ class ClosureJudge:
         """Sizes of the graph and round at the last final decision."""
         self._n_staged = 0
         self._now_ns = 0
+        self._corroborated = GrowingArray((), np.bool_)
+        """Whether a clique of closures outside of the graph supports one that is doubted."""
+        self._next_swap = MORE_CORROBORATED
+        self._swap: tuple[Swap, IntArray, int] | None = None
+        """The trial that goes on, its clique, and the round in which it began."""
+        self._learnt_from: list[int] = []
+        """Number of believed closures of each source when its scale was learnt."""
 
     def configure(self, config: BackendConfig) -> None:
         """Set the settings."""
@@ -104,8 +117,6 @@ class ClosureJudge:
     def n_edges_of_graph(self) -> int:
         """Number of edges in the graph."""
         return self._smoother.graph.n_edges
-
-    # --- arrival ---------------------------------------------------------------------------------
 
     def before(
         self, new: Sequence[NewConstraint], edges: Edges, now_ns: int,
@@ -125,21 +136,28 @@ class ClosureJudge:
         self._chain.extend(self._smoother.graph)
         self._table.append(claims(edges))
         self._states.append(new, now_ns)
-        self._scales += [1.0] * (len(self._states.sources) - len(self._scales))
-        self._spread.append(np.zeros((n, 3, 3)))
-        self._tested.append(np.full(n, -1))
+        self._append_unknown(n)
         numbers = np.arange(begin, begin + n)
         if not self._smoother.graph.has_touched:
             for number, state in self._choose(*self._test(numbers)).items():
                 self._states.state[number] = STATES.index(state)
         return self._weights(numbers)
 
+    def _append_unknown(self, n: int) -> None:
+        """Append n closures that were not tested yet."""
+        self._spread.append(np.zeros((n, 3, 3)))
+        self._tested.append(np.full(n, -1))
+        self._corroborated.append(np.zeros(n, dtype=bool))
+        for source in self._states.sources[len(self._scales):]:
+            self._scales.append(self._fixed_scale(source) or 1.0)
+            self._learnt_from.append(0)
+
     def rollback(self) -> None:
         """Forget the closures of the last `before`."""
         self.reports.forget()
         self._table.drop(self._n_staged)
         self._states.drop(self._n_staged)
-        for array in (self._spread, self._tested):
+        for array in (self._spread, self._tested, self._corroborated):
             array.truncate(len(self._states))
         self._n_staged = 0
 
@@ -151,8 +169,6 @@ class ClosureJudge:
         if np.any(self._states.in_graph[begin:]):
             self._round += 1
             self._set_base_weights(np.arange(begin, len(self._states)))
-
-    # --- tests -----------------------------------------------------------------------------------
 
     def _test(self, numbers: IntArray) -> tuple[IntArray, FloatArray]:
         """Test closures that are not in the graph; return those that pass, and their chances."""
@@ -170,17 +186,12 @@ class ClosureJudge:
                 numbers.tolist(), np.where(passes, WAITING, DOUBTED).tolist(), strict=True):
             before = int(self._states.state[number])
             self._states.state[number] = state
+            if state == DOUBTED and not self._corroborated.values[number]:
+                self._corroborated.values[number] = self._is_corroborated(
+                    number, ~self._states.in_graph)
             if number < len(self._states) - self._n_staged:
                 self._states.announce(number, before, self._now_ns)
-        return numbers[passes], self._chances(total[passes])
-
-    def _chances(self, covariance: FloatArray) -> FloatArray:
-        """Return the chances of random closures to pass gates with these covariances, (M,)."""
-        x, y = self._smoother.poses[:, :2].T    # much faster one by one
-        area = max(float(np.ptp(x) * np.ptp(y)), 1.0)
-        ellipse = math.pi * GATE * np.sqrt(np.linalg.det(covariance[:, :2, :2]))
-        arc = np.sqrt(GATE * covariance[:, 2, 2]) / math.pi
-        return np.minimum(ellipse / area, 1.0) * np.minimum(arc, 1.0)
+        return numbers[passes], chances(total[passes], self._smoother.poses)
 
     def _choose(self, passed: IntArray, chance: FloatArray) -> dict[int, State]:
         """Return which closures that have passed are believed now; of wide gates only one."""
@@ -198,15 +209,14 @@ class ClosureJudge:
         of_source = self._states.source == self._states.source[number]
         n, good = int(np.sum(of_source)), int(np.sum(self._states.in_graph & of_source))
         alone = (n - good + 1.0) * chance < WRONG_ODDS * (good + 1.0)
-        if (alone and chance <= WEAK) or self._is_corroborated(number):
+        if (alone and chance <= WEAK) or self._is_corroborated(
+                number, self._states.decision != OUT):
             return State.BELIEVED
         return State.WEAKLY_BELIEVED if alone else State.WAITING
 
-    def _is_corroborated(self, number: int) -> bool:
-        support = self._table.support(number, self._states.decision != OUT)
+    def _is_corroborated(self, number: int, usable: BoolArray) -> bool:
+        support = self._table.support(number, usable)
         return len(support.clique) >= CLIQUE and support.travel >= CLIQUE_TRAVEL
-
-    # --- changes ---------------------------------------------------------------------------------
 
     def _weights(self, numbers: IntArray) -> FloatArray:
         scales = np.array(self._scales)[self._states.source[numbers]]
@@ -238,7 +248,8 @@ class ClosureJudge:
 
     def work(self) -> bool:
         """Do a bounded part of what is left; tell whether there is more."""
-        return self._part(IN_PART)
+        return self._part(IN_PART) or (not self._smoother.graph.has_touched and (
+            self._learn_scales() or self._look_for_another_set()))
 
     def _part(self, most: int) -> bool:
         if len(self._states) == 0 or self._smoother.graph.has_touched:
@@ -302,23 +313,89 @@ class ClosureJudge:
         present = graph.n_nodes, graph.n_edges, graph.n_observed, self._round
         if len(judged) == 0 or present == self._final:
             return
-        before, forced = graph.poses.copy(), states.row[states.in_graph & ~states.judged]
+        forced = states.row[states.in_graph & ~states.judged]
         choice = final.decide(graph, self._reweighting, states.row[judged], forced)
         if choice is None:
             return
-        different = judged[states.in_graph[judged] != choice.believed]
-        inside = np.isin(different, judged[choice.believed])
-        graph.set_poses(choice.poses)
-        if not self._apply({number: State.BELIEVED if believed else State.DOUBTED
-                            for number, believed in zip(different.tolist(), inside, strict=True)}):
-            graph.set_poses(before)
-            smoother.update(GraphUpdate())
+        inside = states.in_graph
+        inside[judged] = choice.believed
+        self._scales = [self._fixed_scale(name) or 1.0 for name in states.sources]
+        if not self._change_to(inside, choice.poses):
             return
+        self._learnt_from = [0] * len(self._scales)
+        self._learn_scales()
         # nothing is to be tested again until something changes
         self._tested.values[:] = self._round
         self._final = *present[:-1], self._round
 
-    # --- reports ---------------------------------------------------------------------------------
+    def _fixed_scale(self, source: str) -> float:
+        """Return the factor that is set for a source, 0 if it is learnt."""
+        return self._config.measurement_source(source, LoopClosure).sigma_scale
+
+    def _learn_scales(self) -> bool:
+        """Learn the scales of sources of which many more closures are believed than before."""
+        believed = np.flatnonzero(self._states.in_graph)
+        for source, name in enumerate(self._states.sources):
+            numbers = believed[self._states.source[believed] == source]
+            if len(numbers) < 1.25 * self._learnt_from[source] + 5 or self._fixed_scale(name):
+                continue
+            self._learnt_from[source] = len(numbers)
+            some = numbers[np.lexsort(self._states.stamps_ns[numbers].T)]
+            some = some[np.linspace(0, len(some) - 1, min(len(some), MOST)).astype(np.int64)]
+            edges = self._smoother.graph.edges_at(self._states.row[some])
+            scale, before = residual_scale(
+                *self._smoother.edge_innovations(edges), edges.information,
+                self._scales[source]), self._scales[source]
+            if scale == before:
+                continue
+            self._scales[source] = scale
+            if not self._apply(dict(zip(numbers.tolist(), (
+                    STATES[k] for k in self._states.state[numbers].tolist()), strict=True))):
+                self._scales[source] = before
+            self._spread.values[:] = 0.0
+            return True
+        return False
+
+    def _look_for_another_set(self) -> bool:
+        """Go on with a trial, or begin one if enough speaks against what is believed."""
+        if self._swap is not None:
+            swap, clique, began = self._swap
+            goes_on = began == self._round and swap.step(clique)
+            if not goes_on:
+                self._swap = None
+                if swap.found is not None and began == self._round:
+                    self._change_to(swap.found.inside, swap.found.poses)
+            return True
+        against = np.flatnonzero(self._corroborated.values & ~self._states.in_graph
+                                 & self._states.judged)
+        if len(against) < self._next_swap:
+            return False
+        self._next_swap = max(len(against) + MORE_CORROBORATED, math.ceil(1.5 * len(against)))
+        cliques = [self._table.support(number, ~self._states.in_graph & self._states.judged).clique
+                   for number in against[-MOST_SEEDS:].tolist()]
+        clique = max(cliques, key=len)
+        numbers = np.arange(len(self._states))
+        self._swap = Swap(
+            self._smoother.graph, self._table.rows(numbers), self._states.row,
+            self._states.in_graph, self._states.judged), clique, self._round
+        return True
+
+    def _change_to(self, inside: BoolArray, poses: FloatArray) -> bool:
+        """Believe another set, with the poses that it was found with; tell whether that worked."""
+        graph, n, last = self._smoother.graph, len(inside), len(poses) - 1
+        before = graph.poses.copy()
+        behind = se2.compose(poses[last], se2.between(before[last], before[last + 1:]))
+        graph.set_poses(np.concatenate((poses, behind)))
+        now = self._states.in_graph[:n]
+        # those that stay are weighed, too, as scales may have changed
+        done = self._apply({
+            k: (STATES[self._states.state[k]] if now[k] else State.BELIEVED) if inside[k]
+            else State.DOUBTED for k in np.flatnonzero(inside | now).tolist()})
+        if not done:
+            graph.set_poses(before)
+            self._smoother.update(GraphUpdate())
+        self._spread.values[:] = 0.0
+        return done
 
     def verdicts(self, most_believed: int | None = None) -> list[Verdict]:
         """Return all verdicts, but of those that are believed only the newest of each source."""
@@ -334,12 +411,8 @@ class ClosureJudge:
         self._table.append(claims(self._smoother.graph.edges_at(saved.rows)))
         self._states.restore(saved)
         self._scales = saved.scales.tolist()
-        self._spread.append(np.zeros((len(saved.rows), 3, 3)))
-        self._tested.append(np.full(len(saved.rows), -1))
-
-    def take_changes(self) -> list[Change]:
-        """Return the changes of states since the last call."""
-        return self._states.take_changes()
+        self._learnt_from = [0] * len(self._scales)
+        self._append_unknown(len(saved.rows))
 
     def totals(self) -> dict[str, SourceVerdicts]:
         """Return what is believed of each source."""

@@ -55,6 +55,23 @@ def claims(edges: Edges) -> Closures:
     return Closures(first, second, mean, covariance)
 
 
+def chances(covariance: FloatArray, poses: FloatArray) -> FloatArray:
+    """
+    Return the chances of random closures to pass gates, shape (M,).
+
+    Parameters
+    ----------
+    covariance : ndarray, shape (M, 3, 3), of the errors that the gates are for
+    poses : ndarray, shape (N, 3), nodes, which say how large the place is
+
+    """
+    x, y = poses[:, :2].T    # much faster one by one
+    area = max(float(np.ptp(x) * np.ptp(y)), 1.0)
+    ellipse = np.pi * GATE * np.sqrt(np.linalg.det(covariance[:, :2, :2]))
+    arc = np.sqrt(GATE * covariance[:, 2, 2]) / np.pi
+    return np.asarray(np.minimum(ellipse / area, 1.0) * np.minimum(arc, 1.0))
+
+
 class ClosureTable:
     """Closures in the order of their addition, and where they are along the path."""
 

@@ -114,7 +114,7 @@ class Judge:
 
     def changes(self) -> list[Change]:
         """Return the changes of verdicts since the last call."""
-        return self._closures.take_changes()
+        return self._closures.states.take_changes()
 
     def totals(self) -> Mapping[str, SourceVerdicts]:
         """Return what is believed of each source, as a whole."""

@@ -1,0 +1,114 @@
+# Copyright 2026 The pose_graph_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""
+Another set of believed closures, tried on a copy of the graph.
+
+Closures that agree with one another and not with the graph may be right, and others that came
+before them wrong. The copy is optimised with a clique of them forced in. Then all closures are
+chosen anew by their residuals, with a limit that narrows. Sets are compared by the truncated cost
+
+    chi2 of all that is not judged + sum over the judged closures of min(r^2, limit)
+
+with r^2 by the floored covariances, which closures have in the copy.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from pose_graph_ros.core.batch import optimizer
+from pose_graph_ros.core.batch.optimizer import Status
+from pose_graph_ros.core.config import SolverConfig
+from pose_graph_ros.core.geometry.se2 import BoolArray, FloatArray, IntArray
+from pose_graph_ros.core.graph.constraints import Edges
+from pose_graph_ros.core.graph.error_functions import edge_errors, energies
+from pose_graph_ros.core.graph.graph import Graph, GraphUpdate
+from pose_graph_ros.core.judgement.closures import GATE
+from pose_graph_ros.core.judgement.consistency import Closures
+
+_CONFIG = SolverConfig(max_iterations=20, step_tolerance=1e-3)
+# Factors on the limit of r^2 in successive rounds; in the first ones the clique stays in.
+NARROWING, FORCED_ROUNDS = (16.0, 4.0, 2.0, 1.0, 1.0, 1.0, 1.0), 3
+# By how much the truncated cost must fall.
+GAIN = GATE
+
+
+@dataclass(frozen=True, slots=True)
+class Found:
+    """A better set."""
+
+    inside: BoolArray
+    """Which closures are in it, shape (M,)."""
+    poses: FloatArray
+    """Of all hidden nodes, shape (N, 3)."""
+
+
+class Swap:
+    """
+    A trial, one optimisation at each step.
+
+    Parameters
+    ----------
+    graph : Graph
+    closures : Closures, M judged ones, with floored covariances
+    rows : ndarray of int, shape (M,), their edges in the graph
+    inside, free : ndarray of bool, shape (M,), which are believed, and which may change
+
+    """
+
+    def __init__(
+        self, graph: Graph, closures: Closures, rows: IntArray, inside: BoolArray,
+        free: BoolArray,
+    ) -> None:
+        self._rows, self._before, self._free = rows, inside, free
+        copied = graph.rows()
+        information = np.linalg.inv(closures.noise)
+        kinds, weights = copied.edges.kind[rows], inside.astype(np.float64)
+        self._edges = Edges(
+            closures.i, closures.j, closures.mean, information, kinds, np.ones(len(rows)))
+        columns = (closures.i, closures.j, closures.mean, information, kinds, weights)
+        for column, values in zip(copied.edges.columns, columns, strict=False):
+            column[rows] = values
+        self._graph = Graph()
+        self._graph.fill(copied)
+        self._n_steps, self._cost = 0, np.inf
+        self._inside = inside.copy()
+        self.found: Found | None = None
+
+    def step(self, clique: IntArray) -> bool:
+        """Do one optimisation; tell whether the trial goes on. `found` is its result."""
+        if optimizer.optimize(self._graph, _CONFIG).status is Status.FAILED:
+            return False
+        residual = energies(
+            edge_errors(self._graph.poses, self._edges), self._edges.information)
+        if self._n_steps == 0:
+            self._cost = self._truncated(residual)
+            self._choose(self._before, clique)
+            self._n_steps = 1
+            return True
+        if self._n_steps > len(NARROWING):
+            return False
+        limit = GATE * NARROWING[self._n_steps - 1]
+        settled = limit <= GATE
+        if settled and self._truncated(residual) < self._cost - GAIN:
+            self.found = Found(self._inside.copy(), self._graph.poses.copy())
+            self._cost = self._truncated(residual)
+        self._n_steps += 1
+        before = self._inside
+        self._choose(residual < limit,
+                     clique if self._n_steps <= FORCED_ROUNDS else clique[:0])
+        return not (settled and np.array_equal(before, self._inside))
+
+    def _choose(self, wanted: BoolArray, forced: IntArray) -> None:
+        self._inside = np.where(self._free, wanted, self._before)
+        self._inside[forced] = True
+        self._graph.apply(GraphUpdate(weigh_edges=dict(zip(
+            self._rows.tolist(), self._inside.astype(float).tolist(), strict=True))))
+
+    def _truncated(self, residual: FloatArray) -> float:
+        others = np.ones(self._graph.n_edges, dtype=bool)
+        others[self._rows] = False
+        all_energies = self._graph.energies()
+        chi2 = float(np.sum(all_energies.edges[others]) + np.sum(all_energies.observed))
+        return chi2 + float(np.sum(np.minimum(residual[self._free], GATE))) + float(
+            np.sum(residual[~self._free & self._before]))

@@ -1,0 +1,263 @@
+# Copyright 2026 The pose_graph_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""Which loop closures are believed: small worlds with false ones, and the pieces by oracles."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from pose_graph_ros.core.backend import PoseGraphBackend
+from pose_graph_ros.core.batch.optimizer import Status
+from pose_graph_ros.core.config import BackendConfig, MeasurementSource, NodePolicy, Robust
+from pose_graph_ros.core.geometry import se2
+from pose_graph_ros.core.geometry.se2 import FloatArray
+from pose_graph_ros.core.graph.constraints import EdgeKind, Edges
+from pose_graph_ros.core.graph.error_functions import edge_errors
+from pose_graph_ros.core.graph.graph import GraphUpdate
+from pose_graph_ros.core.io.graph_files import read_graph, write_graph
+from pose_graph_ros.core.judgement.closures import claims, FLOORS, GATE
+from pose_graph_ros.core.judgement.residual_scale import residual_scale
+from pose_graph_ros.core.judgement.verdicts import Decision, State, Verdict
+from pose_graph_ros.core.measurements import AnswerStatus, LoopClosure, OdometrySample
+
+SECOND = 10**9
+LAP, LAPS = 80, 3
+CONFIG = BackendConfig(nodes=NodePolicy(minimum_travel_distance=0.9))
+SIGMAS = np.array([0.1, 0.1, 0.03])
+
+
+def drive(seed: int) -> tuple[FloatArray, FloatArray]:
+    """Return truth and odometry of three laps of 80 m, a node each metre."""
+    rng = np.random.default_rng(seed)
+    truth, odometry = np.zeros((LAP * LAPS, 3)), np.zeros((LAP * LAPS, 3))
+    step = np.array([1.0, 0.0, 2.0 * np.pi / LAP])
+    for k in range(1, len(truth)):
+        truth[k] = se2.compose(truth[k - 1], step)
+        odometry[k] = se2.compose(
+            odometry[k - 1], step + rng.normal(0.0, (0.03, 0.02, 0.006)))
+    return truth, odometry
+
+
+TRUTH, ODOMETRY = drive(0)
+Closures = dict[int, list[LoopClosure]]
+
+
+def closure(i: int, j: int, z: FloatArray) -> LoopClosure:
+    return LoopClosure((j + 1) * SECOND, z, np.diag(SIGMAS**2), reference_ns=(i + 1) * SECOND)
+
+
+def true_one(i: int, j: int, rng: np.random.Generator) -> LoopClosure:
+    return closure(i, j, se2.between(TRUTH[i], TRUTH[j]) + rng.normal(0.0, SIGMAS))
+
+
+def run(closures: list[LoopClosure], *, config: BackendConfig = CONFIG,
+        begin: PoseGraphBackend | None = None, first: int = 0,
+        last: int = len(TRUTH)) -> PoseGraphBackend:
+    """Drive, update every 5 s, and do all work in between."""
+    backend = begin or PoseGraphBackend(config)
+    for k in range(first, last):
+        backend.add_odometry(OdometrySample((k + 1) * SECOND, ODOMETRY[k]))
+        for each in closures:
+            if each.stamp_ns == (k + 1) * SECOND:
+                backend.add_measurement(each, 'scan')
+        if k % 5 == 0:
+            backend.update()
+            work(backend)
+    backend.finish()
+    backend.update()
+    work(backend)
+    return backend
+
+
+def work(backend: PoseGraphBackend) -> None:
+    while not backend.refine().finished:
+        pass
+
+
+def states(backend: PoseGraphBackend) -> dict[int, State]:
+    return {each.stamp_ns // SECOND - 1: each.state for each in backend.verdicts()}
+
+
+def verdict(backend: PoseGraphBackend, j: int) -> Verdict:
+    return next(each for each in backend.verdicts() if each.stamp_ns == (j + 1) * SECOND)
+
+
+def error(backend: PoseGraphBackend) -> float:
+    """Return the rms distance to the truth after the best rigid motion [m]."""
+    path = backend.graph.poses[:, :2]
+    ours, theirs = path - path.mean(0), TRUTH[:len(path), :2] - TRUTH[:len(path), :2].mean(0)
+    u, _, v = np.linalg.svd(ours.T @ theirs)
+    return float(np.sqrt(np.mean(np.sum((ours @ u @ v - theirs) ** 2, axis=1))))
+
+
+def true_ones(rng: np.random.Generator) -> list[LoopClosure]:
+    return [true_one(j - LAP, j, rng) for j in range(LAP + 5, LAP * LAPS, 3)]
+
+
+def false_ones(rng: np.random.Generator) -> list[LoopClosure]:
+    """Random places are taken for one another, with a small pose in between."""
+    return [closure(int(rng.integers(0, 30)), j, rng.normal(0.0, (1.0, 1.0, 1.0)))
+            for j in range(LAP - 30, LAP * LAPS - 1, 3) if j % LAP > 40]
+
+
+# --- worlds --------------------------------------------------------------------------------------
+
+@pytest.mark.parametrize('seed', range(2))
+def test_false_closures_are_doubted_and_all_true_ones_believed(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    true, false = true_ones(rng), false_ones(rng)
+    clean, dirty = run(true), run(true + false)
+    expected = {int(each.stamp_ns // SECOND) - 1: True for each in true}
+    expected.update(dict.fromkeys((each.stamp_ns // SECOND - 1 for each in false), False))
+    assert {k: state.in_graph for k, state in states(dirty).items()} == expected
+    dirty.optimize(), clean.optimize()
+    assert np.allclose(dirty.graph.poses, clean.graph.poses, atol=1e-6)
+    assert error(dirty) < 0.5
+    # closures with weight 0 are rows of the graph
+    assert dirty.graph.n_edges == clean.graph.n_edges + len(false)
+
+
+def group(at: int, to: int, n: int, rng: np.random.Generator) -> list[LoopClosure]:
+    """Return n closures that agree that the robot is at the place of another time, turned."""
+    z = np.array([0.5, -0.5, 1.0])
+    return [closure(to + k, at + k, se2.compose(se2.compose(
+        se2.between(TRUTH[to + k], TRUTH[to]), z), se2.between(TRUTH[at], TRUTH[at + k]))
+        + rng.normal(0.0, 0.2 * SIGMAS)) for k in range(n)]
+
+
+def test_a_group_of_false_closures_that_agree_is_doubted() -> None:
+    rng = np.random.default_rng(3)
+    false = group(60, 10, 10, rng)
+    backend = run([*true_ones(rng), *false])
+    assert all(not states(backend)[each.stamp_ns // SECOND - 1].in_graph for each in false)
+    assert error(backend) < 0.5
+
+
+def test_a_false_group_that_came_first_is_thrown_out_by_true_ones() -> None:
+    rng = np.random.default_rng(4)
+    # 20 sigmas are claimed for each metre: anything passes the first gate
+    config = BackendConfig(nodes=CONFIG.nodes)
+    backend = run(false := group(60, 10, 4, rng), config=config, last=66)
+    for each in backend.verdicts():
+        backend.decide(each.id, Decision.IN)
+    for each in backend.verdicts():
+        backend.decide(each.id, Decision.AUTO)
+    run(true_ones(rng), begin=backend, first=66)
+    assert all(not states(backend)[each.stamp_ns // SECOND - 1].in_graph for each in false)
+    assert error(backend) < 0.5
+
+
+def test_a_person_forces_a_closure_in_and_out_and_takes_it_back() -> None:
+    rng = np.random.default_rng(5)
+    backend = run([*true_ones(rng), false := closure(10, 60, np.zeros(3))])
+    before = backend.graph.poses.copy()
+    at = false.stamp_ns // SECOND - 1
+    assert verdict(backend, at).state is State.DOUBTED
+    assert backend.decide(verdict(backend, at).id, Decision.IN).status is AnswerStatus.ACCEPTED
+    work(backend)
+    assert verdict(backend, at).state is State.BELIEVED
+    assert np.max(np.abs(backend.graph.poses - before)) > 0.1
+    assert backend.decide(verdict(backend, at).id, Decision.AUTO).status is AnswerStatus.ACCEPTED
+    work(backend)
+    assert verdict(backend, at).state is State.DOUBTED
+    assert np.allclose(backend.graph.poses, before, atol=0.02)
+    good = verdict(backend, 202)
+    assert good.state is State.BELIEVED
+    backend.decide(good.id, Decision.OUT)
+    work(backend)
+    assert verdict(backend, 202).state is State.DOUBTED
+    assert backend.decide('scan/9999', Decision.OUT).reason == 'unknown_id'
+
+
+def test_a_verdict_has_its_reasons() -> None:
+    rng = np.random.default_rng(6)
+    backend = run([*true_ones(rng), closure(110, 161, np.zeros(3))])
+    good, bad = verdict(backend, 202), verdict(backend, 161)
+    assert good.id.startswith('scan/')
+    assert good.reference_ns == 123 * SECOND
+    assert len(good.supported_by) >= 2
+    assert good.contradicted_by == ()
+    assert good.distance < np.sqrt(GATE) < bad.distance
+    assert bad.contradicted_by[0] == 'odometry'
+    assert np.linalg.norm(bad.residual[:2]) > 5.0
+    totals = backend.verdict_totals()['scan']
+    assert totals.counts[State.DOUBTED] == 1
+    assert [change.after for change in backend.verdict_changes()
+            if change.id == bad.id] == [State.DOUBTED]
+    assert backend.verdict_changes() == []
+
+
+def test_robust_none_believes_everything() -> None:
+    rng = np.random.default_rng(7)
+    config = BackendConfig(
+        nodes=CONFIG.nodes, measurements={'scan': MeasurementSource(robust=Robust.NONE)})
+    backend = run([*true_ones(rng), *false_ones(rng)], config=config)
+    assert backend.verdicts() == []
+    assert error(backend) > 2.0
+
+
+def test_a_saved_graph_goes_on_with_its_judgement(tmp_path: Path) -> None:
+    rng = np.random.default_rng(8)
+    closures = [*true_ones(rng), *false_ones(rng)]
+    backend = run(closures, last=150)
+    write_graph(backend.saved(), tmp_path / 'map')
+    other = PoseGraphBackend.restored(CONFIG, read_graph(tmp_path / 'map'))
+    kept = [(each.id, each.state, each.since_ns, each.decision, each.row)
+            for each in backend.verdicts()]
+    assert kept == [(each.id, each.state, each.since_ns, each.decision, each.row)
+                    for each in other.verdicts()]
+    for each in (backend, other):
+        run(closures, begin=each, first=150)
+        each.optimize()
+    assert states(backend) == states(other)
+    assert np.allclose(backend.graph.poses, other.graph.poses, atol=1e-6)
+
+
+def test_an_update_that_fails_leaves_the_judgement_as_it_was(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    rng = np.random.default_rng(9)
+    backend = run(true_ones(rng), last=120)
+    before = [(each.id, each.state) for each in backend.verdicts()]
+    backend.add_measurement(true_one(34, 114, rng), 'scan')
+    with monkeypatch.context() as patch:
+        failed = backend._smoother.update(GraphUpdate())._replace(
+            status=Status.FAILED, reason='on purpose')
+        patch.setattr(backend._smoother, 'update', lambda _: failed)
+        assert backend.update().status is Status.FAILED
+    assert [(each.id, each.state) for each in backend.verdicts()] == before
+    backend.optimize()     # takes what was set aside
+    assert len(backend.verdicts()) == len(before) + 1
+
+
+# --- pieces --------------------------------------------------------------------------------------
+
+def test_claims_are_floored_and_lead_from_the_earlier_to_the_later_node() -> None:
+    rng = np.random.default_rng(10)
+    poses = rng.normal(0.0, 5.0, (2, 3))
+    z = se2.between(poses[1], poses[0]) + rng.normal(0.0, 1e-6, 3)
+    information = np.diag(SIGMAS**-2.0)
+    edges = Edges([1], [0], z[None], information[None], [EdgeKind.LOOP_CLOSURE])
+    claim = claims(edges)
+    assert (claim.i.tolist(), claim.j.tolist()) == ([0], [1])
+    forward = Edges(claim.i, claim.j, claim.mean, np.linalg.inv(claim.noise), edges.kind)
+    error, back = edge_errors(poses, forward)[0], edge_errors(poses, edges)[0]
+    floored = np.diag(np.square(FLOORS))
+    assert error @ np.linalg.solve(claim.noise[0], error) == pytest.approx(
+        back @ np.linalg.solve(floored, back), rel=1e-4)
+
+
+@pytest.mark.parametrize('factor', [0.5, 1.0, 2.5])
+def test_the_scale_of_the_sigmas_is_found_in_the_residuals(factor: float) -> None:
+    """Linear world: M noisy measurements each of 10 vectors, with the optimum as the estimate."""
+    rng = np.random.default_rng(11)
+    sigmas = np.array([0.2, 0.3, 0.05])
+    measured = factor * sigmas * rng.normal(size=(10, 8, 3))
+    errors = (measured.mean(axis=1, keepdims=True) - measured).reshape(-1, 3)
+    information = np.tile(np.diag(sigmas**-2.0), (80, 1, 1))
+    scale = 1.0
+    for _ in range(5):
+        scale = residual_scale(
+            errors, scale**2 * np.tile(np.diag(sigmas**2 / 8.0), (80, 1, 1)), information, scale)
+    assert scale == pytest.approx(max(factor, 1.0), rel=0.2)
