@@ -28,6 +28,7 @@ from pose_graph_ros.core.config import (
     Loss,
     MeasurementSource,
     OdometryNoise,
+    POSITIONS,
 )
 from pose_graph_ros.core.geometry import se2
 from pose_graph_ros.core.geometry.trajectory import Trajectory
@@ -50,6 +51,10 @@ CAR = Kind('car, 15 m/s, fixes of 1 m at 1 Hz', speed=15.0, odometry_rate=20.0)
 SHORT = Kind('mower, fixes at 10 Hz whose errors live for 5 s', duration=60.0, period=0.1, tau=5.0)
 GNSS = Kind('mower, fixes at 2 Hz, errors live for 60 s, a tenth white', duration=300.0,
             period=0.5, tau=60.0, white_share=0.1)
+FURTHER = tuple(
+    Kind(f'mower, a fix every {period:.0f} s, errors live for {tau:.0f} s', duration=duration,
+         period=period, tau=tau, white_share=0.05)
+    for duration, tau in ((600.0, 10.0), (600.0, 60.0), (900.0, 300.0)) for period in (1.0, 5.0))
 
 
 def uncertainty(runs: int) -> Section:
@@ -57,13 +62,15 @@ def uncertainty(runs: int) -> Section:
     section = Section(
         'Is the claimed uncertainty right?',
         f'The newest pose at the end of a drive, over {runs} seeded runs. Asked for: NEES of '
-        f'{NEES[0]} to {NEES[1]} for white errors, and for correlated ones that are treated so.')
+        f'{NEES[0]} to {NEES[1]} for white errors, for correlated ones that are treated so, and '
+        'with the default, without a parameter being set.')
     table = Table('', ('drive', 'fixes treated as', 'NEES', 'error, rms [m]', 'claimed [m]',
                        'unaligned', 'tau found [s]'))
-    white = MeasurementSource()
+    defaults = {'white': MeasurementSource(), 'default': POSITIONS}
     for kind, treatments in (
-            (MOWER, {'white': white}), (CAR, {'white': white}),
-            (SHORT, _treatments(SHORT)), (GNSS, _treatments(GNSS))):
+            (MOWER, defaults), (CAR, defaults),
+            (SHORT, _treatments(SHORT)), (GNSS, _treatments(GNSS)),
+            *((kind, defaults) for kind in FURTHER)):
         for name, source in treatments.items():
             nees, error, claimed, taus, missing = [], [], [], [], 0
             for seed in range(runs):
@@ -99,7 +106,7 @@ def uncertainty(runs: int) -> Section:
 
 def _treatments(kind: Kind) -> dict[str, MeasurementSource]:
     return {
-        'white': MeasurementSource(),
+        'white': MeasurementSource(), 'default': POSITIONS,
         'inflated': MeasurementSource(
             correlation_time=kind.tau, correlation=Correlation.INFLATE),
         'a bias': MeasurementSource(correlation_time=kind.tau)}

@@ -208,15 +208,18 @@ SOURCE_PARAMETERS: tuple[Parameter, ...] = (
                 'measurements; of closer ones the first to arrive is used. If 0, all are used.',
                 0.0, 3600.0, kinds=kinds) for kinds, period in (
         (_POSITIONS, _MEASUREMENT.minimum_period), ((Kind.IMU,), config.HEADINGS.minimum_period))),
-    Parameter('correlation_time', _MEASUREMENT.correlation_time, 's',
-              'Time constant of time-correlated errors. If 0, errors are white noise.', 0.0, 1e5,
-              kinds=_NOT_CLOSURES, change=Change.UNCONFIGURED),
+    *(Parameter('correlation_time', time, 's', 'Time constant of time-correlated errors. If 0, '
+                'errors are white noise. If -1, the errors themselves show whether they are '
+                'correlated and for how long, and `white_share` has no effect.', config.FOUND,
+                1e5, kinds=kinds, change=Change.UNCONFIGURED) for kinds, time in (
+        (_POSITIONS, config.POSITIONS.correlation_time),
+        ((Kind.IMU,), _MEASUREMENT.correlation_time))),
     Parameter('correlation_model', _MEASUREMENT.correlation.value, '', 'Treatment of '
               'time-correlated errors: `bias` estimates them, `inflate` increases the '
               'covariances.', choices=_values(config.Correlation), kinds=_NOT_CLOSURES,
               change=Change.UNCONFIGURED),
     Parameter('white_share', _MEASUREMENT.white_share, '', 'Fraction of the variance that is '
-              'white noise, if time-correlated errors are estimated as a bias.', 0.0, 1.0,
+              'white noise, if a bias with a given `correlation_time` is estimated.', 0.0, 1.0,
               kinds=_NOT_CLOSURES, change=Change.UNCONFIGURED),
 )
 

@@ -211,6 +211,8 @@ def _report(
         if fit.errors.significant:
             text += (f'; errors of {fit.errors.sigma_correlated:.3g} m with a time constant of '
                      f'{fit.errors.tau:.3g} s')
+        if fit.in_use is not None:
+            text += f'; treated as correlated over {fit.in_use.tau:.3g} s'
         if fit.wrongly_white:
             text += f', but are treated as white: see {source}.correlation_time'
         print(text)

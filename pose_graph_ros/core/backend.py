@@ -14,6 +14,7 @@ from pose_graph_ros.core.alignment.monitor import AlignmentMonitor
 from pose_graph_ros.core.batch import final_optimization, optimizer
 from pose_graph_ros.core.batch.optimizer import Solve, Status
 from pose_graph_ros.core.config import BackendConfig
+from pose_graph_ros.core.error_tuner import ErrorTuner
 from pose_graph_ros.core.estimate import Estimate, UpdateReport
 from pose_graph_ros.core.geometry.geodesy import MapOrigin
 from pose_graph_ros.core.geometry.se2 import FloatArray, IntArray
@@ -50,10 +51,8 @@ class PoseGraphBackend:
     Odometry creates the hidden nodes and the edges between them, and the smoother solves for each
     new node at once. A measurement waits until odometry has reached its stamp, is attached to the
     hidden node before that stamp, and is added to the graph by the next update. An update first
-    aligns the odometry frame with the map, if they are not aligned yet. It then passes all new
-    constraints to the smoother, whose work does not grow with the graph. Constraints that make an
-    update fail are set aside until the next full optimisation. Stamps are integer nanoseconds; the
-    back end has no clock.
+    aligns the odometry frame with the map, if they are not aligned yet. Constraints that make an
+    update fail are set aside until the next full optimisation. Stamps are integer nanoseconds.
 
     Parameters
     ----------
@@ -76,8 +75,10 @@ class PoseGraphBackend:
         """In map axes, shape (3, 3)."""
         self._reweighting = Reweighting()
         self._judge = Judge(self._smoother, self._reweighting, self._config)
-        self._refiner = Refiner(self._smoother, self._reweighting, self._judge)
         self._factors = FactorBuilder(self._config, self._reweighting)
+        self._tuner = ErrorTuner(self._smoother, self._factors, self._reweighting)
+        self._refiner = Refiner(
+            self._smoother, self._reweighting, self._judge, self._tuner)
         self._pipeline = MeasurementPipeline(self._nodes, self._config)
         self._quarantine = Queue()
         self._alignment = AlignmentMonitor(self._config)
@@ -309,9 +310,10 @@ class PoseGraphBackend:
                     transaction.queue)
         self._factors.commit()
         self._judge.commit()
-        self._refiner.restart()
         self._alignment.add(queue.observed)
+        self._refiner.restart()
         result, self._settled = self._refiner.reweight(transaction.result, self._transaction)
+        self._tuner.step()
         self._recheck_alignment()
         self._evaluate()
         return UpdateReport(
@@ -364,6 +366,7 @@ class PoseGraphBackend:
         report = isolation.update_with_all(self._update, self._pipeline, self._quarantine)
         if self.graph.n_nodes == 0:
             return report
+        self._tuner.decide()
         self._settle()
         self._judge.finish()
         return report.after(self._optimize_whole())
@@ -398,6 +401,7 @@ class PoseGraphBackend:
 
     def saved(self, datum: MapOrigin | None = None) -> SavedGraph:
         """Return the graph with its state since the last update; see `io.capture.capture`."""
+        self._tuner.finish_change()
         return capture(self._parts(), self._newest_node_covariance, self._chi2, datum)
 
     @classmethod

@@ -21,6 +21,9 @@ REST_HEADING = 0.05
 # Sigma of a heading that is uniform on the circle [rad].
 FLAT_GUESS = math.pi / math.sqrt(3.0)
 
+# Correlation time of a source whose errors tell whether they are correlated, and for how long.
+FOUND = -1.0
+
 
 def require(settings: object, *names: str, positive: bool = False) -> None:
     """
@@ -219,14 +222,16 @@ class MeasurementSource:
     minimum_period: float = 0.0
     """Of measurements with stamps closer than this only the first to arrive is used [s]."""
     correlation_time: float = 0.0
-    """Time constant of the errors [s]; 0 for white noise."""
+    """Time constant of the errors [s]; 0 for white noise, `FOUND` for one that they show."""
     correlation: Correlation = Correlation.BIAS
     white_share: float = 0.05
     """Fraction of the variance that is white noise if errors are correlated, in [0, 1]."""
 
     def __post_init__(self) -> None:
         require(self, 'rejection_threshold', positive=True)
-        require(self, 'sigma_scale', 'minimum_period', 'correlation_time', 'white_share')
+        require(self, 'sigma_scale', 'minimum_period', 'white_share')
+        if not self.finds_correlation:
+            require(self, 'correlation_time')
         require_member(self, 'robust', Robust)
         require_member(self, 'loss', Loss)
         require_member(self, 'correlation', Correlation)
@@ -235,12 +240,18 @@ class MeasurementSource:
                               f'got {self.white_share!r}')
 
     @property
+    def finds_correlation(self) -> bool:
+        """Whether the time constant of the errors is found from them."""
+        return self.correlation_time == FOUND
+
+    @property
     def applied_loss(self) -> Loss:
         """The loss of its constraints in the graph."""
         return Loss.NONE if self.robust is Robust.NONE else self.loss
 
 
-POSITIONS = MeasurementSource(robust=Robust.JUDGED, loss=Loss.HUBER)
+POSITIONS = MeasurementSource(
+    robust=Robust.JUDGED, loss=Loss.HUBER, correlation_time=FOUND)
 """Defaults of a source of global poses or positions."""
 HEADINGS = MeasurementSource(minimum_period=0.5)
 """Defaults of a source of headings; thinned, as an IMU sends many redundant ones."""

@@ -7,6 +7,7 @@ from collections.abc import Callable
 import numpy as np
 
 from pose_graph_ros.core.batch.optimizer import Status
+from pose_graph_ros.core.error_tuner import ErrorTuner
 from pose_graph_ros.core.graph.graph import GraphUpdate
 from pose_graph_ros.core.graph.reweighting import PART, Reweighting
 from pose_graph_ros.core.judgement.judge import Judge
@@ -32,13 +33,16 @@ class Refiner:
         Constraints of its graph that have a robust loss.
     judge : Judge
         Decides which constraints of the graph are believed.
+    tuner : ErrorTuner
 
     """
 
     def __init__(
         self, smoother: IncrementalSmoother, reweighting: Reweighting, judge: Judge,
+        tuner: ErrorTuner,
     ) -> None:
-        self._smoother, self._reweighting, self._judge = smoother, reweighting, judge
+        self._smoother, self._reweighting = smoother, reweighting
+        self._judge, self._tuner = judge, tuner
         self.finished = True
         """Whether there is nothing to refine until the next update."""
         self._cursor = self._unchanged = self._reweightings = 0
@@ -76,11 +80,20 @@ class Refiner:
         return result, settled
 
     def refine(self) -> Refinement:
-        """Do one iteration; where there is nothing to iterate any more, weigh and judge again."""
+        """
+        Do one step of the tuner, or one iteration.
+
+        Where there is nothing to iterate any more, weigh and judge again.
+        """
         if self._smoother.graph.has_touched:
             self.finished = True    # an update that failed; the next one eliminates all nodes
         if self.finished:
             return Refinement(finished=True, moved=0.0)
+        if not self._tuner.is_idle:
+            moved = self._tuner.step()
+            if moved > 0.0:
+                self.restart()
+            return Refinement(finished=False, moved=moved)
         result = self._smoother.refine()
         if result.finished:
             result = self._reweight(result.moved)

@@ -40,6 +40,7 @@ class Choices(NamedTuple):
 Integers = Annotated[IntArray, Column(int)]
 Flags = Annotated[BoolArray, Column(bool)]
 Numbers = Annotated[FloatArray, Column(float)]
+Rows2 = Annotated[FloatArray, Column(float, (2,))]
 Rows3 = Annotated[FloatArray, Column(float, (3,))]
 Rows4 = Annotated[FloatArray, Column(float, (4,))]
 Rows6 = Annotated[FloatArray, Column(float, (6,))]

@@ -123,8 +123,12 @@ def _fits(session: 'Session') -> dict[str, object]:
     for name, report in session.worker.status.sources.items():
         # 1 if the sigmas are right, less if the estimate depends on this source alone
         found[f'{name}.squared_residual'] = f'{report.energy:.4g}'
-        errors = report.errors
-        if errors.significant and report.energy >= LEAST_ENERGY:
+        errors, in_use = report.errors, report.in_use
+        if in_use is not None and report.found:
+            found[f'{name}.errors_live'] = (
+                f'{in_use.tau:.2g} s, with {math.sqrt(in_use.correlated):.2g} times the sigma of '
+                f'the messages; found by {name}.correlation_time of -1, and treated so')
+        elif errors.significant and report.energy >= LEAST_ENERGY:
             found[f'{name}.errors_live'] = (
                 f'{errors.tau:.2g} s, with a sigma of {errors.sigma_correlated:.2g} m'
                 + (f'; treated as white: set {name}.correlation_time'

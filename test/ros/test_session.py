@@ -576,7 +576,8 @@ def test_errors_that_are_correlated_but_treated_as_white_are_warned_of(
     active.drive(8.0)
     status = active.session.worker.status
     correlated = status.sources['fix']._replace(
-        errors=Space(significant=True, tau=12.0, sigma_correlated=0.8), energy=2.0, white=True)
+        errors=Space(significant=True, tau=12.0, sigma_correlated=0.8), energy=2.0,
+        in_use=None, found=False)
     with monkeypatch.context() as patch:
         patch.setattr(active.session, 'worker', Space(
             alive=True, prepared=True, estimate=active.session.worker.estimate,

@@ -287,7 +287,8 @@ def test_without_fixes_there_is_no_latitude(client: Client) -> None:
     assert client.values['datum'] == 'none'
 
 
-@pytest.mark.parametrize('node', [(), ('-p', 'fix.correlation_time:=20.0')], indirect=True)
+@pytest.mark.parametrize('node', [
+    (), ('-p', 'fix.correlation_time:=0.0'), ('-p', 'fix.correlation_time:=20.0')], indirect=True)
 def test_errors_that_live_on_show_in_the_diagnostics(
     node: NodeProcess, client: Client, request: pytest.FixtureRequest,
 ) -> None:
@@ -307,7 +308,9 @@ def test_errors_that_live_on_show_in_the_diagnostics(
     told = client.values['fix.errors_live']
     assert 0.5 < float(told.partition(' ')[0]) < 100.0
     treated = 'treated as white: set fix.correlation_time' in told
-    assert treated == (request.node.callspec.params['node'] == ())
+    given = request.node.callspec.params['node']
+    assert treated == ('fix.correlation_time:=0.0' in given)
+    assert ('and treated so' in told) == (given == ())
     assert 0.01 < float(client.values['fix.squared_residual']) < 3.0
 
 

@@ -12,7 +12,7 @@ import numpy as np
 from pose_graph_ros.core.alignment import estimator
 from pose_graph_ros.core.alignment.consensus import TimeCorrelation
 from pose_graph_ros.core.alignment.estimator import ALIGNING_SIGMA, GraphAlignment
-from pose_graph_ros.core.config import BackendConfig, MeasurementSource, OdometryNoise
+from pose_graph_ros.core.config import BackendConfig, OdometryNoise
 from pose_graph_ros.core.geometry import se2
 from pose_graph_ros.core.geometry.se2 import FloatArray
 from pose_graph_ros.core.graph.constraints import (
@@ -175,12 +175,12 @@ class AlignmentMonitor:
         return self._config.odometry_source(primary).noise
 
     def _correlation(self, evidence: list[Evidence]) -> TimeCorrelation:
-        times = {name: source.correlation_time
+        # a time that is not known yet counts as white noise
+        times = {name: max(source.correlation_time, 0.0)
                  for name, source in self._config.measurements.items()}
-        default = MeasurementSource().correlation_time
         return TimeCorrelation(
             np.array([each.stamp_ns for each in evidence]) * 1e-9,
-            np.array([times.get(each.source, default) for each in evidence]))
+            np.array([times.get(each.source, 0.0) for each in evidence]))
 
     @property
     def is_aligned(self) -> bool:

@@ -211,6 +211,11 @@ class ObservedNodes(_Table):
     def __len__(self) -> int:
         return len(self.node)
 
+    def weighted(self, weight: float) -> 'ObservedNodes':
+        """Return the same observed nodes with another weight."""
+        return ObservedNodes(self.node, self.offset, self.mean, self.information, self.kind,
+                             np.full(len(self), weight))
+
 
 _FULL: IntArray = np.array((0, 1, 2, 1, 3, 4, 2, 4, 5))
 

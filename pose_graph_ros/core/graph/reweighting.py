@@ -84,6 +84,11 @@ class _Rows:
         self.base_weights.append(saved.shares)
         self.cursor = saved.cursor
 
+    def index(self, row: int) -> int:
+        """Return the index of a row of the graph, -1 if it was not added."""
+        at = int(np.searchsorted(self.rows.values, row))
+        return at if at < len(self.rows) and self.rows.values[at] == row else -1
+
     def some(self) -> IntArray:
         """Return the indices of the newest ones and, in turn, of some older ones."""
         size = len(self.rows)
@@ -154,12 +159,35 @@ class Reweighting:
             table.losses.append_one((_LOSSES.index(loss), threshold))
             table.base_weights.append_one(1.0)
 
+    def move(self, row: int, to_row: int, *, edge: bool, to_edge: bool) -> None:
+        """
+        Give the loss and the base weight of a constraint to another one that replaces it.
+
+        The base weight of the old one becomes 0. Nothing happens if it has no loss.
+
+        Parameters
+        ----------
+        row, to_row : int, rows in the graph; one that is new is above those of its kind before
+        edge, to_edge : bool, whether they are edges
+
+        """
+        old, new = (self._edges if which else self._observed for which in (edge, to_edge))
+        at, to = old.index(row), new.index(to_row)
+        if at < 0:
+            return
+        if to < 0:
+            to = len(new.rows)
+            new.rows.append_one(to_row)
+            new.losses.append_one(old.losses.values[at])
+            new.base_weights.append_one(0.0)
+        new.base_weights.values[to] = old.base_weights.values[at]
+        old.base_weights.values[at] = 0.0
+
     def base_weight(self, row: int) -> float | None:
         """Return the base weight of an observed node, by its row; None without a loss."""
         table = self._observed
-        at = int(np.searchsorted(table.rows.values, row))
-        found = at < len(table.rows) and table.rows.values[at] == row
-        return float(table.base_weights.values[at]) if found else None
+        at = table.index(row)
+        return float(table.base_weights.values[at]) if at >= 0 else None
 
     def set_base_weight(self, row: int, weight: float, *, edge: bool = False) -> None:
         """
@@ -173,8 +201,8 @@ class Reweighting:
 
         """
         table = self._edges if edge else self._observed
-        at = int(np.searchsorted(table.rows.values, row))
-        if at < len(table.rows) and table.rows.values[at] == row:
+        at = table.index(row)
+        if at >= 0:
             table.base_weights.values[at] = weight
 
     def saved(self) -> tuple[SavedLosses, SavedLosses]:

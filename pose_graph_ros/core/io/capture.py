@@ -32,9 +32,9 @@ from pose_graph_ros.core.sources.factor_builder import (
     Queue,
     QueuedEdge,
     SavedEdges,
-    SavedSource,
 )
 from pose_graph_ros.core.sources.pipeline import MeasurementPipeline
+from pose_graph_ros.core.sources.source_constraints import SavedSource
 
 _NONE: IntArray = np.empty(0, dtype=np.int64)
 # Of each source, the number of believed closures whose verdicts are saved as sentences.

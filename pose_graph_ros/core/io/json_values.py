@@ -9,7 +9,7 @@ row, the position of its name among these.
 """
 
 from collections.abc import Mapping
-from dataclasses import is_dataclass
+from dataclasses import fields, is_dataclass, MISSING
 import math
 from types import UnionType
 from typing import Annotated, Any, get_args, get_origin, get_type_hints
@@ -85,10 +85,20 @@ def decoded(kind: Any, plain: Any, where: str) -> Any:
     if _has_fields(kind):
         _expect(isinstance(plain, dict), where, 'an object', plain)
         hints = annotations(kind)
-        _expect(plain.keys() == hints.keys(), where, f'the fields {sorted(hints)}', plain)
+        # a field with a default may be missing: older versions did not write it
+        _expect(plain.keys() <= hints.keys() and plain.keys() >= hints.keys() - _optional(kind),
+                where, f'the fields {sorted(hints)}', plain)
         return kind(**{name: decoded(hint, plain[name], f'{where}.{name}'.lstrip('.'))
-                       for name, hint in hints.items()})
+                       for name, hint in hints.items() if name in plain})
     return _single(kind, plain, where)
+
+
+def _optional(kind: Any) -> set[str]:
+    """Return the names of the fields of a class that have a default."""
+    if not is_dataclass(kind):
+        return set(kind._field_defaults)
+    return {item.name for item in fields(kind)
+            if item.default is not MISSING or item.default_factory is not MISSING}
 
 
 def _single(kind: type, plain: Any, where: str) -> Any:

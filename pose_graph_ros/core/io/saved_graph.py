@@ -26,7 +26,8 @@ from pose_graph_ros.core.judgement.judge import SavedJudgement
 from pose_graph_ros.core.judgement.verdicts import Decision, State
 from pose_graph_ros.core.odometry.hidden_nodes import SavedNodes
 from pose_graph_ros.core.saved_columns import Matrix
-from pose_graph_ros.core.sources.factor_builder import SavedEdges, SavedSource
+from pose_graph_ros.core.sources.factor_builder import SavedEdges
+from pose_graph_ros.core.sources.source_constraints import SavedSource
 
 # Tolerances within which a datum equals that of the saved graph [m], [rad].
 SAME_PLACE = 0.01
@@ -155,13 +156,16 @@ class SavedGraph:
         _require(source.n_otherwise >= 0, f'{where}.n_otherwise: expected a count')
         _inside(f'{where}.ties', source.ties, sizes['edges'])
         constraints = source.rows[:, 1]
-        _inside(f'{where}.rows', constraints,
-                sizes['observed' if source.bins is None else 'edges'])
+        as_edges = source.bins is not None and source.errors is None
+        _inside(f'{where}.rows', constraints, sizes['edges' if as_edges else 'observed'])
+        self._check_errors(where, source)
         if source.bins is None:
             return
         bins, rows = source.bins, self.rows
-        _require(rows.edges.kind[constraints] == EdgeKind.BIAS,
-                 f'{where}.rows: expected edges to biases')
+        held = constraints if as_edges else source.edges
+        _inside(f'{where}.edges', held, sizes['edges'])
+        _require(rows.edges.kind[held] == EdgeKind.BIAS,
+                 f'{where}: expected edges to biases')
         _same_length(f'{where}.bins', bins, 'numbers', 'rows', 'ties')
         _increasing(f'{where}.bins.numbers', bins.numbers)
         _inside(f'{where}.bins.rows', bins.rows, sizes['nodes'])
@@ -169,6 +173,17 @@ class SavedGraph:
         _inside(f'{where}.bins.ties', bins.ties[1:], sizes['edges'])
         _require(bins.width_ns > 0 and np.all(rows.is_bias[bins.rows]),
                  f'{where}.bins: expected biases, and a width')
+
+    def _check_errors(self, where: str, source: SavedSource) -> None:
+        """Check what was estimated of the errors of a source."""
+        n = len(source.rows)
+        _require(len(source.noise) in (0, n) and np.all(source.noise >= 0.0),
+                 f'{where}.noise: expected no rows, or {n} that are not negative')
+        _require(len(source.edges) in (0, n) and np.all(source.edges >= -1),
+                 f'{where}.edges: expected no rows, or {n}')
+        _require(source.next_estimate > 0, f'{where}.next_estimate: expected a positive number')
+        _require(source.errors is None or min(source.errors) > 0.0,
+                 f'{where}.errors: expected positive numbers')
 
 
 def site_refusal(

@@ -3,18 +3,19 @@
 """From attached measurements to one update of the graph."""
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field
-from typing import NamedTuple
+from dataclasses import dataclass, field, replace
+from typing import Final, NamedTuple
 
 import numpy as np
-import numpy.typing as npt
 
 from pose_graph_ros.core.compiled.growing_array import GrowingArray
 from pose_graph_ros.core.config import (
     BackendConfig,
     Correlation,
+    MeasurementSource,
     OdometrySource,
 )
+from pose_graph_ros.core.geometry.se2 import FloatArray
 from pose_graph_ros.core.graph import tables as tb
 from pose_graph_ros.core.graph.constraints import EdgeKinds, Edges, ObservedNodes
 from pose_graph_ros.core.graph.graph import Graph, GraphUpdate
@@ -25,36 +26,26 @@ from pose_graph_ros.core.saved_columns import Integers, Pairs, Rows3, Rows6
 from pose_graph_ros.core.sources import source_report
 from pose_graph_ros.core.sources.gauss_markov import (
     Additions,
+    CorrelatedErrors,
+    ErrorModel,
     GaussMarkovBias,
     GraphSizes,
     InflatedWeights,
-    SavedBins,
+    LEAST_WHITE,
+    new_error_model,
+)
+from pose_graph_ros.core.sources.measurement_constraints import motion_noise
+from pose_graph_ros.core.sources.source_constraints import (
+    FIRST_ESTIMATE,
+    SavedSource,
+    SourceConstraints,
 )
 from pose_graph_ros.core.sources.source_report import SourceReport
 
+NO_NOISE: Final[FloatArray] = np.zeros(2)
+
 # A report is renewed when the number of measurements has grown by this factor.
 MORE_RESIDUALS = 1.05
-
-
-@dataclass(frozen=True, slots=True)
-class SavedSource:
-    """The measurements and constraints of one source."""
-
-    seen_ns: Integers
-    """Stamps of all measurements that were received [ns], sorted."""
-    seen_references: Integers
-    """For each stamp the reference of the loop closure, 0 for others; see `waiting`."""
-    rows: Pairs
-    """
-    Stamp [ns] and row of each constraint, shape (K, 2). The rows are those of edges if the source
-    has a bias, else those of observed nodes.
-    """
-    n_otherwise: int
-    """Number of constraints that were added under other settings."""
-    ties: Integers
-    """Rows of its edges between hidden nodes, except those of the primary odometry."""
-    bins: SavedBins | None
-    """States of its bias, if it has one."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -128,18 +119,6 @@ class ConstraintOrigin(NamedTuple):
     """[ns]; -1 for an edge between poses."""
 
 
-class _SourceConstraints:
-    """The constraints of one source."""
-
-    def __init__(self) -> None:
-        self.rows = GrowingArray((2,), np.int64)
-        """Stamp [ns] and row in the graph."""
-        self.report: SourceReport | None = None
-        """The newest report."""
-        self.n_otherwise = 0
-        """Constraints of a loaded graph that were added under other settings."""
-
-
 class NewConstraint(NamedTuple):
     """A constraint in the update that was built last."""
 
@@ -153,6 +132,10 @@ class NewConstraint(NamedTuple):
     """`LoopClosure` for all edges between poses."""
     reference_ns: int = -1
     """Stamp of the other end of a loop closure [ns]; else -1."""
+    noise: FloatArray = NO_NOISE
+    """What the motion since the node adds to its variances; see `motion_noise`."""
+    held_by: int = -1
+    """Row of the edge that holds it instead of the observed node in `row`, or -1."""
 
 
 class FactorBuilder:
@@ -174,9 +157,9 @@ class FactorBuilder:
     def __init__(self, config: BackendConfig, reweighting: Reweighting) -> None:
         self._config = config
         self._reweighting = reweighting
-        self._error_models: dict[str, GaussMarkovBias | InflatedWeights] = {}
+        self._error_models: dict[str, ErrorModel] = {}
         """Of the sources whose errors are correlated in time."""
-        self._constraints: dict[str, _SourceConstraints] = {}
+        self._constraints: dict[str, SourceConstraints] = {}
         self._pose_edges: dict[str, GrowingArray] = {}
         """Rows of the edges between poses, by source."""
         self.new: list[NewConstraint] = []
@@ -194,7 +177,7 @@ class FactorBuilder:
     @property
     def n_measurements(self) -> int:
         """Number of measurements in the graph, without loop closures."""
-        return sum(len(each.rows) + each.n_otherwise for each in self._constraints.values())
+        return sum(len(each) + each.n_otherwise for each in self._constraints.values())
 
     def build(self, queue: Queue, graph: Graph, *, settle: bool = False) -> GraphUpdate:
         """
@@ -215,28 +198,35 @@ class FactorBuilder:
         self.new = [
             NewConstraint(True, additions.add_edge(edge), source, stamp_ns, LoopClosure, reference)
             for source, edge, stamp_ns, reference in queue.edges]
-        for source, observed, measurement, attachment in sorted(
-                queue.observed, key=lambda attached: attached.measurement.stamp_ns):
-            kind, stamp_ns = type(measurement), measurement.stamp_ns
-            error_model = self._error_model(source, kind)
-            if isinstance(error_model, GaussMarkovBias):
-                row = error_model.add(measurement, attachment, additions)
-            elif isinstance(error_model, InflatedWeights):
-                row = error_model.add(stamp_ns, observed, additions)
-            else:
-                row = additions.add_observed(observed)
-            self.new.append(NewConstraint(
-                isinstance(error_model, GaussMarkovBias), row, source, stamp_ns, kind))
+        self.new += [self._add(attached, additions) for attached in sorted(
+            queue.observed, key=lambda attached: attached.measurement.stamp_ns)]
         self._n_new_bias_edges = len(additions.edges) - len(queue.edges)
         for model in self._error_models.values() if settle else ():
             if isinstance(model, InflatedWeights):
                 model.settle(additions)
         self._new_weights = additions.weigh_observed
-        return GraphUpdate(
-            biases=np.array(additions.biases).reshape(-1, 3),
-            edges=Edges.joined(additions.edges), observed=ObservedNodes.joined(additions.observed),
-            remove_edges=additions.remove_edges, remove_observed=additions.remove_observed,
+        return additions.update()._replace(
             weigh_observed=self._changed_weights(additions.weigh_observed, graph))
+
+    def _add(self, attached: AttachedMeasurement, additions: Additions) -> NewConstraint:
+        """Add a measurement to an update, as the errors of its source ask for."""
+        source, observed, measurement, attachment = attached
+        kind, stamp_ns = type(measurement), measurement.stamp_ns
+        settings = self._config.measurement_source(source, kind)
+        model, noise = self._error_model(source, settings), NO_NOISE
+        if settings.correlation_time != 0.0:
+            noise = motion_noise(measurement, attachment)
+        if isinstance(model, InflatedWeights):
+            row = model.add(stamp_ns, observed, additions)
+            return NewConstraint(False, row, source, stamp_ns, kind, noise=noise)
+        if model is None:
+            row = additions.add_observed(observed)
+            return NewConstraint(False, row, source, stamp_ns, kind, noise=noise)
+        edge = model.add(stamp_ns, observed, noise, additions)
+        if not settings.finds_correlation:
+            return NewConstraint(True, edge, source, stamp_ns, kind)
+        row = additions.add_observed(observed.weighted(0.0))
+        return NewConstraint(False, row, source, stamp_ns, kind, noise=noise, held_by=edge)
 
     def _changed_weights(
         self, base_weights: Mapping[int, float], graph: Graph,
@@ -254,18 +244,68 @@ class FactorBuilder:
                 changed[row] = target
         return changed
 
-    def _error_model(
-        self, source: str, kind: type[Measurement],
-    ) -> GaussMarkovBias | InflatedWeights | None:
+    def _error_model(self, source: str, settings: MeasurementSource) -> ErrorModel | None:
         """Return the model of the correlated errors of a source; None for white errors."""
-        settings = self._config.measurement_source(source, kind)
         if settings.correlation_time == 0.0:
             return None
-        if source not in self._error_models:
-            inflate = settings.correlation is Correlation.INFLATE
-            self._error_models[source] = (
-                InflatedWeights(settings) if inflate else GaussMarkovBias(settings))
-        return self._error_models[source]
+        if source not in self._error_models and not settings.finds_correlation:
+            errors = CorrelatedErrors(
+                settings.correlation_time, 1.0, max(settings.white_share, LEAST_WHITE))
+            self._error_models[source] = new_error_model(errors, settings.correlation)
+        return self._error_models.get(source)
+
+    def finding(self) -> list[str]:
+        """Return the sources whose errors are estimated and that have measurements."""
+        return [source for source, constraints in self._constraints.items()
+                if len(constraints) >= FIRST_ESTIMATE and self._settings(source).finds_correlation]
+
+    def due_for_estimate(self) -> list[str]:
+        """Return those of `finding` with enough new measurements for another estimate."""
+        return [source for source in self.finding() if len(self._constraints[source])
+                >= self._constraints[source].next_estimate]
+
+    def constraints(self, source: str) -> SourceConstraints:
+        """Return the constraints of a source that has some."""
+        return self._constraints[source]
+
+    def correlation(self, source: str) -> Correlation:
+        """Return how correlated errors of a source are treated."""
+        return self._settings(source).correlation
+
+    def errors_in_use(self, source: str) -> CorrelatedErrors | None:
+        """Return the statistics of the errors of a source in use; None for white errors."""
+        model = self._error_models.get(source)
+        return None if model is None or model.errors.tau == 0.0 else model.errors
+
+    def set_error_model(self, source: str, model: ErrorModel | None) -> None:
+        """
+        Set the model of the errors of a source from now on.
+
+        Parameters
+        ----------
+        source : str
+        model : GaussMarkovBias or InflatedWeights, optional, with all measurements of the source
+
+        """
+        self._error_models.pop(source, None)
+        if model is not None:
+            self._error_models[source] = model
+        self._constraints[source].report = None
+
+    def inflate(self, source: str, errors: CorrelatedErrors | None) -> None:
+        """
+        Have later updates renew the weights of a source.
+
+        Parameters
+        ----------
+        source : str
+        errors : CorrelatedErrors, optional, None for white errors
+
+        """
+        # alone in a bin of a nanosecond, each measurement has the weight 1
+        model = InflatedWeights(CorrelatedErrors(0.0, 0.0, 1.0) if errors is None else errors)
+        model.restore(self._constraints[source].rows.values)
+        self.set_error_model(source, model)
 
     def rollback(self) -> None:
         """Discard the update that was built last."""
@@ -275,15 +315,19 @@ class FactorBuilder:
     def commit(self) -> None:
         """Record the constraints of the update that was built last."""
         self.n_bias_edges += self._n_new_bias_edges
-        for is_edge, row, source, stamp_ns, kind, _ in self.new:
+        for is_edge, row, source, stamp_ns, kind, _, noise, held_by in self.new:
             odometry = self._config.odometry.get(source) if stamp_ns < 0 else None
             settings = odometry or self._config.measurement_source(source, kind)
             loss = (settings.loss if isinstance(settings, OdometrySource)
                     else settings.applied_loss)
-            self._reweighting.add(row, loss, settings.rejection_threshold, edge=is_edge)
+            threshold = settings.rejection_threshold
+            self._reweighting.add(row, loss, threshold, edge=is_edge)
+            if held_by >= 0:
+                self._reweighting.add(held_by, loss, threshold, edge=True)
+                self._reweighting.set_base_weight(row, 0.0)
             if kind is not LoopClosure:
-                constraints = self._constraints.setdefault(source, _SourceConstraints())
-                constraints.rows.append_one((stamp_ns, row))
+                constraints = self._constraints.setdefault(source, SourceConstraints())
+                constraints.append(stamp_ns, row, noise, held_by)
             else:
                 edges = self._pose_edges.setdefault(source, GrowingArray((), np.int64))
                 edges.append_one(row)
@@ -304,13 +348,13 @@ class FactorBuilder:
 
         """
         for source, constraints in self._constraints.items():
-            if isinstance(self._error_models.get(source), GaussMarkovBias) is edge:
-                # rows are appended in increasing order
-                at = _find(constraints.rows.values[:, 1], row)
-                if at >= 0:
-                    return ConstraintOrigin(source, int(constraints.rows.values[at, 0]))
+            stamp_ns = constraints.stamp_ns(
+                row, edge=edge, added_as_edges=self._has_given_bias(source))
+            if stamp_ns is not None:
+                return ConstraintOrigin(source, stamp_ns)
         for source, edges in self._pose_edges.items() if edge else ():
-            if _find(edges.values, row) >= 0:
+            at = int(np.searchsorted(edges.values, row))
+            if at < len(edges) and edges.values[at] == row:
                 return ConstraintOrigin(source, -1)
         return None
 
@@ -327,11 +371,17 @@ class FactorBuilder:
         result, none = {}, np.empty(0, dtype=np.int64)
         for source in dict.fromkeys((*self._constraints, *self._pose_edges)):
             model = self._error_models.get(source)
-            constraints = self._constraints.get(source, _SourceConstraints())
+            constraints = self._constraints.get(source, SourceConstraints())
             edges = self._pose_edges.get(source, GrowingArray((), np.int64))
-            result[source] = SavedSource(
+            saved = SavedSource(
                 none, none, constraints.rows.values.copy(), constraints.n_otherwise,
                 edges.values.copy(), model.saved() if isinstance(model, GaussMarkovBias) else None)
+            if self._settings(source).finds_correlation:
+                saved = replace(
+                    saved, errors=self.errors_in_use(source),
+                    noise=constraints.noise.values.copy(), edges=constraints.edges.values.copy(),
+                    next_estimate=constraints.next_estimate)
+            result[source] = saved
         return result
 
     def restore(self, source: str, saved: SavedSource) -> None:
@@ -352,35 +402,45 @@ class FactorBuilder:
             self._pose_edges[source].append(saved.ties)
         if len(saved.rows) + saved.n_otherwise == 0:
             return
-        self._constraints[source] = constraints = _SourceConstraints()
-        # the default settings of all kinds have the same error model
-        model = self._error_model(source, GlobalPose)
+        settings = self._settings(source)
+        if settings.finds_correlation and saved.errors is not None:
+            self._error_models[source] = new_error_model(saved.errors, settings.correlation)
+        model = self._error_model(source, settings)
         if isinstance(model, GaussMarkovBias):
             same = saved.bins is not None and model.restore(saved.bins)
         else:
             same = saved.bins is None
             if isinstance(model, InflatedWeights) and same:
                 model.restore(saved.rows)
-        constraints.rows.append(saved.rows if same else saved.rows[:0])
-        constraints.n_otherwise = saved.n_otherwise + len(saved.rows) - len(constraints.rows)
+        if not same and settings.finds_correlation:
+            self._error_models.pop(source, None)
+        same = same and settings.finds_correlation >= (saved.errors is not None)
+        self._constraints[source] = constraints = SourceConstraints()
+        if same:
+            constraints.restore(saved)
+        constraints.n_otherwise = saved.n_otherwise + len(saved.rows) - len(constraints)
+
+    def _settings(self, source: str) -> MeasurementSource:
+        """Return the settings of a source; without any, headings are white."""
+        return self._config.measurement_source(source, GlobalPose)
+
+    def _has_given_bias(self, source: str) -> bool:
+        """Tell whether measurements of a source are edges to a bias from the beginning."""
+        return (isinstance(self._error_models.get(source), GaussMarkovBias)
+                and not self._settings(source).finds_correlation)
 
     def reports(self, graph: Graph) -> dict[str, SourceReport]:
         """Return how well the newest measurements of each source fit the estimate."""
         reports = {}
         for source, constraints in self._constraints.items():
-            n, model = len(constraints.rows), self._error_models.get(source)
+            n = len(constraints)
             if n > 0 and (constraints.report is None
                           or n > MORE_RESIDUALS * constraints.report.n):
                 constraints.report = source_report.report(
-                    graph, constraints.rows.values, biased=isinstance(model, GaussMarkovBias),
-                    white=model is None)
+                    graph, constraints.rows.values, biased=self._has_given_bias(source),
+                    in_use=self.errors_in_use(source),
+                    found=self._settings(source).finds_correlation)
             # a source of headings alone has no residuals of positions
             if constraints.report is not None and constraints.report.energy > 0.0:
                 reports[source] = constraints.report
         return reports
-
-
-def _find(rows: npt.NDArray[np.generic], row: int) -> int:
-    """Return the index of a row among increasing rows; -1 if it is missing."""
-    at = int(np.searchsorted(rows, row))
-    return at if at < len(rows) and rows[at] == row else -1

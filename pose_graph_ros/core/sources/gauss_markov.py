@@ -3,10 +3,11 @@
 """
 Sources whose errors are correlated in time, such as GNSS receivers.
 
-The error of a measurement at time t is `f m(t)` plus a small white part. f^2 is the variance that
-the sender gives; m is a first-order Gauss-Markov process with variance 1 and time constant tau in
-each coordinate. `GaussMarkovBias` estimates m as a *bias*: time is divided into bins of
-tau / `BINS`, each bin with measurements has one state, and consecutive states are connected by
+The error of a measurement at time t is `f m(t)` plus a small white part. f^2 is proportional to
+the variance that the sender gives (`CorrelatedErrors`); m is a first-order Gauss-Markov process
+with variance 1 and time constant tau in each coordinate. `GaussMarkovBias` estimates m as a
+*bias*: time is divided into bins of tau / `BINS`, each bin with measurements has one state, and
+consecutive states are connected by
 
     m_k = phi m_{k-1} + w,   phi = exp(-gap / tau),   Var w = 1 - phi^2.
 
@@ -29,25 +30,36 @@ from typing import NamedTuple
 
 import numpy as np
 
-from pose_graph_ros.core.config import MeasurementSource
+from pose_graph_ros.core.config import Correlation
 from pose_graph_ros.core.geometry import covariance, se2
 from pose_graph_ros.core.geometry.se2 import FloatArray, IntArray
 from pose_graph_ros.core.graph.constraints import EdgeKind, Edges, ObservedKind, ObservedNodes
-from pose_graph_ros.core.measurements import Absolute, HeadingOnly, Position
-from pose_graph_ros.core.odometry.motion import Attachment
+from pose_graph_ros.core.graph.graph import GraphUpdate
 from pose_graph_ros.core.saved_columns import Integers
-from pose_graph_ros.core.sources.measurement_constraints import swept_variance
 
 # Number of bins in one time constant.
 BINS = 64
 # Lower bound of the white share of the variance; 0 would make the system singular.
 LEAST_WHITE = 1e-3
+# Lower bound of the variance of a measurement without the motion since its node, as a share.
+LEAST_OWN = 0.01
 # Unit of the third number of a state, the error of the heading, in sigmas. Its variance is then
 # 1 / STRETCH^2: the number is wrapped like an angle and must stay well below pi.
 STRETCH = 10.0
 _INFORMATION = np.diag((1.0, 1.0, STRETCH**2))
 # Number of older weights in its bin that a measurement renews, and of such weights in other bins.
 RENEWED = 32
+
+
+class CorrelatedErrors(NamedTuple):
+    """Statistics of the errors of a source."""
+
+    tau: float
+    """Time constant of the correlated part [s]."""
+    correlated: float
+    """Variance of the correlated part, in units of the variance that the sender gives."""
+    white: float
+    """Variance of the white part, in the same units."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -86,6 +98,13 @@ class Additions:
     remove_observed: list[int] = field(default_factory=list)
     weigh_observed: dict[int, float] = field(default_factory=dict)
 
+    def update(self) -> GraphUpdate:
+        """Return the update with all changes but the weights."""
+        return GraphUpdate(
+            biases=np.array(self.biases).reshape(-1, 3), edges=Edges.joined(self.edges),
+            observed=ObservedNodes.joined(self.observed), remove_edges=self.remove_edges,
+            remove_observed=self.remove_observed)
+
     def add_bias(self) -> int:
         """Add a bias state and return its row in the graph."""
         self.biases.append(np.zeros(3))
@@ -113,11 +132,11 @@ class _Bin:
 
 
 class GaussMarkovBias:
-    """The bias of one source with a positive correlation time: a chain of states in the graph."""
+    """The bias of one source: a chain of states in the graph."""
 
-    def __init__(self, source: MeasurementSource) -> None:
-        self._source = source
-        self._width_ns = max(round(source.correlation_time * 1e9 / BINS), 1)
+    def __init__(self, errors: CorrelatedErrors) -> None:
+        self.errors = errors
+        self._width_ns = max(round(errors.tau * 1e9 / BINS), 1)
         self._numbers: list[int] = []
         self._bins: dict[int, _Bin] = {}
         self._log: list[tuple[int, int | None, int]] = []
@@ -156,24 +175,29 @@ class GaussMarkovBias:
             self._bins[number] = _Bin(row, transition)
         return True
 
-    def add(self, measurement: Absolute, attachment: Attachment, additions: Additions) -> int:
+    def add(
+        self, stamp_ns: int, observed: ObservedNodes, noise: FloatArray, additions: Additions,
+    ) -> int:
         """
         Return the row of the edge that is added, from a measurement's node to its bin's state.
 
         Parameters
         ----------
-        measurement : GlobalPose, Position or HeadingOnly
-        attachment : Attachment
+        stamp_ns : int
+        observed : ObservedNodes
+            One row, the measurement if its error were white; the edge gets its weight.
+        noise : array_like, shape (2,)
+            What the motion since the node adds to the variances of the position and the heading of
+            the measurement [m^2, rad^2].
         additions : Additions, receives the edge, and the state if it is new
 
         """
-        number, rest_ns = divmod(measurement.stamp_ns, self._width_ns)
+        number, rest_ns = divmod(stamp_ns, self._width_ns)
         if number not in self._bins:
             self._make_bin(number, additions)
         phi = self._phi(abs(rest_ns - self._width_ns / 2))
         return additions.add_edge(_biased_constraint(
-            measurement, attachment, self._bins[number].row, phi,
-            max(self._source.white_share, LEAST_WHITE)))
+            observed, noise, self._bins[number].row, phi, self.errors))
 
     def begin_ns(self, row: int) -> int | None:
         """Return when the bin of a state begins [ns], by its row; None for another source's."""
@@ -181,7 +205,7 @@ class GaussMarkovBias:
                      if made.row == row), None)
 
     def _phi(self, gap_ns: float) -> float:
-        return math.exp(-gap_ns * 1e-9 / self._source.correlation_time)
+        return math.exp(-gap_ns * 1e-9 / self.errors.tau)
 
     def _make_bin(self, number: int, additions: Additions) -> None:
         """Add the state of a bin between its neighbours in time."""
@@ -230,8 +254,9 @@ class _WeightBin:
 class InflatedWeights:
     """Weights of the measurements of one source, lower the more of them lie within 2 tau."""
 
-    def __init__(self, source: MeasurementSource) -> None:
-        self._width_ns = max(round(2e9 * source.correlation_time), 1)
+    def __init__(self, errors: CorrelatedErrors) -> None:
+        self.errors = errors
+        self._width_ns = max(round(2e9 * errors.tau), 1)
         self._bins: dict[int, _WeightBin] = {}
         self._waiting: dict[int, None] = {}
         """Numbers of the bins with weights that wait to be renewed, the first one first."""
@@ -310,8 +335,25 @@ class InflatedWeights:
             self._waiting.pop(number, None)
 
 
+ErrorModel = GaussMarkovBias | InflatedWeights
+
+
+def new_error_model(errors: CorrelatedErrors, correlation: Correlation) -> ErrorModel:
+    """
+    Return a model of correlated errors, without measurements.
+
+    Parameters
+    ----------
+    errors : CorrelatedErrors
+    correlation : Correlation
+
+    """
+    inflates = correlation is Correlation.INFLATE
+    return InflatedWeights(errors) if inflates else GaussMarkovBias(errors)
+
+
 def _biased_constraint(
-    measurement: Absolute, attachment: Attachment, bias: int, phi: float, white_share: float,
+    observed: ObservedNodes, noise: FloatArray, bias: int, phi: float, errors: CorrelatedErrors,
 ) -> Edges:
     """
     Return the edge from a hidden node x to a state of the bias that holds a measurement.
@@ -321,31 +363,39 @@ def _biased_constraint(
     mean of the variances of x and y. m is phi times the state plus a white rest of variance
     1 - phi^2.
     """
-    factors, information, mean = np.zeros(2), np.zeros((3, 3)), np.zeros(3)
-    offset = attachment.motion
-    if isinstance(measurement, HeadingOnly):
-        variance = measurement.variance
-        factors[1], rest = _split(variance, phi)
-        mean[2] = measurement.heading - offset[2]
-        information[2, 2] = 1.0 / (white_share * variance + rest + attachment.noise[2, 2])
-    elif isinstance(measurement, Position):
-        cov = measurement.covariance
-        factors[0], rest = _split(0.5 * float(np.trace(cov)), phi)
-        mean[:2] = measurement.position
-        offset = se2.compose(offset, np.append(measurement.lever_arm, 0.0))
+    factors, information, mean = np.zeros(2), np.zeros((3, 3)), observed.mean[0].copy()
+    given, kind, offset = observed.information[0], observed.kind[0], observed.offset[0]
+    if kind == ObservedKind.HEADING:
+        own = _own(1.0 / float(given[2, 2]), noise[1])
+        factors[1], rest = _split(errors.correlated * own, phi)
+        information[2, 2] = 1.0 / (errors.white * own + rest + noise[1])
+    elif kind == ObservedKind.POSITION:
+        cov = np.linalg.inv(given[:2, :2])
+        total = 0.5 * float(np.trace(cov))
+        own = _own(total, noise[0])
+        factors[0], rest = _split(errors.correlated * own, phi)
         information[:2, :2] = covariance.information(
-            white_share * cov + (rest + swept_variance(measurement, attachment)) * np.eye(2))
+            errors.white * own / total * cov + (rest + noise[0]) * np.eye(2))
     else:
-        cov = measurement.covariance
-        factors[0], rest = _split(0.5 * float(np.trace(cov[:2, :2])), phi)
-        factors[1], rest_heading = _split(float(cov[2, 2]), phi)
-        mean = measurement.pose - (0.0, 0.0, offset[2])
+        cov = covariance.turned(np.linalg.inv(given), -float(mean[2]))
+        total, total_heading = 0.5 * float(np.trace(cov[:2, :2])), float(cov[2, 2])
+        own, own_heading = _own(total, noise[0]), _own(total_heading, noise[1])
+        factors[0], rest = _split(errors.correlated * own, phi)
+        factors[1], rest_heading = _split(errors.correlated * own_heading, phi)
+        scale = np.sqrt((own / total, own / total, own_heading / total_heading))
         information = covariance.information(
-            white_share * cov + np.diag((rest, rest, rest_heading))
-            + covariance.turned(attachment.noise, -float(measurement.pose[2])))
-    mean[2] = se2.wrap(mean[2])
-    return Edges([attachment.node], [bias], [mean], [information], [EdgeKind.BIAS],
+            errors.white * scale[:, None] * cov * scale
+            + np.diag((rest + noise[0], rest + noise[0], rest_heading + noise[1])))
+    if kind != ObservedKind.POSITION:
+        mean[2] = se2.wrap(mean[2] - offset[2])
+    return Edges([observed.node[0]], [bias], [mean], [information], [EdgeKind.BIAS],
+                 weight=observed.weight,
                  bias=[(offset[0], offset[1], phi * factors[0], STRETCH * phi * factors[1])])
+
+
+def _own(total: float, noise: float) -> float:
+    """Return the variance of a measurement without that of the motion since its node."""
+    return max(total - noise, LEAST_OWN * total)
 
 
 def _split(variance: float, phi: float) -> tuple[float, float]:

@@ -11,6 +11,7 @@ make no hidden nodes, and a constraint depends neither on the order of arrival n
 import numpy as np
 
 from pose_graph_ros.core.geometry import covariance, se2
+from pose_graph_ros.core.geometry.se2 import FloatArray
 from pose_graph_ros.core.graph.constraints import EdgeKind, Edges, ObservedKind, ObservedNodes
 from pose_graph_ros.core.measurements import (
     Absolute,
@@ -107,6 +108,26 @@ def swept_variance(measurement: Position, attachment: Attachment) -> float:
     jacobian = np.eye(2, 3)
     jacobian[:, 2] = -measurement.lever_arm[1], measurement.lever_arm[0]
     return float(np.linalg.eigvalsh(jacobian @ attachment.noise @ jacobian.T)[-1])
+
+
+def motion_noise(measurement: Absolute, attachment: Attachment) -> FloatArray:
+    """
+    Return what the motion since the node adds to the variances of a measurement, shape (2,).
+
+    These are the variances of a coordinate of the position and of the heading [m^2, rad^2].
+
+    Parameters
+    ----------
+    measurement : GlobalPose, Position or HeadingOnly
+    attachment : Attachment
+
+    """
+    noise = attachment.noise
+    if isinstance(measurement, Position):
+        return np.array((swept_variance(measurement, attachment), 0.0))
+    if isinstance(measurement, HeadingOnly):
+        return np.array((0.0, noise[2, 2]))
+    return np.array((np.linalg.eigvalsh(noise[:2, :2])[-1], noise[2, 2]))
 
 
 def loop_closure_constraint(

@@ -12,6 +12,7 @@ from pose_graph_ros.core.graph import error_functions
 from pose_graph_ros.core.graph.constraints import Edges, ObservedNodes
 from pose_graph_ros.core.graph.graph import Graph
 from pose_graph_ros.core.sources import autocorrelation
+from pose_graph_ros.core.sources.gauss_markov import CorrelatedErrors
 
 # Number of the newest residuals of a source that are evaluated.
 MOST_RESIDUALS = 5000
@@ -28,16 +29,26 @@ class SourceReport(NamedTuple):
     """Mean squared residual of a coordinate, in units of its sigma."""
     errors: autocorrelation.Autocorrelation
     """Autocorrelation of the newest residuals [m]."""
-    white: bool
-    """Whether the graph treats its errors as white."""
+    in_use: CorrelatedErrors | None
+    """Statistics of its errors that the graph is built with; None for white errors."""
+    found: bool
+    """Whether these are estimated from the errors (`correlation_time` of -1)."""
 
     @property
     def wrongly_white(self) -> bool:
-        """Whether its errors are treated as white but look correlated: its sigmas are too low."""
-        return self.white and self.errors.significant and self.energy > LEAST_ENERGY
+        """
+        Whether its errors are treated as white but look correlated: its sigmas are too low.
+
+        Where the statistics of the errors are estimated, that estimate is the better judge.
+        """
+        return (self.in_use is None and not self.found and self.errors.significant
+                and self.energy > LEAST_ENERGY)
 
 
-def report(graph: Graph, rows: IntArray, *, biased: bool, white: bool) -> SourceReport:
+def report(
+    graph: Graph, rows: IntArray, *, biased: bool, in_use: CorrelatedErrors | None,
+    found: bool = False,
+) -> SourceReport:
     """
     Return how well the newest measurements of a source fit the estimate.
 
@@ -47,7 +58,8 @@ def report(graph: Graph, rows: IntArray, *, biased: bool, white: bool) -> Source
     rows : ndarray of int64, shape (K, 2)
         Stamp [ns] and row of each constraint of the source, in the order of their addition.
     biased : bool, whether the constraints are edges to a bias; else they are observed nodes
-    white : bool, whether the errors are treated as white
+    in_use : CorrelatedErrors, optional, statistics in use; None for white errors
+    found : bool, whether these are estimated from the errors
 
     """
     newest = rows[-MOST_RESIDUALS:]
@@ -60,7 +72,7 @@ def report(graph: Graph, rows: IntArray, *, biased: bool, white: bool) -> Source
         residuals, information = _residuals(graph, graph.observed_at(numbers))
     energy = np.einsum('ki,kij,kj->k', residuals, information, residuals)
     return SourceReport(len(rows), float(np.mean(energy)) / 2.0,
-                        autocorrelation.estimate(stamps, residuals), white)
+                        autocorrelation.estimate(stamps, residuals), in_use, found)
 
 
 def _residuals(graph: Graph, observed: ObservedNodes) -> tuple[FloatArray, FloatArray]:

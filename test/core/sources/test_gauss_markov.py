@@ -23,7 +23,7 @@ from pose_graph_ros.core.config import (
 )
 from pose_graph_ros.core.exceptions import ConfigError
 from pose_graph_ros.core.geometry import se2
-from pose_graph_ros.core.graph.constraints import EdgeKind
+from pose_graph_ros.core.graph.constraints import EdgeKind, ObservedNodes
 from pose_graph_ros.core.measurements import (
     GlobalPose,
     HeadingOnly,
@@ -36,15 +36,23 @@ from pose_graph_ros.core.sources import gauss_markov
 from pose_graph_ros.core.sources.gauss_markov import (
     Additions,
     BINS,
+    CorrelatedErrors,
     GaussMarkovBias,
     GraphSizes,
     InflatedWeights,
 )
+from pose_graph_ros.core.sources.measurement_constraints import absolute_constraint
 
 SECOND = 1_000_000_000
 TAU = float(BINS)
 """Time constant for which a bin is one second [s]."""
 NOWHERE = Attachment(0, np.zeros(3), np.zeros((3, 3)))
+NO_NOISE = np.zeros(2)
+ERRORS = CorrelatedErrors(TAU, 1.0, 0.05)
+
+
+def observed(seconds: float) -> ObservedNodes:
+    return absolute_constraint(position(seconds), NOWHERE)
 
 
 def position(seconds: float, x: float = 0.0, y: float = 0.0, sigma: float = 1.0) -> Position:
@@ -53,7 +61,7 @@ def position(seconds: float, x: float = 0.0, y: float = 0.0, sigma: float = 1.0)
 
 def transitions(stamps: list[float]) -> set[tuple[object, ...]]:
     """Return the edges, transitions and priors of states for fixes that arrive one by one."""
-    chain = GaussMarkovBias(MeasurementSource(correlation_time=TAU))
+    chain = GaussMarkovBias(ERRORS)
     rows: dict[int, int] = {}
     edges: dict[int, tuple[object, ...]] = {}
     priors: dict[int, int] = {}
@@ -61,7 +69,7 @@ def transitions(stamps: list[float]) -> set[tuple[object, ...]]:
     for stamp in stamps:
         additions = Additions(sizes)
         chain.begin()
-        edge = chain.add(position(stamp), NOWHERE, additions)
+        edge = chain.add(round(stamp * SECOND), observed(stamp), NO_NOISE, additions)
         for number, table in enumerate(additions.edges, sizes.n_edges):
             edges[number] = (int(table.i[0]), int(table.j[0]), table.information.tobytes(),
                              table.bias.tobytes())
@@ -87,21 +95,19 @@ def test_the_order_of_arrival_does_not_change_the_transitions_of_states() -> Non
         assert transitions(list(order)) == expected
 
 
-@pytest.mark.parametrize('source', [
-    MeasurementSource(correlation_time=TAU),
-    MeasurementSource(correlation_time=TAU, correlation=Correlation.INFLATE)])
-def test_the_additions_of_a_failed_update_are_rolled_back(source: MeasurementSource) -> None:
+@pytest.mark.parametrize('model', [GaussMarkovBias, InflatedWeights])
+def test_the_additions_of_a_failed_update_are_rolled_back(
+    model: type[GaussMarkovBias] | type[InflatedWeights],
+) -> None:
     def add(chain: GaussMarkovBias | InflatedWeights, seconds: float) -> Additions:
         additions = Additions(GraphSizes(10, 20, 30))
         if isinstance(chain, InflatedWeights):
             chain.add(round(seconds * SECOND), None, additions)  # type: ignore[arg-type]
         else:
-            chain.add(position(seconds), NOWHERE, additions)
+            chain.add(round(seconds * SECOND), observed(seconds), NO_NOISE, additions)
         return additions
 
-    chains = [(InflatedWeights if source.correlation is Correlation.INFLATE
-               else GaussMarkovBias)(source)
-              for _ in range(2)]
+    chains = [model(ERRORS) for _ in range(2)]
     for chain in chains:
         for seconds in (3.0, 9.0):
             chain.begin()
@@ -119,8 +125,7 @@ def test_the_additions_of_a_failed_update_are_rolled_back(source: MeasurementSou
 
 
 def test_the_weights_of_measurements_within_two_time_constants_add_up_to_one() -> None:
-    inflated = InflatedWeights(
-        MeasurementSource(correlation_time=5.0, correlation=Correlation.INFLATE))
+    inflated = InflatedWeights(ERRORS._replace(tau=5.0))
     weights: dict[int, float] = {}
     sizes = GraphSizes(1, 0, 0)
     for k, seconds in enumerate((20.5, 29.0, 31.0, 22.0)):
@@ -142,7 +147,7 @@ def test_weights_are_renewed_in_turn_and_all_of_them_in_the_end(
     """Against the slow oracle, which sets all weights of a bin at each measurement."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(gauss_markov, 'RENEWED', renewed)
-        inflated, weights, bins = InflatedWeights(INFLATED), {}, {}
+        inflated, weights, bins = InflatedWeights(ERRORS._replace(tau=5.0)), {}, {}
         for tenths, what in steps:
             additions = Additions(GraphSizes(1, 0, len(weights)))
             inflated.begin()
@@ -318,7 +323,7 @@ def test_reports_of_correlated_and_of_white_errors() -> None:
 
 @pytest.mark.parametrize(('settings', 'expected'), [
     ({'white_share': -0.1}, 'white_share'), ({'white_share': 1.5}, 'white_share'),
-    ({'correlation_time': -1.0}, 'correlation_time')])
+    ({'correlation_time': -0.5}, 'correlation_time')])
 def test_settings_that_cannot_be_are_refused(settings: dict[str, object], expected: str) -> None:
     with pytest.raises(ConfigError, match=expected):
         replace(MeasurementSource(), **settings)

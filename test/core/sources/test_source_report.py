@@ -9,7 +9,10 @@ from pose_graph_ros.core.geometry import se2
 from pose_graph_ros.core.graph.constraints import EdgeKind, Edges, ObservedKind, ObservedNodes
 from pose_graph_ros.core.graph.graph import Graph, GraphUpdate
 from pose_graph_ros.core.sources import source_report
+from pose_graph_ros.core.sources.gauss_markov import CorrelatedErrors
 from pose_graph_ros.core.sources.source_report import report
+
+KNOWN = CorrelatedErrors(20.0, 1.0, 0.05)
 
 SECOND = 1_000_000_000
 
@@ -43,7 +46,7 @@ def in_time(n: int) -> np.ndarray:
 @pytest.mark.parametrize('turn', [0.0, 2.0])
 def test_the_energy_is_the_mean_square_of_a_coordinate_in_sigmas(turn: float) -> None:
     residuals = np.random.default_rng(1).normal(0.0, 1.0, (200, 2))
-    found = report(observed(residuals, 0.5, turn=turn), in_time(200), biased=False, white=True)
+    found = report(observed(residuals, 0.5, turn=turn), in_time(200), biased=False, in_use=None)
     assert found.n == 200
     assert found.energy == pytest.approx(np.mean(residuals**2) / 0.25)
     assert not found.errors.significant
@@ -66,18 +69,18 @@ def test_errors_that_are_treated_as_white_but_are_not_are_noticed(
     white: bool, sigma: float, tau: float, wrong: bool,
 ) -> None:
     found = report(observed(gauss_markov(600, tau), sigma), in_time(600), biased=False,
-                   white=white)
+                   in_use=None if white else KNOWN)
     assert found.wrongly_white is wrong
 
 
 def test_neither_the_order_of_arrival_nor_repeated_stamps_change_the_residuals() -> None:
     graph, rows = observed(gauss_markov(300, 20.0), 1.0), in_time(300)
-    expected = report(graph, rows, biased=False, white=True)
+    expected = report(graph, rows, biased=False, in_use=None)
     shuffled = rows[np.random.default_rng(0).permutation(300)]
     np.testing.assert_allclose(
-        report(graph, shuffled, biased=False, white=True).errors, expected.errors)
+        report(graph, shuffled, biased=False, in_use=None).errors, expected.errors)
     twice = np.concatenate((rows, rows))
-    found = report(graph, twice, biased=False, white=True)
+    found = report(graph, twice, biased=False, in_use=None)
     assert found.n == 600
     np.testing.assert_allclose(found.errors, expected.errors)
 
@@ -86,7 +89,7 @@ def test_only_the_newest_residuals_are_evaluated(monkeypatch: pytest.MonkeyPatch
     monkeypatch.setattr(source_report, 'MOST_RESIDUALS', 100)
     residuals = np.ones((300, 2))
     residuals[:200] = 50.0
-    found = report(observed(residuals, 1.0), in_time(300), biased=False, white=True)
+    found = report(observed(residuals, 1.0), in_time(300), biased=False, in_use=None)
     assert found.n == 300
     assert found.energy == pytest.approx(1.0)
 
@@ -106,7 +109,7 @@ def test_of_a_biased_source_the_whole_error_counts_not_the_white_rest() -> None:
             np.arange(n), n + np.arange(n),
             np.column_stack((se2.transform(poses, arm) - error, np.zeros(n))), information,
             [EdgeKind.BIAS] * n, bias=np.tile((*arm, factor, 0.0), (n, 1)))))
-    found = report(graph, in_time(n), biased=True, white=False)
+    found = report(graph, in_time(n), biased=True, in_use=KNOWN)
     variance = np.mean(error**2)
     assert found.energy == pytest.approx(variance, rel=0.02)
     assert found.errors.significant

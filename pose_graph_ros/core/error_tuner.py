@@ -1,0 +1,236 @@
+# Copyright 2026 The pose_graph_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""
+Estimates of the errors of sources, and the change of the graph to new ones.
+
+When a source with `correlation_time` of -1 has sent enough measurements, the statistics of its
+errors are estimated (`sources.error_estimate`), and again whenever there are some more. If they
+differ much from those in use, the source gets a new bias, and all its measurements get edges to
+it, the newest first. All that is done in steps of a bounded time. At the end of a stream the
+statistics are those that all measurements show, whatever was in use.
+"""
+
+from dataclasses import dataclass
+import math
+
+import numpy as np
+
+from pose_graph_ros.core.batch.optimizer import Status
+from pose_graph_ros.core.config import Correlation
+from pose_graph_ros.core.geometry.se2 import IntArray
+from pose_graph_ros.core.graph.reweighting import Reweighting
+from pose_graph_ros.core.smoother.incremental import IncrementalSmoother
+from pose_graph_ros.core.sources import error_estimate
+from pose_graph_ros.core.sources.error_likelihood import Track
+from pose_graph_ros.core.sources.factor_builder import FactorBuilder
+from pose_graph_ros.core.sources.gauss_markov import (
+    Additions,
+    CorrelatedErrors,
+    GaussMarkovBias,
+    GraphSizes,
+)
+from pose_graph_ros.core.sources.source_constraints import SourceConstraints
+
+# Factor on the number of measurements from one estimate to the next.
+MORE = 1.3
+# Number of measurements that a step moves, online and at the end of a stream.
+PART, WHOLE = 100, 5000
+# Estimates that differ by less than this factor from what is in use change nothing online.
+SIMILAR = 1.9
+
+
+@dataclass(slots=True)
+class _Change:
+    """A change of the error model of a source that is under way."""
+
+    source: str
+    model: GaussMarkovBias | None
+    """The new model; None for white errors."""
+    left: IntArray
+    """Numbers of the measurements to be moved, the next ones last."""
+    before: IntArray
+    """Row of the edge that held each measurement at the beginning, or -1."""
+    undoing: bool = False
+
+
+@dataclass(slots=True)
+class _Search:
+    """An estimate that is under way."""
+
+    source: str
+    steps: error_estimate.Search
+    n: int
+    """Number of measurements when it began."""
+
+
+class ErrorTuner:
+    """
+    Finds out whether the errors of sources are correlated, and has the graph treat them so.
+
+    Parameters
+    ----------
+    smoother : IncrementalSmoother
+    factors : FactorBuilder
+    reweighting : Reweighting
+
+    """
+
+    def __init__(
+        self, smoother: IncrementalSmoother, factors: FactorBuilder, reweighting: Reweighting,
+    ) -> None:
+        self._smoother, self._factors, self._reweighting = smoother, factors, reweighting
+        self._search: _Search | None = None
+        self._change: _Change | None = None
+        self.n_failures = 0
+        """Number of changes that were undone because the solver failed."""
+
+    def step(self) -> float:
+        """Do a bounded part of the work that is due; return how far a node has moved [m]."""
+        graph = self._smoother.graph
+        if graph.has_touched:
+            return 0.0  # an update has failed
+        if self._change is not None:
+            before = graph.poses.copy()
+            self._move(PART)
+            moved = np.abs(graph.poses[:len(before)] - before)[~graph.is_bias[:len(before)], :2]
+            return float(np.max(moved, initial=0.0))
+        if self._search is None:
+            self._search = self._next_search()
+        if self._search is not None:
+            try:
+                next(self._search.steps)
+            except StopIteration as end:
+                search, self._search = self._search, None
+                constraints = self._factors.constraints(search.source)
+                constraints.next_estimate = math.ceil(MORE * search.n)
+                if _differ(self._factors.errors_in_use(search.source), end.value):
+                    self._begin(search.source, end.value)
+        return 0.0
+
+    @property
+    def is_idle(self) -> bool:
+        """Whether `step` has nothing to do."""
+        return (self._change is None and self._search is None
+                and len(self._factors.due_for_estimate()) == 0)
+
+    def finish_change(self) -> None:
+        """Do all that is left of a change that is under way."""
+        while self._change is not None and self._move(WHOLE):
+            pass
+
+    def decide(self) -> None:
+        """Give all sources the errors that their measurements show; for the end of a stream."""
+        self.finish_change()
+        self._search = None
+        for source in self._factors.finding():
+            constraints = self._factors.constraints(source)
+            found = error_estimate.finished(error_estimate.search(self._track(constraints)))
+            constraints.next_estimate = max(
+                constraints.next_estimate, math.ceil(MORE * len(constraints)))
+            if found != self._factors.errors_in_use(source):
+                self._begin(source, found)
+                self.finish_change()
+
+    def _next_search(self) -> _Search | None:
+        for source in self._factors.due_for_estimate():
+            constraints = self._factors.constraints(source)
+            steps = error_estimate.search(self._track(constraints))
+            return _Search(source, steps, len(constraints))
+        return None
+
+    def _track(self, constraints: SourceConstraints) -> Track:
+        """Return the measurements of a source that take part in the estimate of the graph."""
+        held = constraints.held(np.arange(len(constraints)))
+        edges, observed = self._smoother.graph.weights
+        weights = np.zeros(len(constraints))
+        weights[held.is_edge] = edges[held.rows[held.is_edge]]
+        weights[~held.is_edge] = observed[held.rows[~held.is_edge]]
+        used = constraints.rows.values[weights > 0.0]
+        return error_estimate.track(self._smoother.graph, used[:, 0], used[:, 1])
+
+    def _begin(self, source: str, errors: CorrelatedErrors | None) -> None:
+        """Begin to change the error model of a source."""
+        if self._factors.correlation(source) is Correlation.INFLATE:
+            self._factors.inflate(source, errors)
+            return
+        constraints = self._factors.constraints(source)
+        n = len(constraints)
+        self._change = _Change(
+            source, None if errors is None else GaussMarkovBias(errors), np.arange(n),
+            constraints.edges.values.copy())
+
+    def _move(self, most: int) -> bool:
+        """Move some measurements to the new model; return False if that has failed for good."""
+        change = self._change
+        assert change is not None
+        constraints = self._factors.constraints(change.source)
+        if not change.undoing:  # those that came meanwhile
+            known = len(change.before)
+            change.left = np.append(change.left, np.arange(known, len(constraints)))
+            change.before = np.append(change.before, constraints.edges.values[known:])
+        some = change.left[-most:]
+        if self._apply(change, constraints, some):
+            change.left = change.left[:len(change.left) - len(some)]
+            if len(change.left) == 0:
+                if not change.undoing:
+                    self._factors.set_error_model(change.source, change.model)
+                self._change = None
+            return True
+        if change.undoing:
+            return False    # tried again at the next step
+        self.n_failures += 1
+        moved = np.flatnonzero(constraints.edges.values[:len(change.before)] != change.before)
+        change.undoing, change.left, change.model = True, moved, None
+        return True
+
+    def _apply(self, change: _Change, constraints: SourceConstraints, some: IntArray) -> bool:
+        """Have other rows hold some measurements; return whether the solver succeeded."""
+        graph, model = self._smoother.graph, change.model
+        held = constraints.held(some)
+        edges, observed = graph.weights
+        weights = np.where(held.is_edge, edges[np.where(held.is_edge, held.rows, 0)],
+                           observed[np.where(held.is_edge, 0, held.rows)])
+        additions = Additions(GraphSizes(graph.n_nodes, graph.n_edges, graph.n_observed))
+        rows = constraints.rows.values[some]
+        new = change.before[some] if change.undoing else np.full(len(some), -1)
+        if model is not None:
+            model.begin()
+            table = graph.observed_at(rows[:, 1])
+            for k, (stamp_ns, weight) in enumerate(
+                    zip(rows[:, 0].tolist(), weights.tolist(), strict=True)):
+                one = table.rows(slice(k, k + 1)).weighted(weight)
+                new[k] = model.add(stamp_ns, one, constraints.noise.values[some[k]], additions)
+        weigh_edges = dict.fromkeys(held.rows[held.is_edge].tolist(), 0.0)
+        weigh_observed = dict.fromkeys(held.rows[~held.is_edge].tolist(), 0.0)
+        if model is None:
+            for row, edge, weight in zip(
+                    rows[:, 1].tolist(), new.tolist(), weights.tolist(), strict=True):
+                if edge >= 0:
+                    weigh_edges[edge] = weight
+                else:
+                    weigh_observed[row] = weight
+        update = additions.update()._replace(
+            weigh_edges=weigh_edges, weigh_observed=weigh_observed)
+        try:
+            failed = self._smoother.update(update).status is Status.FAILED
+        except Exception:
+            failed = True   # whatever it is, the smoother has rolled its part back
+        if failed:
+            if model is not None:
+                model.rollback()
+            return False
+        self._factors.n_bias_edges += len(additions.edges)
+        constraints.edges.values[some] = new
+        after = constraints.held(some)
+        for row, is_edge, to_row, to_edge in zip(
+                held.rows.tolist(), held.is_edge.tolist(), after.rows.tolist(),
+                after.is_edge.tolist(), strict=True):
+            self._reweighting.move(row, to_row, edge=is_edge, to_edge=to_edge)
+        return True
+
+
+def _differ(one: CorrelatedErrors | None, other: CorrelatedErrors | None) -> bool:
+    """Tell whether two estimates differ by more than the factor `SIMILAR` in a number."""
+    if one is None or other is None:
+        return one is not other
+    return any(max(a, b) > SIMILAR * min(a, b) for a, b in zip(one, other, strict=True))

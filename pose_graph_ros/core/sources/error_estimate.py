@@ -1,0 +1,237 @@
+# Copyright 2026 The pose_graph_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""
+The statistics of the errors of a source that its measurements and odometry make the most likely.
+
+Of all values on a lattice those with the largest likelihood (`error_likelihood`) are searched,
+once for errors that are white and once for errors with a correlated part. Senders know the size of
+their errors better than how these go on, so a total variance other than the claimed one counts
+against both. The noise of odometry, whose settings are mostly guesses, is searched along: its
+drift must not be taken for an error of the source. Correlated errors are believed if they are much
+more likely than white ones.
+
+The result depends on the measurements and on odometry alone, not on the estimate of the graph,
+and so not on the order of arrival. Searches are generators: each step takes a bounded time.
+"""
+
+from collections.abc import Generator
+import math
+from typing import NamedTuple
+
+import numpy as np
+
+from pose_graph_ros.core.geometry.se2 import BoolArray, FloatArray, IntArray
+from pose_graph_ros.core.graph import tables as tb
+from pose_graph_ros.core.graph.constraints import EdgeKind, ObservedKind
+from pose_graph_ros.core.graph.graph import Graph
+from pose_graph_ros.core.sources.error_likelihood import (
+    chain_motions,
+    filtered,
+    Track,
+    UNKNOWN,
+)
+from pose_graph_ros.core.sources.gauss_markov import CorrelatedErrors
+
+# Number of measurements that are used: the newest ones, and as many of all older ones.
+NEWEST = OLDER = 2000
+# Minimum number of measurements for an estimate.
+LEAST_POSITIONS = 20
+# Number of filtered measurements in one step of a search, of 0.4 us each.
+PER_STEP = 5000
+# How much more likely correlated errors must be: twice the difference of the logarithms.
+SIGNIFICANT = 15.0
+# The same for each time that the filter was lost: then odometry was wrong, or many positions.
+PER_LOST = 100.0
+# Smallest correlation of consecutive measurements that matters.
+LEAST_CORRELATION = 0.2
+# Sigma of the logarithm of the total variance in units of the claimed one, before it is seen.
+SPREAD = 0.7
+# The same of the noise of odometry.
+ODOMETRY_SPREAD = 1.5
+# Exponents of 2 on the lattice: smallest step, and bounds of the variances.
+FINEST, LEAST, MOST = 0.25, -8.0, 8.0
+# Exponents with which the searches begin: correlated part, odometry, white part.
+BEGINNINGS = ((0.0, 0.0, -5.0), (0.0, 0.0, -3.0), (-0.5, 0.0, -2.0), (-1.0, 0.0, -1.0))
+WHITE_BEGINNINGS = tuple((0.0, at) for at in (-6.0, -4.0, -2.0, 0.0, 2.0, 4.0, 6.0))
+# Headings at which the filter starts, of which the best one is used.
+HEADINGS = 16
+# Motion without an odometry edge: its covariance [m^2, m^2, rad^2].
+NO_ODOMETRY = np.diag((1e4, 1e4, 2.0 * UNKNOWN))
+
+Point = tuple[float, ...]
+Search = Generator[None, None, CorrelatedErrors | None]
+"""Yields after each step; returns the statistics, or None for white errors."""
+
+
+class _Minimum(NamedTuple):
+    """The best point of the lattice so far."""
+
+    value: float
+    point: Point
+
+
+def track(graph: Graph, stamps_ns: IntArray, rows: IntArray) -> Track:
+    """
+    Return the positions of a source along the path by odometry, sorted by stamp.
+
+    Parameters
+    ----------
+    graph : Graph
+    stamps_ns : ndarray of int64, shape (K,)
+    rows : ndarray of int64, shape (K,), of the observed nodes; headings among them are left out
+
+    """
+    placed = graph.memory['observed_i'][rows, tb.OBS_KIND] != ObservedKind.HEADING
+    stamps_ns, rows = stamps_ns[placed], rows[placed]
+    where = graph.memory['observed_f'][rows, tb.MEAN:tb.MEAN + 2]
+    order = np.lexsort((where[:, 1], where[:, 0], stamps_ns))
+    order = order[_chosen(len(order))]
+    stamps_ns, observed = stamps_ns[order], graph.observed_at(rows[order])
+    nodes, motion, noise = _odometry(graph, observed.node)
+    until = np.maximum.accumulate(np.searchsorted(nodes, observed.node))
+    joined, spread = np.zeros((len(until), 3)), np.zeros((len(until), 3, 3))
+    chain_motions(motion, noise, until, joined, spread)
+    covariance = np.linalg.inv(observed.information[:, :2, :2])
+    seconds = np.asarray((stamps_ns - stamps_ns[:1]) * 1e-9, dtype=np.float64)
+    return Track(
+        seconds, observed.mean[:, :2].copy(), 0.5 * np.trace(covariance, axis1=1, axis2=2),
+        observed.offset[:, :2].copy(), joined, spread)
+
+
+def _chosen(n: int) -> IntArray | slice:
+    """Return which of n measurements, by stamp, are used."""
+    if n <= NEWEST + OLDER:
+        return slice(n)
+    older = np.linspace(0, n - NEWEST, OLDER, endpoint=False).astype(np.int64)
+    return np.concatenate((older, np.arange(n - NEWEST, n)))
+
+
+def _odometry(graph: Graph, nodes: IntArray) -> tuple[IntArray, FloatArray, FloatArray]:
+    """Return the poses from the first to the last of some nodes, and the motions between them."""
+    poses = np.flatnonzero(~graph.is_bias)
+    begin, end = np.searchsorted(poses, (np.min(nodes, initial=0), np.max(nodes, initial=0)))
+    poses = poses[begin:end + 1]
+    motion = np.zeros((len(poses), 3))
+    noise = np.tile(NO_ODOMETRY, (len(poses), 1, 1))
+    table = graph.memory['edge_i'][:graph.n_edges]
+    edges = np.flatnonzero(table[:, tb.EDGE_KIND] == EdgeKind.ODOMETRY)
+    start, end_at = (np.searchsorted(poses, table[edges, column])
+                     for column in (tb.END_I, tb.END_J))
+    inside: BoolArray = (end_at == start + 1) & (end_at < len(poses))
+    inside[inside] = (poses[start[inside]] == table[edges[inside], tb.END_I]) & (
+        poses[end_at[inside]] == table[edges[inside], tb.END_J])
+    # of several edges the first is that of the primary odometry
+    start, first = np.unique(start[inside], return_index=True)
+    used = graph.edges_at(edges[inside][first])
+    motion[start], noise[start] = used.mean, np.linalg.inv(used.information)
+    return poses, motion, noise
+
+
+def search(positions: Track) -> Search:
+    """Search for the statistics of the errors of a track."""
+    if len(positions.seconds) < LEAST_POSITIONS:
+        return None
+    evaluate = _Evaluation(positions)
+    yield from evaluate.find_heading()
+    white = yield from _descend(evaluate, list(WHITE_BEGINNINGS))
+    period = float(np.median(np.diff(positions.seconds)))
+    shortest, longest = (
+        math.ceil(math.log2(max(time, 1e-3)) / FINEST) * FINEST
+        for time in (period, 4.0 * float(positions.seconds[-1])))
+    evaluate.bounds = shortest, longest
+    found = yield from _descend(evaluate, [
+        (time, *parts) for time in np.arange(shortest, longest + 0.1, 1.0).tolist()
+        for parts in BEGINNINGS])
+    tau, correlated, _, white_part = (2.0 ** exponent for exponent in found.point)
+    errors = CorrelatedErrors(tau, correlated, white_part)
+    correlation = errors.correlated * math.exp(-period / errors.tau) / (
+        errors.correlated + errors.white)
+    needed = SIGNIFICANT + PER_LOST * max(
+        evaluate.lost[white.point], evaluate.lost[found.point])
+    significant = white.value - found.value > needed and correlation > LEAST_CORRELATION
+    return errors if significant else None
+
+
+class _Evaluation:
+    """Evaluates points of the lattice, at most once each."""
+
+    def __init__(self, positions: Track) -> None:
+        self._track = positions
+        self._heading = 0.0
+        self._values: dict[Point, float] = {}
+        self.lost: dict[Point, int] = {}
+        """How often the filter was lost."""
+        self._left = PER_STEP
+        self.bounds = LEAST, MOST
+        """Of the exponent of the time constant."""
+
+    def find_heading(self) -> Generator[None, None, None]:
+        """Find the heading at the first position that makes white errors the most likely."""
+        best = math.inf
+        for angle in (2.0 * math.pi / HEADINGS * np.arange(HEADINGS)).tolist():
+            value, _ = filtered(*self._track, 1.0, 0.0, 1.0, 1.0, angle)
+            if value < best:
+                best, self._heading = value, angle
+            yield from self._pause()
+
+    def value(self, point: Point) -> Generator[None, None, float]:
+        """
+        Return twice the negative logarithm of the posterior probability of a point.
+
+        A point has the exponents of tau, the correlated variance, the noise of odometry and the
+        white variance; for white errors only the last two.
+        """
+        if point not in self._values:
+            tau, correlated = (
+                (1.0, 0.0) if len(point) == 2 else (2.0 ** point[0], 2.0 ** point[1]))
+            odometry, white = 2.0 ** point[-2], 2.0 ** point[-1]
+            value, self.lost[point] = filtered(
+                *self._track, tau, correlated, odometry, white, self._heading)
+            self._values[point] = (
+                value + (math.log(correlated + white) / SPREAD) ** 2
+                + (math.log(odometry) / ODOMETRY_SPREAD) ** 2)
+            yield from self._pause()
+        return self._values[point]
+
+    def _pause(self) -> Generator[None, None, None]:
+        self._left -= len(self._track.seconds)
+        if self._left < 0:
+            self._left = PER_STEP
+            yield
+
+    def clipped(self, point: Point) -> Point:
+        """Return a point inside the bounds."""
+        low, high = self.bounds
+        return (*(min(max(exponent, low), high) for exponent in point[:-3]),
+                *(min(max(exponent, LEAST), MOST) for exponent in point[-3:]))
+
+
+def _descend(
+    evaluate: _Evaluation, beginnings: list[Point],
+) -> Generator[None, None, _Minimum]:
+    """Return the best point near the best beginning, by steps that are halved."""
+    values: list[_Minimum] = []
+    for point in beginnings:
+        values.append(_Minimum((yield from evaluate.value(point)), point))
+    best, step = min(values), 1.0
+    while step >= FINEST:
+        before = best
+        for axis in range(len(best.point)):
+            for move in (step, -step):
+                moved = list(best.point)
+                moved[axis] += move
+                point = evaluate.clipped(tuple(moved))
+                best = min(best, _Minimum((yield from evaluate.value(point)), point))
+        if best.value == before.value:
+            step /= 2.0
+    return best
+
+
+def finished(steps: Search) -> CorrelatedErrors | None:
+    """Return the result of a search that is done without a pause."""
+    while True:
+        try:
+            next(steps)
+        except StopIteration as end:
+            found: CorrelatedErrors | None = end.value
+            return found

@@ -1,0 +1,224 @@
+# Copyright 2026 The pose_graph_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""
+How likely the measured positions of a source are, for given statistics of their errors.
+
+The estimate of the graph follows the measurements, so its residuals show too little of their
+errors. Here the positions are compared with odometry alone: a Kalman filter runs along the path
+with the states
+
+    x, y, theta      pose of the robot in the map
+    m_x, m_y         correlated error of the source, of variance 1 and with time constant tau
+
+and sums up the negative logarithm of the likelihood of each position given those before it. The
+error of a position is `sqrt(correlated v) m` plus white noise of variance `white v`; v is the
+claimed variance. The noise of odometry is that of the edges of the graph times `odometry`. See
+e.g. Y. Bar-Shalom et al., "Estimation with applications to tracking and navigation", sections 8.2
+and 11.4.
+"""
+
+import math
+from typing import NamedTuple
+
+import numpy as np
+
+from pose_graph_ros.core.compiled.jit import (
+    INTEGERS,
+    kernel,
+    MATRICES,
+    NUMBER,
+    NUMBERS,
+    ROWS,
+)
+from pose_graph_ros.core.geometry.se2 import FloatArray
+
+# Squared Mahalanobis distance beyond which a position is taken for wrong, and left out.
+GATE = 16.0
+# Number of successive positions that are left out after which the filter starts again.
+LOST = 5
+# Variance of the heading of a motion above which the filter starts again after it [rad^2].
+UNKNOWN = 0.3
+# Variance of the heading at the first start, and at a later one [rad^2].
+START_VARIANCE, RESTART_VARIANCE = 0.1, 1.0
+# Variance of a position at a start, in units of the claimed variance.
+START_SPREAD = 1e4
+
+
+class Track(NamedTuple):
+    """K measured positions in the order of their stamps, and the motion by odometry between."""
+
+    seconds: FloatArray
+    """Stamps since the first one, shape (K,) [s]."""
+    position: FloatArray
+    """Measured positions in the map, shape (K, 2) [m]."""
+    variance: FloatArray
+    """Claimed variance of a coordinate, shape (K,) [m^2]."""
+    offset: FloatArray
+    """Positions in their hidden nodes, shape (K, 2) [m]."""
+    motion: FloatArray
+    """Pose of each one's hidden node in that of the one before, shape (K, 3); 0 for the first."""
+    noise: FloatArray
+    """Covariance of that motion in the frame at its end, shape (K, 3, 3)."""
+
+
+@kernel(signature=(ROWS, MATRICES, INTEGERS, ROWS, MATRICES))
+def chain_motions(motion, noise, until, out_motion, out_noise):  # type: ignore[no-untyped-def]
+    """
+    Join motions along a path: row k of the result is those of the rows until[k - 1] to until[k].
+
+    Parameters
+    ----------
+    motion, noise : ndarray, shapes (N, 3) and (N, 3, 3), each in the frame at its start or its end
+    until : ndarray of int, shape (K,), not decreasing, at most N
+    out_motion, out_noise : ndarray, shapes (K, 3) and (K, 3, 3), are written
+
+    """
+    for k in range(len(until)):
+        x = y = theta = 0.0
+        cov = out_noise[k]
+        cov[:] = 0.0
+        for n in range(until[k - 1] if k > 0 else until[k], until[k]):
+            dx, dy, turn = motion[n, 0], motion[n, 1], motion[n, 2]
+            c, s = math.cos(turn), math.sin(turn)
+            # adjoint of the inverse of the motion maps the covariance to the frame at its end
+            a, b = -c * dy + s * dx, s * dy + c * dx
+            for i in range(3):
+                p, q, r = cov[i, 0], cov[i, 1], cov[i, 2]
+                cov[i, 0] = c * p + s * q + a * r
+                cov[i, 1] = -s * p + c * q + b * r
+            for i in range(3):
+                p, q, r = cov[0, i], cov[1, i], cov[2, i]
+                cov[0, i] = c * p + s * q + a * r
+                cov[1, i] = -s * p + c * q + b * r
+            for i in range(3):
+                for j in range(3):
+                    cov[i, j] += noise[n, i, j]
+            c, s = math.cos(theta), math.sin(theta)
+            x, y, theta = x + c * dx - s * dy, y + s * dx + c * dy, theta + turn
+        out_motion[k, 0], out_motion[k, 1], out_motion[k, 2] = x, y, theta
+
+
+@kernel
+def _start(pose, p, z, offset, variance, heading_variance):  # type: ignore[no-untyped-def]
+    """Start the filter at a position; the heading of `pose` stays."""
+    c, s = math.cos(pose[2]), math.sin(pose[2])
+    pose[0] = z[0] - c * offset[0] + s * offset[1]
+    pose[1] = z[1] - s * offset[0] - c * offset[1]
+    pose[3] = pose[4] = 0.0
+    for i in range(5):
+        for j in range(5):
+            p[i, j] = 0.0
+    p[0, 0] = p[1, 1] = START_SPREAD * variance
+    p[2, 2] = heading_variance
+    p[3, 3] = p[4, 4] = 1.0
+
+
+@kernel
+def _move(pose, p, motion, noise, scale):  # type: ignore[no-untyped-def]
+    """Predict the pose after a motion, with its noise times a scale."""
+    c, s = math.cos(pose[2]), math.sin(pose[2])
+    dx, dy = c * motion[0] - s * motion[1], s * motion[0] + c * motion[1]
+    pose[0] += dx
+    pose[1] += dy
+    pose[2] += motion[2]
+    for i in range(5):
+        p[i, 0] -= dy * p[i, 2]
+        p[i, 1] += dx * p[i, 2]
+    for i in range(5):
+        p[0, i] -= dy * p[2, i]
+        p[1, i] += dx * p[2, i]
+    c, s = math.cos(pose[2]), math.sin(pose[2])
+    xx, xy, yy = scale * noise[0, 0], scale * noise[0, 1], scale * noise[1, 1]
+    p[0, 0] += c * c * xx - 2.0 * c * s * xy + s * s * yy
+    p[1, 1] += s * s * xx + 2.0 * c * s * xy + c * c * yy
+    cross = c * s * (xx - yy) + (c * c - s * s) * xy
+    xt = scale * (c * noise[0, 2] - s * noise[1, 2])
+    yt = scale * (s * noise[0, 2] + c * noise[1, 2])
+    p[0, 1] += cross
+    p[1, 0] += cross
+    p[0, 2] += xt
+    p[2, 0] += xt
+    p[1, 2] += yt
+    p[2, 1] += yt
+    p[2, 2] += scale * noise[2, 2]
+
+
+@kernel
+def _fade(pose, p, phi):  # type: ignore[no-untyped-def]
+    """Predict the correlated error, of which the part phi is left."""
+    for i in range(3, 5):
+        pose[i] *= phi
+        for j in range(5):
+            p[i, j] *= phi
+        for j in range(5):
+            p[j, i] *= phi
+        p[i, i] += 1.0 - phi * phi
+
+
+@kernel
+def _measure(pose, p, gain, z, offset, factor, white):  # type: ignore[no-untyped-def]
+    """
+    Return twice the negative logarithm of the likelihood of a position, after correcting by it.
+
+    The second result is whether it was left out as wrong, for which the likelihood has a bound.
+    """
+    c, s = math.cos(pose[2]), math.sin(pose[2])
+    ox, oy = c * offset[0] - s * offset[1], s * offset[0] + c * offset[1]
+    ex = z[0] - pose[0] - ox - factor * pose[3]
+    ey = z[1] - pose[1] - oy - factor * pose[4]
+    for i in range(5):
+        gain[i, 0] = p[i, 0] - oy * p[i, 2] + factor * p[i, 3]
+        gain[i, 1] = p[i, 1] + ox * p[i, 2] + factor * p[i, 4]
+    sxx = gain[0, 0] - oy * gain[2, 0] + factor * gain[3, 0] + white
+    sxy = gain[0, 1] - oy * gain[2, 1] + factor * gain[3, 1]
+    syy = gain[1, 1] + ox * gain[2, 1] + factor * gain[4, 1] + white
+    det = sxx * syy - sxy * sxy
+    distance = (syy * ex * ex - 2.0 * sxy * ex * ey + sxx * ey * ey) / det
+    if not distance <= GATE:
+        return math.log(det) + GATE, True
+    ax, ay = (syy * ex - sxy * ey) / det, (sxx * ey - sxy * ex) / det
+    for i in range(5):
+        pose[i] += gain[i, 0] * ax + gain[i, 1] * ay
+    for i in range(5):
+        kx = (syy * gain[i, 0] - sxy * gain[i, 1]) / det
+        ky = (sxx * gain[i, 1] - sxy * gain[i, 0]) / det
+        for j in range(i, 5):
+            p[i, j] -= kx * gain[j, 0] + ky * gain[j, 1]
+            p[j, i] = p[i, j]
+    return math.log(det) + distance, False
+
+
+@kernel(signature=(NUMBERS, ROWS, NUMBERS, ROWS, ROWS, MATRICES, NUMBER, NUMBER, NUMBER, NUMBER,
+                   NUMBER), allocates=True)
+def filtered(  # type: ignore[no-untyped-def]
+    seconds, position, variance, offset, motion, noise, tau, correlated, odometry, white, heading,
+):
+    """
+    Return twice the negative logarithm of the likelihood of positions, and how often it was lost.
+
+    Parameters
+    ----------
+    seconds, position, variance, offset, motion, noise : ndarray, columns of a `Track`
+    tau : float, time constant of the correlated error [s]
+    correlated, white : float, variances of the two parts, in units of the claimed variance
+    odometry : float, factor on the noise of the motions
+    heading : float, of the robot at the first position [rad]
+
+    """
+    pose, p, gain = np.zeros(5), np.zeros((5, 5)), np.zeros((5, 2))
+    pose[2] = heading
+    total, left_out, n_lost = 0.0, 0, 0
+    for k in range(len(seconds)):
+        if k > 0:
+            _move(pose, p, motion[k], noise[k], odometry)
+            _fade(pose, p, math.exp((seconds[k - 1] - seconds[k]) / tau))
+        n_lost += 1 if left_out >= LOST else 0
+        if k == 0 or left_out >= LOST or noise[k, 2, 2] > UNKNOWN:
+            _start(pose, p, position[k], offset[k], variance[k],
+                   RESTART_VARIANCE if k > 0 else START_VARIANCE)
+            left_out = 0
+        cost, wrong = _measure(pose, p, gain, position[k], offset[k],
+                               math.sqrt(correlated * variance[k]), white * variance[k])
+        total += cost
+        left_out = left_out + 1 if wrong else 0
+    return total, n_lost

@@ -1,0 +1,129 @@
+# Copyright 2026 The pose_graph_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""The measurements of one source in the graph, and which row holds each of them."""
+
+from dataclasses import dataclass, field
+from typing import NamedTuple
+
+import numpy as np
+
+from pose_graph_ros.core.compiled.growing_array import GrowingArray
+from pose_graph_ros.core.geometry.se2 import BoolArray, FloatArray, IntArray
+from pose_graph_ros.core.saved_columns import Integers, Pairs, Rows2
+from pose_graph_ros.core.sources.gauss_markov import CorrelatedErrors, SavedBins
+from pose_graph_ros.core.sources.source_report import SourceReport
+
+# A source with at least so many measurements has its errors estimated.
+FIRST_ESTIMATE = 20
+
+
+@dataclass(frozen=True, slots=True)
+class SavedSource:
+    """The measurements and constraints of one source."""
+
+    seen_ns: Integers
+    """Stamps of all measurements that were received [ns], sorted."""
+    seen_references: Integers
+    """For each stamp the reference of the loop closure, 0 for others; see `waiting`."""
+    rows: Pairs
+    """
+    Stamp [ns] and row of each constraint, shape (K, 2). The rows are those of edges if a bias with
+    a given correlation time was estimated, else those of observed nodes.
+    """
+    n_otherwise: int
+    """Number of constraints that were added under other settings."""
+    ties: Integers
+    """Rows of its edges between hidden nodes, except those of the primary odometry."""
+    bins: SavedBins | None
+    """States of its bias, if it has one."""
+    errors: CorrelatedErrors | None = None
+    """Estimated statistics of its errors that are in use; None for white or given ones."""
+    noise: Rows2 = field(default_factory=lambda: np.empty((0, 2)))
+    """What the motion since the node adds to the variances, or empty; see `motion_noise`."""
+    edges: Integers = field(default_factory=lambda: np.empty(0, dtype=np.int64))
+    """With estimated statistics, rows of the edges that hold the measurements, or empty."""
+    next_estimate: int = FIRST_ESTIMATE
+    """Number of measurements at which its errors are estimated next."""
+
+
+class Held(NamedTuple):
+    """The row in the graph that holds each of some measurements."""
+
+    rows: IntArray
+    is_edge: BoolArray
+
+
+class SourceConstraints:
+    """
+    The constraints of one source.
+
+    A measurement whose error was found to be correlated keeps its observed node, with weight 0;
+    an edge to the bias holds it instead. So it can become white again, or get another bias.
+    """
+
+    def __init__(self) -> None:
+        self.rows = GrowingArray((2,), np.int64)
+        """Stamp [ns] of each measurement, and the row that it was first added as."""
+        self.noise = GrowingArray((2,), np.float64)
+        """What the motion since the node adds to its variances; see `motion_noise`."""
+        self.edges = GrowingArray((), np.int64)
+        """Row of the edge that holds it instead, or -1."""
+        self.report: SourceReport | None = None
+        """The newest report."""
+        self.n_otherwise = 0
+        """Constraints of a loaded graph that were added under other settings."""
+        self.next_estimate = FIRST_ESTIMATE
+        """Number of measurements at which the errors are estimated next."""
+
+    def __len__(self) -> int:
+        return len(self.rows)
+
+    def append(self, stamp_ns: int, row: int, noise: FloatArray, edge: int) -> None:
+        """
+        Append a measurement.
+
+        Parameters
+        ----------
+        stamp_ns : int
+        row : int, row that it was added as
+        noise : ndarray, shape (2,), see `motion_noise`
+        edge : int, row of the edge that holds it instead, or -1
+
+        """
+        self.rows.append_one((stamp_ns, row))
+        self.noise.append_one(noise)
+        self.edges.append_one(edge)
+
+    def held(self, which: IntArray) -> Held:
+        """Return the rows that hold some measurements, given by their numbers."""
+        edges = self.edges.values[which]
+        return Held(np.where(edges >= 0, edges, self.rows.values[which, 1]), edges >= 0)
+
+    def stamp_ns(self, row: int, *, edge: bool, added_as_edges: bool) -> int | None:
+        """
+        Return the stamp of the measurement that a row holds [ns], or None.
+
+        Parameters
+        ----------
+        row : int
+        edge : bool, whether it is the row of an edge
+        added_as_edges : bool, whether the measurements were first added as edges
+
+        """
+        if edge is added_as_edges:
+            # rows are appended in increasing order
+            at = int(np.searchsorted(self.rows.values[:, 1], row))
+            found = at < len(self.rows) and self.rows.values[at, 1] == row
+            return int(self.rows.values[at, 0]) if found else None
+        if not edge:
+            return None
+        found_at = np.flatnonzero(self.edges.values == row)
+        return int(self.rows.values[found_at[0], 0]) if len(found_at) > 0 else None
+
+    def restore(self, saved: SavedSource) -> None:
+        """Restore saved measurements."""
+        n = len(saved.rows)
+        self.rows.append(saved.rows)
+        self.noise.append(saved.noise if len(saved.noise) == n else np.zeros((n, 2)))
+        self.edges.append(saved.edges if len(saved.edges) == n else np.full(n, -1))
+        self.next_estimate = saved.next_estimate

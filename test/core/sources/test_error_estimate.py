@@ -1,0 +1,182 @@
+# Copyright 2026 The pose_graph_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""The statistics of errors: the likelihood by an oracle, what is found, and what is not."""
+
+import numpy as np
+import pytest
+
+from pose_graph_ros.core.geometry import se2
+from pose_graph_ros.core.graph.constraints import EdgeKind, Edges, ObservedKind, ObservedNodes
+from pose_graph_ros.core.graph.graph import Graph, GraphUpdate
+from pose_graph_ros.core.sources import error_estimate
+from pose_graph_ros.core.sources.error_estimate import finished, search, track
+from pose_graph_ros.core.sources.error_likelihood import chain_motions, filtered, Track
+
+SECOND = 1_000_000_000
+
+
+def errors(
+    rng: np.random.Generator, n: int, period: float, tau: float, white: float,
+) -> np.ndarray:
+    """Return errors of variance 1, shape (n, 2), of which a part is white; all for a tau of 0."""
+    noise = rng.standard_normal((n, 2))
+    if tau == 0.0:
+        return noise
+    kept, slow = np.exp(-period / tau), rng.standard_normal((n, 2))
+    for k in range(1, n):
+        slow[k] = kept * slow[k - 1] + np.sqrt(1.0 - kept**2) * slow[k]
+    return np.sqrt(1.0 - white) * slow + np.sqrt(white) * noise
+
+
+def a_drive(
+    seed: int, *, n: int = 200, period: float = 1.0, tau: float = 0.0, white: float = 0.05,
+    sigma: float = 1.0, drift: float = 1.0, wrong: float = 0.0,
+) -> Track:
+    """Return a drive at 1 m/s with positions of a claimed sigma of 1 m."""
+    rng = np.random.default_rng(seed)
+    steps = np.column_stack((np.full(n, period), np.zeros(n), 0.1 * np.sin(np.arange(n))))
+    cov = period * np.diag((0.0025, 0.0009, 1e-4))
+    slips = drift * rng.standard_normal((n, 3)) * np.sqrt(np.diagonal(cov))
+    true = np.zeros((n, 3))
+    true[0, 2] = rng.uniform(-3.0, 3.0)
+    for k in range(1, n):
+        true[k] = se2.compose(true[k - 1], se2.compose(steps[k], slips[k]))
+    seen = true[:, :2] + sigma * errors(rng, n, period, tau, white)
+    jumps = rng.random(n) < wrong
+    seen[jumps] += rng.uniform(-50.0, 50.0, (np.sum(jumps), 2))
+    return Track(period * np.arange(n), seen, np.ones(n), np.zeros((n, 2)), steps,
+                 np.tile(cov, (n, 1, 1)))
+
+
+def test_the_likelihood_is_that_of_the_full_covariance() -> None:
+    """On a straight line with a known heading the positions are jointly Gaussian."""
+    n, tau, correlated, odometry, white = 12, 7.0, 0.8, 1.5, 0.3
+    rng = np.random.default_rng(0)
+    cov = np.diag((0.04, 0.09, 1e-12))
+    seconds = np.cumsum(rng.uniform(0.5, 2.0, n))
+    variance = rng.uniform(0.5, 2.0, n)
+    position = np.column_stack((np.arange(n), np.zeros(n))) + 0.3 * rng.standard_normal((n, 2))
+    given = Track(seconds, position, variance, np.zeros((n, 2)),
+                  np.tile((1.0, 0.0, 0.0), (n, 1)), np.tile(cov, (n, 1, 1)))
+    sigma = np.sqrt(variance)
+    bias = correlated * np.outer(sigma, sigma) * np.exp(
+        -np.abs(np.subtract.outer(seconds, seconds)) / tau)
+    steps = np.minimum.outer(np.arange(n), np.arange(n))
+
+    expected = 0.0
+    for axis, first in ((0, 0.0), (1, 0.1)):
+        # the position at the start is unknown; a wrong heading there turns the whole line
+        full = (bias + white * np.diag(variance) + odometry * cov[axis, axis] * steps
+                + 1e4 * variance[0] + first * np.outer(np.arange(n), np.arange(n)))
+        off = position[:, axis] - np.arange(n) * (axis == 0) - position[0, axis]
+        expected += np.linalg.slogdet(full)[1] + off @ np.linalg.solve(full, off)
+    found, n_lost = filtered(*given, tau, correlated, odometry, white, 0.0)
+    assert n_lost == 0
+    assert found == pytest.approx(expected, abs=0.05)
+
+
+@pytest.mark.parametrize(('tau', 'period', 'n'), [
+    (5.0, 0.5, 200), (10.0, 5.0, 120), (60.0, 1.0, 400), (60.0, 5.0, 120), (300.0, 1.0, 900)])
+def test_the_time_constant_is_found_within_a_factor(tau: float, period: float, n: int) -> None:
+    found = [finished(search(a_drive(seed, n=n, period=period, tau=tau))) for seed in range(3)]
+    known = [each for each in found if each is not None]
+    assert len(known) == 3
+    assert tau / 2.5 < np.median([each.tau for each in known]) < 2.5 * tau
+    assert all(0.4 < each.correlated + each.white < 3.0 for each in known)
+    assert all(each.white < 0.3 for each in known)
+
+
+@pytest.mark.parametrize('settings', [
+    {}, {'n': 30}, {'n': 60, 'period': 0.1}, {'period': 5.0}, {'sigma': 2.0}, {'sigma': 0.7},
+    {'drift': 0.3}, {'drift': 3.0}, {'wrong': 0.2}], ids=str)
+def test_white_errors_are_not_taken_for_correlated_ones(settings: dict[str, float]) -> None:
+    """Nor the drift of odometry that is better or worse than it says, nor wrong positions."""
+    for seed in range(12):
+        assert finished(search(a_drive(seed, **settings))) is None
+
+
+def test_correlated_errors_are_found_among_wrong_positions() -> None:
+    for seed in range(3):
+        found = finished(search(a_drive(seed, n=400, tau=20.0, wrong=0.2)))
+        assert found is not None
+        assert 8.0 < found.tau < 50.0
+
+
+def test_too_few_positions_show_nothing() -> None:
+    assert finished(search(a_drive(0, n=error_estimate.LEAST_POSITIONS - 1, tau=30.0))) is None
+
+
+def test_a_step_of_a_search_is_bounded(monkeypatch: pytest.MonkeyPatch) -> None:
+    done = []
+
+    def counting(*arguments: object) -> tuple[float, int]:
+        done.append(len(arguments[0]))  # type: ignore[arg-type]
+        return filtered(*arguments)
+
+    monkeypatch.setattr(error_estimate, 'filtered', counting)
+    steps, found = search(a_drive(1, n=300, tau=20.0)), None
+    while found is None:
+        before = len(done)
+        try:
+            next(steps)
+        except StopIteration as end:
+            found = end.value
+        assert sum(done[before:]) <= error_estimate.PER_STEP + 300
+    assert found == finished(search(a_drive(1, n=300, tau=20.0)))
+
+
+def line(n: int) -> Graph:
+    """Return nodes at every metre, each with a position, the odd ones with a second edge."""
+    graph, ahead = Graph(), np.arange(n - 1)
+    graph.apply(GraphUpdate(
+        hidden=np.column_stack((np.arange(n), np.zeros((n, 2)))), fix=(0,), edges=Edges(
+            np.append(ahead, ahead[::2]), np.append(ahead + 1, ahead[::2] + 1),
+            np.tile((1.0, 0.0, 0.0), (n - 1 + len(ahead[::2]), 1)),
+            np.concatenate((np.tile(100.0 * np.eye(3), (n - 1, 1, 1)),
+                            np.tile(np.eye(3), (len(ahead[::2]), 1, 1)))),
+            [EdgeKind.ODOMETRY] * (n - 1 + len(ahead[::2]))),
+        observed=ObservedNodes(
+            np.arange(n), np.tile((0.2, 0.1, 0.0), (n, 1)),
+            np.column_stack((np.arange(n) + 0.2, np.full(n, 0.1), np.zeros(n))),
+            np.tile(np.diag((4.0, 4.0, 0.0)), (n, 1, 1)), [ObservedKind.POSITION] * n)))
+    return graph
+
+
+def test_a_track_has_the_motions_of_the_primary_odometry_in_the_order_of_stamps() -> None:
+    graph, rng = line(30), np.random.default_rng(0)
+    rows = np.sort(rng.choice(30, 12, replace=False))
+    some = rng.permutation(rows)
+    found = track(graph, SECOND * (some + 5), some)
+    np.testing.assert_allclose(found.seconds, rows - rows[0])
+    np.testing.assert_allclose(found.position, np.column_stack((rows + 0.2, np.full(12, 0.1))))
+    np.testing.assert_allclose(found.variance, 0.25)
+    np.testing.assert_allclose(found.motion[1:, 0], np.diff(rows))
+    np.testing.assert_allclose(found.noise[1:, 0, 0], 0.01 * np.diff(rows))
+    np.testing.assert_array_equal(found.motion[0], 0.0)
+
+
+def test_chained_motions_are_those_of_an_oracle() -> None:
+    rng, n = np.random.default_rng(4), 20
+    motion = rng.normal(0.0, 1.0, (n, 3))
+    root = rng.normal(0.0, 0.1, (n, 3, 3))
+    noise, until = root @ np.swapaxes(root, 1, 2), np.array((2, 2, 7, 20))
+    got, spread = np.zeros((4, 3)), np.zeros((4, 3, 3))
+    chain_motions(motion, noise, until, got, spread)
+    for k in range(1, 4):
+        pose, cov = np.zeros(3), np.zeros((3, 3))
+        for row in range(until[k - 1], until[k]):
+            back = se2.adjoint(se2.inverse(motion[row]))
+            pose, cov = se2.compose(pose, motion[row]), back @ cov @ back.T + noise[row]
+        np.testing.assert_allclose(got[k, :2], pose[:2], atol=1e-12)
+        assert se2.wrap(got[k, 2] - pose[2]) == pytest.approx(0.0, abs=1e-12)
+        np.testing.assert_allclose(spread[k], cov, atol=1e-12)
+
+
+def test_of_many_positions_the_newest_and_a_sample_of_the_others_are_used(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr(error_estimate, 'NEWEST', 10)
+    monkeypatch.setattr(error_estimate, 'OLDER', 5)
+    found = track(line(40), SECOND * np.arange(40), np.arange(40))
+    assert len(found.seconds) == 15
+    np.testing.assert_allclose(found.seconds[-10:], np.arange(30, 40))
