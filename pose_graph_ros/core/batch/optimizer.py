@@ -88,12 +88,25 @@ def optimize(graph: Graph, config: SolverConfig) -> BatchResult:
     config : SolverConfig
 
     """
+    return to_the_end(in_parts(graph, config))
+
+
+def in_parts(graph: Graph, config: SolverConfig) -> Parts:
+    """
+    Return the result of `optimize`, after a pause at each iteration.
+
+    Parameters
+    ----------
+    graph : Graph
+    config : SolverConfig
+
+    """
     chi2, answer = _check_before(graph)
     if answer is not None:
         return answer
     poses = graph.poses.copy()
-    return _finished(graph, poses, chi2, to_the_end(
-        _minimize(graph, config, _analysed(graph), chi2)))
+    return _finished(graph, poses, chi2, (
+        yield from _minimize(graph, config, _analysed(graph), chi2)))
 
 
 def to_the_end(parts: Parts) -> BatchResult:

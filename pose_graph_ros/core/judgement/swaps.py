@@ -45,7 +45,7 @@ class Found:
 
 class Swap:
     """
-    A trial, one optimisation at each step.
+    A trial, an iteration of its optimisations at each step.
 
     Parameters
     ----------
@@ -71,14 +71,22 @@ class Swap:
             column[rows] = values
         self._graph = Graph()
         self._graph.fill(copied)
+        self._parts = optimizer.in_parts(self._graph, _CONFIG)
         self._n_steps, self._cost = 0, np.inf
         self._inside = inside.copy()
         self.found: Found | None = None
 
     def step(self, clique: IntArray) -> bool:
-        """Do one optimisation; tell whether the trial goes on. `found` is its result."""
-        if optimizer.optimize(self._graph, _CONFIG).status is Status.FAILED:
-            return False
+        """Do an iteration; tell whether the trial goes on. `found` is its result."""
+        try:
+            next(self._parts)
+        except StopIteration as end:
+            self._parts = optimizer.in_parts(self._graph, _CONFIG)
+            return end.value.status is not Status.FAILED and self._goes_on(clique)
+        return True
+
+    def _goes_on(self, clique: IntArray) -> bool:
+        """Compare the set that was optimised, and choose the next one; tell if there is any."""
         residual = energies(
             edge_errors(self._graph.poses, self._edges), self._edges.information)
         if self._n_steps == 0:
