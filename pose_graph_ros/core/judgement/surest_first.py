@@ -70,21 +70,21 @@ def select(problem: TruncatedProblem, *, insured: bool = False) -> BoolArray | N
     thrown = np.zeros(len(problem), dtype=np.int64)
     seen, scale, level = np.zeros(len(problem)), 1.0, 0.0
     kept_out = np.zeros(len(problem), dtype=bool)
+
+    def sure(numbers: IntArray, believed: BoolArray) -> IntArray:
+        return numbers[gates.is_sure(numbers, believed)] if insured else numbers
+
     for _ in range(ROUNDS):
         waiting = np.flatnonzero(~believed & (thrown < THROWN_OUT))
-        passing = gates.passing(waiting, scale, REACH * level)
-        if insured:
-            passing = passing[gates.is_sure(passing, believed)]
+        passing = sure(gates.passing(waiting, scale, REACH * level), believed)
         if not np.any(gates.volume[passing] <= level):
-            some = np.sort(gates.volume[waiting])[:max(SOME, len(waiting) // 4)]
-            passing = gates.passing(waiting, scale, float(some[-1]) if len(some) > 0 else 0.0)
-            if len(passing) == 0 or insured:
-                passing = gates.passing(waiting, scale, np.inf)
-            if insured:
-                sure = gates.is_sure(passing, believed)
+            some = np.sort(gates.volume[waiting])[:max(SOME, len(waiting) // 16)]
+            passing = sure(gates.passing(waiting, scale, np.max(some, initial=0.0)), believed)
+            if len(passing) == 0:
+                everything = gates.passing(waiting, scale, np.inf)
+                passing = sure(everything, believed)
                 kept_out[:] = False
-                kept_out[passing[~sure]] = True
-                passing = passing[sure]
+                kept_out[np.setdiff1d(everything, passing)] = True
             if len(passing) == 0:
                 break
             level = max(level, ROUND * float(np.min(gates.volume[passing])))
