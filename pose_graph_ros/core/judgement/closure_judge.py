@@ -207,8 +207,9 @@ class ClosureJudge:
     def _belief(self, number: int, chance: float) -> State:
         """Return the state of a closure that has passed the gate."""
         of_source = self._states.source == self._states.source[number]
-        n, good = int(np.sum(of_source)), int(np.sum(self._states.in_graph & of_source))
-        alone = (n - good + 1.0) * chance < WRONG_ODDS * (good + 1.0)
+        bad = int(np.sum((self._states.state == DOUBTED) & of_source))
+        good = int(np.sum(self._states.in_graph & of_source))
+        alone = (bad + 1.0) * chance < WRONG_ODDS * (good + 1.0)
         if (alone and chance <= WEAK) or self._is_corroborated(
                 number, self._states.decision != OUT):
             return State.BELIEVED

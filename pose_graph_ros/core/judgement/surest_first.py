@@ -72,7 +72,7 @@ def select(problem: TruncatedProblem, *, insured: bool = False) -> BoolArray | N
     kept_out = np.zeros(len(problem), dtype=bool)
 
     def sure(numbers: IntArray, believed: BoolArray) -> IntArray:
-        return numbers[gates.is_sure(numbers, believed)] if insured else numbers
+        return numbers[gates.is_sure(numbers, believed, scale)] if insured else numbers
 
     for _ in range(ROUNDS):
         waiting = np.flatnonzero(~believed & (thrown < THROWN_OUT))
@@ -153,17 +153,18 @@ class _Gates:
         self._compute(near)
         return near[self.share[near] <= scale]
 
-    def is_sure(self, numbers: IntArray, believed: BoolArray) -> BoolArray:
+    def is_sure(self, numbers: IntArray, believed: BoolArray, scale: float) -> BoolArray:
         """
         Return whether neighbours or the odds are for constraints that pass their gates.
 
         The chance of a wrong one to pass is the part of all errors that its gate lets through; the
-        share of wrong ones is that of those that are not believed.
+        share of wrong ones is that of those that do not pass, or were not looked at yet.
 
         Parameters
         ----------
         numbers : ndarray of int, shape (K,)
         believed : ndarray of bool, shape (M,)
+        scale : float, factor on the limits
 
         """
         alone = np.asarray(ALONE)[self._agreeing[numbers]]
@@ -171,9 +172,11 @@ class _Gates:
         ball = 4.0 / 3.0 * np.pi * self._problem.limits[numbers] ** 1.5
         chance = np.minimum(
             ball * self.volume[numbers] / alone / (np.prod(extent) * 2.0 * np.pi), 1.0)
-        n_believed = np.sum(believed)
+        n_believed, rest = np.sum(believed), ~believed
+        passing = rest & (self.volume > 0.0) & (self.share <= scale)
+        n_wrong = np.sum(rest) - np.sum(passing)
         return (self._agreeing[numbers] >= 2) | (
-            (len(believed) - n_believed + 1.0) * chance < WRONG_ODDS * (n_believed + 1.0))
+            (n_wrong + 1.0) * chance < WRONG_ODDS * (n_believed + 1.0))
 
     def _squared(self, numbers: IntArray, errors: FloatArray) -> FloatArray:
         return Innovations(errors, self._covariances[numbers]).squared_distances(
