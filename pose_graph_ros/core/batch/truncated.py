@@ -150,18 +150,27 @@ class TruncatedProblem:
         cost = known + float(np.sum(np.minimum(squares, self.limits)))
         return Choice(believed.copy(), squares, cost, self.graph.poses.copy())
 
-    def improved(self, choice: Choice) -> Choice:
+    def improved(
+        self, choice: Choice, retests: int = RETESTS, config: SolverConfig = CONFIG,
+    ) -> Choice:
         """
         Return a set that no retest lowers the cost of.
 
         All that is within its limit at the poses of the set is believed, and nothing else, as long
         as that lowers the cost.
+
+        Parameters
+        ----------
+        choice : Choice
+        retests : int, their maximum number
+        config : SolverConfig
+
         """
-        for _ in range(RETESTS):
+        for _ in range(retests):
             believed = self.allowed & (choice.energies <= self.limits)
             if np.array_equal(believed, choice.believed):
                 break
-            other = self.choice(believed)
+            other = self.choice(believed, config)
             if other is None or other.cost >= choice.cost:
                 break
             choice = other

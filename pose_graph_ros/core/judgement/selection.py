@@ -10,7 +10,7 @@ from pose_graph_ros.core.batch.truncated import Choice, ROUGH, TruncatedProblem
 from pose_graph_ros.core.geometry import se2
 from pose_graph_ros.core.geometry.se2 import FloatArray
 from pose_graph_ros.core.graph.constraints import Edges
-from pose_graph_ros.core.judgement import surest_first
+from pose_graph_ros.core.judgement import group_search, surest_first
 
 # Least sigmas of loop closures for decisions: front ends claim too small ones [m, m, rad].
 FLOORS = np.array([0.3, 0.3, 0.05])
@@ -47,7 +47,9 @@ def best(problem: TruncatedProblem, *, insured: bool = False) -> Choice | None:
     choices = [problem.choice(believed) for believed in sets]
     choices.append(gnc.select(problem, Surrogate.TRUNCATED))
     solved = [problem.improved(choice) for choice in choices if choice is not None]
-    return min(solved, key=lambda choice: choice.cost, default=None)
+    if len(solved) == 0:
+        return None
+    return group_search.improved(problem, min(solved, key=lambda choice: choice.cost))
 
 
 def floored(edges: Edges, sigmas: FloatArray = FLOORS) -> Edges:

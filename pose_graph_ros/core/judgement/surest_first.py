@@ -206,13 +206,20 @@ class _Gates:
 
 def _agreeing(problem: TruncatedProblem) -> IntArray:
     """Return for each constraint the number of neighbouring closures that agree with it."""
-    closures, chain = problem.edges, OdometryChain()
     count = np.zeros(len(problem), dtype=np.int64)
+    for numbers in agreeing_pairs(problem):
+        np.add.at(count, numbers, 1)
+    return count
+
+
+def agreeing_pairs(problem: TruncatedProblem) -> tuple[IntArray, IntArray]:
+    """Return the numbers of neighbouring closures that agree with each other, shape (P,) each."""
+    closures, chain, none = problem.edges, OdometryChain(), np.empty(0, dtype=np.int64)
     usable = np.flatnonzero((closures.kind == EdgeKind.LOOP_CLOSURE)
                             & np.all(np.einsum('mii->mi', closures.information) > 0.0, axis=1))
     chain.extend(problem.graph)
     if len(usable) == 0 or len(chain) < 2:
-        return count
+        return none, none
     ends = chain.travel(np.concatenate((closures.i[usable], closures.j[usable]))).reshape(2, -1)
     first, second = np.min(ends, axis=0), np.max(ends, axis=0)
     order = np.argsort(first, kind='stable')
@@ -225,11 +232,9 @@ def _agreeing(problem: TruncatedProblem) -> IntArray:
         close = close[np.abs(second[close + shift] - second[close]) <= NEAR]
         pairs.append(np.column_stack((close, close + shift)))
     if len(pairs) == 0:
-        return count
+        return none, none
     a, b = np.concatenate(pairs).T
     noise = np.asarray(np.linalg.inv(closures.information[usable]), dtype=np.float64)
     table = Closures(closures.i[usable], closures.j[usable], closures.mean[usable], noise)
     agree = chain.squared_distances(table, a, b) <= LIMITS[3]
-    np.add.at(count, usable[a[agree]], 1)
-    np.add.at(count, usable[b[agree]], 1)
-    return count
+    return usable[a[agree]], usable[b[agree]]
