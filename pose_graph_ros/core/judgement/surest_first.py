@@ -174,7 +174,7 @@ class _Gates:
             ball * self.volume[numbers] / alone / (np.prod(extent) * 2.0 * np.pi), 1.0)
         n_believed, rest = np.sum(believed), ~believed
         passing = rest & (self.volume > 0.0) & (self.share <= scale)
-        n_wrong = np.sum(rest) - np.sum(passing)
+        n_wrong = int(np.sum(rest)) - int(np.sum(passing))
         return (self._agreeing[numbers] >= 2) | (
             (n_wrong + 1.0) * chance < WRONG_ODDS * (n_believed + 1.0))
 
