@@ -68,6 +68,11 @@ class OdometryChain:
     def __len__(self) -> int:
         return len(self._rows)
 
+    @property
+    def nodes(self) -> IntArray:
+        """Rows of the nodes in the graph, in their order."""
+        return self._rows.values
+
     def extend(self, graph: Graph) -> None:
         """Append the nodes that were added to the graph since; the work is linear in these."""
         if len(self) == 0:

@@ -17,6 +17,7 @@ limits are lowered; else a wrong constraint would fit wherever the graph is clai
 import numpy as np
 
 from pose_graph_ros.core.batch.truncated import LIMITS, TruncatedProblem
+from pose_graph_ros.core.geometry import se2
 from pose_graph_ros.core.geometry.se2 import BoolArray, FloatArray, IntArray
 from pose_graph_ros.core.graph.constraints import EdgeKind
 from pose_graph_ros.core.judgement.consistency import Closures, OdometryChain
@@ -41,8 +42,9 @@ ENOUGH, SHARE, SHARE_LIMIT = 50, 0.9, 6.25
 MARGIN, LEAST_SCALE = 3.0, 0.02
 # Volumes shrink: those above this times the volume of the round are not looked at in it.
 REACH = 20.0
-# Number of those with the smallest volumes, at least, that are looked at before all others.
-SOME = 200
+# Number of those with the smallest volumes, at least, that are looked at before all others, and
+# their share; both double after each round in which most of these were believed.
+SOME, SOME_SHARE = 200, 1.0 / 16.0
 # Largest odds that a constraint is wrong which no neighbours support, where these are counted.
 WRONG_ODDS = 0.02
 # What is not measured of an error could be anything within this [m, m, rad].
@@ -68,7 +70,7 @@ def select(problem: TruncatedProblem, *, insured: bool = False) -> BoolArray | N
         return None
     gates = _Gates(problem)
     thrown = np.zeros(len(problem), dtype=np.int64)
-    seen, scale, level = np.zeros(len(problem)), 1.0, 0.0
+    seen, scale, level, more = np.zeros(len(problem)), 1.0, 0.0, 1
     kept_out = np.zeros(len(problem), dtype=bool)
 
     def sure(numbers: IntArray, believed: BoolArray) -> IntArray:
@@ -76,9 +78,12 @@ def select(problem: TruncatedProblem, *, insured: bool = False) -> BoolArray | N
 
     for _ in range(ROUNDS):
         waiting = np.flatnonzero(~believed & (thrown < THROWN_OUT))
+        gates.begin_round()
+        n_some = 0
         passing = sure(gates.passing(waiting, scale, REACH * level), believed)
         if not np.any(gates.volume[passing] <= level):
-            some = np.sort(gates.volume[waiting])[:max(SOME, len(waiting) // 16)]
+            n_some = more * max(SOME, int(SOME_SHARE * len(waiting)))
+            some = np.sort(gates.volume[waiting])[:n_some]
             passing = sure(gates.passing(waiting, scale, np.max(some, initial=0.0)), believed)
             if len(passing) == 0:
                 everything = gates.passing(waiting, scale, np.inf)
@@ -102,6 +107,7 @@ def select(problem: TruncatedProblem, *, insured: bool = False) -> BoolArray | N
             believed[wrong] = False
             if not problem.solve(believed.astype(np.float64), go_on=True):
                 return None
+        more = 2 * more if 0 < n_some <= 2 * len(new) and not np.any(wrong) else 1
     problem.limits = scale * problem.limits
     problem.allowed &= ~kept_out
     return believed
@@ -131,6 +137,36 @@ class _Gates:
         self.volume = np.zeros(len(problem))
         self.share = np.zeros(len(problem))
         """Squared Mahalanobis distance, in limits."""
+        self._present = np.zeros(len(problem), dtype=bool)
+        """Which were computed in this round."""
+        self._begin_with_odometry()
+
+    def _begin_with_odometry(self) -> None:
+        """
+        Set the gates of closures to those by odometry alone, which are the largest.
+
+        The tree of a graph without closures is as deep as the path is long, so those that are not
+        among the surest are computed by it only later, when it is flat.
+        """
+        problem, chain = self._problem, OdometryChain()
+        chain.extend(problem.graph)
+        edges = problem.graph.edges
+        chained = np.zeros(problem.graph.n_nodes, dtype=bool)
+        chained[chain.nodes] = True
+        if np.any(edges.weight[edges.kind == EdgeKind.ODOMETRY] < 1.0):
+            return    # the graph knows less than odometry claims
+        numbers = np.flatnonzero(chained[problem.edges.i] & chained[problem.edges.j])
+        some = problem.edges.rows(numbers)
+        pose, covariance = chain.between(some.i, some.j)
+        # from the axes of the predicted pose to those of the measured one
+        turn = np.zeros((len(numbers), 3))
+        turn[:, 2] = pose[:, 2] - some.mean[:, 2]
+        axes = se2.adjoint(turn)
+        self._set(numbers, axes @ covariance @ np.swapaxes(axes, 1, 2))
+
+    def begin_round(self) -> None:
+        """Compute gates again where they are asked for, as the graph has changed."""
+        self._present[:] = False
 
     def passing(self, waiting: IntArray, scale: float, reach: float) -> IntArray:
         """
@@ -150,7 +186,7 @@ class _Gates:
         old = np.nan_to_num(self._squared(near, self._problem.errors(near)), nan=0.0)
         limits = scale * self._problem.limits
         near = near[old <= limits[near]]
-        self._compute(near)
+        self._compute(near[~self._present[near]])
         return near[self.share[near] <= scale]
 
     def is_sure(self, numbers: IntArray, believed: BoolArray, scale: float) -> BoolArray:
@@ -198,8 +234,12 @@ class _Gates:
         innovations.of_observed(head, *map(np.ascontiguousarray, (
             observed.node, observed.offset, observed.mean)), *part)
         errors[~is_edge], covariances[~is_edge] = part
-        self._covariances[numbers] = covariances
+        self._present[numbers] = True
+        self._set(numbers, covariances)
         self.share[numbers] = self._squared(numbers, errors) / problem.limits[numbers]
+
+    def _set(self, numbers: IntArray, covariances: FloatArray) -> None:
+        self._covariances[numbers] = covariances
         grown = np.linalg.det(np.eye(3) + covariances @ self._information[numbers])
         self.volume[numbers] = self._own[numbers] * np.sqrt(np.maximum(grown, 1.0))
 

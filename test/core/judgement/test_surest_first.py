@@ -88,6 +88,17 @@ def test_a_gate_is_that_of_the_smoother() -> None:
         assert min(abs(ratio / factor - 1.0) for factor in surest_first.ALONE) < 1e-5
 
 
+def test_gates_begin_with_those_of_odometry_alone() -> None:
+    drive = laps(2, n_wrong=5)
+    problem = TruncatedProblem(drive.graph, drive.closures)
+    problem.solve(np.zeros(len(problem)))
+    gates = surest_first._Gates(problem)
+    volume, covariances = gates.volume.copy(), gates._covariances.copy()
+    gates.passing(np.arange(len(problem)), 1e9, np.inf)
+    np.testing.assert_allclose(volume, gates.volume, rtol=1e-5)
+    np.testing.assert_allclose(covariances, gates._covariances, rtol=1e-4, atol=1e-7)
+
+
 def _jacobian(poses: np.ndarray, edge: Edges) -> np.ndarray:
     """Return the Jacobian of an edge's error by both ends, by differences, shape (3, 6)."""
     columns = []
