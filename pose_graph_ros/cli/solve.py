@@ -17,17 +17,15 @@ import time
 
 import numpy as np
 
-from pose_graph_ros.cli.believe import believe
 from pose_graph_ros.core.batch import optimizer
 from pose_graph_ros.core.batch.optimizer import BatchResult, Status
-from pose_graph_ros.core.config import SolverConfig
+from pose_graph_ros.core.config import CLOSURE_FLOORS, SolverConfig
 from pose_graph_ros.core.elimination import symbolic
 from pose_graph_ros.core.geometry.se2 import FloatArray, IntArray
 from pose_graph_ros.core.graph.constraints import ObservedKind, ObservedNodes
 from pose_graph_ros.core.graph.error_functions import edge_errors, energies as energies_of
 from pose_graph_ros.core.graph.graph import Graph, GraphUpdate
 from pose_graph_ros.core.io.g2o import EDGE2_ORDERS, GraphFile, read_g2o, write_g2o
-from pose_graph_ros.core.judgement import selection
 
 N_LARGEST = 5  # number of edges, of observed nodes, and of names, that are printed
 N_TAGS = 10  # number of warnings of tags
@@ -46,7 +44,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
                         help='decide which loop closures (edges between ids that are no '
                              'neighbours) to believe, and leave the others out')
     parser.add_argument('--closure-sigma', nargs=2, type=float, metavar=('M', 'RAD'),
-                        default=(float(selection.FLOORS[0]), float(selection.FLOORS[2])),
+                        default=(CLOSURE_FLOORS[0], CLOSURE_FLOORS[2]),
                         help='least standard deviations of loop closures for this decision '
                              '(default: %(default)s); the result has those of the file')
     parser.add_argument('--edge2', choices=EDGE2_ORDERS,
@@ -90,6 +88,9 @@ def execute(options: argparse.Namespace) -> int:
 
 def _doubt(file: GraphFile, sigma: Sequence[float]) -> IntArray:
     """Give the closures that are not believed the weight 0; print and return their rows."""
+    # what judges takes longer to load than all else here
+    from pose_graph_ros.cli.believe import believe  # noqa: PLC0415
+
     graph = file.graph
     beliefs = believe(graph, np.array([sigma[0], sigma[0], sigma[1]]))
     if beliefs is None:

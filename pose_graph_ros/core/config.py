@@ -18,6 +18,9 @@ from pose_graph_ros.core.measurements import HeadingOnly, LoopClosure, Measureme
 # Motion since the last hidden node below which the robot stands still [m], [rad].
 REST_DISTANCE = 0.05
 REST_HEADING = 0.05
+# Least sigmas of loop closures to decide by whether to believe them, as claimed covariances are
+# mostly too small [m, m, rad].
+CLOSURE_FLOORS = (0.3, 0.3, 0.05)
 # Sigma of a heading that is uniform on the circle [rad].
 FLAT_GUESS = math.pi / math.sqrt(3.0)
 

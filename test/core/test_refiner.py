@@ -54,7 +54,8 @@ def refined(backend: PoseGraphBackend) -> float:
     raise AssertionError('the refinement does not end')
 
 
-@pytest.mark.parametrize('loss', list(Loss))
+# those that take weight away again have other minima, which a full optimisation may find
+@pytest.mark.parametrize('loss', [Loss.NONE, Loss.HUBER, Loss.CAUCHY])
 def test_a_full_optimisation_moves_a_refined_path_by_below_a_millimetre(loss: Loss) -> None:
     backend = PoseGraphBackend(config(loss))
     drive(backend, refine=False)

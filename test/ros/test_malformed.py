@@ -213,7 +213,8 @@ def check_counts(values: dict[str, str]) -> None:
                   if key.startswith(f'{topic}.') and value.isdigit()}
         # these come beside the answer
         for key in list(counts):
-            if key in ('jump', 'sorted', 'without_lever_arm', 'default_covariance') or (
+            if key in ('jump', 'sorted', 'without_lever_arm', 'default_covariance', 'believed',
+                       'believed_weakly', 'doubted', 'waiting') or (
                     key.startswith('repaired_')):
                 del counts[key]
         assert len(counts) > 4, counts

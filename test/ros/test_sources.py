@@ -252,7 +252,8 @@ def test_the_lever_arm_comes_from_tf_static(node: NodeProcess) -> None:
 
 
 @pytest.mark.parametrize(
-    'node', [(*DATUM[:1], f'datum:=[{PLANE.latitude}, {PLANE.longitude}, 0.5]')], indirect=True)
+    'node', [(*DATUM[:1], f'datum:=[{PLANE.latitude}, {PLANE.longitude}, 0.5]',
+              '-p', 'fix.correlation_time:=0.0')], indirect=True)
 def test_the_pose_comes_back_in_latitude_and_longitude(node: NodeProcess, client: Client) -> None:
     def unequal(seconds: float) -> NavSatFix:
         message = fix_at(seconds)
@@ -353,7 +354,10 @@ def drifting(seconds: float) -> Odometry:
                     angle)
 
 
-def test_a_loop_closure_waits_until_odometry_has_reached_both_ends(client: Client) -> None:
+@pytest.mark.parametrize('node', [('-p', 'loop_closure.robust:=none')], indirect=True)
+def test_a_loop_closure_waits_until_odometry_has_reached_both_ends(
+    node: NodeProcess, client: Client,
+) -> None:
     # the other end is later than the stamp; both lie ahead
     seen = se2.between(true_pose(66.0), true_pose(3.0))
     client.loop_closure.publish(pose(

@@ -9,6 +9,7 @@ from typing import NamedTuple
 import numpy as np
 
 from pose_graph_ros.core.compiled.growing_array import GrowingArray
+from pose_graph_ros.core.config import CLOSURE_FLOORS
 from pose_graph_ros.core.geometry import se2
 from pose_graph_ros.core.geometry.se2 import BoolArray, FloatArray, IntArray
 from pose_graph_ros.core.graph.constraints import Edges
@@ -16,8 +17,6 @@ from pose_graph_ros.core.judgement.consistency import Closures, OdometryChain
 
 # Squared Mahalanobis distance that 99 % of errors with three components are within.
 GATE = 11.34
-# Sigmas that covariances are raised to for decisions: front ends claim too much [m, m, rad].
-FLOORS = (0.3, 0.3, 0.05)
 # Closures are compared whose ends are within this of each other, along the path [m].
 NEAR = 10.0
 # Largest number of closures that one is compared with, and of a clique.
@@ -42,7 +41,7 @@ def claims(edges: Edges) -> Closures:
     covariance = np.asarray(
         np.linalg.inv(edges.information + _LEAST_INFORMATION * np.eye(3)), dtype=np.float64)
     diagonal = np.einsum('mii->mi', covariance)
-    np.maximum(diagonal, np.square(FLOORS), out=diagonal)
+    np.maximum(diagonal, np.square(CLOSURE_FLOORS), out=diagonal)
     first, second, mean = edges.i.copy(), edges.j.copy(), edges.mean.copy()
     back = np.flatnonzero(first > second)
     if len(back) == 0:

@@ -84,7 +84,10 @@ class Judge:
             edges.i, edges.j, edges.mean, edges.information, edges.kind, weights, edges.bias))
 
     def _is_judged_closure(self, one: NewConstraint, change: GraphUpdate, first: int) -> bool:
-        return (change.edges.kind[one.row - first] == EdgeKind.LOOP_CLOSURE
+        number = one.row - first
+        # one without a position, such as of the walls of a building, recognises no place
+        return (change.edges.kind[number] == EdgeKind.LOOP_CLOSURE
+                and bool(change.edges.information[number, 0, 0] > 0.0)
                 and self._config.measurement_source(
                     one.source, LoopClosure).robust is Robust.JUDGED)
 

@@ -7,13 +7,13 @@ import numpy as np
 from pose_graph_ros.core.batch import gnc
 from pose_graph_ros.core.batch.gnc import Surrogate
 from pose_graph_ros.core.batch.truncated import Choice, ROUGH, TruncatedProblem
+from pose_graph_ros.core.config import CLOSURE_FLOORS
 from pose_graph_ros.core.geometry import se2
 from pose_graph_ros.core.geometry.se2 import FloatArray
 from pose_graph_ros.core.graph.constraints import Edges
 from pose_graph_ros.core.judgement import group_search, surest_first
 
-# Least sigmas of loop closures for decisions: front ends claim too small ones [m, m, rad].
-FLOORS = np.array([0.3, 0.3, 0.05])
+FLOORS = np.array(CLOSURE_FLOORS)
 # Number of closures with neighbours that agree, from which on the record speaks for the others.
 SUPPORTED = 50
 # Entries of the factorisation with all of them, per node, above which some must be wrong.

@@ -9,14 +9,20 @@ import pytest
 
 from pose_graph_ros.core.backend import PoseGraphBackend
 from pose_graph_ros.core.batch.optimizer import Status
-from pose_graph_ros.core.config import BackendConfig, MeasurementSource, NodePolicy, Robust
+from pose_graph_ros.core.config import (
+    BackendConfig,
+    CLOSURE_FLOORS,
+    MeasurementSource,
+    NodePolicy,
+    Robust,
+)
 from pose_graph_ros.core.geometry import se2
 from pose_graph_ros.core.geometry.se2 import FloatArray
 from pose_graph_ros.core.graph.constraints import EdgeKind, Edges
 from pose_graph_ros.core.graph.error_functions import edge_errors
 from pose_graph_ros.core.graph.graph import GraphUpdate
 from pose_graph_ros.core.io.graph_files import read_graph, write_graph
-from pose_graph_ros.core.judgement.closures import claims, FLOORS, GATE
+from pose_graph_ros.core.judgement.closures import claims, GATE
 from pose_graph_ros.core.judgement.residual_scale import residual_scale
 from pose_graph_ros.core.judgement.verdicts import Decision, State, Verdict
 from pose_graph_ros.core.measurements import AnswerStatus, LoopClosure, OdometrySample
@@ -243,7 +249,7 @@ def test_claims_are_floored_and_lead_from_the_earlier_to_the_later_node() -> Non
     assert (claim.i.tolist(), claim.j.tolist()) == ([0], [1])
     forward = Edges(claim.i, claim.j, claim.mean, np.linalg.inv(claim.noise), edges.kind)
     error, back = edge_errors(poses, forward)[0], edge_errors(poses, edges)[0]
-    floored = np.diag(np.square(FLOORS))
+    floored = np.diag(np.square(CLOSURE_FLOORS))
     assert error @ np.linalg.solve(claim.noise[0], error) == pytest.approx(
         back @ np.linalg.solve(floored, back), rel=1e-4)
 
