@@ -315,10 +315,11 @@ class ClosureJudge:
         if len(judged) == 0 or present == self._final:
             return
         forced = states.row[states.in_graph & ~states.judged]
-        choice = final.decide(graph, self._reweighting, states.row[judged], forced)
+        inside = states.in_graph
+        choice = final.decide(
+            graph, self._reweighting, states.row[judged], forced, inside[judged])
         if choice is None:
             return
-        inside = states.in_graph
         inside[judged] = choice.believed
         self._scales = [self._fixed_scale(name) or 1.0 for name in states.sources]
         if not self._change_to(inside, choice.poses):

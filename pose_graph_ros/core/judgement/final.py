@@ -6,6 +6,9 @@ The decision on all loop closures at the end of a stream.
 While measurements come, what is believed depends on their order. At the end it must not: the set
 is a function of the graph alone. All closures are taken out, the rest is solved with robust
 weights computed from initial values, and `selection` decides from there.
+
+That would take long for a very large graph. There the set that is believed already is kept, but
+for retests of all closures at its poses.
 """
 
 import numpy as np
@@ -14,20 +17,24 @@ from pose_graph_ros.core.batch import final_optimization, optimizer
 from pose_graph_ros.core.batch.optimizer import Start, Status
 from pose_graph_ros.core.batch.truncated import Choice, TruncatedProblem
 from pose_graph_ros.core.config import SolverConfig
-from pose_graph_ros.core.geometry.se2 import IntArray
+from pose_graph_ros.core.geometry.se2 import BoolArray, IntArray
 from pose_graph_ros.core.graph.constraints import Edges
 from pose_graph_ros.core.graph.graph import Graph, GraphUpdate
 from pose_graph_ros.core.graph.reweighting import Reweighting
 from pose_graph_ros.core.judgement import selection
 
 CONFIG = SolverConfig(max_iterations=100)
+# Nodes and closures, together, above which the set is only improved, and the number of retests.
+MOST, RETESTS = 30_000, 3
 
 
 def decide(
-    graph: Graph, reweighting: Reweighting, rows: IntArray, forced: IntArray,
+    graph: Graph, reweighting: Reweighting, rows: IntArray, forced: IntArray, inside: BoolArray,
 ) -> Choice | None:
     """
     Return which loop closures to believe; None if the graph cannot be solved.
+
+    With more than `MOST` nodes and closures that is `inside`, improved.
 
     Parameters
     ----------
@@ -35,9 +42,14 @@ def decide(
     reweighting : Reweighting, of its constraints with a robust loss; it is not changed
     rows : ndarray of int, shape (M,), edges that may be doubted; their weights do not matter
     forced : ndarray of int, edges that a person has decided to believe
+    inside : ndarray of bool, shape (M,), which of `rows` are believed now
 
     """
     copy = _copy(graph, np.union1d(rows, forced))
+    if graph.n_nodes + len(rows) > MOST:
+        problem = TruncatedProblem(copy, rows, start=copy.poses.copy())
+        present = problem.choice(inside)
+        return None if present is None else problem.improved(present, RETESTS)
     weights = dict.fromkeys(rows.tolist(), 0.0) | dict.fromkeys(forced.tolist(), 1.0)
     copy.apply(GraphUpdate(weigh_edges=weights))
     others = Reweighting()

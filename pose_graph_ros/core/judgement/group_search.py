@@ -18,8 +18,8 @@ from pose_graph_ros.core.geometry.se2 import IntArray
 from pose_graph_ros.core.judgement.surest_first import agreeing_pairs
 
 # Limits of the search: rounds, trials of groups to take in and to take out in one, and nodes times
-# trials.
-ROUNDS, MOST_IN, MOST_OUT, WORK = 4, 30, 10, 200_000
+# trials of all rounds.
+ROUNDS, MOST_IN, MOST_OUT, WORK = 4, 30, 10, 60_000
 # Maximum number of retests of a trial.
 RETESTS = 4
 # Least reduction of the truncated cost, that of one constraint [sigma^2].
@@ -36,19 +36,28 @@ def improved(problem: TruncatedProblem, choice: Choice) -> Choice:
     choice : Choice
 
     """
-    groups = _groups(problem)
-    most = WORK // max(problem.graph.n_nodes, 1)
+    groups, given = _groups(problem), choice
+    left = WORK // max(problem.graph.n_nodes, 1)
+    tried: set[int] = set()     # first members of groups, in or out of the present choice
     for _ in range(ROUNDS):
         before = choice
-        for group in _to_try(problem, choice, groups)[:most]:
+        for group in _to_try(problem, choice, groups):
+            if left == 0 or int(group[0]) in tried:
+                continue
+            left -= 1
+            tried.add(int(group[0]))
             believed = choice.believed.copy()
             believed[group] = problem.allowed[group] & (np.mean(believed[group]) < 0.5)
             trial = problem.choice(believed, ROUGH)
             if trial is not None:
                 trial = problem.improved(trial, RETESTS, ROUGH)
-                choice = trial if trial.cost < choice.cost - LEAST_GAIN else choice
+                if trial.cost < choice.cost - LEAST_GAIN:
+                    choice = trial
+                    tried.clear()
         if choice is before:
             break
+    if choice is given:
+        return choice
     return problem.improved(problem.choice(choice.believed) or choice)
 
 

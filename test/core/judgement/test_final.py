@@ -190,3 +190,13 @@ def test_a_graph_without_a_solution_keeps_what_is_believed(
     monkeypatch.setattr(final, 'decide', lambda *_: None)
     backend = run(sorted([*drive.odometry, *drive.measurements], key=lambda one: one.stamp_ns))
     assert len(believed(backend)) > 10
+
+
+def test_in_a_very_large_graph_the_set_is_improved(monkeypatch: pytest.MonkeyPatch) -> None:
+    drive = DRIVES[1, False]
+    monkeypatch.setattr(final, 'MOST', 100)
+    backend = run(sorted([*drive.odometry, *drive.measurements], key=lambda one: one.stamp_ns))
+    scans = {one.stamp_ns for one in drive.measurements}
+    found = believed(backend)
+    assert not found & drive.wrong
+    assert len(found) > 0.9 * len(scans - drive.wrong)
