@@ -214,7 +214,7 @@ def check_counts(values: dict[str, str]) -> None:
         # these come beside the answer
         for key in list(counts):
             if key in ('jump', 'sorted', 'without_lever_arm', 'default_covariance', 'believed',
-                       'believed_weakly', 'doubted', 'waiting') or (
+                       'believed_weakly', 'doubted', 'waiting', 'scale') or (
                     key.startswith('repaired_')):
                 del counts[key]
         assert len(counts) > 4, counts
