@@ -13,7 +13,6 @@ again. If p is large, only the record q of the source speaks for it: it is belie
 """
 
 from collections.abc import Mapping, Sequence
-import math
 
 import numpy as np
 
@@ -41,7 +40,7 @@ from pose_graph_ros.core.judgement.closure_states import (
 from pose_graph_ros.core.judgement.closures import chances, claims, ClosureTable, GATE
 from pose_graph_ros.core.judgement.consistency import OdometryChain
 from pose_graph_ros.core.judgement.residual_scale import MOST, residual_scale
-from pose_graph_ros.core.judgement.swaps import Swap
+from pose_graph_ros.core.judgement.set_search import SetSearch
 from pose_graph_ros.core.judgement.texts import sentence
 from pose_graph_ros.core.judgement.verdicts import (
     Decision,
@@ -63,10 +62,6 @@ WEAK = 0.02
 NARROW = 1e-3
 # Numbers of closures that are tested again in an update, and in a part of the work.
 IN_UPDATE, IN_PART = 16, 64
-# Another set is tried when so many more closures speak for one than the last time, and half more.
-MORE_CORROBORATED = 5
-# Most closures from which the clique is grown that is forced in.
-MOST_SEEDS = 50
 
 
 class ClosureJudge:
@@ -103,9 +98,7 @@ class ClosureJudge:
         self._now_ns = 0
         self._corroborated = GrowingArray((), np.bool_)
         """Whether a clique of closures outside of the graph supports one that is doubted."""
-        self._next_swap = MORE_CORROBORATED
-        self._swap: tuple[Swap, IntArray, int] | None = None
-        """The trial that goes on, its clique, and the round in which it began."""
+        self._search = SetSearch(self._states, self._table)
         self._learnt_from: list[int] = []
         """Number of believed closures of each source when its scale was learnt."""
 
@@ -359,28 +352,11 @@ class ClosureJudge:
         return False
 
     def _look_for_another_set(self) -> bool:
-        """Go on with a trial, or begin one if enough speaks against what is believed."""
-        if self._swap is not None:
-            swap, clique, began = self._swap
-            goes_on = began == self._round and swap.step(clique)
-            if not goes_on:
-                self._swap = None
-                if swap.found is not None and began == self._round:
-                    self._change_to(swap.found.inside, swap.found.poses)
-            return True
-        against = np.flatnonzero(self._corroborated.values & ~self._states.in_graph
-                                 & self._states.judged)
-        if len(against) < self._next_swap:
-            return False
-        self._next_swap = max(len(against) + MORE_CORROBORATED, math.ceil(1.5 * len(against)))
-        cliques = [self._table.support(number, ~self._states.in_graph & self._states.judged).clique
-                   for number in against[-MOST_SEEDS:].tolist()]
-        clique = max(cliques, key=len)
-        numbers = np.arange(len(self._states))
-        self._swap = Swap(
-            self._smoother.graph, self._table.rows(numbers), self._states.row,
-            self._states.in_graph, self._states.judged), clique, self._round
-        return True
+        """Do a part of the search of another set; tell whether there was anything to do."""
+        more = self._search.work(self._smoother.graph, self._corroborated.values, self._round)
+        if self._search.found is not None:
+            self._change_to(self._search.found.inside, self._search.found.poses)
+        return more
 
     def _change_to(self, inside: BoolArray, poses: FloatArray) -> bool:
         """Believe another set, with the poses that it was found with; tell whether that worked."""

@@ -17,12 +17,12 @@ from dataclasses import dataclass
 import numpy as np
 
 from pose_graph_ros.core.batch import optimizer
-from pose_graph_ros.core.batch.optimizer import Status
+from pose_graph_ros.core.batch.optimizer import Parts, Status
 from pose_graph_ros.core.config import SolverConfig
 from pose_graph_ros.core.geometry.se2 import BoolArray, FloatArray, IntArray
 from pose_graph_ros.core.graph.constraints import Edges
 from pose_graph_ros.core.graph.error_functions import edge_errors, energies
-from pose_graph_ros.core.graph.graph import Graph, GraphUpdate
+from pose_graph_ros.core.graph.graph import Graph, GraphRows, GraphUpdate
 from pose_graph_ros.core.judgement.closures import GATE
 from pose_graph_ros.core.judgement.consistency import Closures
 
@@ -45,7 +45,7 @@ class Found:
 
 class Swap:
     """
-    A trial, an iteration of its optimisations at each step.
+    A trial: at each step the copy is filled, or an iteration of its optimisations is done.
 
     Parameters
     ----------
@@ -70,11 +70,16 @@ class Swap:
         for column, values in zip(copied.edges.columns, columns, strict=False):
             column[rows] = values
         self._graph = Graph()
-        self._graph.fill(copied)
-        self._parts = optimizer.in_parts(self._graph, _CONFIG)
+        self._parts = self._first(copied)
         self._n_steps, self._cost = 0, np.inf
         self._inside = inside.copy()
         self.found: Found | None = None
+
+    def _first(self, rows: GraphRows) -> Parts:
+        """Fill the copy and optimise it with the present set."""
+        self._graph.fill(rows)
+        yield
+        return (yield from optimizer.in_parts(self._graph, _CONFIG))
 
     def step(self, clique: IntArray) -> bool:
         """Do an iteration; tell whether the trial goes on. `found` is its result."""
@@ -108,10 +113,13 @@ class Swap:
         return not (settled and np.array_equal(before, self._inside))
 
     def _choose(self, wanted: BoolArray, forced: IntArray) -> None:
+        before = self._inside
         self._inside = np.where(self._free, wanted, self._before)
         self._inside[forced] = True
+        changed = np.flatnonzero(self._inside != before)
         self._graph.apply(GraphUpdate(weigh_edges=dict(zip(
-            self._rows.tolist(), self._inside.astype(float).tolist(), strict=True))))
+            self._rows[changed].tolist(), self._inside[changed].astype(float).tolist(),
+            strict=True))))
 
     def _truncated(self, residual: FloatArray) -> float:
         others = np.ones(self._graph.n_edges, dtype=bool)

@@ -1,0 +1,82 @@
+# Copyright 2026 The pose_graph_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""When another set of believed closures is tried, and with which of them: see `swaps`."""
+
+from collections.abc import Generator
+import math
+
+import numpy as np
+
+from pose_graph_ros.core.geometry.se2 import BoolArray, IntArray
+from pose_graph_ros.core.graph.graph import Graph
+from pose_graph_ros.core.judgement.closure_states import ClosureStates
+from pose_graph_ros.core.judgement.closures import ClosureTable
+from pose_graph_ros.core.judgement.swaps import Found, Swap
+
+# Another set is tried when so many more closures speak for one than the last time, and half more.
+MORE_CORROBORATED = 5
+# Most closures from which the clique is grown that is forced in.
+MOST_SEEDS = 50
+
+
+class SetSearch:
+    """
+    Tries other sets, one bounded part at each call.
+
+    Parameters
+    ----------
+    states : ClosureStates
+    table : ClosureTable
+
+    """
+
+    def __init__(self, states: ClosureStates, table: ClosureTable) -> None:
+        self._states, self._table = states, table
+        self._next = MORE_CORROBORATED
+        self._parts: Generator[None, None, Found | None] | None = None
+        """The trial that goes on."""
+        self._began = 0
+        self.found: Found | None = None
+        """What the last part has ended with."""
+
+    def work(self, graph: Graph, corroborated: BoolArray, now: int) -> bool:
+        """
+        Go on with a trial, or begin one if enough speaks against what is believed.
+
+        Tell whether there was anything to do.
+
+        Parameters
+        ----------
+        graph : Graph
+        corroborated : ndarray of bool, shape (M,), which are supported by doubted ones
+        now : int, a number that changes with what is believed, so that a trial is given up
+
+        """
+        self.found = None
+        if self._parts is not None and self._began != now:
+            self._parts = None
+            return True
+        if self._parts is None:
+            against = np.flatnonzero(
+                corroborated & ~self._states.in_graph & self._states.judged)
+            if len(against) < self._next:
+                return False
+            self._next = max(len(against) + MORE_CORROBORATED, math.ceil(1.5 * len(against)))
+            self._parts, self._began = self._trial(graph, against[-MOST_SEEDS:]), now
+        try:
+            next(self._parts)
+        except StopIteration as end:
+            self._parts, self.found = None, end.value
+        return True
+
+    def _trial(self, graph: Graph, seeds: IntArray) -> Generator[None, None, Found | None]:
+        states, clique = self._states, seeds[:0]
+        for number in seeds.tolist():
+            other = self._table.support(number, ~states.in_graph & states.judged).clique
+            clique = other if len(other) > len(clique) else clique
+            yield
+        swap = Swap(graph, self._table.rows(np.arange(len(states))), states.row.copy(),
+                    states.in_graph, states.judged)
+        while swap.step(clique):
+            yield
+        return swap.found
