@@ -159,6 +159,8 @@ class ClosureJudge:
         begin, self._n_staged = len(self._states) - self._n_staged, 0
         for number in range(begin, len(self._states)):
             self._states.announce(number, -1, self._now_ns)
+        for source in np.unique(self._states.source[begin:]).tolist():
+            self._states.forget(source, self._corroborated.values)
         if np.any(self._states.in_graph[begin:]):
             self._round += 1
             self._set_base_weights(np.arange(begin, len(self._states)))
@@ -418,6 +420,7 @@ class ClosureJudge:
                  Decision.AUTO: State.WAITING}[decision]
         forced = decision is not Decision.AUTO or before != AUTO
         self._states.decision[number] = DECISIONS.index(decision)
+        self._states.forgotten[number] = False
         if forced and not self._apply({number: state}):
             self._states.decision[number] = before
             return rejected('failed', 'the solver failed with it')

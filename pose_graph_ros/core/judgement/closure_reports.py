@@ -12,6 +12,7 @@ from pose_graph_ros.core.graph.error_functions import edge_errors
 from pose_graph_ros.core.graph.graph import Graph
 from pose_graph_ros.core.graph.graph_view import DrawnRows
 from pose_graph_ros.core.judgement.closure_states import (
+    AUTO,
     ClosureStates,
     DECISIONS,
     DOUBTED,
@@ -57,7 +58,8 @@ class ClosureReports:
 
         """
         states = self._states
-        numbers = listed(states.source, states.state == BELIEVED, ~states.judged, most_believed)
+        numbers = listed(
+            states.source, states.state == BELIEVED, states.decision != AUTO, most_believed)
         return self.of(graph, numbers.tolist())
 
     def of(self, graph: Graph, numbers: Sequence[int]) -> list[Verdict]:
@@ -103,11 +105,12 @@ class ClosureReports:
         """Return what is believed of each source, given the factors on their sigmas."""
         totals = {}
         for k, source in enumerate(self._states.sources):
-            counts = np.bincount(
-                self._states.state[self._states.source == k], minlength=len(STATES))
+            own = self._states.source == k
+            counts = np.bincount(self._states.state[own], minlength=len(STATES))
             # wrong closures among right ones are what place recognition is like
             totals[source] = SourceVerdicts(
-                dict(zip(STATES, counts.tolist(), strict=True)), scales[k], doubting=False)
+                dict(zip(STATES, counts.tolist(), strict=True)), scales[k], doubting=False,
+                n_forgotten=int(np.count_nonzero(self._states.forgotten[own])))
         return totals
 
     def drawn_rows(self) -> DrawnRows:

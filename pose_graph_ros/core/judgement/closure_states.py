@@ -11,6 +11,7 @@ import numpy as np
 
 from pose_graph_ros.core.compiled.growing_array import GrowingArray
 from pose_graph_ros.core.geometry.se2 import BoolArray, IntArray
+from pose_graph_ros.core.judgement.closures import GATE
 from pose_graph_ros.core.judgement.verdicts import Change, Decision, Judged, State
 from pose_graph_ros.core.saved_columns import Choices, Integers, Numbers, Pairs
 from pose_graph_ros.core.sources.factor_builder import NewConstraint
@@ -19,6 +20,11 @@ STATES, DECISIONS = tuple(State), tuple(Decision)
 WAITING, DOUBTED = STATES.index(State.WAITING), STATES.index(State.DOUBTED)
 AUTO, OUT = DECISIONS.index(Decision.AUTO), DECISIONS.index(Decision.OUT)
 _IN_GRAPH = np.array([state.in_graph for state in STATES])
+# Largest number of closures of a source that are not believed and judged again, and how many are
+# left when there are more.
+MOST_WAITING, LEFT = 20_000, 18_000
+# Squared Mahalanobis distance from which on one that nobody supports is hopeless, in gates.
+HOPELESS = 10.0
 # Largest number of changes that are kept for the announcement.
 MOST_CHANGES = 1000
 
@@ -52,6 +58,7 @@ class ClosureStates:
             GrowingArray((), np.int64) for _ in range(6))
         self._stamps_ns = GrowingArray((2,), np.int64)
         self._distance = GrowingArray((), np.float64)
+        self._forgotten = GrowingArray((), np.bool_)
         self.counts: Counter[tuple[str, str]] = Counter()
         """How often closures of a source became believed, doubted, ..., or were thrown out."""
         self._changes: deque[Change] = deque(maxlen=MOST_CHANGES)
@@ -104,9 +111,34 @@ class ClosureStates:
         return bool(_IN_GRAPH[self.state[number]])
 
     @property
+    def forgotten(self) -> BoolArray:
+        """Whether they are hopeless and not judged again."""
+        return self._forgotten.values
+
+    @property
     def judged(self) -> BoolArray:
-        """Whether no person has decided on them."""
-        return self.decision == AUTO
+        """Whether they are judged: no person has decided on them, and they are not forgotten."""
+        return (self.decision == AUTO) & ~self.forgotten
+
+    def forget(self, source: int, supported: BoolArray) -> None:
+        """
+        Forget closures of a source that are not believed, if these are too many.
+
+        The oldest hopeless ones leave first, then doubted ones, then those that wait.
+
+        Parameters
+        ----------
+        source : int
+        supported : ndarray of bool, shape (M,), which are not hopeless as others support them
+
+        """
+        kept = np.flatnonzero((self.source == source) & ~self.in_graph & self.judged)
+        if len(kept) <= MOST_WAITING:
+            return
+        doubted = self.state[kept] == DOUBTED
+        hopeless = doubted & ~supported[kept] & (self.distance[kept] > HOPELESS * GATE)
+        order = np.lexsort((self.stamps_ns[kept, 0], ~doubted, ~hopeless))
+        self.forgotten[kept[order[:len(kept) - LEFT]]] = True
 
     def name(self, number: int) -> str:
         """Return the id of a closure."""
@@ -143,12 +175,13 @@ class ClosureStates:
             self._since_ns.append_one(now_ns)
             self._decision.append_one(AUTO)
             self._distance.append_one(np.nan)
+            self._forgotten.append_one(False)
 
     def drop(self, count: int) -> None:
         """Remove the newest closures again."""
         size = len(self) - count
         for array in (self._row, self._source, self._number, self._state, self._since_ns,
-                      self._decision, self._stamps_ns, self._distance):
+                      self._decision, self._stamps_ns, self._distance, self._forgotten):
             array.truncate(size)
 
     def announce(self, number: int, before: int, now_ns: int) -> None:
@@ -199,6 +232,7 @@ class ClosureStates:
             array.append(values)
         self._distance.append(np.where(
             saved.distance < 0.0, np.nan, np.square(saved.distance)))
+        self._forgotten.append(np.zeros(len(saved.source), dtype=bool))
         order = np.zeros(len(saved.source), dtype=np.int64)
         for source in range(len(self.sources)):
             chosen = np.flatnonzero(saved.source == source)

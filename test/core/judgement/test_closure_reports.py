@@ -12,6 +12,8 @@ from pose_graph_ros.core.backend import PoseGraphBackend
 from pose_graph_ros.core.config import BackendConfig, LOOP_CLOSURES, Loss, Robust
 from pose_graph_ros.core.geometry import se2
 from pose_graph_ros.core.graph.graph_view import DrawnRows
+from pose_graph_ros.core.judgement import closure_states
+from pose_graph_ros.core.judgement.closures import GATE
 from pose_graph_ros.core.judgement.verdicts import Change, Decision, State
 from pose_graph_ros.core.measurements import AnswerStatus, LoopClosure, OdometrySample
 
@@ -165,3 +167,28 @@ def test_a_source_that_is_no_longer_judged_keeps_the_verdicts_so_far(robust: Rob
     assert len(backend.verdicts()) == len(before)
     assert backend.graph.edges.weight[-1] > 0.0
     assert len(backend._reweighting) == (1 if robust is Robust.LOSS else 0)
+
+
+def test_of_many_hopeless_closures_the_oldest_are_forgotten(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr(closure_states, 'MOST_WAITING', 6)
+    monkeypatch.setattr(closure_states, 'LEFT', 4)
+    # each is so far off that none agrees with another one
+    backend = driven(*(12.0 * (-1.0) ** k * (k + 2) for k in range(9)), 0.0, 0.0, 0.0, 0.0)
+    total = backend.verdict_totals()['loop']
+    assert total.n_forgotten == 6    # three by the seventh, three by the first right one
+    assert sum(total.counts.values()) == 13
+    assert states(backend) == 9 * [False] + 4 * [True]
+    judge = backend._judge._closures
+    # the first one is the nearest to the gate: not hopeless
+    assert math.sqrt(10.0 * GATE) > backend.verdicts()[0].distance > math.sqrt(GATE)
+    assert np.flatnonzero(judge.states.forgotten).tolist() == list(range(1, 7))
+    assert not np.any(backend.graph.edges.weight[judge.states.row[:9]])
+    # whom a person decides on is judged again when that is taken back
+    for decision in (Decision.OUT, Decision.AUTO):
+        assert backend.decide('loop/1', decision).status is AnswerStatus.ACCEPTED
+    settle(backend)
+    assert backend.verdict_totals()['loop'].n_forgotten == 5
+    backend.optimize()
+    assert states(backend) == 9 * [False] + 4 * [True]
