@@ -41,9 +41,9 @@ class SetSearch:
 
     def work(self, graph: Graph, corroborated: BoolArray, now: int) -> bool:
         """
-        Go on with a trial, or begin one if enough speaks against what is believed.
+        Return whether there was anything to do.
 
-        Tell whether there was anything to do.
+        Goes on with a trial, or begins one if enough speaks against what is believed.
 
         Parameters
         ----------
