@@ -60,8 +60,9 @@ WRONG_ODDS = 0.02
 WEAK = 0.02
 # The same, below which several are believed at once, as none changes the gates of others much.
 NARROW = 1e-3
-# Numbers of closures that are tested again in an update, and in a part of the work.
-IN_UPDATE, IN_PART = 16, 64
+# Numbers of new closures that are tested before an update, and of those that are tested later: in
+# an update, and in a part of the work.
+MOST_NEW, IN_UPDATE, IN_PART = 32, 16, 64
 
 
 class ClosureJudge:
@@ -132,7 +133,7 @@ class ClosureJudge:
         self._append_unknown(n)
         numbers = np.arange(begin, begin + n)
         if not self._smoother.graph.has_touched:
-            for number, state in self._choose(*self._test(numbers)).items():
+            for number, state in self._choose(*self._test(numbers[:MOST_NEW])).items():
                 self._states.state[number] = STATES.index(state)
         return self._weights(numbers)
 

@@ -12,7 +12,7 @@ from pose_graph_ros.core.backend import PoseGraphBackend
 from pose_graph_ros.core.config import BackendConfig, LOOP_CLOSURES, Loss, Robust
 from pose_graph_ros.core.geometry import se2
 from pose_graph_ros.core.graph.graph_view import DrawnRows
-from pose_graph_ros.core.judgement import closure_states
+from pose_graph_ros.core.judgement import closure_judge, closure_states
 from pose_graph_ros.core.judgement.closures import GATE
 from pose_graph_ros.core.judgement.verdicts import Change, Decision, State
 from pose_graph_ros.core.measurements import AnswerStatus, LoopClosure, OdometrySample
@@ -192,3 +192,20 @@ def test_of_many_hopeless_closures_the_oldest_are_forgotten(
     assert backend.verdict_totals()['loop'].n_forgotten == 5
     backend.optimize()
     assert states(backend) == 9 * [False] + 4 * [True]
+
+
+def test_of_many_new_closures_an_update_tests_some_and_the_work_the_others() -> None:
+    backend = driven()
+    n = 60
+    for k in range(n):
+        first, second = 2.0 + 0.2 * k, LAP + 2.0 + 0.2 * k
+        z = se2.between(true_pose(first), true_pose(second))
+        backend.add_measurement(LoopClosure(
+            round(second * SECOND), z, np.diag((0.01, 0.01, 0.0025)), round(first * SECOND)),
+            'loop')
+    backend.update()
+    tested = ~np.isnan(backend._judge._closures.states.distance)
+    most = closure_judge.MOST_NEW + closure_judge.IN_UPDATE
+    assert closure_judge.MOST_NEW <= np.count_nonzero(tested) <= most
+    settle(backend)
+    assert states(backend) == n * [True]
