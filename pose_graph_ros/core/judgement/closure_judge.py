@@ -63,6 +63,9 @@ NARROW = 1e-3
 # Numbers of new closures that are tested before an update, and of those that are tested later: in
 # an update, and in a part of the work.
 MOST_NEW, IN_UPDATE, IN_PART = 32, 16, 64
+# Number of nodes above which nothing is tested again in an update: what is believed then would be
+# solved for a second time.
+LARGE = 5000
 
 
 class ClosureJudge:
@@ -240,8 +243,9 @@ class ClosureJudge:
         return True
 
     def after(self) -> None:
-        """Judge again, within bounds, after an update."""
-        self._part(IN_UPDATE)
+        """Judge again, within bounds, after an update of a graph that is not large."""
+        if self._smoother.graph.n_nodes <= LARGE:
+            self._part(IN_UPDATE)
 
     def work(self) -> bool:
         """Do a bounded part of what is left; tell whether there is more."""
