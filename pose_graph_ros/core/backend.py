@@ -76,7 +76,8 @@ class PoseGraphBackend:
         self._reweighting = Reweighting()
         self._judge = Judge(self._smoother, self._reweighting, self._config)
         self._factors = FactorBuilder(self._config, self._reweighting)
-        self._tuner = ErrorTuner(self._smoother, self._factors, self._reweighting)
+        self._tuner = ErrorTuner(
+            self._smoother, self._factors, self._reweighting, self._judge)
         self._refiner = Refiner(
             self._smoother, self._reweighting, self._judge, self._tuner)
         self._pipeline = MeasurementPipeline(self._nodes, self._config)
@@ -368,8 +369,12 @@ class PoseGraphBackend:
             return report
         self._tuner.decide()
         self._settle()
-        self._judge.finish()
-        return report.after(self._optimize_whole())
+        undo = self._judge.finish()
+        self._settle()  # what is believed again
+        optimized = self._optimize_whole()
+        if optimized.status is Status.FAILED:
+            undo()
+        return report.after(optimized)
 
     def _optimize_whole(self) -> UpdateReport:
         """Optimise the whole graph; a failure leaves all poses and weights unchanged."""

@@ -17,8 +17,9 @@ import numpy as np
 
 from pose_graph_ros.core.batch.optimizer import Status
 from pose_graph_ros.core.config import Correlation
-from pose_graph_ros.core.geometry.se2 import IntArray
+from pose_graph_ros.core.geometry.se2 import FloatArray, IntArray
 from pose_graph_ros.core.graph.reweighting import Reweighting
+from pose_graph_ros.core.judgement.judge import Judge
 from pose_graph_ros.core.smoother.incremental import IncrementalSmoother
 from pose_graph_ros.core.sources import error_estimate
 from pose_graph_ros.core.sources.error_likelihood import Track
@@ -72,13 +73,16 @@ class ErrorTuner:
     smoother : IncrementalSmoother
     factors : FactorBuilder
     reweighting : Reweighting
+    judge : Judge
 
     """
 
     def __init__(
         self, smoother: IncrementalSmoother, factors: FactorBuilder, reweighting: Reweighting,
+        judge: Judge,
     ) -> None:
         self._smoother, self._factors, self._reweighting = smoother, factors, reweighting
+        self._judge = judge
         self._search: _Search | None = None
         self._change: _Change | None = None
         self.n_failures = 0
@@ -122,9 +126,15 @@ class ErrorTuner:
         """Give all sources the errors that their measurements show; for the end of a stream."""
         self.finish_change()
         self._search = None
-        for source in self._factors.finding():
+        sources = self._factors.finding()
+        if len(sources) == 0:
+            return
+        # moving the measurements of one source changes no rows of another one
+        weights = self._judge.weights_as_claimed()
+        for source in sources:
             constraints = self._factors.constraints(source)
-            found = error_estimate.finished(error_estimate.search(self._track(constraints)))
+            found = error_estimate.finished(
+                error_estimate.search(self._track(constraints, weights)))
             constraints.next_estimate = max(
                 constraints.next_estimate, math.ceil(MORE * len(constraints)))
             if found != self._factors.errors_in_use(source):
@@ -134,14 +144,17 @@ class ErrorTuner:
     def _next_search(self) -> _Search | None:
         for source in self._factors.due_for_estimate():
             constraints = self._factors.constraints(source)
-            steps = error_estimate.search(self._track(constraints))
+            steps = error_estimate.search(
+                self._track(constraints, self._smoother.graph.weights))
             return _Search(source, steps, len(constraints))
         return None
 
-    def _track(self, constraints: SourceConstraints) -> Track:
-        """Return the measurements of a source that take part in the estimate of the graph."""
+    def _track(
+        self, constraints: SourceConstraints, by_row: tuple[FloatArray, FloatArray],
+    ) -> Track:
+        """Return the measurements of a source whose edges or observed nodes have a weight."""
         held = constraints.held(np.arange(len(constraints)))
-        edges, observed = self._smoother.graph.weights
+        edges, observed = by_row
         weights = np.zeros(len(constraints))
         weights[held.is_edge] = edges[held.rows[held.is_edge]]
         weights[~held.is_edge] = observed[held.rows[~held.is_edge]]
@@ -222,6 +235,7 @@ class ErrorTuner:
         self._factors.n_bias_edges += len(additions.edges)
         constraints.edges.values[some] = new
         after = constraints.held(some)
+        self._judge.moved(held, after)
         for row, is_edge, to_row, to_edge in zip(
                 held.rows.tolist(), held.is_edge.tolist(), after.rows.tolist(),
                 after.is_edge.tolist(), strict=True):

@@ -20,7 +20,6 @@ from pose_graph_ros.core.batch.optimizer import (
     Status,
 )
 from pose_graph_ros.core.config import SolverConfig
-from pose_graph_ros.core.geometry.se2 import FloatArray
 from pose_graph_ros.core.graph.graph import Graph, GraphUpdate
 from pose_graph_ros.core.graph.reweighting import Reweighting
 
@@ -63,7 +62,7 @@ def optimize(
         result = BatchResult(Status.FAILED, reason, 0, float('nan'))
     if result.status is Status.FAILED:
         if len(reweighting) > 0:
-            _restore_weights(graph, weights)
+            graph.set_weights(weights)
         graph.set_poses(poses)
     return result
 
@@ -93,7 +92,7 @@ def _optimize_robustly(
                 not failed and result.chi2 < best.chi2 * (1.0 - SAME_MINIMUM)):
             best, poses, weights = result, graph.poses.copy(), graph.weights
     assert best is not None
-    _restore_weights(graph, weights)
+    graph.set_weights(weights)
     graph.set_poses(poses)
     return best
 
@@ -143,15 +142,8 @@ def _solved_with(
     smallest = min(min(new.values(), default=1.0) for new in changes)
     if result.status is not Status.FAILED or smallest > SMALL_WEIGHT:
         return result
-    _restore_weights(graph, before)
+    graph.set_weights(before)
     return None
-
-
-def _restore_weights(graph: Graph, weights: tuple[FloatArray, FloatArray]) -> None:
-    """Set the weights of all edges and observed nodes to those of `Graph.weights`."""
-    _set_weights(graph, *(
-        {int(row): float(wanted[row]) for row in np.flatnonzero(wanted != present)}
-        for wanted, present in zip(weights, graph.weights, strict=True)))
 
 
 def _set_weights(graph: Graph, edges: Mapping[int, float], observed: Mapping[int, float]) -> None:

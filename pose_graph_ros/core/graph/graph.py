@@ -168,6 +168,13 @@ class Graph:
         return (self.memory['edge_f'][:self.n_edges, tb.WEIGHT].copy(),
                 self.memory['observed_f'][:self.n_observed, tb.WEIGHT].copy())
 
+    def set_weights(self, weights: tuple[FloatArray, FloatArray]) -> None:
+        """Set the weights of all edges and observed nodes to what `weights` has returned."""
+        edges, observed = (
+            {int(row): float(wanted[row]) for row in np.flatnonzero(wanted != present)}
+            for wanted, present in zip(weights, self.weights, strict=True))
+        self.apply(GraphUpdate(weigh_edges=edges, weigh_observed=observed))
+
     def apply(self, update: GraphUpdate) -> None:
         """Apply an update; a GraphUpdateError for an invalid part leaves the graph unchanged."""
         hidden, edges, observed, *by_number, biases = update

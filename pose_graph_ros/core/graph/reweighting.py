@@ -189,6 +189,19 @@ class Reweighting:
         at = table.index(row)
         return float(table.base_weights.values[at]) if at >= 0 else None
 
+    def uses(self, row: int, weight: float) -> bool:
+        """
+        Tell whether an observed node is used, even if its loss has left nothing of its weight.
+
+        Parameters
+        ----------
+        row : int
+        weight : float, in the graph
+
+        """
+        base = self.base_weight(row)
+        return (weight if base is None else base) > 0.0
+
     def set_base_weight(self, row: int, weight: float, *, edge: bool = False) -> None:
         """
         Set the base weight of a constraint, if it was added.
@@ -204,6 +217,15 @@ class Reweighting:
         at = table.index(row)
         if at >= 0:
             table.base_weights.values[at] = weight
+
+    def base_weights(self) -> tuple[FloatArray, FloatArray]:
+        """Return copies of the base weights of edges and of observed nodes."""
+        return (self._edges.base_weights.values.copy(), self._observed.base_weights.values.copy())
+
+    def set_base_weights(self, weights: tuple[FloatArray, FloatArray]) -> None:
+        """Set what `base_weights` has returned; nothing may have been added in between."""
+        for table, values in zip((self._edges, self._observed), weights, strict=True):
+            table.base_weights.values[:] = values
 
     def saved(self) -> tuple[SavedLosses, SavedLosses]:
         """Return the state of the edges and of the observed nodes."""

@@ -21,7 +21,10 @@ NUMBERED = {
 EMPTY_JUDGEMENT: dict[str, Any] = {'closures': {
     'sources': [], 'scales': [], 'rows': [], 'source': [], 'stamps_ns': [],
     'state': {'names': [], 'of': []}, 'since_ns': [], 'decision': {'names': [], 'of': []},
-    'distance': []}}
+    'distance': []}, 'fixes': {
+    'sources': [], 'rows': [], 'edges': [], 'source': [], 'stamps_ns': [], 'believed': [],
+    'since_ns': [], 'decision': {'names': [], 'of': []}, 'observed': [], 'distance': [],
+    'loosened': [], 'weights': []}}
 
 
 def with_judgement(members: dict[str, Any]) -> dict[str, Any]:

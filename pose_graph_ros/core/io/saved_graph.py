@@ -22,6 +22,7 @@ from pose_graph_ros.core.graph.constraints import check as check_table, EdgeKind
 from pose_graph_ros.core.graph.graph import GraphRows
 from pose_graph_ros.core.graph.reweighting import SavedLosses
 from pose_graph_ros.core.judgement.closure_states import SavedClosures
+from pose_graph_ros.core.judgement.fix_states import SavedFixes
 from pose_graph_ros.core.judgement.judge import SavedJudgement
 from pose_graph_ros.core.judgement.verdicts import Decision, State
 from pose_graph_ros.core.odometry.hidden_nodes import SavedNodes
@@ -104,6 +105,7 @@ class SavedGraph:
         _require(alignment.state in STATES, f'alignment.state: expected one of {STATES}')
         _require(alignment.next_verdict > 0, 'alignment.next_verdict: expected a positive number')
         self._check_judgement(self.judgement.closures, sizes['edges'])
+        self._check_fixes(self.judgement.fixes, sizes)
         for name, edges in (('waiting', self.waiting), ('set_aside', self.set_aside)):
             _same_length(name, edges, 'sources', 'i', 'j', 'mean', 'information', 'kind',
                          'stamps_ns')
@@ -149,6 +151,21 @@ class SavedGraph:
         _require(self.rows.edges.kind[closures.rows] == EdgeKind.LOOP_CLOSURE,
                  f'{where}: expected rows of loop closures')
         _require(closures.scales > 0.0, f'{where}: expected positive scales')
+
+    def _check_fixes(self, fixes: SavedFixes, sizes: Mapping[str, int]) -> None:
+        where = 'judgement.fixes'
+        _same_length(where, fixes, 'rows', 'edges', 'source', 'stamps_ns', 'believed', 'since_ns',
+                     'decision', 'observed', 'distance')
+        _inside(where, fixes.observed + 1, sizes['observed'] + 1)
+        _same_length(where, fixes, 'loosened', 'weights')
+        _inside(where, fixes.edges, 2)
+        _inside(where, fixes.believed, 2)
+        for kind, table in enumerate(('observed', 'edges')):
+            _inside(where, fixes.rows[fixes.edges == kind], sizes[table])
+        _inside(where, fixes.source, len(fixes.sources))
+        _inside(where, fixes.decision, len(Decision))
+        _inside(where, fixes.loosened, sizes['edges'])
+        _require(fixes.weights > 0.0, f'{where}: expected positive weights')
 
     def _check_source(self, where: str, source: SavedSource, sizes: Mapping[str, int]) -> None:
         _same_length(where, source, 'seen_ns', 'seen_references')

@@ -12,7 +12,7 @@ that is believed and does not fit any more is thrown out: back to weight 0, from
 again. If p is large, only the record q of the source speaks for it: it is believed weakly.
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 
 import numpy as np
 
@@ -46,7 +46,6 @@ from pose_graph_ros.core.judgement.verdicts import (
     Decision,
     SourceVerdicts,
     State,
-    Verdict,
 )
 from pose_graph_ros.core.measurements import Answer, AnswerStatus, LoopClosure, rejected
 from pose_graph_ros.core.smoother.incremental import IncrementalSmoother
@@ -109,11 +108,6 @@ class ClosureJudge:
     def configure(self, config: BackendConfig) -> None:
         """Set the settings."""
         self._config = config
-
-    @property
-    def n_edges_of_graph(self) -> int:
-        """Number of edges in the graph."""
-        return self._smoother.graph.n_edges
 
     def before(
         self, new: Sequence[NewConstraint], edges: Edges, now_ns: int,
@@ -330,6 +324,17 @@ class ClosureJudge:
         self._tested.values[:] = self._round
         self._final = *present[:-1], self._round
 
+    def state(self) -> Callable[[], None]:
+        """Return what brings the present state back, as long as no closure is added."""
+        states, scales, learnt = self._states.state_of_all(), [*self._scales], [*self._learnt_from]
+
+        def bring_back() -> None:
+            self._states.set_state_of_all(*states)
+            self._scales, self._learnt_from = scales, learnt
+            self._search = SetSearch(self._states, self._table)
+            self._tested.values[:], self._spread.values[:] = -1, 0.0
+        return bring_back
+
     def _fixed_scale(self, source: str) -> float:
         """Return the factor that is set for a source, 0 if it is learnt."""
         return self._config.measurement_source(source, LoopClosure).sigma_scale
@@ -381,10 +386,6 @@ class ClosureJudge:
             self._smoother.update(GraphUpdate())
         self._spread.values[:] = 0.0
         return done
-
-    def verdicts(self, most_believed: int | None = None) -> list[Verdict]:
-        """Return all verdicts, but of those that are believed only the newest of each source."""
-        return self.reports.verdicts(self._smoother.graph, most_believed)
 
     def saved(self) -> SavedClosures:
         """Return the state; what is left to be tested is not part of it."""

@@ -214,6 +214,27 @@ class ClosureStates:
         self._changes.clear()
         return changes
 
+    def state_of_all(self) -> tuple[IntArray, IntArray, np.ndarray, list[Change]]:
+        """Return copies of states, stamps, distances, and the changes to be announced."""
+        return self.state.copy(), self.since_ns.copy(), self.distance.copy(), list(self._changes)
+
+    def set_state_of_all(
+        self, state: IntArray, since_ns: IntArray, distance: np.ndarray, changes: list[Change],
+    ) -> None:
+        """
+        Set what `state_of_all` has returned; there are as many closures.
+
+        Parameters
+        ----------
+        state, since_ns : ndarray of int, shape (M,)
+        distance : ndarray, shape (M,)
+        changes : list of Change
+
+        """
+        self.state[:], self.since_ns[:], self.distance[:] = state, since_ns, distance
+        self._changes.clear()
+        self._changes.extend(changes)
+
     def saved(self, scales: Sequence[float]) -> SavedClosures:
         """Return all columns, with the scales of the sources."""
         distance = np.sqrt(self.distance)

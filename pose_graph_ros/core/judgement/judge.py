@@ -9,22 +9,27 @@ update the judge is called three times: `before` weighs the new rows by what is 
 changed. It does a bounded part of that; `work` does the rest, part by part, between two updates.
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
 from pose_graph_ros.core.config import BackendConfig, Robust
+from pose_graph_ros.core.geometry.se2 import FloatArray
 from pose_graph_ros.core.graph.constraints import EdgeKind
 from pose_graph_ros.core.graph.graph import GraphUpdate
 from pose_graph_ros.core.graph.graph_view import DrawnRows
 from pose_graph_ros.core.graph.reweighting import Reweighting
+from pose_graph_ros.core.judgement import fix_verdicts
 from pose_graph_ros.core.judgement.closure_judge import ClosureJudge
 from pose_graph_ros.core.judgement.closure_states import SavedClosures
+from pose_graph_ros.core.judgement.fix_states import SavedFixes
+from pose_graph_ros.core.judgement.fixes import FixJudge
 from pose_graph_ros.core.judgement.verdicts import Change, Decision, SourceVerdicts, Verdict
 from pose_graph_ros.core.measurements import Answer, LoopClosure
 from pose_graph_ros.core.smoother.incremental import IncrementalSmoother
 from pose_graph_ros.core.sources.factor_builder import NewConstraint
+from pose_graph_ros.core.sources.source_constraints import Held
 
 
 @dataclass(frozen=True, slots=True)
@@ -32,6 +37,7 @@ class SavedJudgement:
     """Saved state of the judgement."""
 
     closures: SavedClosures
+    fixes: SavedFixes
 
 
 class Judge:
@@ -49,13 +55,15 @@ class Judge:
     def __init__(
         self, smoother: IncrementalSmoother, reweighting: Reweighting, config: BackendConfig,
     ) -> None:
-        self._config = config
+        self._smoother, self._reweighting, self._config = smoother, reweighting, config
         self._closures = ClosureJudge(smoother, reweighting, config)
+        self._fixes = FixJudge(smoother, reweighting, config)
 
     def configure(self, config: BackendConfig) -> None:
         """Set the settings for later constraints."""
         self._config = config
         self._closures.configure(config)
+        self._fixes.configure(config)
 
     def before(
         self, new: Sequence[NewConstraint], change: GraphUpdate, now_ns: int,
@@ -70,7 +78,8 @@ class Judge:
         now_ns : int, stamp of the newest odometry
 
         """
-        first = self._closures.n_edges_of_graph
+        change = self._fixes.before(new, change, now_ns)
+        first = self._smoother.graph.n_edges
         closures = [
             one for one in new if one.is_edge and self._is_judged_closure(one, change, first)]
         if len(closures) == 0:
@@ -94,10 +103,12 @@ class Judge:
     def commit(self) -> None:
         """Keep what the last `before` has decided, after its update has succeeded."""
         self._closures.commit()
+        self._fixes.commit()
 
     def rollback(self) -> None:
         """Forget the constraints of the last `before`, as their update has failed."""
         self._closures.rollback()
+        self._fixes.rollback()
 
     def after(self) -> None:
         """Judge again what an update may have changed, in bounded time."""
@@ -109,19 +120,22 @@ class Judge:
 
     def verdicts(self, most_believed: int | None = None) -> list[Verdict]:
         """Return all verdicts, but of those that are believed only the newest of each source."""
-        return self._closures.verdicts(most_believed)
+        graph = self._smoother.graph
+        return [*self._closures.reports.verdicts(graph, most_believed),
+                *fix_verdicts.verdicts(self._fixes.states, graph, most_believed)]
 
     def drawn_rows(self) -> DrawnRows:
         """Return the rows of constraints that are drawn in another way than believed ones."""
-        return self._closures.reports.drawn_rows()
+        return fix_verdicts.drawn_rows(
+            self._fixes.states, self._closures.reports.drawn_rows())
 
     def changes(self) -> list[Change]:
         """Return the changes of verdicts since the last call."""
-        return self._closures.states.take_changes()
+        return [*self._closures.states.take_changes(), *self._fixes.states.take_changes()]
 
     def totals(self) -> Mapping[str, SourceVerdicts]:
         """Return what is believed of each source, as a whole."""
-        return self._closures.totals()
+        return {**self._closures.totals(), **self._fixes.states.totals()}
 
     def decide(self, name: str, decision: Decision) -> Answer:
         """
@@ -133,18 +147,57 @@ class Judge:
         decision : Decision
 
         """
-        return self._closures.decide(name, decision)
+        judge = self._fixes if self._fixes.states.find(name) >= 0 else self._closures
+        return judge.decide(name, decision)
 
     def saved(self) -> SavedJudgement:
         """Return the state; what is left to be done is not part of it."""
-        return SavedJudgement(self._closures.saved())
+        return SavedJudgement(self._closures.saved(), self._fixes.saved())
 
     def restore(self, saved: SavedJudgement) -> None:
         """Restore what `saved` has returned, for a graph with the same rows."""
         self._closures.restore(saved.closures)
+        self._fixes.restore(saved.fixes)
 
-    def finish(self) -> None:
-        """Do all the work that is left, then decide on all by the graph alone."""
+    def moved(self, before: Held, after: Held) -> None:
+        """
+        Follow measurements that other rows of the graph hold now, with the same weights.
+
+        Parameters
+        ----------
+        before, after : Held, rows of the same measurements
+
+        """
+        self._fixes.states.moved(before, after)
+
+    def weights_as_claimed(self) -> tuple[FloatArray, FloatArray]:
+        """
+        Return weights of edges and observed nodes by which the errors of sources are estimated.
+
+        Measurements in the map have those that the end would give them if errors were as claimed,
+        which does not depend on what was decided before.
+        """
+        return self._fixes.weights_as_claimed()
+
+    def finish(self) -> Callable[[], None]:
+        """
+        Do all the work that is left, then decide on all by the graph alone.
+
+        What is returned undoes all that, if what follows fails: verdicts, weights and poses. The
+        next update of the smoother then eliminates the graph again.
+        """
+        graph = self._smoother.graph
+        poses, weights, base = graph.poses.copy(), graph.weights, self._reweighting.base_weights()
+        bring_back = self._closures.state(), self._fixes.state()
+
+        def undo() -> None:
+            for each in bring_back:
+                each()
+            self._reweighting.set_base_weights(base)
+            graph.set_weights(weights)
+            graph.set_poses(poses)
         while self.work():
             pass
+        self._fixes.finish()
         self._closures.decide_finally()
+        return undo

@@ -204,9 +204,12 @@ class FactorBuilder:
         for model in self._error_models.values() if settle else ():
             if isinstance(model, InflatedWeights):
                 model.settle(additions)
-        self._new_weights = additions.weigh_observed
+        present = graph.memory['observed_f'][:graph.n_observed, tb.WEIGHT]
+        self._new_weights = {
+            row: weight for row, weight in additions.weigh_observed.items()
+            if row >= graph.n_observed or self._reweighting.uses(row, float(present[row]))}
         return additions.update()._replace(
-            weigh_observed=self._changed_weights(additions.weigh_observed, graph))
+            weigh_observed=self._changed_weights(self._new_weights, graph))
 
     def _add(self, attached: AttachedMeasurement, additions: Additions) -> NewConstraint:
         """Add a measurement to an update, as the errors of its source ask for."""

@@ -311,9 +311,13 @@ class InflatedWeights:
         return row
 
     def settle(self, additions: Additions) -> None:
-        """Add the weights of all measurements that wait to be renewed."""
-        for number in list(self._waiting):
-            self._renew(number, len(self._bins[number].rows), additions)
+        """Add the weights of all measurements, as other ones may be believed than before."""
+        for number, made in self._bins.items():
+            if len(made.rows) == 0:
+                continue    # all of it was rolled back
+            self._log.append((number, len(made.rows), made.next, made.n_waiting))
+            made.n_waiting = len(made.rows)
+            self._renew(number, len(made.rows), additions)
 
     def _renew(self, number: int, most: int, additions: Additions) -> int:
         """Add some weights of a bin that wait to be renewed, and return how many."""

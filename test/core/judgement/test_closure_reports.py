@@ -97,7 +97,8 @@ def test_what_is_drawn_apart_is_what_the_verdicts_say() -> None:
     by_state = {state: [each.row for each in backend.verdicts() if each.state is state]
                 for state in State}
     assert backend._judge.drawn_rows() == DrawnRows(
-        by_state[State.WEAKLY_BELIEVED], by_state[State.WAITING], by_state[State.DOUBTED])
+        by_state[State.WEAKLY_BELIEVED], by_state[State.WAITING], by_state[State.DOUBTED],
+        [], [])
     view = backend.view()
     assert view is not None
     assert len(view.waiting.ends) + len(view.doubted.ends) == 2

@@ -1,0 +1,332 @@
+# Copyright 2026 The pose_graph_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""What is decided on each position and pose in the map: one record each, as they were added."""
+
+from collections import deque
+from dataclasses import dataclass
+from typing import Annotated
+
+import numpy as np
+
+from pose_graph_ros.core.compiled.growing_array import GrowingArray
+from pose_graph_ros.core.geometry.se2 import BoolArray, FloatArray, IntArray
+from pose_graph_ros.core.graph.reweighting import Reweighting
+from pose_graph_ros.core.judgement.verdicts import (
+    Change,
+    Decision,
+    Judged,
+    SourceVerdicts,
+    State,
+)
+from pose_graph_ros.core.saved_columns import Choices, Integers, Numbers
+from pose_graph_ros.core.sources.factor_builder import NewConstraint
+from pose_graph_ros.core.sources.source_constraints import Held
+
+DECISIONS = tuple(Decision)
+AUTO, IN = DECISIONS.index(Decision.AUTO), DECISIONS.index(Decision.IN)
+# Columns of the records. `OBSERVED` is the row of the observed node, if it was added as one.
+ROW, EDGE, SOURCE, NUMBER, STAMP, RUN, BELIEVED, SINCE, DECISION, OBSERVED = range(10)
+# Run of a measurement that is in none.
+LONE = -1
+# Largest number of changes that are kept for the announcement.
+MOST_CHANGES = 1000
+# Number of records around one among which another one is looked for.
+NEAR = 100
+# Number of the newest measurements of a source that tell whether it is doubted.
+NEWEST = 3
+
+
+@dataclass(frozen=True, slots=True)
+class SavedFixes:
+    """Saved state of the judgement of positions and poses in the map."""
+
+    sources: tuple[str, ...]
+    rows: Integers
+    """Rows in the graph."""
+    edges: Integers
+    """1 for those of edges, to a bias; 0 for those of observed nodes."""
+    source: Integers
+    """Index into `sources`."""
+    stamps_ns: Integers
+    believed: Integers
+    since_ns: Integers
+    decision: Annotated[IntArray, Choices(Decision)]
+    observed: Integers
+    """Rows of the observed nodes that they were added as; -1 for those added as edges."""
+    distance: Numbers
+    """Mahalanobis distance when it was judged first [sigma]."""
+    loosened: Integers
+    """Rows of odometry edges that are believed less than claimed."""
+    weights: Numbers
+    """Their weights."""
+
+
+class FixStates:
+    """Records of what is decided, and the changes that are to be announced."""
+
+    def __init__(self) -> None:
+        self._records = GrowingArray((10,), np.int64)
+        self._distances = GrowingArray((), np.float64)
+        self.sources: list[str] = []
+        self._counts: list[int] = []
+        self._changes: deque[Change] = deque(maxlen=MOST_CHANGES)
+        self._before: list[tuple[IntArray, IntArray]] = []
+        """Numbers of records that were changed, and what they were, for `undo`."""
+        self.changed: dict[int, bool] = {}
+        """Records that an update believes or doubts anew, and whether they were believed."""
+
+    def __len__(self) -> int:
+        return len(self._records)
+
+    @property
+    def records(self) -> IntArray:
+        """All records, shape (M, 10), writeable."""
+        return self._records.values
+
+    @property
+    def distances(self) -> FloatArray:
+        """Mahalanobis distances when they were judged first, shape (M,) [sigma]."""
+        return self._distances.values
+
+    @property
+    def believed(self) -> BoolArray:
+        """Whether they have a weight above 0, shape (M,)."""
+        return np.asarray(self._records.values[:, BELIEVED] != 0)
+
+    def append(
+        self, one: NewConstraint, *, run: int, believed: bool, distance: float, now_ns: int,
+    ) -> None:
+        """
+        Append a record.
+
+        Parameters
+        ----------
+        one : NewConstraint
+        run : int, number of its run
+        believed : bool
+        distance : float, Mahalanobis distance [sigma]
+        now_ns : int, newest stamp of odometry
+
+        """
+        if one.source not in self.sources:
+            self.sources.append(one.source)
+            self._counts.append(0)
+        index = self.sources.index(one.source)
+        held = (one.held_by, True) if one.held_by >= 0 else (one.row, one.is_edge)
+        self._records.append_one((
+            *held, index, self._counts[index], one.stamp_ns, run, believed, now_ns, AUTO,
+            -1 if one.is_edge else one.row))
+        self._counts[index] += 1
+        self._distances.append_one(distance)
+
+    def keep(self, numbers: IntArray) -> None:
+        """Remember some records that are about to be changed, until `forget` or `undo`."""
+        self._before.append((numbers, self.records[numbers]))
+
+    def forget(self) -> None:
+        """Forget what records were before."""
+        self._before.clear()
+        self.changed = {}
+
+    def undo(self, size: int) -> None:
+        """Make the records what they were before, and remove the newest, so that some are left."""
+        for numbers, records in reversed(self._before):
+            self.records[numbers] = records
+        self.forget()
+        for index in self._records.values[size:, SOURCE].tolist():
+            self._counts[index] -= 1
+        self._records.truncate(size)
+        self._distances.truncate(size)
+
+    def by_stamp(self) -> IntArray:
+        """Return the numbers of all records, by stamp, then by the name of the source."""
+        names = np.argsort(np.argsort(np.array(self.sources)))
+        return np.lexsort((names[self.records[:, SOURCE]], self.records[:, STAMP]))
+
+    def believe(self, which: IntArray, *, believed: bool, now_ns: int) -> None:
+        """
+        Believe or doubt some records, but not those that a person has decided on.
+
+        Parameters
+        ----------
+        which : ndarray of int
+        believed : bool
+        now_ns : int, newest stamp of odometry
+
+        """
+        records = self.records
+        which = which[(records[which, DECISION] == AUTO)
+                      & (records[which, BELIEVED] != int(believed))]
+        self.keep(which)
+        for number in which.tolist():
+            self.changed.setdefault(number, not believed)
+        records[which, BELIEVED], records[which, SINCE] = int(believed), now_ns
+
+    def weights(
+        self, first: int, reweighting: Reweighting,
+    ) -> tuple[dict[int, float], dict[int, float]]:
+        """
+        Return weights that change, of edges and of observed nodes by row.
+
+        Parameters
+        ----------
+        first : int, number of the first new record
+        reweighting : Reweighting
+
+        """
+        weights: tuple[dict[int, float], dict[int, float]] = {}, {}
+        doubted = np.flatnonzero(self.records[first:, BELIEVED] == 0) + first
+        for number in (*doubted.tolist(), *self._after_return(), *self.changed):
+            row, edge, believed = self.records[number, (ROW, EDGE, BELIEVED)].tolist()
+            weights[0 if edge else 1][row] = (
+                self._base_weight(number, reweighting) if believed else 0.0)
+        return weights
+
+    def set_base_weights(self, first: int, reweighting: Reweighting) -> None:
+        """
+        Tell what is not believed any more, or again.
+
+        Parameters
+        ----------
+        first : int, number of the first new record
+        reweighting : Reweighting, is changed
+
+        """
+        for number in (*range(first, len(self)), *self.changed):
+            row, edge, believed = self.records[number, (ROW, EDGE, BELIEVED)].tolist()
+            if not believed:
+                reweighting.set_base_weight(row, 0.0, edge=bool(edge))
+            elif number < first:
+                base = self._base_weight(number, reweighting)
+                reweighting.set_base_weight(row, base, edge=bool(edge))
+
+    def _after_return(self) -> list[int]:
+        """
+        Return the believed records from the first one on that is believed again.
+
+        With what a loss has left of their weights they might hold the path where it was.
+        """
+        again = [number for number, believed in self.changed.items() if not believed]
+        if len(again) == 0:
+            return []
+        since = np.min(self.records[again, STAMP])
+        return np.flatnonzero((self.records[:, STAMP] >= since) & self.believed).tolist()
+
+    def _base_weight(self, number: int, reweighting: Reweighting) -> float:
+        """Return the base weight of a believed record, or else that of one next to it."""
+        row, edge, source = self.records[number, (ROW, EDGE, SOURCE)].tolist()
+        if edge:
+            return 1.0
+        own = reweighting.base_weight(row)
+        if own:
+            return own
+        first = max(number - NEAR, 0)
+        near = self.records[first:number + NEAR]
+        alike = first + np.flatnonzero((near[:, BELIEVED] != 0) & (near[:, EDGE] == 0)
+                                       & (near[:, SOURCE] == source))
+        for other in alike[np.argsort(np.abs(alike - number), kind='stable')].tolist():
+            if other not in self.changed:
+                return reweighting.base_weight(int(self.records[other, ROW])) or 1.0
+        return 1.0
+
+    def name(self, number: int) -> str:
+        """Return the id of a measurement."""
+        return f'{self.sources[self.records[number, SOURCE]]}/{self.records[number, NUMBER]}'
+
+    def find(self, name: str) -> int:
+        """Return the index of the record with an id, -1 if there is none."""
+        source, _, text = name.rpartition('/')
+        if source not in self.sources or not text.isdecimal():
+            return -1
+        found = np.flatnonzero((self.records[:, SOURCE] == self.sources.index(source))
+                               & (self.records[:, NUMBER] == int(text)))
+        return int(found[0]) if len(found) > 0 else -1
+
+    def moved(self, before: Held, after: Held) -> None:
+        """
+        Have records follow measurements that other rows of the graph hold now.
+
+        Parameters
+        ----------
+        before, after : Held, rows of the same measurements
+
+        """
+        held = 2 * self.records[:, ROW] + self.records[:, EDGE]
+        wanted = 2 * before.rows + before.is_edge
+        numbers = np.flatnonzero(np.isin(held, wanted))
+        order = np.argsort(wanted)
+        at = order[np.searchsorted(wanted, held[numbers], sorter=order)]
+        self.records[numbers, ROW], self.records[numbers, EDGE] = after.rows[at], after.is_edge[at]
+
+    def announce(self, number: int, before: State | None) -> None:
+        """
+        Note a change of the state of a measurement.
+
+        Parameters
+        ----------
+        number : int
+        before : State, or None for a new one
+
+        """
+        record = self.records[number]
+        after = State.BELIEVED if record[BELIEVED] else State.DOUBTED
+        self._changes.append(Change(
+            self.name(number), Judged.FIX, self.sources[record[SOURCE]], int(record[STAMP]),
+            before, after))
+
+    def take_changes(self) -> list[Change]:
+        """Return the changes since the last call."""
+        changes = list(self._changes)
+        self._changes.clear()
+        return changes
+
+    def totals(self) -> dict[str, SourceVerdicts]:
+        """Return what is believed of each source."""
+        totals = {}
+        for index, source in enumerate(self.sources):
+            believed = self.believed[self.records[:, SOURCE] == index]
+            n = int(np.count_nonzero(believed))
+            totals[source] = SourceVerdicts(
+                {State.BELIEVED: n, State.DOUBTED: len(believed) - n}, 1.0,
+                len(believed) > 0 and not bool(np.any(believed[-NEWEST:])))
+        return totals
+
+    def state(self) -> tuple[IntArray, list[Change]]:
+        """Return copies of all records and of the changes that are to be announced."""
+        return self.records.copy(), list(self._changes)
+
+    def set_state(self, records: IntArray, changes: list[Change]) -> None:
+        """
+        Set what `state` has returned; there are as many records.
+
+        Parameters
+        ----------
+        records : ndarray of int, shape (M, 10)
+        changes : list of Change
+
+        """
+        self.records[:] = records
+        self._changes.clear()
+        self._changes.extend(changes)
+
+    def saved(self, loosened: dict[int, float]) -> SavedFixes:
+        """Return all records, and the weights of odometry edges by row."""
+        records = self.records.copy().T
+        return SavedFixes(
+            tuple(self.sources), records[ROW], records[EDGE], records[SOURCE], records[STAMP],
+            records[BELIEVED], records[SINCE], records[DECISION], records[OBSERVED],
+            self.distances.copy(),
+            np.array(list(loosened), dtype=np.int64),
+            np.array(list(loosened.values()), dtype=np.float64))
+
+    def restore(self, saved: SavedFixes) -> None:
+        """Fill empty records with saved ones; they belong to no run."""
+        self.sources = list(saved.sources)
+        self._counts = [0] * len(self.sources)
+        for k, source in enumerate(saved.source.tolist()):
+            self._records.append_one((
+                saved.rows[k], saved.edges[k], source, self._counts[source], saved.stamps_ns[k],
+                LONE, saved.believed[k], saved.since_ns[k], saved.decision[k],
+                saved.observed[k]))
+            self._counts[source] += 1
+        self._distances.append(saved.distance)

@@ -1,0 +1,101 @@
+# Copyright 2026 The pose_graph_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""The verdicts on positions and poses in the map, with the reasons."""
+
+import numpy as np
+
+from pose_graph_ros.core.geometry.se2 import FloatArray, IntArray
+from pose_graph_ros.core.graph.error_functions import edge_errors, observed_errors
+from pose_graph_ros.core.graph.graph import Graph
+from pose_graph_ros.core.graph.graph_view import DrawnRows
+from pose_graph_ros.core.judgement.fix_states import (
+    AUTO,
+    BELIEVED,
+    DECISION,
+    DECISIONS,
+    EDGE,
+    FixStates,
+    LONE,
+    ROW,
+    RUN,
+    SINCE,
+    SOURCE,
+    STAMP,
+)
+from pose_graph_ros.core.judgement.listing import listed
+from pose_graph_ros.core.judgement.verdicts import Judged, State, Verdict
+
+# Number of others that a verdict names.
+MOST_NAMED = 5
+
+
+def verdicts(states: FixStates, graph: Graph, most_believed: int | None) -> list[Verdict]:
+    """
+    Return all verdicts, but of those that are believed only the newest of each source.
+
+    Parameters
+    ----------
+    states : FixStates
+    graph : Graph
+    most_believed : int, optional, number of believed ones of each source; None for all
+
+    """
+    numbers = listed(states.records[:, SOURCE], states.believed,
+                     states.records[:, DECISION] != AUTO, most_believed)
+    return [verdict(states, graph, number) for number in numbers.tolist()]
+
+
+def drawn_rows(states: FixStates, others: DrawnRows) -> DrawnRows:
+    """
+    Return rows that are drawn apart, with those of measurements that are not used.
+
+    Parameters
+    ----------
+    states : FixStates
+    others : DrawnRows, of loop closures
+
+    """
+    unused = states.records[~states.believed]
+    edge = unused[:, EDGE] != 0
+    return others._replace(unused_edges=unused[edge, ROW].tolist(),
+                           unused_observed=unused[~edge, ROW].tolist())
+
+
+def verdict(states: FixStates, graph: Graph, number: int) -> Verdict:
+    """
+    Return the verdict on one measurement.
+
+    Parameters
+    ----------
+    states : FixStates
+    graph : Graph
+    number : int
+
+    """
+    record = states.records[number]
+    believed, edge = bool(record[BELIEVED]), bool(record[EDGE])
+    # members of a run follow one another
+    first, records = max(number - 50, 0), states.records
+    alike = first + np.flatnonzero(records[first:number + 50, RUN] == record[RUN])
+    alike = alike[alike != number] if record[RUN] != LONE else alike[:0]
+    near = alike[np.argsort(np.abs(alike - number), kind='stable')][:MOST_NAMED]
+    return Verdict(
+        id=states.name(number), kind=Judged.FIX, source=states.sources[record[SOURCE]],
+        stamp_ns=int(record[STAMP]), reference_ns=None,
+        state=State.BELIEVED if believed else State.DOUBTED, since_ns=int(record[SINCE]),
+        decision=DECISIONS[record[DECISION]],
+        residual=_residual(graph, record[ROW:ROW + 1], edge=edge),
+        distance=float(states.distances[number]),
+        supported_by=tuple(states.name(other) for other in near.tolist()),
+        contradicted_by=() if believed else ('odometry',), edge=edge, row=int(record[ROW]))
+
+
+def _residual(graph: Graph, row: IntArray, *, edge: bool) -> FloatArray:
+    """Return the error at the estimate, nan where nothing is measured."""
+    if edge:
+        biased = graph.edges_at(row)
+        error, information = edge_errors(graph.poses, biased), biased.information
+    else:
+        observed = graph.observed_at(row)
+        error, information = observed_errors(graph.poses, observed), observed.information
+    return np.where(np.diagonal(information[0]) > 0.0, error[0], np.nan)

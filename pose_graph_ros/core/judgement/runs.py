@@ -1,0 +1,367 @@
+# Copyright 2026 The pose_graph_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""
+Runs of measurements that agree with one another by odometry, and which runs to believe.
+
+Where consecutive fixes do not agree, either some of them are wrong, or odometry is. Each has a
+price in units of chi2:
+
+- a run of wrong measurements costs `EVENT`, and `RATE` for each second that it lasts: errors live
+  for seconds to minutes, so a hundred fixes within one correlation time count as one;
+- two runs that are believed one after the other cost the squared Mahalanobis distance between
+  them, or, if odometry was worse than claimed in between, `EVENT` and a price that grows with the
+  square of the jump over the way travelled in between, later with its logarithm: where there is
+  little way, a jump is unlikely, however large.
+
+The set of runs with the lowest price is a shortest path through the runs in the order of time.
+"""
+
+from collections.abc import Sequence
+import copy
+import math
+from typing import NamedTuple
+
+import numpy as np
+
+from pose_graph_ros.core.geometry import se2
+from pose_graph_ros.core.geometry.se2 import FloatArray, IntArray
+from pose_graph_ros.core.graph import tables as tb
+from pose_graph_ros.core.graph.constraints import EdgeKind
+from pose_graph_ros.core.graph.graph import Graph
+from pose_graph_ros.core.judgement.consistency import OdometryChain
+from pose_graph_ros.core.judgement.tracks import Observation, Track
+
+# Price of one run of wrong measurements, or of one fault of odometry; a single measurement is in
+# doubt beyond this squared distance (chi2 with 2 degrees of freedom, 99.9 %).
+EVENT = 13.8
+# Price of a second of wrong measurements [1/s], and the longest time that one of them counts [s].
+RATE = 0.25
+LONGEST = 10.0
+# Sigma of what odometry is worse than claimed, if it is: by the way [m/m], and in any case [m],
+# and that of the heading [rad].
+WORSE_BY_WAY = 0.1
+WORSE = 0.5
+WORSE_HEADING = 0.1
+# Squared sigmas of a jump at which its price becomes logarithmic.
+KNEE = 9.0
+# Number of states that a run notes, and the time between them [ns].
+NOTED, NOTED_EVERY_NS = 10, 3_000_000_000
+# Price of a transition above which the earlier run may have ended with wrong members.
+CUT_ABOVE = 6.0
+# Number of runs that are remembered; time after which those of few members are forgotten [ns].
+MOST_RUNS = 24
+SHORT_LIVED_NS = 30_000_000_000
+# Excess of the price of a believed run over that of a hopeless one.
+HOPELESS = 50.0
+# Squared sigmas that the direction of a run may be off for nothing, and the highest price of it.
+TURN_ALLOWED, MOST_OF_TURN = 9.0, 20.0
+# Time for which a run must keep its direction for that, as errors drift as well [s].
+TURN_AFTER = 30.0
+# Least number of measurements of a run that can show a fault of odometry.
+LEAST_MEMBERS = 3
+# Number of measurements, and way [m], from which the pose at the beginning of a run is estimated.
+BEGIN_MEMBERS, BEGIN_WAY = 40, 50.0
+
+
+class Transition(NamedTuple):
+    """What it takes to believe one run after another."""
+
+    price: float
+    scale: float = 1.0
+    """Factor on the covariance of the odometry in between that explains the jump."""
+    cut: int = -1
+    """Index of the state of the earlier run after which its members are wrong; -1 for none."""
+
+
+class Run:
+    """
+    Measurements that agree with one another, one after the other.
+
+    Parameters
+    ----------
+    number : int, counts the runs
+    stamp_ns : int, of the first member [ns]
+    track : Track, with the first member
+    believed : bool
+
+    """
+
+    def __init__(self, number: int, stamp_ns: int, track: Track, *, believed: bool) -> None:
+        self.number = number
+        """Counts the runs."""
+        self.believed = believed
+        self.track = track
+        """By the newest member."""
+        self.expected: tuple[float, float] | None = None
+        """Heading at the first member without the run, and its variance; None if it is a pose."""
+        self.prices: dict[int, list[Transition]] = {}
+        """The ways to believe it after an earlier run, by the number of that."""
+        self.states: list[tuple[int, Track]] = []
+        """Stamps [ns] and tracks at some earlier times, the newest last."""
+        self.restart(stamp_ns)
+
+    def restart(self, stamp_ns: int) -> None:
+        """Begin with the newest member, as something else was believed since the others."""
+        self.begin_ns = self.end_ns = stamp_ns
+        self.first = self.track
+        """Pose at the first member, by the members after it as well."""
+        self.n = 1
+        self.seconds = 0.0
+        """How long it has lasted, without gaps [s]."""
+        self.contradicted = False
+        """Whether something else was believed since its newest member."""
+        self.prices.clear()
+
+    def copy(self) -> 'Run':
+        """Return a copy that does not change with this one."""
+        other = copy.copy(self)
+        other.prices = dict(self.prices)
+        return other
+
+    def add(self, stamp_ns: int, seen: Observation, track: Track, chain: OdometryChain) -> None:
+        """
+        Take in a measurement that is not older than the others.
+
+        Parameters
+        ----------
+        stamp_ns : int
+        seen : Observation
+        track : Track, with the measurement
+        chain : OdometryChain
+
+        """
+        self.n += 1
+        self.count_time(stamp_ns)
+        self.track = track
+        if self.n <= BEGIN_MEMBERS and not self.believed:
+            self._improve_begin(seen, chain)
+
+    def predicted(self, seen: Observation, chain: OdometryChain) -> tuple[Track, Track, float]:
+        """
+        Return the pose at the begin and that at an observation, and the price of the turn.
+
+        After an outage the heading of odometry may be far off. So where the first two positions
+        are as far from each other as odometry says, they tell the heading.
+
+        Parameters
+        ----------
+        seen : Observation
+        chain : OdometryChain
+
+        """
+        begin, end = self.track, self.track.moved(chain, seen.node)
+        if (self.n > 1 or self.expected is None or seen.size == 3
+                or end.innovation(seen).d2 <= EVENT):
+            return self.first, end, 0.0
+        way, seen_way = end.pose[:2] - begin.pose[:2], seen.mean[:2] - begin.pose[:2]
+        length, seen_length = math.hypot(*way.tolist()), math.hypot(*seen_way.tolist())
+        variance = float(begin.cov[0, 0] + seen.noise[0, 0])
+        if length**2 < 4.0 * variance or (length - seen_length)**2 > 4.0 * variance:
+            return self.first, end, 0.0
+        turn = math.atan2(*seen_way[::-1].tolist()) - math.atan2(*way[::-1].tolist())
+        cov = np.diag((begin.cov[0, 0], begin.cov[1, 1], variance / length**2))
+        turned = Track(begin.node, se2.wrapped(begin.pose + np.array((0.0, 0.0, turn))), cov)
+        return turned, turned.moved(chain, seen.node), EVENT
+
+    def count_time(self, stamp_ns: int) -> None:
+        """Let the run last until a stamp [ns]."""
+        if stamp_ns > self.end_ns:
+            self.seconds += min((stamp_ns - self.end_ns) * 1e-9, LONGEST)
+            self.end_ns = stamp_ns
+
+    def _improve_begin(self, seen: Observation, chain: OdometryChain) -> None:
+        if _way(chain, self.first.node, seen.node) > BEGIN_WAY:
+            return
+        begin = self.first
+        end = begin.moved(chain, seen.node)
+        innovation = end.innovation(seen)
+        # the jacobian by the pose at the beginning: a turn there moves the end
+        back = np.eye(3)
+        back[0, 2] = -(end.pose[1] - begin.pose[1])
+        back[1, 2] = end.pose[0] - begin.pose[0]
+        self.first = begin.updated(innovation._replace(jacobian=innovation.jacobian @ back))
+        self.prices.clear()
+
+    @property
+    def price(self) -> float:
+        """What it costs if its measurements are wrong."""
+        return EVENT + RATE * self.seconds + self.turned
+
+    @property
+    def turned(self) -> float:
+        """
+        Price of a path that is turned against that of odometry, if it is wrong.
+
+        Positions that are off by the same vector keep the direction of the path.
+        """
+        if self.expected is None or self.seconds < TURN_AFTER:
+            return 0.0
+        heading, variance = self.expected
+        turn = float(se2.wrap(self.first.pose[2] - heading))
+        d2 = turn**2 / (variance + float(self.first.cov[2, 2]))
+        return min(max(d2 - TURN_ALLOWED, 0.0), MOST_OF_TURN)
+
+    def note_state(self, stamp_ns: int, track: Track) -> None:
+        """
+        Note where the robot was, if it was not noted lately.
+
+        Parameters
+        ----------
+        stamp_ns : int
+        track : Track, by the members before
+
+        """
+        if len(self.states) == 0 or stamp_ns - self.states[-1][0] >= NOTED_EVERY_NS:
+            self.states = [*self.states[1 - NOTED:], (stamp_ns, track)]
+
+    def ways_after(self, other: 'Run', chain: OdometryChain) -> Sequence[Transition]:
+        """
+        Return the ways to believe this run after an earlier one.
+
+        Parameters
+        ----------
+        other : Run
+        chain : OdometryChain
+
+        """
+        if other.end_ns > self.begin_ns or self.first.node < other.track.node:
+            return ()
+        if other.number not in self.prices:
+            self.prices[other.number] = self._ways_after(other, chain)
+        return self.prices[other.number]
+
+    def _ways_after(self, other: 'Run', chain: OdometryChain) -> list[Transition]:
+        ways = [self._price_of_jump(other.track, chain)]
+        if ways[0].price <= CUT_ABOVE or self.n < LEAST_MEMBERS:
+            return ways
+        # the last members may be the beginning of an error that grows
+        cuts = []
+        for cut, (stamp_ns, track) in enumerate(other.states):
+            d2, _, _ = self._jump(track, chain)
+            if d2 <= EVENT:
+                cuts.append(Transition(
+                    d2 + RATE * (other.end_ns - stamp_ns) * 1e-9, 1.0, cut))
+        return [*ways, min(cuts)] if len(cuts) > 0 else ways
+
+    def _jump(self, track: Track, chain: OdometryChain) -> tuple[float, FloatArray, FloatArray]:
+        """Return the jump from a track, its squared distance first, and its covariance."""
+        predicted = track.moved(chain, self.first.node)
+        jump = self.first.pose - predicted.pose
+        jump[2] = se2.wrap(jump[2])
+        cov = predicted.bent(track.pose).cov + self.first.cov
+        return float(jump @ np.linalg.solve(cov, jump)), jump, cov
+
+    def _price_of_jump(self, track: Track, chain: OdometryChain) -> Transition:
+        d2, jump, cov = self._jump(track, chain)
+        if d2 <= EVENT:
+            return Transition(d2)
+        if self.n < LEAST_MEMBERS:
+            return Transition(math.inf)
+        way = _way(chain, track.node, self.first.node)
+        worse = (WORSE + WORSE_BY_WAY * way)**2
+        size2 = float(jump[0]**2 + jump[1]**2)
+        variance = float(jump[:2] @ cov[:2, :2] @ jump[:2]) / max(size2, 1e-12)
+        s2 = size2 / max(variance, worse) + jump[2]**2 / max(cov[2, 2], WORSE_HEADING**2)
+        return Transition(min(EVENT + KNEE * math.log1p(s2 / KNEE), d2),
+                          self._scale(track, jump, chain))
+
+    def cut_after(self, state: int, number: int) -> 'Run':
+        """
+        Return a run of the members after a noted state, after taking them away from this one.
+
+        Parameters
+        ----------
+        state : int, index of the state
+        number : int, of the new run
+
+        """
+        stamp_ns, track = self.states[state]
+        rest = Run(number, stamp_ns, track, believed=False)
+        rest.track, rest.end_ns = self.track, self.end_ns
+        rest.seconds = (self.end_ns - stamp_ns) * 1e-9
+        rest.n = max(int(self.n * rest.seconds / max(self.seconds, 1e-9)), 1)
+        rest.contradicted = True
+        self.seconds = max(self.seconds - rest.seconds, 0.0)
+        self.end_ns, self.track, self.states = stamp_ns - 1, track, self.states[:state]
+        return rest
+
+    def _scale(self, track: Track, jump: FloatArray, chain: OdometryChain) -> float:
+        """Return the factor on the covariance of odometry that makes a jump one of 1 sigma."""
+        begin = track._replace(cov=np.zeros((3, 3)))
+        gap = begin.moved(chain, self.first.node).cov[:2, :2]
+        size2 = float(jump[0]**2 + jump[1]**2)
+        along = float(jump[:2] @ gap @ jump[:2]) / max(size2, 1e-12)
+        return max(size2 / max(along, 0.03**2), 1.0)
+
+
+def _way(chain: OdometryChain, begin: int, end: int) -> float:
+    first, last = chain.travel(np.array((begin, end))).tolist()
+    return float(last - first)
+
+
+def best_runs(runs: list[Run], chain: OdometryChain) -> list[tuple[Run, Transition]]:
+    """
+    Return the runs to believe, in the order of time, each with the way from the one before.
+
+    Parameters
+    ----------
+    runs : list of Run, at least one
+    chain : OdometryChain
+
+    """
+    ordered = sorted(runs, key=lambda run: (run.begin_ns, run.number))
+    total: list[float] = []
+    before: list[tuple[int, Transition]] = []
+    for k, run in enumerate(ordered):
+        cost, best = 0.0, (-1, Transition(0.0))
+        for m, other in enumerate(ordered[:k]):
+            for way in run.ways_after(other, chain):
+                price = total[m] + way.price
+                if way.cut >= 0 and not any(wrong.n > 1 for wrong in ordered[m + 1:k]):
+                    price += EVENT  # no wrong run follows that the last members could belong to
+                if price < cost:
+                    cost, best = price, (m, way)
+        total.append(cost - run.price)
+        before.append(best)
+    k, chosen = int(np.argmin(total)), []
+    while k >= 0:
+        chosen.append((ordered[k], before[k][1]))
+        k = before[k][0]
+    return chosen[::-1]
+
+
+def remembered(runs: list[Run], stamp_ns: int) -> list[Run]:
+    """
+    Return the runs without those that cannot win any more, and at most `MOST_RUNS` of them.
+
+    Parameters
+    ----------
+    runs : list of Run
+    stamp_ns : int, of the newest measurement
+
+    """
+    price = max((run.price for run in runs if run.believed), default=0.0)
+    runs = [run for run in runs if run.believed or not (
+        (run.n < LEAST_MEMBERS and stamp_ns - run.end_ns > SHORT_LIVED_NS)
+        or (run.contradicted and price > run.price + HOPELESS))]
+    while len(runs) > MOST_RUNS:
+        doubted = [run for run in runs if not run.believed]
+        runs.remove(min(doubted, key=lambda run: run.seconds) if len(doubted) > 0
+                    else min(runs, key=lambda run: run.begin_ns))
+    return runs
+
+
+def odometry_between(graph: Graph, begin: int, end: int) -> IntArray:
+    """
+    Return the rows of odometry edges between two nodes, or of those around them if they are one.
+
+    Parameters
+    ----------
+    graph : Graph
+    begin, end : int, rows of the nodes, `end` not before `begin`
+
+    """
+    ends = graph.memory['edge_i'][:graph.n_edges]
+    i, j = ends[:, tb.END_I], ends[:, tb.END_J]
+    inside = (i < end) & (j > begin) if end > begin else (i == end) | (j == end)
+    return np.flatnonzero(inside & (ends[:, tb.EDGE_KIND] == EdgeKind.ODOMETRY))

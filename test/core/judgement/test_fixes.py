@@ -1,0 +1,250 @@
+# Copyright 2026 The pose_graph_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""Judging fixes over time, in drives in which some fixes, or odometry, are wrong."""
+
+import numpy as np
+import pytest
+
+from pose_graph_ros.core.alignment.monitor import AlignmentState
+from pose_graph_ros.core.backend import PoseGraphBackend
+from pose_graph_ros.core.config import BackendConfig, Correlation, MeasurementSource, POSITIONS
+from pose_graph_ros.core.geometry import se2
+from pose_graph_ros.core.geometry.se2 import BoolArray, FloatArray
+from pose_graph_ros.core.judgement.verdicts import Decision, State
+from pose_graph_ros.core.measurements import GlobalPose, Measurement, OdometrySample, Position
+
+SECOND = 1_000_000_000
+
+
+class Drive:
+    """A winding drive at 1 m/s: odometry at 5 Hz with noise, fixes of 0.5 m at 1 Hz."""
+
+    def __init__(self, seconds: int, seed: int = 0) -> None:
+        rng = np.random.default_rng(seed)
+        n = 5 * seconds
+        self.time = np.arange(n) / 5.0
+        self.motion = np.zeros((n, 3))
+        self.motion[:, 0], self.motion[:, 2] = 0.2, 0.03 * np.sin(self.time / 7.0)
+        self.noise = rng.standard_normal((n, 3)) * (0.02, 0.01, 0.004)
+        self.truth = np.zeros((n, 3))
+        for k in range(1, n):
+            self.truth[k] = se2.compose(self.truth[k - 1], self.motion[k])
+        self.rng = rng
+        self.fix_time = np.arange(seconds) + 0.0
+        self.fixes = self.truth[::5, :2] + 0.5 * rng.standard_normal((seconds, 2))
+        self.sent = np.ones(seconds, dtype=bool)
+
+    def between(self, begin: float, end: float) -> BoolArray:
+        """Return which fixes have a stamp in an interval [s]."""
+        return np.asarray((self.fix_time >= begin) & (self.fix_time < end))
+
+    def move(self, begin: float, end: float, offset: tuple[float, float]) -> None:
+        """Move the fixes of an interval."""
+        self.fixes[self.between(begin, end)] += offset
+
+    def slip(self, begin: float, distance: float) -> None:
+        """Let odometry move farther than the robot for 5 s."""
+        self.noise[(self.time >= begin) & (self.time < begin + 5.0), 0] += distance / 25.0
+
+    def poses(self) -> list[OdometrySample]:
+        odometry, samples = np.array((3.0, -2.0, 1.0)), []
+        for k, time in enumerate(self.time):
+            if k > 0:
+                odometry = se2.compose(odometry, self.motion[k] + self.noise[k])
+            samples.append(OdometrySample(SECOND + round(time * SECOND), odometry))
+        return samples
+
+    def measurements(self) -> list[tuple[str, Measurement]]:
+        return [('fix', Position(
+            SECOND + round(time * SECOND), where, 0.25 * np.eye(2), np.zeros(2)))
+            for time, where in zip(self.fix_time[self.sent], self.fixes[self.sent], strict=True)]
+
+
+class Driven:
+    """What the engine made of a drive: at each second and at the end."""
+
+    def __init__(
+        self, drive: Drive, more: list[tuple[str, Measurement]] | None = None,
+        source: MeasurementSource = POSITIONS, final: bool = True,
+    ) -> None:
+        self.backend = backend = PoseGraphBackend(BackendConfig(
+            measurements=dict.fromkeys(('fix', 'other'), source)))
+        self.newest: dict[int, float] = {}
+        self.doubting: dict[int, bool] = {}
+        events = [('odom', sample) for sample in drive.poses()]
+        events += drive.measurements() if more is None else more
+        for name, event in sorted(events, key=lambda each: each[1].stamp_ns):
+            if not isinstance(event, OdometrySample):
+                backend.add_measurement(event, name)
+                continue
+            backend.add_odometry(event)
+            if (event.stamp_ns - SECOND) % SECOND == 0:
+                backend.update()
+                estimate = backend.estimate(with_path=False)
+                if estimate is None or estimate.alignment is not AlignmentState.ALIGNED:
+                    continue
+                at = (event.stamp_ns - SECOND) // SECOND
+                k = round((estimate.stamp_ns - SECOND) * 5 / SECOND)
+                self.newest[at] = float(np.hypot(
+                    *(estimate.T_map_base - drive.truth[k])[:2]))
+                totals = backend.verdict_totals()
+                self.doubting[at] = 'fix' in totals and totals['fix'].doubting
+        if final:
+            backend.optimize()
+        end = backend.estimate()
+        assert end is not None
+        k = np.round((end.path.stamps_ns - SECOND) * 5 / SECOND).astype(int)
+        off: FloatArray = end.path.poses - drive.truth[k]
+        self.rms = float(np.sqrt(np.mean(np.sum(off[:, :2]**2, axis=1))))
+        self.doubted = {
+            verdict.id for verdict in backend.verdicts() if verdict.state is State.DOUBTED}
+
+
+def ids(drive: Drive, begin: float, end: float, source: str = 'fix') -> set[str]:
+    """Return the ids of the fixes of an interval."""
+    numbers = np.cumsum(drive.sent) - 1
+    return {f'{source}/{number}' for number in numbers[drive.between(begin, end) & drive.sent]}
+
+
+def test_right_fixes_are_believed() -> None:
+    drive = Drive(120)
+    driven = Driven(drive)
+    assert len(driven.doubted) <= 1
+    assert driven.rms < 0.4
+
+
+def test_single_wrong_fixes_are_doubted() -> None:
+    drive = Drive(120)
+    wrong = drive.rng.random(120) < 0.2
+    angle = drive.rng.uniform(0.0, 6.28, 120)
+    drive.fixes[wrong] += 30.0 * np.column_stack((np.cos(angle), np.sin(angle)))[wrong]
+    driven = Driven(drive)
+    bad = {f'fix/{number}' for number in np.flatnonzero(wrong)}
+    assert bad <= driven.doubted
+    assert len(driven.doubted - bad) <= 1
+    assert driven.rms < 0.45
+
+
+def test_consistent_offset_after_an_outage_is_doubted_throughout() -> None:
+    drive = Drive(150)
+    drive.sent[drive.between(40.0, 80.0)] = False
+    drive.move(80.0, 110.0, (25.0, -31.0))
+    driven = Driven(drive)
+    assert ids(drive, 80.0, 110.0) <= driven.doubted
+    assert len(driven.doubted) <= 31
+    assert all(driven.doubting[at] for at in range(84, 111))
+    assert max(driven.newest[at] for at in range(80, 111)) < 5.0
+    assert driven.rms < 1.5
+
+
+def test_slip_in_an_outage_right_fixes_win() -> None:
+    drive = Drive(120)
+    drive.sent[drive.between(30.0, 70.0)] = False
+    drive.slip(50.0, 8.0)
+    driven = Driven(drive)
+    assert max(driven.newest[at] for at in range(90, 120)) < 2.0
+    assert len(driven.doubted) <= 1
+
+
+def test_receiver_that_is_initialised_wrongly_for_a_minute_is_forgiven() -> None:
+    drive = Drive(150)
+    drive.move(60.0, 120.0, (-60.0, 80.0))
+    driven = Driven(drive)
+    assert ids(drive, 60.0, 120.0) <= driven.doubted
+    assert len(driven.doubted) <= 61
+    assert max(driven.newest.values()) < 10.0
+    assert driven.rms < 1.5
+
+
+def test_wrong_fixes_at_the_beginning_are_thrown_out() -> None:
+    drive = Drive(100)
+    drive.move(0.0, 20.0, (30.0, 20.0))
+    driven = Driven(drive)
+    assert ids(drive, 0.0, 20.0) <= driven.doubted
+    assert driven.newest[99] < 2.0
+    assert driven.rms < 1.0
+
+
+def test_slip_without_an_outage_is_found() -> None:
+    drive = Drive(200)
+    drive.slip(60.0, 12.0)
+    driven = Driven(drive)
+    assert max(driven.newest[at] for at in range(180, 200)) < 2.0
+    assert driven.rms < 2.0
+
+
+def test_receivers_that_contradict_each_other_the_first_one_is_believed() -> None:
+    drive = Drive(120)
+    first = drive.measurements()
+    other = [('other', Position(fix.stamp_ns + SECOND // 5, fix.position + np.array((20.0, 0.0)),
+                                fix.covariance, np.zeros(2)))
+             for _, fix in first[50:] if isinstance(fix, Position)]
+    driven = Driven(drive, first + other)
+    assert {f'other/{number}' for number in range(len(other) - 1)} <= driven.doubted
+    assert driven.rms < 0.4
+    totals = driven.backend.verdict_totals()
+    assert totals['other'].doubting
+    assert not totals['fix'].doubting
+
+
+def test_poses_in_the_wrong_corridor() -> None:
+    drive = Drive(120)
+    poses: list[tuple[str, Measurement]] = []
+    for time in range(120):
+        pose = drive.truth[5 * time] + drive.rng.standard_normal(3) * (0.1, 0.1, 0.02)
+        if 50 <= time < 75:
+            pose = se2.compose(pose, np.array((0.0, 5.0, np.pi)))
+        poses.append(('other', GlobalPose(
+            SECOND + time * SECOND, se2.wrapped(pose), np.diag((0.01, 0.01, 0.0004)))))
+    driven = Driven(drive, poses)
+    assert {f'other/{number}' for number in range(50, 75)} <= driven.doubted
+    assert len(driven.doubted) <= 27
+    assert driven.rms < 0.5
+
+
+@pytest.mark.parametrize('correlation', list(Correlation))
+def test_correlated_errors_are_judged_as_well(correlation: Correlation) -> None:
+    drive = Drive(120)
+    drive.move(60.0, 80.0, (20.0, 15.0))
+    driven = Driven(drive, source=MeasurementSource(
+        robust=POSITIONS.robust, loss=POSITIONS.loss, correlation_time=5.0,
+        correlation=correlation))
+    assert ids(drive, 60.0, 80.0) <= driven.doubted
+    assert len(driven.doubted) <= 22
+    graph = driven.backend.graph
+    for verdict in driven.backend.verdicts():
+        weights = graph.weights[0 if verdict.edge else 1]
+        assert bool(weights[verdict.row] > 0.0) is verdict.state.in_graph
+    assert driven.rms < 1.0
+
+
+def test_decisions_of_a_person_are_kept_and_taken_back() -> None:
+    driven = Driven(Drive(60), final=False)
+    backend = driven.backend
+    backend.verdict_changes()
+    backend.decide('fix/30', Decision.OUT)
+    backend.update()
+
+    def state() -> State:
+        return next(each for each in backend.verdicts() if each.id == 'fix/30').state
+
+    assert state() is State.DOUBTED
+    assert [change.id for change in backend.verdict_changes()] == ['fix/30']
+    backend.decide('fix/30', Decision.AUTO)
+    assert state() is State.BELIEVED
+    assert backend.decide('fix/999', Decision.IN).reason == 'unknown_id'
+
+
+def test_a_failed_update_changes_no_verdict(monkeypatch: pytest.MonkeyPatch) -> None:
+    drive = Drive(60)
+    drive.move(50.0, 60.0, (30.0, 0.0))
+    driven = Driven(drive, final=False)
+    judge = driven.backend._judge._fixes
+
+    def state() -> list[object]:
+        return [judge._states.records.copy().tolist(),
+                [(run.number, run.n, run.seconds, run.believed) for run in judge._runs]]
+
+    before = state()
+    judge.rollback()
+    assert state() == before

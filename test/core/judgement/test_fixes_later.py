@@ -1,0 +1,226 @@
+# Copyright 2026 The pose_graph_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""What is decided on fixes survives failures, another order of arrival and another error model."""
+
+from dataclasses import replace
+
+import numpy as np
+from numpy.testing import assert_allclose
+import pytest
+from random_graphs import snapshot
+
+from pose_graph_ros.core.backend import PoseGraphBackend
+from pose_graph_ros.core.batch import optimizer
+from pose_graph_ros.core.batch.optimizer import BatchResult, Status
+from pose_graph_ros.core.config import BackendConfig, Correlation, POSITIONS, SolverConfig
+from pose_graph_ros.core.geometry import se2
+from pose_graph_ros.core.geometry.se2 import FloatArray
+from pose_graph_ros.core.graph.graph import Graph, GraphUpdate
+from pose_graph_ros.core.judgement.verdicts import Decision, State, Verdict
+from pose_graph_ros.core.measurements import Measurement, OdometrySample, Position
+from pose_graph_ros.core.smoother.incremental import IncrementalSmoother, UpdateResult
+
+SECOND = 1_000_000_000
+Event = OdometrySample | Measurement
+
+
+def drive(
+    seed: int, *, n: int = 150, tau: float = 20.0, wrong: float = 0.2, offset: bool = False,
+) -> tuple[list[Event], set[int]]:
+    """Return odometry and fixes of 1 m with correlated errors, and stamps of wrong ones."""
+    rng = np.random.default_rng(seed)
+    true, seen, events, bad = np.zeros(3), np.array((3.0, 1.0, 2.0)), [], set()
+    error, kept = rng.standard_normal(2), np.exp(-1.0 / tau)
+    for second in range(1, n + 1):
+        step = np.array((1.0, 0.0, 0.15 * np.sin(0.2 * second)))
+        slip = rng.standard_normal(3) * (0.05, 0.03, 0.01)
+        true, seen = se2.compose(true, step), se2.compose(seen, se2.compose(step, slip))
+        events.append(OdometrySample(second * SECOND, seen))
+        error = kept * error + np.sqrt(1.0 - kept**2) * rng.standard_normal(2)
+        where = true[:2] + np.sqrt(0.95) * error + np.sqrt(0.05) * rng.standard_normal(2)
+        angle = rng.uniform(0.0, 2.0 * np.pi)
+        if offset and 60 <= second < 75:
+            where += (30.0, -20.0)
+            bad.add(second * SECOND)
+        elif rng.random() < wrong and second > 5:
+            where += 30.0 * np.array((np.cos(angle), np.sin(angle)))
+            bad.add(second * SECOND)
+        events.append(Position(second * SECOND, where, np.eye(2), np.zeros(2)))
+    return events, bad
+
+
+def feed(backend: PoseGraphBackend, events: list[Event], every: int = 8) -> None:
+    for k, event in enumerate(events):
+        if isinstance(event, OdometrySample):
+            backend.add_odometry(event)
+        else:
+            backend.add_measurement(event, 'fix')
+        if k % every == every - 1:
+            backend.update()
+
+
+def late(events: list[Event], seed: int, delay: float = 60.0) -> list[Event]:
+    """Return the events with fixes that come later, out of order."""
+    random = np.random.default_rng(seed)
+    when = [event.stamp_ns + (delay * SECOND * random.random() if isinstance(event, Position)
+                              else 0.0) for event in events]
+    return [events[k] for k in np.argsort(when, kind='stable')]
+
+
+def path(backend: PoseGraphBackend) -> FloatArray:
+    estimate = backend.estimate()
+    assert estimate is not None
+    return estimate.path.poses
+
+
+def doubted(backend: PoseGraphBackend) -> set[int]:
+    return {each.stamp_ns for each in backend.verdicts() if each.state is State.DOUBTED}
+
+
+def used(backend: PoseGraphBackend, verdict: Verdict) -> bool:
+    """Tell whether the row of a verdict has a weight."""
+    return bool(backend.graph.weights[0 if verdict.edge else 1][verdict.row] > 0.0)
+
+
+def assert_weights_are_as_decided(backend: PoseGraphBackend) -> None:
+    """Each measurement has a weight in the row that holds it, if it is believed, and no other."""
+    constraints = backend._factors.constraints('fix')
+    held = constraints.held(np.arange(len(constraints)))
+    rows = {stamp: (row, edge) for stamp, row, edge in zip(
+        constraints.rows.values[:, 0].tolist(), held.rows.tolist(), held.is_edge.tolist(),
+        strict=True)}
+    observed = backend.graph.weights[1]
+    for verdict in backend.verdicts():
+        assert (verdict.row, verdict.edge) == rows[verdict.stamp_ns]
+        assert used(backend, verdict) is verdict.state.in_graph
+    as_edges = constraints.rows.values[held.is_edge, 1]
+    assert np.all(observed[as_edges] == 0.0)
+
+
+@pytest.mark.parametrize('correlation', Correlation)
+@pytest.mark.parametrize('seed', [1, 2])
+def test_the_end_does_not_depend_on_the_order_of_arrival(
+    seed: int, correlation: Correlation,
+) -> None:
+    events, bad = drive(seed, offset=True)
+    backends = []
+    for those, every in ((events, 8), (late(events, seed), 8), (late(events, seed + 1, 400.0), 3)):
+        backends.append(PoseGraphBackend(BackendConfig(
+            measurements={'fix': replace(POSITIONS, correlation=correlation)})))
+        feed(backends[-1], those, every)
+        assert backends[-1].optimize().status is Status.CONVERGED
+    assert bad <= doubted(backends[0])
+    for other in backends[1:]:
+        assert doubted(other) == doubted(backends[0])
+        assert_allclose(path(other), path(backends[0]), atol=1e-9)
+
+
+def test_what_is_doubted_stays_doubted_when_the_error_model_changes() -> None:
+    events, bad = drive(1)
+    backend = PoseGraphBackend(BackendConfig(measurements={'fix': POSITIONS}))
+    feed(backend, events)
+    while not backend.refine().finished:
+        pass
+    assert backend._factors.errors_in_use('fix') is not None
+    verdicts = backend.verdicts()
+    assert all(verdict.edge for verdict in verdicts)
+    assert len(doubted(backend) & bad) > 0.9 * len(bad)
+    assert_weights_are_as_decided(backend)
+    # what is forgiven gets a weight in the row that holds it, and so does the rest at the end
+    name = next(each.id for each in verdicts if not each.state.in_graph)
+    backend.decide(name, Decision.IN)
+    assert used(backend, next(each for each in backend.verdicts() if each.id == name))
+    assert_weights_are_as_decided(backend)
+    backend.optimize()
+    assert_weights_are_as_decided(backend)
+    # and back to white errors
+    backend._tuner._begin('fix', None)
+    backend._tuner.finish_change()
+    assert not any(verdict.edge for verdict in backend.verdicts())
+    assert_weights_are_as_decided(backend)
+
+
+class Flaky(IncrementalSmoother):
+    """A smoother that fails, and undoes the update, while `broken`."""
+
+    broken = False
+
+    def update(self, update: GraphUpdate, **options: bool) -> UpdateResult:
+        if not self.broken:
+            return super().update(update, **options)
+        self.graph.begin()
+        self.graph.apply(update)
+        self.graph.rollback()
+        return UpdateResult(Status.FAILED, 'broken on purpose', 0, 0, 0, 0)
+
+
+def everything(backend: PoseGraphBackend) -> list[object]:
+    judge = backend._judge._fixes
+    return [judge.states.records.tolist(), judge._loosened,
+            [base.tolist() for base in backend._reweighting.base_weights()],
+            [(run.number, run.n, run.seconds, run.believed) for run in judge._runs]]
+
+
+def test_a_failed_update_that_would_turn_a_decision_changes_nothing() -> None:
+    # the first 15 fixes are off by the same vector: 10 s later they are thrown out
+    events, _ = drive(3, n=60, wrong=0.1)
+    events = [replace(event, position=event.position + np.array((40.0, 0.0)))
+              if isinstance(event, Position) and event.stamp_ns <= 15 * SECOND else event
+              for event in events]
+    config = BackendConfig(measurements={'fix': replace(POSITIONS, correlation_time=0.0)})
+    smoother = Flaky(config.smoother)
+    backend, n_turned = PoseGraphBackend(config, smoother=smoother), 0
+    judge = backend._judge._fixes
+    for k, event in enumerate(events):
+        feed(backend, [event])
+        if k % 2 == 0:
+            continue
+        before, n = everything(backend), len(judge.states)
+        smoother.broken = True
+        change = backend._factors.build(backend._pipeline.queue, backend.graph)
+        backend._judge.before(backend._factors.new, change, 0)
+        n_turned += judge.states.records[:n].tolist() != before[0]
+        backend._judge.rollback()
+        backend._factors.rollback()
+        assert everything(backend) == before
+        smoother.broken = False
+        backend.update()
+    assert n_turned >= 1
+    assert {second * SECOND for second in range(1, 16)} <= doubted(backend)
+
+
+def test_a_final_optimisation_that_fails_undoes_what_was_decided_for_it() -> None:
+    broken = [True]
+
+    def solve(graph: Graph, config: SolverConfig) -> BatchResult:
+        if broken[0]:
+            return BatchResult(Status.FAILED, 'broken on purpose', 0, 1.0)
+        return optimizer.optimize(graph, config)
+
+    events, bad = drive(2, n=80)
+    config = BackendConfig(measurements={'fix': replace(POSITIONS, correlation_time=0.0)})
+    backend = PoseGraphBackend(config, solve=solve)
+    feed(backend, late(events, 5, 400.0), 5)
+    backend.update()
+    # the judge decides otherwise at the end
+    believed = next(each.id for each in backend.verdicts() if each.state.in_graph)
+    record = backend._judge._fixes.states.records[int(believed.split('/')[1])]
+    record[6] = 0
+    backend._smoother.update(GraphUpdate(weigh_observed={int(record[0]): 0.0}))
+    backend._reweighting.set_base_weight(int(record[0]), 0.0)
+    backend.verdict_changes()
+    backend.finish()
+    for _ in range(20):
+        backend.update()
+    before, poses = snapshot(backend.graph)[1:], backend.graph.poses.copy()
+    decided = everything(backend)
+    assert backend.optimize().status is Status.FAILED
+    assert snapshot(backend.graph)[1:] == before
+    assert_allclose(backend.graph.poses, poses, atol=1e-3)
+    assert everything(backend) == decided
+    assert backend.verdict_changes() == []
+    assert backend.update().status is not Status.FAILED
+    broken[0] = False
+    assert backend.optimize().status is Status.CONVERGED
+    assert [change.id for change in backend.verdict_changes()].count(believed) == 1
+    assert bad <= doubted(backend)
