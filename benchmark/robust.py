@@ -55,7 +55,6 @@ DATA = Path(__file__).resolve().parents[2] / 'shared' / 'data'
 PLACES = ('false_loops/B25b_0.150.g2o', 'false_loops/Bicocca25b_GT_GPS.g2o',
           'false_loops/B25b_timestamps.txt')
 M3500 = 'graphs/input_M3500_g2o.g2o', 'graphs/manhattanOlson3500_groundtruth.txt'
-MOWER = 'robot/plaza1'
 B25B_RMS, RECALL, WORST = 1.4, 0.8, 1.1
 """What is asked for: rms [m], share of the right closures, ratio to odometry while driving."""
 CLOSURES = ('closures, of which right', 'odometry', 'all', 'only right', 'judged', 'kept wrong',
@@ -72,6 +71,8 @@ class Options:
     recordings: tuple[tuple[Path, ...], ...]
     gtsam: bool
     out: Path
+    fix_robust: Robust | None
+    cases: tuple[str, ...]
 
 
 @dataclass(frozen=True, slots=True)
@@ -277,59 +278,6 @@ def grids(options: Options) -> Section:
     return section
 
 
-def fixes(options: Options) -> Section:
-    """Measure drives with wrong fixes."""
-    section = Section(
-        'Fixes', 'Fixes of 1 m at 1 Hz; no rigid motion. *Wins*: time from when what is right '
-        'comes (again) until the newest pose stays within 3 m. *Doubt said*: share of the updates '
-        'in the fault at which the verdicts have some of its fixes waiting or doubted. Asked of '
-        'all: at most 1.15 times the clean rms (0.45 m after the outage), and 20 s.')
-    table = Table('', ('drive', 'fault', 'rms [m]', 'newest pose, rms [m]',
-                       'newest pose, worst from the fault on [m]', 'wins [s]', 'doubt said',
-                       'wrong believed', 'right doubted'))
-    makers: dict[str, Callable[[int], robust_fixes.Drive]] = {'simulated': robust_fixes.simulated}
-    folder = options.data / MOWER
-    if folder.is_dir():
-        makers = {'plaza 1': lambda seed: robust_fixes.plaza(folder, seed), **makers}
-    else:
-        section.notes.append('plaza 1: the data is not there, skipped.')
-    for place, make in makers.items():
-        clean = np.nan
-        for fault, change in robust_fixes.FAULTS.items():
-            if options.quick and place == 'plaza 1' and not fault.startswith(('clean', '60 s')):
-                continue
-            seeds = range(1 if options.quick or place == 'plaza 1' else 2)
-            runs = [robust_fixes.run(change(make(seed), np.random.default_rng(seed)))
-                    for seed in seeds]
-            error = float(np.sqrt(np.mean([run.rms**2 for run in runs])))
-            clean = error if fault == robust_fixes.CLEAN else clean
-            worst = max(run.worst for run in runs)
-            won, said = max(run.won for run in runs), min(run.said for run in runs)
-            table.add(
-                place, fault, f'{error:.2f}',
-                f'{np.sqrt(np.mean([run.newest**2 for run in runs])):.2f}',
-                _cell(worst), _cell(won), _cell(said, 2),
-                f'{sum(run.wrong_believed for run in runs)} of '
-                + str(sum(run.n_wrong for run in runs)),
-                str(sum(run.right_doubted for run in runs)))
-            say('  ' + ' | '.join(table.rows[-1]))
-            name, limit = f'{place}, {fault}', 0.45 if '30 s all' in fault else 1.15 * clean
-            section.metrics += [
-                Metric(f'{name}: {what}', value, unit, target=target)
-                for what, value, unit, target in (
-                    ('rms', error, ' m', np.nan if np.isnan(clean) else limit),
-                    ('wins', won, ' s', 20.0)) if np.isfinite(value) and np.isfinite(target)]
-            if np.isfinite(said):
-                section.metrics.append(Metric(f'{name}: doubt said', said, target=0.5,
-                                              higher_is_better=True))
-    section.tables.append(table)
-    return section
-
-
-def _cell(value: float, digits: int = 1) -> str:
-    return f'{value:.{digits}f}' if np.isfinite(value) else ''
-
-
 def peers(options: Options) -> Section:
     """Compare with GTSAM on the same graphs."""
     section = Section(
@@ -384,7 +332,9 @@ def _for_peers(options: Options) -> list[Recording]:
 SECTIONS: dict[str, Callable[[Options], Section]] = {
     'places': places, 'worlds': worlds, 'arrivals': arrivals, 'gates': gates, 'grids': grids,
     'timing': lambda options: robust_timing.timing(quick=options.quick),
-    'fixes': fixes, 'peers': peers}
+    'fixes': lambda options: robust_fixes.section(
+        options.data, quick=options.quick, robust=options.fix_robust, cases=options.cases),
+    'peers': peers}
 
 
 def main(arguments: list[str]) -> int:
@@ -399,11 +349,17 @@ def main(arguments: list[str]) -> int:
                         metavar=('GRAPH', 'TRUTH', 'STAMPS'),
                         help='a further recording of place recognition: two g2o files, and the '
                         'stamps of the nodes')
+    parser.add_argument('--fix-robust', type=Robust, choices=tuple(Robust), metavar='ROBUST',
+                        help='`robust` of fixes and poses: judged, loss or none, if not the '
+                        'default')
+    parser.add_argument('--case', action='append', default=[], metavar='TEXT',
+                        help='of the section fixes, only drives whose names hold one of these')
     parser.add_argument('--without-gtsam', action='store_true')
     parser.add_argument('--out', type=Path, default=Path('build/benchmark/robust'), metavar='DIR')
     chosen = parser.parse_args(arguments)
     options = Options(chosen.quick, chosen.data, tuple(map(tuple, chosen.recording)),
-                      not chosen.without_gtsam, chosen.out)
+                      not chosen.without_gtsam, chosen.out, chosen.fix_robust,
+                      tuple(chosen.case))
     chosen.out.mkdir(parents=True, exist_ok=True)
     sections = []
     for name in chosen.only or SECTIONS:
