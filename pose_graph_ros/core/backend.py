@@ -422,6 +422,7 @@ class PoseGraphBackend:
         """
         backend = cls(config)
         restore(backend._parts(), saved)
+        backend._tuner.tell_scale()
         backend._newest_node_covariance = np.array(saved.newest_covariance)
         backend._chi2 = saved.chi2
         backend._settled = False    # the next update eliminates all nodes

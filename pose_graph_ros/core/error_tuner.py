@@ -107,8 +107,11 @@ class ErrorTuner:
                 search, self._search = self._search, None
                 constraints = self._factors.constraints(search.source)
                 constraints.next_estimate = math.ceil(MORE * search.n)
-                if _differ(self._factors.errors_in_use(search.source), end.value):
-                    self._begin(search.source, end.value)
+                found: error_estimate.Estimate = end.value
+                constraints.odometry_scale = found.odometry_scale
+                self.tell_scale()
+                if _differ(self._factors.errors_in_use(search.source), found.errors):
+                    self._begin(search.source, found.errors)
         return 0.0
 
     @property
@@ -137,9 +140,17 @@ class ErrorTuner:
                 error_estimate.search(self._track(constraints, weights)))
             constraints.next_estimate = max(
                 constraints.next_estimate, math.ceil(MORE * len(constraints)))
-            if found != self._factors.errors_in_use(source):
-                self._begin(source, found)
+            constraints.odometry_scale = found.odometry_scale
+            self.tell_scale()
+            if found.errors != self._factors.errors_in_use(source):
+                self._begin(source, found.errors)
                 self.finish_change()
+
+    def tell_scale(self) -> None:
+        """Have fixes judged by an odometry that is as uncertain as the sources show."""
+        self._judge.odometry_scale = max((
+            self._factors.constraints(source).odometry_scale
+            for source in self._factors.finding()), default=1.0)
 
     def _next_search(self) -> _Search | None:
         for source in self._factors.due_for_estimate():

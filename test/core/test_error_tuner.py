@@ -28,7 +28,7 @@ SOURCE = replace(POSITIONS, robust=MeasurementSource().robust)
 Event = OdometrySample | Measurement
 
 
-def drive(seed: int, tau: float, *, n: int = 200) -> list[Event]:
+def drive(seed: int, tau: float, *, n: int = 200, drift: float = 1.0) -> list[Event]:
     """Return odometry and fixes of 1 m at 1 Hz on a winding road of n seconds."""
     rng = np.random.default_rng(seed)
     noise = BackendConfig().odometry_source('odom').noise
@@ -37,7 +37,7 @@ def drive(seed: int, tau: float, *, n: int = 200) -> list[Event]:
     kept = np.exp(-1.0 / tau)
     for second in range(1, n + 1):
         step = np.array((1.0, 0.0, 0.15 * np.sin(0.2 * second)))
-        slip = rng.standard_normal(3) * (
+        slip = drift * rng.standard_normal(3) * (
             noise.sigma_distance, noise.sigma_lateral, noise.sigma_heading_distance)
         true, seen = se2.compose(true, step), se2.compose(seen, se2.compose(step, slip))
         events.append(OdometrySample(second * SECOND, seen))
@@ -201,3 +201,14 @@ def test_a_change_that_fails_is_undone_as_a_whole(
     assert_each_held_once(backend)
     assert backend.optimize().status is Status.CONVERGED
     np.testing.assert_allclose(path(backend), white, atol=1e-9)
+
+
+def test_an_odometry_that_drifts_more_than_it_claims_is_noticed_and_saved() -> None:
+    backend = fed(drive(6, 1e-3, drift=4.0))
+    assert backend._judge.odometry_scale > 2.0
+    backend.optimize()
+    scale = backend._judge.odometry_scale
+    assert 2.5 < scale < 6.0
+    restored = PoseGraphBackend.restored(backend._config, backend.saved())
+    assert restored._judge.odometry_scale == scale
+    assert fed(drive(6, 1e-3))._judge.odometry_scale == 1.0

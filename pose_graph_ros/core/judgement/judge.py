@@ -58,6 +58,8 @@ class Judge:
         self._smoother, self._reweighting, self._config = smoother, reweighting, config
         self._closures = ClosureJudge(smoother, reweighting, config)
         self._fixes = FixJudge(smoother, reweighting, config)
+        self.odometry_scale = 1.0
+        """Factor on the sigmas of odometry that the measurements show, at least 1."""
 
     def configure(self, config: BackendConfig) -> None:
         """Set the settings for later constraints."""

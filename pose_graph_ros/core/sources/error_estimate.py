@@ -42,6 +42,8 @@ PER_STEP = 5000
 SIGNIFICANT = 15.0
 # The same for each time that the filter was lost: then odometry was wrong, or many positions.
 PER_LOST = 100.0
+# The same of a scale of the noise of odometry other than 1.
+SIGNIFICANT_ODOMETRY = 10.0
 # Smallest correlation of consecutive measurements that matters.
 LEAST_CORRELATION = 0.2
 # Sigma of the logarithm of the total variance in units of the claimed one, before it is seen.
@@ -53,14 +55,28 @@ FINEST, LEAST, MOST = 0.25, -8.0, 8.0
 # Exponents with which the searches begin: correlated part, odometry, white part.
 BEGINNINGS = ((0.0, 0.0, -5.0), (0.0, 0.0, -3.0), (-0.5, 0.0, -2.0), (-1.0, 0.0, -1.0))
 WHITE_BEGINNINGS = tuple((0.0, at) for at in (-6.0, -4.0, -2.0, 0.0, 2.0, 4.0, 6.0))
+# Place of the noise of odometry in a point, from the end.
+ODOMETRY = -2
 # Headings at which the filter starts, of which the best one is used.
 HEADINGS = 16
 # Motion without an odometry edge: its covariance [m^2, m^2, rad^2].
 NO_ODOMETRY = np.diag((1e4, 1e4, 2.0 * UNKNOWN))
 
 Point = tuple[float, ...]
-Search = Generator[None, None, CorrelatedErrors | None]
-"""Yields after each step; returns the statistics, or None for white errors."""
+
+
+class Estimate(NamedTuple):
+    """What the positions of a source and odometry show together."""
+
+    errors: CorrelatedErrors | None
+    """Statistics of the errors of the source; None for white errors."""
+    odometry_scale: float
+    """Factor on the sigmas of odometry, at least 1."""
+
+
+NOTHING = Estimate(None, 1.0)
+Search = Generator[None, None, Estimate]
+"""Yields after each step."""
 
 
 class _Minimum(NamedTuple):
@@ -130,7 +146,7 @@ def _odometry(graph: Graph, nodes: IntArray) -> tuple[IntArray, FloatArray, Floa
 def search(positions: Track) -> Search:
     """Search for the statistics of the errors of a track."""
     if len(positions.seconds) < LEAST_POSITIONS:
-        return None
+        return NOTHING
     evaluate = _Evaluation(positions)
     yield from evaluate.find_heading()
     white = yield from _descend(evaluate, list(WHITE_BEGINNINGS))
@@ -149,7 +165,24 @@ def search(positions: Track) -> Search:
     needed = SIGNIFICANT + PER_LOST * max(
         evaluate.lost[white.point], evaluate.lost[found.point])
     significant = white.value - found.value > needed and correlation > LEAST_CORRELATION
-    return errors if significant else None
+    scale = yield from _odometry_scale(evaluate, white, found, correlated=significant)
+    return Estimate(errors if significant else None, scale)
+
+
+def _odometry_scale(
+    evaluate: '_Evaluation', white: '_Minimum', found: '_Minimum', *, correlated: bool,
+) -> Generator[None, None, float]:
+    """Return the factor on the sigmas of odometry; 1 unless its claim is much less likely."""
+    best = found if correlated else white
+    exponent = best.point[ODOMETRY]
+    if exponent <= 0.0:
+        return 1.0
+    for point in (white.point, found.point):
+        claimed = yield from _descend(
+            evaluate, [(*point[:ODOMETRY], 0.0, point[ODOMETRY + 1])], fixed=ODOMETRY)
+        if claimed.value - best.value < SIGNIFICANT_ODOMETRY:
+            return 1.0
+    return float(2.0 ** (0.5 * exponent))
 
 
 class _Evaluation:
@@ -207,16 +240,27 @@ class _Evaluation:
 
 
 def _descend(
-    evaluate: _Evaluation, beginnings: list[Point],
+    evaluate: _Evaluation, beginnings: list[Point], fixed: int = 0,
 ) -> Generator[None, None, _Minimum]:
-    """Return the best point near the best beginning, by steps that are halved."""
+    """
+    Return the best point near the best beginning, by steps that are halved.
+
+    Parameters
+    ----------
+    evaluate : _Evaluation
+    beginnings : list of points
+    fixed : int, index from the end of a number that stays as it is, if it is negative
+
+    """
     values: list[_Minimum] = []
     for point in beginnings:
         values.append(_Minimum((yield from evaluate.value(point)), point))
     best, step = min(values), 1.0
     while step >= FINEST:
         before = best
-        for axis in range(len(best.point)):
+        for axis in range(-len(best.point), 0):
+            if axis == fixed:
+                continue
             for move in (step, -step):
                 moved = list(best.point)
                 moved[axis] += move
@@ -227,11 +271,11 @@ def _descend(
     return best
 
 
-def finished(steps: Search) -> CorrelatedErrors | None:
+def finished(steps: Search) -> Estimate:
     """Return the result of a search that is done without a pause."""
     while True:
         try:
             next(steps)
         except StopIteration as end:
-            found: CorrelatedErrors | None = end.value
+            found: Estimate = end.value
             return found

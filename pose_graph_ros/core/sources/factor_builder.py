@@ -383,7 +383,8 @@ class FactorBuilder:
                 saved = replace(
                     saved, errors=self.errors_in_use(source),
                     noise=constraints.noise.values.copy(), edges=constraints.edges.values.copy(),
-                    next_estimate=constraints.next_estimate)
+                    next_estimate=constraints.next_estimate,
+                    odometry_scale=constraints.odometry_scale)
             result[source] = saved
         return result
 

@@ -44,6 +44,8 @@ class SavedSource:
     """With estimated statistics, rows of the edges that hold the measurements, or empty."""
     next_estimate: int = FIRST_ESTIMATE
     """Number of measurements at which its errors are estimated next."""
+    odometry_scale: float = 1.0
+    """Factor on the sigmas of odometry that its measurements show."""
 
 
 class Held(NamedTuple):
@@ -74,6 +76,8 @@ class SourceConstraints:
         """Constraints of a loaded graph that were added under other settings."""
         self.next_estimate = FIRST_ESTIMATE
         """Number of measurements at which the errors are estimated next."""
+        self.odometry_scale = 1.0
+        """Factor on the sigmas of odometry that the measurements show."""
 
     def __len__(self) -> int:
         return len(self.rows)
@@ -127,3 +131,4 @@ class SourceConstraints:
         self.noise.append(saved.noise if len(saved.noise) == n else np.zeros((n, 2)))
         self.edges.append(saved.edges if len(saved.edges) == n else np.full(n, -1))
         self.next_estimate = saved.next_estimate
+        self.odometry_scale = saved.odometry_scale

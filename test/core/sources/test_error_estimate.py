@@ -78,7 +78,8 @@ def test_the_likelihood_is_that_of_the_full_covariance() -> None:
 @pytest.mark.parametrize(('tau', 'period', 'n'), [
     (5.0, 0.5, 200), (10.0, 5.0, 120), (60.0, 1.0, 400), (60.0, 5.0, 120), (300.0, 1.0, 900)])
 def test_the_time_constant_is_found_within_a_factor(tau: float, period: float, n: int) -> None:
-    found = [finished(search(a_drive(seed, n=n, period=period, tau=tau))) for seed in range(3)]
+    found = [finished(search(a_drive(seed, n=n, period=period, tau=tau))).errors
+             for seed in range(3)]
     known = [each for each in found if each is not None]
     assert len(known) == 3
     assert tau / 2.5 < np.median([each.tau for each in known]) < 2.5 * tau
@@ -92,18 +93,19 @@ def test_the_time_constant_is_found_within_a_factor(tau: float, period: float, n
 def test_white_errors_are_not_taken_for_correlated_ones(settings: dict[str, float]) -> None:
     """Nor the drift of odometry that is better or worse than it says, nor wrong positions."""
     for seed in range(12):
-        assert finished(search(a_drive(seed, **settings))) is None
+        assert finished(search(a_drive(seed, **settings))).errors is None
 
 
 def test_correlated_errors_are_found_among_wrong_positions() -> None:
     for seed in range(3):
-        found = finished(search(a_drive(seed, n=400, tau=20.0, wrong=0.2)))
+        found = finished(search(a_drive(seed, n=400, tau=20.0, wrong=0.2))).errors
         assert found is not None
         assert 8.0 < found.tau < 50.0
 
 
 def test_too_few_positions_show_nothing() -> None:
-    assert finished(search(a_drive(0, n=error_estimate.LEAST_POSITIONS - 1, tau=30.0))) is None
+    drive = a_drive(0, n=error_estimate.LEAST_POSITIONS - 1, tau=30.0)
+    assert finished(search(drive)) == error_estimate.NOTHING
 
 
 def test_a_step_of_a_search_is_bounded(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -123,6 +125,19 @@ def test_a_step_of_a_search_is_bounded(monkeypatch: pytest.MonkeyPatch) -> None:
             found = end.value
         assert sum(done[before:]) <= error_estimate.PER_STEP + 300
     assert found == finished(search(a_drive(1, n=300, tau=20.0)))
+
+
+@pytest.mark.parametrize(('drift', 'tau', 'n'), [
+    (1.0, 0.0, 200), (1.0, 60.0, 400), (0.3, 0.0, 400), (2.0, 0.0, 600), (3.0, 0.0, 400),
+    (3.0, 60.0, 600)])
+def test_the_noise_of_odometry_is_found_where_it_is_more_than_claimed(
+    drift: float, tau: float, n: int,
+) -> None:
+    """Odometry that is as it says, or better, keeps its noise."""
+    scales = [finished(search(a_drive(seed, n=n, tau=tau, drift=drift))).odometry_scale
+              for seed in range(5)]
+    assert max(drift, 1.0) / 1.35 < np.median(scales) < 1.35 * max(drift, 1.0)
+    assert drift > 1.0 or sum(scale > 1.0 for scale in scales) <= 1
 
 
 def line(n: int) -> Graph:
