@@ -27,8 +27,9 @@ from pose_graph_ros.core.config import (
 from pose_graph_ros.core.geometry import covariance, se2
 from pose_graph_ros.core.geometry.se2 import BoolArray, FloatArray, IntArray
 from pose_graph_ros.core.geometry.trajectory import Trajectory
-from pose_graph_ros.core.graph.constraints import EdgeKind
+from pose_graph_ros.core.graph.constraints import EdgeKind, Edges
 from pose_graph_ros.core.io.g2o import read_g2o
+from pose_graph_ros.core.judgement import selection
 from pose_graph_ros.core.measurements import LoopClosure, OdometrySample
 
 SECOND = 1_000_000_000
@@ -242,15 +243,23 @@ def while_driving(run: Run, recording: Recording) -> tuple[float, float]:
             float(np.max(path / np.maximum(odometry.rms[at], SMALLEST_RMS))))
 
 
-def hidden_graph(
-    run: Run,
-) -> tuple[IntArray, FloatArray, FloatArray, IntArray, IntArray, FloatArray, FloatArray]:
-    """Return what the peers get: stamps, and the odometry and the closures between the nodes."""
+def hidden_graph(run: Run) -> tuple[IntArray, Edges, Edges, BoolArray]:
+    """
+    Return what the peers get of a run.
+
+    Returns
+    -------
+    stamps_ns : ndarray of int, shape (N,), of the hidden nodes
+    chain : Edges, odometry
+    loops : Edges, closures between nodes that are no neighbours
+    believed : ndarray of bool, shape (M,), which of them take part at the end
+
+    """
     edges = run.backend.graph.edges
     chain = edges.rows(edges.kind == EdgeKind.ODOMETRY)
-    loops = edges.rows(edges.kind == EdgeKind.LOOP_CLOSURE)
-    return (run.backend.node_stamps_ns, chain.mean, chain.information,
-            loops.i, loops.j, loops.mean, loops.information)
+    loops = edges.rows((edges.kind == EdgeKind.LOOP_CLOSURE) & (np.abs(edges.j - edges.i) > 1))
+    loops = selection.forward(loops)
+    return run.backend.node_stamps_ns, chain, loops, loops.weight > 0.0
 
 
 def read_recording(graph: Path, truth: Path, stamps: Path | None = None) -> Recording:

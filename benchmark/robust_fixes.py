@@ -8,11 +8,12 @@ from pathlib import Path
 
 import numpy as np
 
-from benchmark import robust_faults
+from benchmark import robust_drives
 from benchmark.drives import SECOND
 from benchmark.metrics import Metric
 from benchmark.robust_closures import drain
-from benchmark.robust_faults import ASKED, CLEAN, Drive, Fault, FURTHER
+from benchmark.robust_drives import Drive
+from benchmark.robust_faults import ASKED, CLEAN, Fault, FURTHER
 from benchmark.section import say, Section, Table
 from pose_graph_ros.core.alignment.monitor import AlignmentState
 from pose_graph_ros.core.backend import PoseGraphBackend
@@ -140,13 +141,13 @@ def section(data: Path, *, quick: bool, robust: Robust | None, cases: Sequence[s
                        'newest, worst [m]', 'wins [s]', 'doubt said', 'right doubted',
                        'wrong believed'))
     makers: list[tuple[str, Callable[[int], Drive], dict[str, Fault]]] = [
-        ('simulated', robust_faults.simulated, ASKED)]
-    further = [('simulated, 10 min', lambda seed: robust_faults.simulated(seed, 2.0 * AROUND),
+        ('simulated', robust_drives.simulated, ASKED)]
+    further = [('simulated, 10 min', lambda seed: robust_drives.simulated(seed, 2.0 * AROUND),
                 FURTHER)]
     folder = data / MOWER
     if folder.is_dir():
-        makers.insert(0, ('plaza 1', lambda seed: robust_faults.plaza(folder, seed), ASKED))
-        further.insert(0, ('plaza 1, 10 min', lambda seed: robust_faults.plaza(
+        makers.insert(0, ('plaza 1', lambda seed: robust_drives.plaza(folder, seed), ASKED))
+        further.insert(0, ('plaza 1, 10 min', lambda seed: robust_drives.plaza(
             folder, seed, AROUND), {CLEAN: ASKED[CLEAN], **FURTHER}))
     else:
         found.notes.append('plaza 1: the data is not there, skipped.')

@@ -1,136 +1,154 @@
 # Copyright 2026 The pose_graph_ros authors
 # SPDX-License-Identifier: Apache-2.0
 """
-GTSAM on the graphs of our runs: graduated non-convexity, and robust losses, on the whole graph.
+GTSAM on a graph with wrong loop closures, as a command of its own.
 
-It gets the same nodes, edges and information matrices, starts from odometry, and knows that
-odometry is right; only its optimiser is timed. Closures count as kept if their weight is at least
-a half.
+    .venv/bin/python -m benchmark.robust_peer GNC-TLS graph.g2o result.npz
+
+Each starts from odometry, and knows that edges between consecutive nodes are right. The result has
+the poses, the time of the optimiser alone [s], and which closures, in the order of the file, have
+a weight of at least a half; none where the method does not tell. Nothing of this project is
+loaded.
 """
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+import sys
 import time
+from typing import Any
 
 import gtsam
 import numpy as np
+import numpy.typing as npt
 
-from benchmark.gtsam_peer import Models, poses_of, values_of
-from benchmark.runs import quiet
-from benchmark.worlds import integrate
-from pose_graph_ros.core.geometry.se2 import FloatArray, IntArray
+Array = npt.NDArray[Any]
+Result = tuple[Array, float, Array]
 
 PRIOR_SIGMA = 1e-5
 MAX_ITERATIONS = 100
-FLOORS = np.diag((0.3**2, 0.3**2, 0.05**2))
-"""Least covariance of closures in the variant that does not take them at their word."""
+PROBABILITY = 0.99
+"""With which a right closure is within the threshold of graduated non-convexity."""
+CAUCHY, DCS = 1.0, 1.0
+"""Thresholds of losses [sigma]."""
+UNKNOWN = np.empty(0, dtype=bool)
 
 
-@dataclass(frozen=True, slots=True)
-class Problem:
-    """A graph of N nodes in a chain, with M loop closures."""
-
-    steps: FloatArray
-    """Shape (N - 1, 3)."""
-    step_information: FloatArray
-    i: IntArray
-    j: IntArray
-    means: FloatArray
-    """Shape (M, 3)."""
-    information: FloatArray
-    """Shape (M, 3, 3)."""
-
-    def start(self) -> FloatArray:
-        """Return the poses by odometry alone, shape (N, 3)."""
-        return integrate(np.zeros(3), self.steps)
-
-    def with_floors(self) -> 'Problem':
-        """Return the problem with covariances of closures of at least `FLOORS`."""
-        cov = np.linalg.inv(self.information)
-        short = np.maximum(np.diagonal(FLOORS) - np.diagonal(cov, axis1=1, axis2=2), 0.0)
-        raised = cov + short[:, :, None] * np.eye(3)
-        return Problem(self.steps, self.step_information, self.i, self.j, self.means,
-                       np.linalg.inv(raised))
+def read(path: Path) -> tuple[Array, Array, Array, Array]:
+    """Return poses, ends, means and information matrices of a g2o file with `EDGE_SE2`."""
+    rows = [line.split() for line in path.read_text(encoding='ascii').splitlines()]
+    poses = np.array([row[2:5] for row in rows if row[0] == 'VERTEX_SE2'], dtype=float)
+    edges = np.array([row[1:] for row in rows if row[0] == 'EDGE_SE2'], dtype=float)
+    upper = np.array(((0, 1, 2), (1, 3, 4), (2, 4, 5)))
+    return poses, edges[:, :2].astype(int), edges[:, 2:5], edges[:, 5:][:, upper]
 
 
-@dataclass(frozen=True, slots=True)
-class Solved:
-    """What a peer makes of a problem."""
-
-    name: str
-    poses: FloatArray
-    seconds: float
-    kept: int
-    """Number of closures; -1 if the method does not tell."""
-
-
-def solve(problem: Problem, *, losses: bool) -> list[Solved]:
+def from_odometry(ends: Array, means: Array, n: int) -> Array:
     """
-    Solve a problem by GNC, and by robust losses.
+    Return the poses by odometry alone, shape (n, 3).
 
     Parameters
     ----------
-    problem : Problem
-    losses : bool, whether to run the losses, too
+    ends : ndarray of int, shape (M, 2)
+    means : ndarray, shape (M, 3)
+    n : int
 
     """
-    results = [_gnc('GTSAM GNC-TLS', problem),
-               _gnc('GTSAM GNC-TLS, floors', problem.with_floors())]
-    models = gtsam.noiseModel.mEstimator
-    for name, make in (('Huber', lambda: models.Huber.Create(1.345)),
-                       ('Cauchy', lambda: models.Cauchy.Create(1.0)),
-                       ('DCS', lambda: models.DCS.Create(1.0))) if losses else ():
-        results.append(_loss(f'GTSAM LM, {name}', problem, make))
-    return results
+    steps = {int(i): mean for (i, j), mean in zip(ends, means, strict=True) if j == i + 1}
+    poses = np.zeros((n, 3))
+    for k in range(n - 1):
+        x, y, theta = poses[k]
+        dx, dy, turn = steps[k]
+        c, s = np.cos(theta), np.sin(theta)
+        poses[k + 1] = x + c * dx - s * dy, y + s * dx + c * dy, theta + turn
+    return poses
 
 
-def _graph(
-    problem: Problem, loss: Callable[[], object] | None = None,
-) -> gtsam.NonlinearFactorGraph:
-    graph, models = gtsam.NonlinearFactorGraph(), Models()
-    graph.push_back(gtsam.PriorFactorPose2(
-        0, gtsam.Pose2(), gtsam.noiseModel.Isotropic.Sigma(3, PRIOR_SIGMA)))
-    for k, (mean, information) in enumerate(
-            zip(problem.steps, problem.step_information, strict=True)):
-        graph.push_back(gtsam.BetweenFactorPose2(
-            k, k + 1, gtsam.Pose2(*mean.tolist()), models.of(information)))
-    for i, j, mean, information in zip(
-            problem.i.tolist(), problem.j.tolist(), problem.means, problem.information,
-            strict=True):
-        model = models.of(information)
-        if loss is not None:
-            model = gtsam.noiseModel.Robust.Create(loss(), model)
-        graph.push_back(gtsam.BetweenFactorPose2(i, j, gtsam.Pose2(*mean.tolist()), model))
-    return graph
+def gtsam_gnc(path: Path, loss: str) -> Result:
+    """
+    Run GncLMOptimizer.
 
+    Parameters
+    ----------
+    path : Path
+    loss : str, `TLS` or `GM`
 
-def _gnc(name: str, problem: Problem) -> Solved:
-    graph, start = _graph(problem), values_of(problem.start())
+    """
+    graph, start, closures = _gtsam_graph(path, None)
     params = gtsam.GncLMParams()
-    params.setLossType(gtsam.GncLossType.TLS)
-    params.setKnownInliers(list(range(len(problem.steps) + 1)))
+    params.setLossType(getattr(gtsam.GncLossType, loss))
+    params.setKnownInliers(np.flatnonzero(~closures).tolist())
     optimizer = gtsam.GncLMOptimizer(graph, start, params)
-    optimizer.setInlierCostThresholdsAtProbability(0.99)
-    with quiet():
-        begin = time.perf_counter()
-        try:
-            values = optimizer.optimize()
-        except RuntimeError:    # its Cholesky has given up
-            values = start
-        seconds = time.perf_counter() - begin
-    weights = np.asarray(optimizer.getWeights())[len(problem.steps) + 1:]
-    return Solved(name, poses_of(values), seconds, int(np.sum(weights >= 0.5)))
+    optimizer.setInlierCostThresholdsAtProbability(PROBABILITY)
+    begin = time.perf_counter()
+    try:
+        values = optimizer.optimize()
+    except RuntimeError:    # its Cholesky has given up
+        values = start
+    seconds = time.perf_counter() - begin
+    weights = np.asarray(optimizer.getWeights())[closures]
+    return _gtsam_poses(values), seconds, weights >= 0.5
 
 
-def _loss(name: str, problem: Problem, make: Callable[[], object]) -> Solved:
-    graph, start = _graph(problem, make), values_of(problem.start())
+def gtsam_loss(path: Path, loss: str, threshold: float) -> Result:
+    """
+    Run LevenbergMarquardtOptimizer with a robust loss on each closure.
+
+    Parameters
+    ----------
+    path : Path
+    loss : str, of `gtsam.noiseModel.mEstimator`
+    threshold : float [sigma]
+
+    """
+    estimator = getattr(gtsam.noiseModel.mEstimator, loss).Create(threshold)
+    graph, start, _ = _gtsam_graph(path, estimator)
     params = gtsam.LevenbergMarquardtParams()
     params.setMaxIterations(MAX_ITERATIONS)
-    with quiet():
-        begin = time.perf_counter()
-        try:
-            values = gtsam.LevenbergMarquardtOptimizer(graph, start, params).optimize()
-        except RuntimeError:
-            values = start
-        seconds = time.perf_counter() - begin
-    return Solved(name, poses_of(values), seconds, -1)
+    begin = time.perf_counter()
+    try:
+        values = gtsam.LevenbergMarquardtOptimizer(graph, start, params).optimize()
+    except RuntimeError:
+        values = start
+    return _gtsam_poses(values), time.perf_counter() - begin, UNKNOWN
+
+
+def _gtsam_graph(path: Path, estimator: Any) -> tuple[Any, Any, Array]:
+    """Return a graph, its start, and which of its factors are closures; the last is a prior."""
+    poses, ends, means, information = read(path)
+    closures = np.append(np.abs(np.diff(ends, axis=1)[:, 0]) != 1, False)
+    graph, values = gtsam.NonlinearFactorGraph(), gtsam.Values()
+    for k, (i, j) in enumerate(ends.tolist()):
+        model = gtsam.noiseModel.Gaussian.Information(information[k])
+        if closures[k] and estimator is not None:
+            model = gtsam.noiseModel.Robust.Create(estimator, model)
+        graph.push_back(gtsam.BetweenFactorPose2(i, j, gtsam.Pose2(*means[k].tolist()), model))
+    graph.push_back(gtsam.PriorFactorPose2(
+        0, gtsam.Pose2(), gtsam.noiseModel.Isotropic.Sigma(3, PRIOR_SIGMA)))
+    for k, pose in enumerate(from_odometry(ends, means, len(poses))):
+        values.insert(k, gtsam.Pose2(*pose.tolist()))
+    return graph, values, closures
+
+
+def _gtsam_poses(values: Any) -> Array:
+    return np.asarray(gtsam.utilities.extractPose2(values))
+
+
+METHODS: dict[str, Callable[[Path], Result]] = {
+    'GNC-TLS': partial(gtsam_gnc, loss='TLS'),
+    'GNC-GM': partial(gtsam_gnc, loss='GM'),
+    'LM, Cauchy': partial(gtsam_loss, loss='Cauchy', threshold=CAUCHY),
+    'LM, DCS': partial(gtsam_loss, loss='DCS', threshold=DCS),
+}
+
+
+def main(arguments: list[str]) -> int:
+    """Run a method on a file."""
+    method, graph, result = arguments
+    poses, seconds, kept = METHODS[method](Path(graph))
+    np.savez(result, poses=poses, seconds=seconds, kept=kept)
+    return 0
+
+
+if __name__ == '__main__':
+    sys.exit(main(sys.argv[1:]))
