@@ -12,20 +12,19 @@ that is believed and does not fit any more is thrown out: back to weight 0, from
 again. If p is large, only the record q of the source speaks for it: it is believed weakly.
 """
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 
 import numpy as np
 
-from pose_graph_ros.core.batch.optimizer import Status
 from pose_graph_ros.core.compiled.growing_array import GrowingArray
 from pose_graph_ros.core.config import BackendConfig
-from pose_graph_ros.core.geometry import se2
 from pose_graph_ros.core.geometry.se2 import BoolArray, FloatArray, IntArray
 from pose_graph_ros.core.graph import tables as tb
 from pose_graph_ros.core.graph.constraints import EdgeKind, Edges
 from pose_graph_ros.core.graph.graph import GraphUpdate
 from pose_graph_ros.core.graph.reweighting import Reweighting
 from pose_graph_ros.core.judgement import final, relative
+from pose_graph_ros.core.judgement.beliefs import Beliefs
 from pose_graph_ros.core.judgement.closure_reports import ClosureReports
 from pose_graph_ros.core.judgement.closure_states import (
     AUTO,
@@ -49,6 +48,7 @@ from pose_graph_ros.core.judgement.verdicts import (
 )
 from pose_graph_ros.core.measurements import Answer, AnswerStatus, LoopClosure, rejected
 from pose_graph_ros.core.smoother.incremental import IncrementalSmoother
+from pose_graph_ros.core.smoother.trial import continued
 from pose_graph_ros.core.sources.factor_builder import NewConstraint
 
 # A clique supports a closure if it has so many members, over so long a way [m].
@@ -60,10 +60,11 @@ WEAK = 0.02
 # The same, below which several are believed at once, as none changes the gates of others much.
 NARROW = 1e-3
 # Numbers of new closures that are tested before an update, and of those that are tested later: in
-# an update, and in a part of the work.
-MOST_NEW, IN_UPDATE, IN_PART = 32, 16, 64
-# Number of nodes above which nothing is tested again in an update: what is believed then would be
-# solved for a second time.
+# an update, and in a part of the work. Without closures the tree is as deep as the path is long,
+# and so is what a test has to solve for; the last is the limit of nodes times tests in a part.
+MOST_NEW, IN_UPDATE, IN_PART, NODES_IN_PART = 32, 16, 64, 160_000
+# Number of nodes above which an update adds closures with weight 0 and leaves all tests to the
+# work after it, so that it has nothing to solve for but what is new.
 LARGE = 5000
 
 
@@ -87,21 +88,18 @@ class ClosureJudge:
         self._table = ClosureTable(self._chain)
         self.states = self._states = ClosureStates()
         self.reports = ClosureReports(self._states, self._table)
-        self._scales: list[float] = []
-        """Of each source, the factor on its sigmas in the graph."""
         self._spread = GrowingArray((3, 3), np.float64)
         """Covariance of the prediction when a closure was tested last; 0 if unknown."""
         self._tested = GrowingArray((), np.int64)
         """The round in which it was tested last."""
-        self._round = 0
-        """Increases when more or less is believed, so that those that wait are tested again."""
         self._final = (0, 0, 0, -1)
         """Sizes of the graph and round at the last final decision."""
         self._n_staged = 0
-        self._now_ns = 0
         self._corroborated = GrowingArray((), np.bool_)
         """Whether a clique of closures outside of the graph supports one that is doubted."""
         self._search = SetSearch(self._states, self._table)
+        self._beliefs = Beliefs(smoother, reweighting, self._states, self._table)
+        self._tries = False
         self._learnt_from: list[int] = []
         """Number of believed closures of each source when its scale was learnt."""
 
@@ -123,24 +121,41 @@ class ClosureJudge:
 
         """
         begin, n = len(self._states), len(new)
-        self._now_ns, self._n_staged = now_ns, n
+        self._beliefs.now_ns, self._n_staged = now_ns, n
         self._chain.extend(self._smoother.graph)
         self._table.append(claims(edges))
         self._states.append(new, now_ns)
         self._append_unknown(n)
         numbers = np.arange(begin, begin + n)
-        if not self._smoother.graph.has_touched:
+        if not self._smoother.graph.has_touched and not self._is_large:
             for number, state in self._choose(*self._test(numbers[:MOST_NEW])).items():
                 self._states.state[number] = STATES.index(state)
-        return self._weights(numbers)
+        return self._beliefs.weights(numbers)
+
+    def withhold(self) -> FloatArray | None:
+        """
+        Return the weights of the last `before` without belief; None if nothing was believed.
+
+        The closures are tested again later: with them the iterations of the update diverge.
+        """
+        numbers = np.arange(len(self._states) - self._n_staged, len(self._states))
+        if not np.any(self._states.in_graph[numbers]):
+            return None
+        self._states.state[numbers] = WAITING
+        self._tested.values[numbers] = -1
+        return self._beliefs.weights(numbers)
+
+    @property
+    def _is_large(self) -> bool:
+        return self._smoother.graph.n_nodes > LARGE
 
     def _append_unknown(self, n: int) -> None:
         """Append n closures that were not tested yet."""
         self._spread.append(np.zeros((n, 3, 3)))
         self._tested.append(np.full(n, -1))
         self._corroborated.append(np.zeros(n, dtype=bool))
-        for source in self._states.sources[len(self._scales):]:
-            self._scales.append(self._fixed_scale(source) or 1.0)
+        for source in self._states.sources[len(self._beliefs.scales):]:
+            self._beliefs.scales.append(self._fixed_scale(source) or 1.0)
             self._learnt_from.append(0)
 
     def rollback(self) -> None:
@@ -156,12 +171,12 @@ class ClosureJudge:
         """Keep the closures of the last `before`."""
         begin, self._n_staged = len(self._states) - self._n_staged, 0
         for number in range(begin, len(self._states)):
-            self._states.announce(number, -1, self._now_ns)
+            self._states.announce(number, -1, self._beliefs.now_ns)
         for source in np.unique(self._states.source[begin:]).tolist():
             self._states.forget(source, self._corroborated.values)
         if np.any(self._states.in_graph[begin:]):
-            self._round += 1
-            self._set_base_weights(np.arange(begin, len(self._states)))
+            self._beliefs.round += 1
+            self._beliefs.set_base_weights(np.arange(begin, len(self._states)))
 
     def _test(self, numbers: IntArray) -> tuple[IntArray, FloatArray]:
         """Test closures that are not in the graph; return those that pass, and their chances."""
@@ -173,7 +188,7 @@ class ClosureJudge:
         relative.distances(errors, total, distance)
         self._spread.values[numbers] = spread
         self._states.distance[numbers] = distance
-        self._tested.values[numbers] = self._round
+        self._tested.values[numbers] = self._beliefs.round
         passes = distance < GATE
         for number, state in zip(
                 numbers.tolist(), np.where(passes, WAITING, DOUBTED).tolist(), strict=True):
@@ -183,7 +198,7 @@ class ClosureJudge:
                 self._corroborated.values[number] = self._is_corroborated(
                     number, ~self._states.in_graph)
             if number < len(self._states) - self._n_staged:
-                self._states.announce(number, before, self._now_ns)
+                self._states.announce(number, before, self._beliefs.now_ns)
         return numbers[passes], chances(total[passes], self._smoother.poses)
 
     def _choose(self, passed: IntArray, chance: FloatArray) -> dict[int, State]:
@@ -212,39 +227,30 @@ class ClosureJudge:
         support = self._table.support(number, usable)
         return len(support.clique) >= CLIQUE and support.travel >= CLIQUE_TRAVEL
 
-    def _weights(self, numbers: IntArray) -> FloatArray:
-        scales = np.array(self._scales)[self._states.source[numbers]]
-        return np.where(self._states.in_graph[numbers], 1.0 / np.square(scales), 0.0)
-
-    def _set_base_weights(self, numbers: IntArray) -> None:
-        for number, weight in zip(numbers.tolist(), self._weights(numbers).tolist(), strict=True):
-            self._reweighting.set_base_weight(int(self._states.row[number]), weight, edge=True)
-
-    def _apply(self, changes: Mapping[int, State]) -> bool:
-        """Change states and weights; tell whether the smoother could, else nothing has changed."""
-        numbers = np.array(sorted(changes), dtype=np.int64)
-        before = self._states.state[numbers].copy()
-        self._states.state[numbers] = [STATES.index(changes[k]) for k in numbers.tolist()]
-        result = self._smoother.update(GraphUpdate(weigh_edges=dict(zip(
-            self._states.row[numbers].tolist(), self._weights(numbers).tolist(), strict=True))))
-        if result.status is Status.FAILED:
-            self._states.state[numbers] = before
-            return False
-        for number, old in zip(numbers.tolist(), before.tolist(), strict=True):
-            self._states.announce(number, old, self._now_ns)
-        self._set_base_weights(numbers)
-        self._round += 1
-        return True
-
     def after(self) -> None:
         """Judge again, within bounds, after an update of a graph that is not large."""
-        if self._smoother.graph.n_nodes <= LARGE:
+        if not self._is_large:
             self._part(IN_UPDATE)
 
     def work(self) -> bool:
         """Do a bounded part of what is left; tell whether there is more."""
-        return self._part(IN_PART) or (not self._smoother.graph.has_touched and (
-            self._learn_scales() or self._look_for_another_set()))
+        graph = self._smoother.graph
+        if graph.has_touched:
+            return False
+        self._tries = not self._tries   # a trial and the tests take turns
+        most = max(min(IN_PART, NODES_IN_PART // max(graph.n_nodes, 1)), 1)
+        return ((self._tries and self._try()) or self._part(most) or self._try()
+                or self._learn_scales() or self._look_for_another_set())
+
+    def _try(self) -> bool:
+        """Do a part of a trial; tell whether there is any."""
+        before, again = self._beliefs.round, self._beliefs.try_part()
+        if again is None:
+            return False
+        self._tested.values[again] = -1
+        if self._beliefs.round > before:
+            self._spread.values[:] = 0.0
+        return True
 
     def _part(self, most: int) -> bool:
         if len(self._states) == 0 or self._smoother.graph.has_touched:
@@ -255,8 +261,9 @@ class ClosureJudge:
         """Take out of the graph what does not fit any more; tell whether there was any."""
         inside = np.flatnonzero(self._states.in_graph & self._states.judged)
         inside = inside[self._may_not_fit(inside)]
-        bad = inside[self._residuals(inside) > GATE]
-        if len(bad) == 0 or not self._apply(dict.fromkeys(bad.tolist(), State.DOUBTED)):
+        fit = relative.residuals(self._smoother.graph, self._table.rows(inside))
+        bad = inside[fit > GATE]
+        if len(bad) == 0 or not self._beliefs.apply(dict.fromkeys(bad.tolist(), State.DOUBTED)):
             return False
         # without them the graph is less certain
         self._spread.values[:] = 0.0
@@ -268,19 +275,10 @@ class ClosureJudge:
         rows, edges = self._states.row[numbers], self._smoother.graph.memory['edge_f']
         return np.asarray(edges[rows, tb.ENERGY] > 0.5 * GATE * edges[rows, tb.WEIGHT])
 
-    def _residuals(self, numbers: IntArray) -> FloatArray:
-        """Return squared residuals at the estimate, by the floored covariances, shape (M,)."""
-        some, errors = self._table.rows(numbers), np.empty((len(numbers), 3))
-        relative.errors_at(self._smoother.graph.memory.head, some.i, some.j, some.mean,
-                           errors)
-        out = np.empty(len(numbers))
-        relative.distances(errors, some.noise, out)
-        return out
-
     def _test_again(self, most: int) -> bool:
         """Test some closures that wait; tell whether some are left."""
         waiting = np.flatnonzero(~self._states.in_graph & self._states.judged
-                                 & (self._tested.values < self._round))
+                                 & (self._tested.values < self._beliefs.round))
         if len(waiting) == 0:
             return False
         some, errors = self._table.rows(waiting), np.empty((len(waiting), 3))
@@ -291,11 +289,11 @@ class ClosureJudge:
         relative.distances(errors, spread + some.noise, least)
         known = spread[:, 0, 0] > 0.0
         hopeless = known & ~(least < GATE)
-        self._tested.values[waiting[hopeless]] = self._round
+        self._tested.values[waiting[hopeless]] = self._beliefs.round
         rest = waiting[~hopeless]
         rest = rest[np.argsort(np.where(known, least, 0.0)[~hopeless], kind='stable')]
         chosen = self._choose(*self._test(rest[:most]))
-        return (len(chosen) > 0 and self._apply(chosen)) or len(rest) > most
+        return (len(chosen) > 0 and self._beliefs.apply(chosen)) or len(rest) > most
 
     def decide_finally(self) -> None:
         """
@@ -305,7 +303,7 @@ class ClosureJudge:
         """
         smoother, states = self._smoother, self._states
         graph, judged = smoother.graph, np.flatnonzero(states.judged)
-        present = graph.n_nodes, graph.n_edges, graph.n_observed, self._round
+        present = graph.n_nodes, graph.n_edges, graph.n_observed, self._beliefs.round
         if len(judged) == 0 or present == self._final:
             return
         forced = states.row[states.in_graph & ~states.judged]
@@ -315,23 +313,25 @@ class ClosureJudge:
         if choice is None:
             return
         inside[judged] = choice.believed
-        self._scales = [self._fixed_scale(name) or 1.0 for name in states.sources]
+        self._beliefs.scales = [self._fixed_scale(name) or 1.0 for name in states.sources]
         if not self._change_to(inside, choice.poses):
             return
-        self._learnt_from = [0] * len(self._scales)
+        self._learnt_from = [0] * len(self._beliefs.scales)
         self._learn_scales()
         # nothing is to be tested again until something changes
-        self._tested.values[:] = self._round
-        self._final = *present[:-1], self._round
+        self._tested.values[:] = self._beliefs.round
+        self._final = *present[:-1], self._beliefs.round
 
     def state(self) -> Callable[[], None]:
         """Return what brings the present state back, as long as no closure is added."""
-        states, scales, learnt = self._states.state_of_all(), [*self._scales], [*self._learnt_from]
+        states, scales, learnt = (
+            self._states.state_of_all(), [*self._beliefs.scales], [*self._learnt_from])
 
         def bring_back() -> None:
             self._states.set_state_of_all(*states)
-            self._scales, self._learnt_from = scales, learnt
+            self._beliefs.scales, self._learnt_from = scales, learnt
             self._search = SetSearch(self._states, self._table)
+            self._beliefs.trial.end()
             self._tested.values[:], self._spread.values[:] = -1, 0.0
         return bring_back
 
@@ -352,35 +352,34 @@ class ClosureJudge:
             edges = self._smoother.graph.edges_at(self._states.row[some])
             scale, before = residual_scale(
                 *self._smoother.edge_innovations(edges), edges.information,
-                self._scales[source]), self._scales[source]
+                self._beliefs.scales[source]), self._beliefs.scales[source]
             if scale == before:
                 continue
-            self._scales[source] = scale
-            if not self._apply(dict(zip(numbers.tolist(), (
+            self._beliefs.scales[source] = scale
+            if not self._beliefs.apply(dict(zip(numbers.tolist(), (
                     STATES[k] for k in self._states.state[numbers].tolist()), strict=True))):
-                self._scales[source] = before
+                self._beliefs.scales[source] = before
             self._spread.values[:] = 0.0
             return True
         return False
 
     def _look_for_another_set(self) -> bool:
         """Do a part of the search of another set; tell whether there was anything to do."""
-        more = self._search.work(self._smoother.graph, self._corroborated.values, self._round)
+        more = self._search.work(
+            self._smoother.graph, self._corroborated.values, self._beliefs.round)
         if self._search.found is not None:
-            self._change_to(self._search.found.inside, self._search.found.poses)
+            changes = self._states.changes_to(self._search.found.inside)
+            self._beliefs.trial.begin(
+                changes, self._beliefs.weights_with(changes),
+                continued(self._smoother.graph, self._search.found.poses))
         return more
 
     def _change_to(self, inside: BoolArray, poses: FloatArray) -> bool:
-        """Believe another set, with the poses that it was found with; tell whether that worked."""
-        graph, n, last = self._smoother.graph, len(inside), len(poses) - 1
+        """Believe another set at once, at the poses of its solution; tell whether that worked."""
+        graph = self._smoother.graph
         before = graph.poses.copy()
-        behind = se2.compose(poses[last], se2.between(before[last], before[last + 1:]))
-        graph.set_poses(np.concatenate((poses, behind)))
-        now = self._states.in_graph[:n]
-        # those that stay are weighed, too, as scales may have changed
-        done = self._apply({
-            k: (STATES[self._states.state[k]] if now[k] else State.BELIEVED) if inside[k]
-            else State.DOUBTED for k in np.flatnonzero(inside | now).tolist()})
+        graph.set_poses(continued(graph, poses))
+        done = self._beliefs.apply(self._states.changes_to(inside), at_once=True)
         if not done:
             graph.set_poses(before)
             self._smoother.update(GraphUpdate())
@@ -389,20 +388,20 @@ class ClosureJudge:
 
     def saved(self) -> SavedClosures:
         """Return the state; what is left to be tested is not part of it."""
-        return self._states.saved(self._scales)
+        return self._states.saved(self._beliefs.scales)
 
     def restore(self, saved: SavedClosures) -> None:
         """Restore what `saved` has returned, for a graph with the same rows."""
         self._chain.extend(self._smoother.graph)
         self._table.append(claims(self._smoother.graph.edges_at(saved.rows)))
         self._states.restore(saved)
-        self._scales = saved.scales.tolist()
-        self._learnt_from = [0] * len(self._scales)
+        self._beliefs.scales = saved.scales.tolist()
+        self._learnt_from = [0] * len(self._beliefs.scales)
         self._append_unknown(len(saved.rows))
 
     def totals(self) -> dict[str, SourceVerdicts]:
         """Return what is believed of each source."""
-        return self.reports.totals(self._scales)
+        return self.reports.totals(self._beliefs.scales)
 
     def decide(self, name: str, decision: Decision) -> Answer:
         """
@@ -427,9 +426,9 @@ class ClosureJudge:
         forced = decision is not Decision.AUTO or before != AUTO
         self._states.decision[number] = DECISIONS.index(decision)
         self._states.forgotten[number] = False
-        if forced and not self._apply({number: state}):
+        if forced and not self._beliefs.apply({number: state}, at_once=True):
             self._states.decision[number] = before
             return rejected('failed', 'the solver failed with it')
-        self._round += 1
+        self._beliefs.round += 1
         verdict, = self.reports.of(self._smoother.graph, [number])
         return Answer(AnswerStatus.ACCEPTED, detail=f'{name}: {sentence(verdict)}')

@@ -140,6 +140,13 @@ class ClosureStates:
         order = np.lexsort((self.stamps_ns[kept, 0], ~doubted, ~hopeless))
         self.forgotten[kept[order[:len(kept) - LEFT]]] = True
 
+    def changes_to(self, inside: BoolArray) -> dict[int, State]:
+        """Return the states of another set of believed ones, also of those that stay in it."""
+        now = self.in_graph[:len(inside)]
+        return {
+            k: (STATES[self.state[k]] if now[k] else State.BELIEVED) if inside[k]
+            else State.DOUBTED for k in np.flatnonzero(inside | now).tolist()}
+
     def name(self, number: int) -> str:
         """Return the id of a closure."""
         return f'{self.sources[self.source[number]]}/{self._number.values[number]}'

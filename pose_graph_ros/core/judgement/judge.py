@@ -15,8 +15,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from pose_graph_ros.core.config import BackendConfig, Robust
-from pose_graph_ros.core.geometry.se2 import FloatArray
-from pose_graph_ros.core.graph.constraints import EdgeKind
+from pose_graph_ros.core.geometry.se2 import FloatArray, IntArray
+from pose_graph_ros.core.graph.constraints import EdgeKind, Edges
 from pose_graph_ros.core.graph.graph import GraphUpdate
 from pose_graph_ros.core.graph.graph_view import DrawnRows
 from pose_graph_ros.core.graph.reweighting import Reweighting
@@ -60,6 +60,8 @@ class Judge:
         self._fixes = FixJudge(smoother, reweighting, config)
         self.odometry_scale = 1.0
         """Factor on the sigmas of odometry that the measurements show, at least 1."""
+        self._staged = np.empty(0, dtype=np.int64)
+        """The judged closures of the last `before`, by their numbers among its edges."""
 
     def configure(self, config: BackendConfig) -> None:
         """Set the settings for later constraints."""
@@ -86,13 +88,18 @@ class Judge:
             one for one in new if one.is_edge and self._is_judged_closure(one, change, first)]
         if len(closures) == 0:
             return change
-        numbers = np.array([one.row - first for one in closures])
-        weights = change.edges.weight.copy()
-        weights[numbers] = self._closures.before(
-            closures, change.edges.rows(numbers), now_ns)
-        edges = change.edges
-        return change._replace(edges=type(edges)(
-            edges.i, edges.j, edges.mean, edges.information, edges.kind, weights, edges.bias))
+        self._staged = np.array([one.row - first for one in closures])
+        return _weighed(change, self._staged, self._closures.before(
+            closures, change.edges.rows(self._staged), now_ns))
+
+    def withhold(self, change: GraphUpdate) -> GraphUpdate:
+        """
+        Return the update of the last `before` with the new closures doubted for the moment.
+
+        With them the iterations of the smoother diverge, so they are tried between two updates.
+        """
+        weights = self._closures.withhold()
+        return change if weights is None else _weighed(change, self._staged, weights)
 
     def _is_judged_closure(self, one: NewConstraint, change: GraphUpdate, first: int) -> bool:
         number = one.row - first
@@ -203,3 +210,11 @@ class Judge:
         self._fixes.finish()
         self._closures.decide_finally()
         return undo
+
+
+def _weighed(change: GraphUpdate, numbers: IntArray, weights: FloatArray) -> GraphUpdate:
+    edges = change.edges
+    every = edges.weight.copy()
+    every[numbers] = weights
+    return change._replace(edges=Edges(
+        edges.i, edges.j, edges.mean, edges.information, edges.kind, every, edges.bias))

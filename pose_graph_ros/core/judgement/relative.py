@@ -10,9 +10,14 @@ pose, and so are all covariances here.
 
 import math
 
+import numpy as np
+
 from pose_graph_ros.core.compiled.jit import INTEGERS, kernel, MATRICES, NUMBERS, ROWS
+from pose_graph_ros.core.geometry.se2 import FloatArray
 from pose_graph_ros.core.graph import tables as tb
 from pose_graph_ros.core.graph.factors import wrap
+from pose_graph_ros.core.graph.graph import Graph
+from pose_graph_ros.core.judgement.consistency import Closures
 
 
 @kernel
@@ -77,3 +82,19 @@ def distances(errors, covariances, out):  # type: ignore[no-untyped-def]
     """
     for k in range(len(errors)):
         out[k] = _quadratic_form(errors[k], covariances[k])
+
+
+def residuals(graph: Graph, some: Closures) -> FloatArray:
+    """
+    Return squared residuals at the estimate of a graph, by the floored covariances, shape (M,).
+
+    Parameters
+    ----------
+    graph : Graph
+    some : Closures, M of them
+
+    """
+    errors, out = np.empty((len(some.i), 3)), np.empty(len(some.i))
+    errors_at(graph.memory.head, some.i, some.j, some.mean, errors)
+    distances(errors, some.noise, out)
+    return out

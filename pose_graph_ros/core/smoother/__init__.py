@@ -8,7 +8,7 @@ update as a transaction and returns covariances of the nodes. `step` repeats thr
 the linearization error is within a budget: `tree_update` eliminates the affected cliques of the
 Bayes tree again, `back_substitution` (with `rigid_propagation`) solves as far as values change,
 and `relinearization` selects the constraints to linearize again. `chain` appends a node to a chain
-in constant time, and `batch_fallback` optimises the whole graph if a step diverges. `covariances`
-and `sparse_inverse` compute marginal covariances from the tree, `innovations` those of the errors
-of new constraints.
+in constant time, and `batch_fallback` optimises the whole graph if a step diverges. `trial`
+optimises a copy with other weights, part by part. `covariances` and `sparse_inverse` compute
+marginal covariances from the tree, `innovations` those of the errors of new constraints.
 """

@@ -24,6 +24,7 @@ from pose_graph_ros.core.smoother import (
 )
 from pose_graph_ros.core.smoother.innovations import Innovations
 from pose_graph_ros.core.smoother.sparse_inverse import all_covariances
+from pose_graph_ros.core.smoother.trial import Trial
 
 
 class UpdateResult(NamedTuple):
@@ -55,6 +56,9 @@ class Refinement(NamedTuple):
     """Largest change of a coordinate of a position [m]."""
 
 
+DIVERGED = 'the iterations diverge'
+"""Reason of an update that has failed because it must not fall back to the batch optimiser."""
+
 _NOT_REFINED = Refinement(finished=True, moved=0.0)
 _EXTENDED_RESULT = UpdateResult(Status.CONVERGED, '', 0, 1, 1, 1)
 
@@ -67,11 +71,16 @@ class IncrementalSmoother:
     needs a fixed or an observed node. An update that leaves a node undetermined is rolled back,
     bit for bit.
 
+    Parameters
+    ----------
+    config : SmootherConfig, optional
+    graph : Graph, optional, that the batch optimiser has solved, or an empty one
+
     """
 
-    def __init__(self, config: SmootherConfig | None = None) -> None:
+    def __init__(self, config: SmootherConfig | None = None, graph: Graph | None = None) -> None:
         self._config = SmootherConfig() if config is None else config
-        self.graph = Graph()
+        self.graph = Graph() if graph is None else graph
         """The pose graph; only this object edits it."""
         self._memory = self.graph.memory
         scalars = self._memory['scalars']
@@ -84,17 +93,26 @@ class IncrementalSmoother:
         """Estimates of all hidden nodes in the map, shape (N, 3), as a view that stays current."""
         return self.graph.poses
 
-    def update(self, update: GraphUpdate) -> UpdateResult:
+    def update(self, update: GraphUpdate, *, fall_back: bool = True) -> UpdateResult:
         """
-        Edit the graph and bring the estimate up to date.
+        Return the result of editing the graph and bringing the estimate up to date.
 
         A GraphUpdateError, for a part that does not fit the graph, leaves the graph unchanged, as
         any other exception does.
+
+        Parameters
+        ----------
+        update : GraphUpdate
+        fall_back : bool
+            Whether the whole graph is optimised at once if the iterations diverge, which takes ten
+            times as long as them; otherwise the result is FAILED with the reason `DIVERGED`, and a
+            `trial` can find the optimum part by part.
+
         """
         self.graph.begin()
         try:
             self.graph.apply(update)
-            result = self._step(step.FIRST)
+            result = self._step(step.FIRST, fall_back=fall_back)
         except BaseException:
             self.graph.rollback()
             raise
@@ -128,6 +146,38 @@ class IncrementalSmoother:
                 self._make_room(*head[tb.NEED_F:tb.NEED_WORK + 1].tolist())
         head[tb.INTERRUPT] = 0
         return _NOT_REFINED._replace(finished=code == refinement.FAILED)
+
+    def trial(self, update: GraphUpdate, poses: FloatArray | None = None) -> Trial:
+        """
+        Return a trial of new weights, on a copy.
+
+        Parameters
+        ----------
+        update : GraphUpdate, new weights; raises ValueError as `refine` does
+        poses : ndarray, shape (N, 3), optional, where it starts
+
+        """
+        self._require_eliminated()
+        other = IncrementalSmoother(self._config)
+        return Trial(self.graph, other.graph, update, other._eliminate, poses)
+
+    def adopt(self, trial: Trial) -> UpdateResult:
+        """
+        Replace the graph by the copy of a trial, with all that was added to the graph meanwhile.
+
+        FAILED, and nothing has changed, if the trial has failed or is outdated, or if what was
+        added cannot be solved for. The trial must have come to its end, and cannot be used again.
+        """
+        failed = UpdateResult(Status.FAILED, 'the trial has failed', 0, 0, 0, 0)
+        if trial.result is None or trial.result.status is Status.FAILED or trial.is_outdated:
+            return failed
+        other = IncrementalSmoother(self._config, trial.graph)
+        other.graph.begin()
+        trial.catch_up()
+        result = other._step(step.AFTER_BATCH)
+        if result.status is not Status.FAILED:
+            self.graph.memory = self._memory = other.graph.memory
+        return result
 
     def interrupt(self) -> None:
         """Let the running or the next `refine` end early, without effect; any thread may call."""
@@ -250,7 +300,12 @@ class IncrementalSmoother:
         """Return the energy of all constraints; see `chi2_of`."""
         return chi2_of(self.graph)
 
-    def _step(self, entered: int) -> UpdateResult:
+    def _eliminate(self) -> bool:
+        """Eliminate what waits, from poses of the batch optimiser; tell whether that worked."""
+        self.graph.begin()
+        return self._step(step.AFTER_BATCH).status is not Status.FAILED
+
+    def _step(self, entered: int, *, fall_back: bool = True) -> UpdateResult:
         """Bring the estimate up to date, growing the memory as needed, or roll the update back."""
         head = self._memory.head
         code = step.run(head, self._config.max_iterations, entered)
@@ -258,6 +313,9 @@ class IncrementalSmoother:
             self._make_room(*head[tb.NEED_F:tb.NEED_WORK + 1].tolist())
             entered = step.AFTER_BATCH if entered == step.AFTER_BATCH else step.RESUMED
             code = step.run(head, self._config.max_iterations, entered)
+        if code == step.DIVERGED and not fall_back:
+            self.graph.rollback()
+            return UpdateResult(Status.FAILED, DIVERGED, 0, 0, 0, 0)
         if code == step.DIVERGED:
             return self._fall_back_to_batch()
         if code == step.BAD_PIVOT:

@@ -1,0 +1,122 @@
+# Copyright 2026 The pose_graph_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""
+What is believed of the loop closures, as states, as weights of the graph and as announcements.
+
+Some beliefs cannot be changed in the time of an update, as its iterations diverge with them. They
+are tried on a copy, part by part (`closure_trial`), and kept if they fit there.
+"""
+
+from collections.abc import Mapping
+
+import numpy as np
+
+from pose_graph_ros.core.batch.optimizer import Status
+from pose_graph_ros.core.geometry.se2 import FloatArray, IntArray
+from pose_graph_ros.core.graph.graph import GraphUpdate
+from pose_graph_ros.core.graph.reweighting import Reweighting
+from pose_graph_ros.core.judgement.closure_states import ClosureStates, DOUBTED, STATES
+from pose_graph_ros.core.judgement.closure_trial import ClosureTrial
+from pose_graph_ros.core.judgement.closures import ClosureTable
+from pose_graph_ros.core.judgement.verdicts import State
+from pose_graph_ros.core.smoother.incremental import DIVERGED, IncrementalSmoother
+
+
+class Beliefs:
+    """
+    Changes states and weights of closures together.
+
+    Parameters
+    ----------
+    smoother : IncrementalSmoother
+    reweighting : Reweighting, of its constraints with a robust loss
+    states : ClosureStates
+    table : ClosureTable
+
+    """
+
+    def __init__(
+        self, smoother: IncrementalSmoother, reweighting: Reweighting, states: ClosureStates,
+        table: ClosureTable,
+    ) -> None:
+        self._smoother, self._reweighting = smoother, reweighting
+        self._states, self._table = states, table
+        self.scales: list[float] = []
+        """Of each source, the factor on its sigmas in the graph."""
+        self.round = 0
+        """Increases when more or less is believed, so that those that wait are tested again."""
+        self.now_ns = 0
+        self.trial = ClosureTrial(smoother)
+
+    def weights(self, numbers: IntArray) -> FloatArray:
+        """Return the weights of closures by their states."""
+        scales = np.array(self.scales)[self._states.source[numbers]]
+        return np.where(self._states.in_graph[numbers], 1.0 / np.square(scales), 0.0)
+
+    def set_base_weights(self, numbers: IntArray) -> None:
+        """Tell robust losses the weights of closures, which the graph has already."""
+        for number, weight in zip(numbers.tolist(), self.weights(numbers).tolist(), strict=True):
+            self._reweighting.set_base_weight(int(self._states.row[number]), weight, edge=True)
+
+    def apply(self, changes: Mapping[int, State], *, at_once: bool = False) -> bool:
+        """
+        Return whether states and weights could be changed; else nothing has.
+
+        If its iterations diverge, they are tried on a copy later, or solved for at once.
+
+        Parameters
+        ----------
+        changes : mapping, new states by the numbers of closures
+        at_once : bool
+
+        """
+        weights = self.weights_with(changes)
+        result = self._smoother.update(GraphUpdate(weigh_edges=weights), fall_back=at_once)
+        if result.status is Status.FAILED:
+            if result.reason == DIVERGED:
+                self.trial.begin(changes, weights)
+            return False
+        self._keep(changes)
+        return True
+
+    def weights_with(self, changes: Mapping[int, State]) -> dict[int, float]:
+        """Return the weights of edges, by row, after a change of states."""
+        numbers = np.array(sorted(changes), dtype=np.int64)
+        before = self._states.state[numbers].copy()
+        self._states.state[numbers] = [STATES.index(changes[k]) for k in numbers.tolist()]
+        weights = self.weights(numbers).tolist()
+        self._states.state[numbers] = before
+        return dict(zip(self._states.row[numbers].tolist(), weights, strict=True))
+
+    def _keep(self, changes: Mapping[int, State]) -> None:
+        """Change states, of which the graph has the weights already."""
+        for number, state in sorted(changes.items()):
+            before = int(self._states.state[number])
+            self._states.state[number] = STATES.index(state)
+            self._states.announce(number, before, self.now_ns)
+        self.set_base_weights(np.array(sorted(changes), dtype=np.int64))
+        self.round += 1
+
+    def try_part(self) -> list[int] | None:
+        """
+        Do a part of a trial, and keep what fits; None if there is none.
+
+        Returns closures that are to be tested again.
+        """
+        trial, states = self.trial, self._states
+        if not trial.work():
+            return None
+        later: set[int] = set()
+        if trial.is_finished:
+            later = trial.later
+            if trial.weights == self.weights_with(trial.changes) and bool(
+                    np.all(states.judged[[*trial.changes]])):
+                bad = trial.misfits(self._table)
+                if len(bad) == 0 and trial.adopt():
+                    self._keep(trial.changes)
+                for number in bad:
+                    before, states.state[number] = int(states.state[number]), DOUBTED
+                    states.announce(number, before, self.now_ns)
+                later |= set(trial.changes) - set(bad) if len(bad) > 0 else set()
+            trial.end()
+        return sorted(later)

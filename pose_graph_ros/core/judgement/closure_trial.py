@@ -1,0 +1,95 @@
+# Copyright 2026 The pose_graph_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""
+Beliefs that an update cannot change in its time, as its iterations diverge with them.
+
+The graph is solved with them as a copy, part by part, between the updates (`smoother/trial.py`).
+The result is adopted if they fit there.
+"""
+
+from collections.abc import Mapping
+
+import numpy as np
+
+from pose_graph_ros.core.batch.optimizer import Status
+from pose_graph_ros.core.geometry.se2 import FloatArray
+from pose_graph_ros.core.graph.graph import GraphUpdate
+from pose_graph_ros.core.judgement import relative
+from pose_graph_ros.core.judgement.closures import ClosureTable, GATE
+from pose_graph_ros.core.judgement.verdicts import State
+from pose_graph_ros.core.smoother.incremental import IncrementalSmoother
+from pose_graph_ros.core.smoother.trial import Trial
+
+
+class ClosureTrial:
+    """
+    One trial at a time, and the closures that have to wait for its end.
+
+    Parameters
+    ----------
+    smoother : IncrementalSmoother
+
+    """
+
+    def __init__(self, smoother: IncrementalSmoother) -> None:
+        self._smoother = smoother
+        self._trial: Trial | None = None
+        self.changes: dict[int, State] = {}
+        """The states that are tried, by the numbers of closures."""
+        self.weights: dict[int, float] = {}
+        """The weights that are tried, by the rows of edges."""
+        self._is_set = False
+        """Whether it is a whole set, whose residuals were compared already."""
+        self.later: set[int] = set()
+        """Numbers of closures that another update has diverged with meanwhile."""
+
+    def begin(
+        self, changes: Mapping[int, State], weights: Mapping[int, float],
+        poses: FloatArray | None = None,
+    ) -> None:
+        """
+        Begin a trial; while another one goes on, only note whose.
+
+        Parameters
+        ----------
+        changes : mapping, the states of closures that are tried, by number
+        weights : mapping, the weights of their edges, by row
+        poses : ndarray, shape (N, 3), optional, where it starts
+
+        """
+        if self._trial is not None:
+            self.later.update(changes)
+            return
+        self.changes, self.weights = dict(changes), dict(weights)
+        self._is_set = poses is not None
+        self._trial = self._smoother.trial(GraphUpdate(weigh_edges=self.weights), poses)
+
+    def work(self) -> bool:
+        """Do a part; tell whether there was any."""
+        if self._trial is None:
+            return False
+        self._trial.work()
+        return True
+
+    @property
+    def is_finished(self) -> bool:
+        """Whether a trial has come to its end, and waits to be adopted or dropped."""
+        return self._trial is not None and self._trial.result is not None
+
+    def misfits(self, table: ClosureTable) -> list[int]:
+        """Return which of the closures that would be believed do not fit into the copy."""
+        assert self._trial is not None
+        wanted = np.array(
+            [k for k, state in self.changes.items() if state.in_graph], dtype=np.int64)
+        fit = relative.residuals(self._trial.graph, table.rows(wanted))
+        return [] if self._is_set else wanted[~(fit <= GATE)].tolist()
+
+    def adopt(self) -> bool:
+        """Replace the graph by the copy; tell whether that was possible."""
+        assert self._trial is not None
+        return self._smoother.adopt(self._trial).status is not Status.FAILED
+
+    def end(self) -> set[int]:
+        """Forget the trial; return the numbers of those that have waited."""
+        later, self._trial, self.later = self.later, None, set()
+        return later

@@ -1,0 +1,164 @@
+# Copyright 2026 The pose_graph_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""What an update leaves to the work after it: closures it diverges with, tests of large graphs."""
+
+import numpy as np
+import pytest
+
+from pose_graph_ros.core.backend import PoseGraphBackend
+from pose_graph_ros.core.batch import optimizer
+from pose_graph_ros.core.config import (
+    BackendConfig,
+    NodePolicy,
+    OdometryNoise,
+    OdometrySource,
+    SolverConfig,
+)
+from pose_graph_ros.core.geometry import se2
+from pose_graph_ros.core.geometry.se2 import FloatArray
+from pose_graph_ros.core.graph.constraints import Edges
+from pose_graph_ros.core.graph.graph import Graph, GraphUpdate
+from pose_graph_ros.core.judgement.closure_judge import LARGE, NODES_IN_PART
+from pose_graph_ros.core.judgement.residual_scale import MOST
+from pose_graph_ros.core.judgement.verdicts import Decision, State
+from pose_graph_ros.core.measurements import LoopClosure, OdometrySample
+from pose_graph_ros.core.smoother.incremental import (
+    DIVERGED,
+    IncrementalSmoother,
+    UpdateResult,
+)
+from pose_graph_ros.core.smoother.innovations import Innovations
+
+SECOND = 10**9
+COVARIANCE = np.square(np.diag([0.1, 0.1, 0.03]))
+CONFIG = BackendConfig(
+    nodes=NodePolicy(minimum_travel_distance=0.9),
+    odometry={'odom': OdometrySource(OdometryNoise(sigma_heading_distance=0.1))})
+
+
+class Counting(IncrementalSmoother):
+    """Counts what it is asked for."""
+
+    def __init__(self) -> None:
+        super().__init__(CONFIG.smoother)
+        self.solves = self.gates = self.diverged = self.fallbacks = 0
+
+    def update(self, update: GraphUpdate, *, fall_back: bool = True) -> UpdateResult:
+        result = super().update(update, fall_back=fall_back)
+        self.solves += 1
+        self.diverged += result.reason == DIVERGED
+        return result
+
+    def edge_innovations(self, edges: Edges) -> Innovations:
+        self.gates += len(edges)
+        return super().edge_innovations(edges)
+
+    def _fall_back_to_batch(self) -> UpdateResult:
+        self.fallbacks += 1
+        return super()._fall_back_to_batch()
+
+
+def driven(n: int) -> tuple[PoseGraphBackend, Counting, FloatArray]:
+    """Return a back end with n nodes along circles, its smoother and the poses."""
+    smoother, poses = Counting(), np.zeros((n, 3))
+    backend = PoseGraphBackend(CONFIG, smoother=smoother)
+    for k in range(n):
+        if k > 0:
+            poses[k] = se2.compose(poses[k - 1], np.array([1.0, 0.0, 0.02]))
+        backend.add_odometry(OdometrySample((k + 1) * SECOND, poses[k]))
+    backend.finish()
+    backend.update()
+    smoother.solves = smoother.gates = 0
+    return backend, smoother, poses
+
+
+def add_group(backend: PoseGraphBackend, poses: FloatArray, place: FloatArray, count: int) -> None:
+    """Add closures that agree with one another, the first from node 10 to its newer end."""
+    first = len(poses) - 2 * count
+    for k in range(count):
+        i, j = 10 + 2 * k, first + 2 * k
+        z = se2.between(poses[i], se2.compose(poses[10], se2.compose(
+            place, se2.between(poses[first], poses[j]))))
+        backend.add_measurement(LoopClosure(
+            (j + 1) * SECOND, z, COVARIANCE, reference_ns=(i + 1) * SECOND), 'scan')
+
+
+def work(backend: PoseGraphBackend) -> None:
+    while not backend.refine().finished:
+        pass
+
+
+def states(backend: PoseGraphBackend) -> set[State]:
+    return {each.state for each in backend.verdicts()}
+
+
+def best_chi2(graph: Graph) -> float:
+    copy = Graph()
+    copy.fill(graph.rows())
+    return optimizer.optimize_from_linear_start(copy, SolverConfig()).chi2
+
+
+DIVERGING = np.array([20.0, 60.0, 2.0])
+
+
+def test_closures_that_an_update_diverges_with_are_believed_after_it() -> None:
+    backend, smoother, poses = driven(600)
+    add_group(backend, poses, DIVERGING, 6)
+    odometry = backend.graph.poses[-1].copy()
+    backend.update()
+    assert smoother.diverged >= 1
+    np.testing.assert_allclose(backend.graph.poses[-1], odometry, atol=1e-6)
+    work(backend)
+    assert states(backend) == {State.BELIEVED}
+    assert smoother.fallbacks == 0
+    assert smoother.chi2() <= best_chi2(backend.graph) * (1.0 + 1e-6)
+
+
+def test_what_comes_while_it_is_tried_is_kept() -> None:
+    backend, smoother, poses = driven(600)
+    add_group(backend, poses, DIVERGING, 6)
+    backend.update()
+    pose = poses[-1]
+    for k in range(600, 700):
+        pose = se2.compose(pose, np.array([1.0, 0.0, 0.02]))
+        backend.add_odometry(OdometrySample((k + 1) * SECOND, pose))
+        backend.update()
+        backend.refine()
+    backend.finish()
+    backend.update()
+    work(backend)
+    assert states(backend) == {State.BELIEVED}
+    assert (backend.graph.n_nodes, smoother.fallbacks) == (700, 0)
+    assert smoother.chi2() <= best_chi2(backend.graph) * (1.0 + 1e-6)
+
+
+@pytest.mark.parametrize('parts', [1, 8])
+def test_a_person_who_decides_meanwhile_wins(parts: int) -> None:
+    backend, _, poses = driven(600)
+    add_group(backend, poses, DIVERGING, 6)
+    backend.update()
+    for _ in range(parts):
+        backend.refine()
+    for verdict in backend.verdicts():
+        backend.decide(verdict.id, Decision.OUT)
+    work(backend)
+    assert states(backend) == {State.DOUBTED}
+    assert best_chi2(backend.graph) < 1e-6
+
+
+def test_an_update_of_a_large_graph_tests_nothing_and_its_work_a_bounded_number() -> None:
+    backend, smoother, poses = driven(LARGE + 200)
+    place = se2.between(poses[10], poses[-80]) + np.array([0.5, 0.3, 0.01])
+    add_group(backend, poses, place, 40)
+    backend.update()
+    assert (smoother.solves, smoother.gates) == (1, 0)
+    assert states(backend) == {State.WAITING}
+    finished, most = False, 0
+    while not finished:
+        smoother.solves = smoother.gates = 0
+        finished = backend.refine().finished
+        most = max(most, smoother.gates)
+        assert smoother.solves <= 1
+    # a scale is learnt from more of them
+    assert 0 < most <= max(NODES_IN_PART // LARGE, MOST)
+    assert states(backend) == {State.BELIEVED}
