@@ -29,12 +29,12 @@ class Picky(IncrementalSmoother):
 
     picky, asked = True, 0
 
-    def update(self, update: GraphUpdate) -> UpdateResult:
+    def update(self, update: GraphUpdate, **options: bool) -> UpdateResult:
         self.asked += 1
         means = np.concatenate((update.edges.mean, update.observed.mean))
         if self.picky and np.any(means[:, 0] == POISON):
             return UpdateResult(Status.FAILED, 'broken on purpose', 0, 0, 0, 0)
-        return super().update(update)
+        return super().update(update, **options)
 
 
 def queue_of(numbers: range) -> Queue:
@@ -152,7 +152,7 @@ def test_a_solver_that_always_fails_is_not_asked_for_each_constraint(
     smoother = Picky()
     backend = driven(0, smoother)
     with monkeypatch.context() as patch:
-        patch.setattr(IncrementalSmoother, 'update', lambda *_: UpdateResult(
+        patch.setattr(IncrementalSmoother, 'update', lambda *_, **__: UpdateResult(
             Status.FAILED, 'out of order', 0, 0, 0, 0))
         before = smoother.asked
         assert backend.update().reason == 'out of order'

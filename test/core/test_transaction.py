@@ -57,7 +57,7 @@ def fails(*_: object, **__: object) -> Any:
     raise RuntimeError('broken on purpose')
 
 
-def is_failed(_: GraphUpdate) -> UpdateResult:
+def is_failed(_: GraphUpdate, **options: bool) -> UpdateResult:
     return UpdateResult(Status.FAILED, 'broken on purpose', 0, 0, 0, 0)
 
 
@@ -124,9 +124,9 @@ def test_what_was_committed_survives_a_later_solve_that_fails(
     backend, updates = PoseGraphBackend(CONFIG), []
     original = backend._smoother.update
 
-    def second_fails(update: GraphUpdate) -> UpdateResult:
+    def second_fails(update: GraphUpdate, **options: bool) -> UpdateResult:
         updates.append(update)
-        return is_failed(update) if len(updates) == 2 else original(update)
+        return is_failed(update) if len(updates) == 2 else original(update, **options)
 
     drive(backend, 0, 8)
     with monkeypatch.context() as patch:
