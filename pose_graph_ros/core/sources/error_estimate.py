@@ -43,7 +43,7 @@ SIGNIFICANT = 15.0
 # The same for each time that the filter was lost: then odometry was wrong, or many positions.
 PER_LOST = 100.0
 # The same of a scale of the noise of odometry other than 1.
-SIGNIFICANT_ODOMETRY = 10.0
+SIGNIFICANT_SCALE = 6.0
 # Smallest correlation of consecutive measurements that matters.
 LEAST_CORRELATION = 0.2
 # Sigma of the logarithm of the total variance in units of the claimed one, before it is seen.
@@ -165,24 +165,20 @@ def search(positions: Track) -> Search:
     needed = SIGNIFICANT + PER_LOST * max(
         evaluate.lost[white.point], evaluate.lost[found.point])
     significant = white.value - found.value > needed and correlation > LEAST_CORRELATION
-    scale = yield from _odometry_scale(evaluate, white, found, correlated=significant)
+    scale = yield from _odometry_scale(evaluate, found if significant else white)
     return Estimate(errors if significant else None, scale)
 
 
 def _odometry_scale(
-    evaluate: '_Evaluation', white: '_Minimum', found: '_Minimum', *, correlated: bool,
+    evaluate: '_Evaluation', best: '_Minimum',
 ) -> Generator[None, None, float]:
     """Return the factor on the sigmas of odometry; 1 unless its claim is much less likely."""
-    best = found if correlated else white
     exponent = best.point[ODOMETRY]
     if exponent <= 0.0:
         return 1.0
-    for point in (white.point, found.point):
-        claimed = yield from _descend(
-            evaluate, [(*point[:ODOMETRY], 0.0, point[ODOMETRY + 1])], fixed=ODOMETRY)
-        if claimed.value - best.value < SIGNIFICANT_ODOMETRY:
-            return 1.0
-    return float(2.0 ** (0.5 * exponent))
+    claimed = yield from _descend(
+        evaluate, [(*best.point[:ODOMETRY], 0.0, best.point[-1])], fixed=ODOMETRY)
+    return 2.0 ** (0.5 * exponent) if claimed.value - best.value > SIGNIFICANT_SCALE else 1.0
 
 
 class _Evaluation:
