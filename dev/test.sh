@@ -40,6 +40,8 @@ if [ -z "${ROS_DISTRO:-}" ]; then
 else
     echo '--- mypy: left out, it is exact only with the NumPy of requirements.lock'
 fi
+# once on all processors, and not by each worker of its own accord
+run kernels "$PYTHON" -m pose_graph_ros.cli.main compile-kernels
 if [ "$#" -gt 0 ]; then
     run pytest "$PYTHON" -m pytest -ra --durations=10 "$@"
 else

@@ -3,15 +3,20 @@
 """
 Coverage is measured in the processes that run tests, and not in the nodes that these start.
 
-Nodes would take twice as long under a tracer, and what they run has tests without a process.
-Tests that repeat the same lines a thousand times are marked `untraced` and run without it too.
+Nodes would take twice as long under a tracer, and what they run has tests without a process. A
+long test repeats the same lines, so it is traced at its beginning alone. The folder ros is left
+out of this, as its tests use signals themselves; those marked `untraced` have no tracer at all.
 """
 
 from collections.abc import Iterator
 import os
+import signal
 import sys
 
 import pytest
+
+TRACED = 0.25
+"""Time of the processor for which a test is traced [s]."""
 
 if 'PYTEST_XDIST_WORKER' in os.environ:
     os.environ.pop('COVERAGE_PROCESS_CONFIG', None)
@@ -23,11 +28,16 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
 
 
 @pytest.fixture(autouse=True)
-def _without_tracer(request: pytest.FixtureRequest) -> Iterator[None]:
+def _tracer(request: pytest.FixtureRequest) -> Iterator[None]:
     tracer = sys.gettrace()
-    if request.node.get_closest_marker('untraced') is None:
+    if tracer is None:
         yield
         return
-    sys.settrace(None)
+    if request.node.get_closest_marker('untraced') is not None:
+        sys.settrace(None)
+    elif request.path.parent.name != 'ros':
+        signal.signal(signal.SIGVTALRM, lambda *_: sys.settrace(None))
+        signal.setitimer(signal.ITIMER_VIRTUAL, TRACED)
     yield
+    signal.setitimer(signal.ITIMER_VIRTUAL, 0.0)
     sys.settrace(tracer)

@@ -386,8 +386,7 @@ ONE_CHANGE = st.sampled_from(sorted(TABLE)).flatmap(lambda name: st.tuples(
 ANY_CHANGE = st.tuples(st.sampled_from([*sorted(TABLE), 'no_such', 'fix.no_such']), ANYTHING)
 
 
-@pytest.mark.untraced
-@settings(max_examples=300, deadline=None)
+@settings(max_examples=150, deadline=None)
 @given(st.lists(ONE_CHANGE | ANY_CHANGE, max_size=4).map(dict), st.booleans())
 def test_whatever_is_wanted_is_taken_whole_or_refused(
     wanted: dict[str, object], configured: bool,

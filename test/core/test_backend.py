@@ -183,7 +183,6 @@ def test_a_quick_robot_makes_no_more_nodes_than_the_interval_allows() -> None:
 
 # --- Order of arrival ------------------------------------------------------------------------
 
-@pytest.mark.untraced
 @settings(max_examples=15)
 @given(st.data())
 def test_any_interleaving_of_the_topics_gives_the_same_path(data: st.DataObject) -> None:
@@ -197,7 +196,6 @@ def test_any_interleaving_of_the_topics_gives_the_same_path(data: st.DataObject)
     assert_same_path(run(events, data.draw(st.sampled_from((0, 11, 40)))), REFERENCE_PATH)
 
 
-@pytest.mark.untraced
 @settings(max_examples=15)
 @given(st.randoms(use_true_random=False), st.integers(0, 141), st.sampled_from((0, 7, 50)))
 def test_shuffled_measurements_give_the_same_path(
@@ -211,7 +209,6 @@ def test_shuffled_measurements_give_the_same_path(
     assert_same_path(run(events, update_every), REFERENCE_PATH)
 
 
-@pytest.mark.untraced
 @settings(max_examples=10)
 @given(st.randoms(use_true_random=False), st.sampled_from((0, 1, 9)))
 def test_with_positions_alone_any_order_gives_the_same_path(
@@ -716,7 +713,6 @@ def long_drive(backend: PoseGraphBackend, n: int, *, closures: bool) -> list[Upd
 
 # Of an update when the graph has ten times the nodes; rounds on top of each other make the tree of
 # cliques a little deeper.
-@pytest.mark.untraced
 @pytest.mark.parametrize(('closures', 'growth'), [(False, 1.1), (True, 2.0)])
 def test_the_work_of_an_update_does_not_grow_with_the_graph(
     closures: bool, growth: float,
@@ -724,16 +720,15 @@ def test_the_work_of_an_update_does_not_grow_with_the_graph(
     # with odometry that is better than it says, late poses would be found to be correlated
     white = replace(POSITIONS, correlation_time=0.0)
     backend = PoseGraphBackend(prompt(measurements={'fix': white, 'late': white}))
-    reports = long_drive(backend, 5_000, closures=closures)
-    assert backend.graph.n_nodes == 5_000
+    reports = long_drive(backend, 2_500, closures=closures)
+    assert backend.graph.n_nodes == 2_500
     assert all(report.status is not Status.FAILED for report in reports)
     work = np.array([report.eliminated + report.visited for report in reports])
-    early, late = work[400:600], work[4_800:]
+    early, late = work[200:300], work[2_400:]
     assert np.mean(late) < growth * np.mean(early)
     assert np.mean(late) < 100.0
 
 
-@pytest.mark.untraced
 def test_the_path_is_current_after_every_update() -> None:
     backend = PoseGraphBackend(prompt(measurements=LEAST_SQUARES))
     late = [*DRIVE.positions[::2], *DRIVE.global_poses[1:], *DRIVE.closures]
@@ -754,6 +749,8 @@ def test_the_path_is_current_after_every_update() -> None:
         assert estimate.path.stamps_ns[-1] == max(
             event.stamp_ns for event in events[:k + 1] if isinstance(event, OdometrySample))
         assert estimate.chi2 == pytest.approx(backend.graph.energies().chi2, rel=1e-2, abs=0.05)
+        if k % 3 > 0:
+            continue
         other = Graph()
         edges, observed = backend.graph.edges, backend.graph.observed
         other.apply(GraphUpdate(hidden=backend.graph.poses, edges=edges, observed=observed))
@@ -946,7 +943,7 @@ def covariances(draw: st.DrawFn) -> FloatArray:
         return correlation * deviation * deviation[:, None]
 
 
-@settings(max_examples=300)
+@settings(max_examples=150)
 @given(st.lists(st.tuples(triples, covariances(), st.integers(0, 3), st.integers(0, 40)),
                 min_size=1, max_size=4))
 def test_no_numbers_bring_the_backend_down(
@@ -1008,7 +1005,6 @@ def drive_with_outage(
 
 
 # with seed 1 a step is only 8 % shorter than the one before
-@pytest.mark.untraced
 @pytest.mark.parametrize(
     ('drift', 'seed'), [(-2.0, 5), (-1.0, 5), (0.5, 5), (1.0, 5), (2.0, 5), (2.0, 1)])
 def test_a_heading_that_drifts_far_in_a_long_outage_is_wound_the_right_way(

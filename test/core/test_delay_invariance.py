@@ -7,7 +7,6 @@ from dataclasses import dataclass
 
 from hypothesis import given, settings, strategies as st
 import numpy as np
-import pytest
 
 from pose_graph_ros.core.alignment.monitor import AlignmentState
 from pose_graph_ros.core.backend import PoseGraphBackend
@@ -195,7 +194,6 @@ def assert_same(result: Result, expected: Result) -> None:
     assert np.max(off) < SAME_ONLINE
 
 
-@pytest.mark.untraced
 def test_the_drive_is_one_that_asks_for_something() -> None:
     for number, robust in DRIVES:
         result = reference(number, robust=robust)
@@ -205,7 +203,6 @@ def test_the_drive_is_one_that_asks_for_something() -> None:
         assert np.sqrt(np.mean(off**2)) < 0.25
 
 
-@pytest.mark.untraced
 @settings(max_examples=25)
 @given(st.integers(0, 2), st.booleans(), st.integers(0, 2**32 - 1),
        st.sampled_from((0.1, 2.0, LONGEST_DELAY)), st.sampled_from((1, 7, 50, 400)))

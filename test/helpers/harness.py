@@ -20,6 +20,7 @@ from diagnostic_msgs.msg import DiagnosticArray
 from geometry_msgs.msg import PoseWithCovarianceStamped, TransformStamped
 from lifecycle_msgs.srv import GetState
 from nav_msgs.msg import Odometry, Path as PathMessage
+from prepared_node import PreparedNode
 from rcl_interfaces.srv import SetParameters
 import rclpy
 from rclpy.context import Context
@@ -46,6 +47,8 @@ PATIENCE = 60.0
 """How long a test waits for something that comes at once, but for a busy machine [s]."""
 PREPARE_PATIENCE = 300.0
 """How long it waits for a node that may have to compile its kernels first [s]."""
+AS_A_USER = ('-m', 'pose_graph_ros.ros.main')
+"""How Python starts a node from nothing."""
 
 
 def copy_kernels(folder: Path, *, without: str) -> None:
@@ -68,22 +71,35 @@ def copy_kernels(folder: Path, *, without: str) -> None:
 
 
 class NodeProcess:
-    """The node as a user starts it."""
+    """
+    A node in a process of its own.
+
+    Parameters
+    ----------
+    log : path, folder for its logs
+    arguments : sequence of str, further arguments of ROS
+    domain : int, optional, of ROS; by default a free one
+    program : sequence of str, optional
+        What Python runs, such as AS_A_USER; by default the process comes from one that has done
+        the slow part of a start.
+
+    """
 
     def __init__(
         self, log: Path, arguments: Sequence[str] = (), domain: int | None = None,
-        program: Sequence[str] = ('-m', 'pose_graph_ros.ros.main'),
+        program: Sequence[str] = (),
     ) -> None:
         self._stack = ExitStack()
         self.env = self._stack.enter_context(isolated_environment(log))
         if domain is not None:
             self.env['ROS_DOMAIN_ID'] = str(domain)
         self._stderr = (log / 'stderr').open('w+')
-        self.process = subprocess.Popen(
-            [sys.executable, *program, '--ros-args',
-             '-p', 'diagnostics_period:=0.1', '-p', 'frequency:=10.0', '-p', 'path_period:=0.1',
-             *arguments],
-            env=self.env, stderr=self._stderr)
+        arguments = ['--ros-args', '-p', 'diagnostics_period:=0.1', '-p', 'frequency:=10.0',
+                     '-p', 'path_period:=0.1', *arguments]
+        self.process = (
+            subprocess.Popen([sys.executable, *program, *arguments], env=self.env,
+                             stderr=self._stderr) if program
+            else PreparedNode(arguments, self.env, log / 'stderr'))
 
     def stderr(self) -> str:
         self._stderr.seek(0)

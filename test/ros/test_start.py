@@ -7,7 +7,7 @@ import signal
 import time
 
 from circle import fix_at, odometry_at, path_error
-from harness import Client, copy_kernels, NodeProcess, PREPARE_PATIENCE
+from harness import AS_A_USER, Client, copy_kernels, NodeProcess, PREPARE_PATIENCE
 import pytest
 
 
@@ -18,7 +18,7 @@ def test_nothing_is_lost_while_kernels_are_compiled(
     # what the elimination needs is compiled: some eight seconds
     copy_kernels(tmp_path / 'kernels', without='elimination')
     monkeypatch.setenv('NUMBA_CACHE_DIR', str(tmp_path / 'kernels'))
-    with NodeProcess(tmp_path) as node:
+    with NodeProcess(tmp_path, program=AS_A_USER) as node:
         client = Client(int(node.env['ROS_DOMAIN_ID']))
         client.spin_until(lambda: len(client.diagnostics) > 0
                           and client.odom.get_subscription_count() > 0
@@ -55,7 +55,7 @@ def test_a_signal_while_kernels_are_compiled_ends_the_node(
 ) -> None:
     # all is compiled, as after an installation
     monkeypatch.setenv('NUMBA_CACHE_DIR', str(tmp_path / 'kernels'))
-    with NodeProcess(tmp_path) as node:
+    with NodeProcess(tmp_path, program=AS_A_USER) as node:
         client = Client(int(node.env['ROS_DOMAIN_ID']))
         client.spin_until(lambda: len(client.diagnostics) > 0, 'it runs', PREPARE_PATIENCE)
         assert client.values['prepared'] == '0'
@@ -75,7 +75,7 @@ def catches(pid: int, number: signal.Signals) -> bool:
 def test_a_signal_while_modules_are_imported_ends_the_node(
     tmp_path: Path, number: signal.Signals,
 ) -> None:
-    with NodeProcess(tmp_path) as node:
+    with NodeProcess(tmp_path, program=AS_A_USER) as node:
         deadline = time.monotonic() + 20.0
         while not catches(node.process.pid, signal.SIGTERM):
             assert time.monotonic() < deadline

@@ -17,9 +17,10 @@ from pose_graph_ros.core.estimate import Estimate
 from pose_graph_ros.core.exceptions import FileFormatError
 from pose_graph_ros.core.measurements import Answer, GlobalPose, OdometrySample
 from pose_graph_ros.core.smoother.incremental import Refinement
-from pose_graph_ros.ros.worker import Worker
+from pose_graph_ros.ros.worker import GATHERING, Worker
 
-PATIENCE = 10.0
+PATIENCE = 60.0
+"""How long a test waits for what comes at once, but for compilations or a busy machine [s]."""
 
 
 def wait_until(done: Callable[[], bool]) -> None:
@@ -65,12 +66,14 @@ def test_measurements_are_added_many_at_a_time_and_an_update_has_all_of_them() -
         worker.post('odom', sample(1 + step))
     wait_until(lambda: worker.estimate is not None and worker.status.processed == 5)
     turns.clear()
+    begin = time.monotonic()
     for step in range(6, 206):
         worker.post('odom', sample(step))
         time.sleep(0.001)
     wait_until(lambda: worker.status.processed == 205)
     assert sum(turns) == 200
-    assert len(turns) <= 100
+    # of which the first waits for a turn that may have begun before
+    assert len(turns) <= 2 + (time.monotonic() - begin) / GATHERING
     worker.post('odom', sample(206))
     worker.request_update()
     wait_until(lambda: worker.estimate.stamp_ns == 206 * 100_000_000)
@@ -167,9 +170,10 @@ def test_posting_never_waits_for_the_solver() -> None:
 
 
 def test_stopping_does_not_wait_for_ever() -> None:
-    release = threading.Event()
+    begun, release = threading.Event(), threading.Event()
 
     def solve(*arguments: object) -> object:
+        begun.set()
         release.wait(PATIENCE)
         return optimizer.optimize(*arguments)
 
@@ -177,8 +181,7 @@ def test_stopping_does_not_wait_for_ever() -> None:
     worker.start()
     worker.post('odom', sample(1))
     worker.request_final_optimization()
-    wait_until(lambda: worker.status is not None)
-    time.sleep(0.05)
+    assert begun.wait(PATIENCE)
     assert not worker.stop(0.1)
     release.set()
     assert worker.stop(PATIENCE)

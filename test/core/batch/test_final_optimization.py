@@ -127,7 +127,6 @@ def test_the_minimum_is_that_of_the_robust_cost(loss: Loss, seed: int) -> None:
     assert weights[0] == 1.0
 
 
-@pytest.mark.untraced
 @pytest.mark.parametrize('seed', range(4))
 @pytest.mark.parametrize('off', [5.0, 20.0, 1000.0])
 def test_a_fifth_of_outliers_hardly_shows_with_cauchy(seed: int, off: float) -> None:
@@ -141,10 +140,11 @@ def test_a_fifth_of_outliers_hardly_shows_with_cauchy(seed: int, off: float) -> 
     assert rms(with_, truth) < rms(without, truth) + 0.1     # before the final optimisation
     with_.optimize()
     assert rms(with_, truth) < rms(without, truth) + 0.1
-    plain = fed(PoseGraphBackend(config(Loss.NONE)), odometry, dirty)
-    plain.optimize()
-    assert rms(plain, truth) > rms(with_, truth)
-    huber = fed(PoseGraphBackend(config(Loss.HUBER)), odometry, dirty)
+    if off < 100.0:     # it takes long to fold the path to the farther ones
+        plain = fed(PoseGraphBackend(config(Loss.NONE)), odometry, dirty, updates=False)
+        plain.optimize()
+        assert rms(plain, truth) > rms(with_, truth)
+    huber = fed(PoseGraphBackend(config(Loss.HUBER)), odometry, dirty, updates=False)
     huber.optimize()
     assert rms(with_, truth) - 0.05 < rms(huber, truth) < 1.0
 

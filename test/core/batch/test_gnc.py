@@ -78,7 +78,8 @@ class Dense:
             return (factor[:, None] * self.errors(poses)).ravel()
 
         found = least_squares(residuals, self.start[1:].ravel(), method='lm', xtol=1e-12)
-        return np.vstack((self.start[:1], found.x.reshape(-1, 3)))
+        self.start = np.vstack((self.start[:1], found.x.reshape(-1, 3)))
+        return self.start
 
     def squares(self, poses: FloatArray) -> FloatArray:
         return np.sum(self.errors(poses) ** 2, axis=1)

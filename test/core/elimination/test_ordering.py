@@ -78,7 +78,7 @@ def graphs(draw: st.DrawFn) -> tuple[int, Pairs, list[list[int]], int]:
 
 
 @given(graphs())
-@settings(max_examples=300)
+@settings(max_examples=100)
 def test_cliques_are_what_elimination_node_by_node_gives(
     graph: tuple[int, Pairs, list[list[int]], int],
 ) -> None:
@@ -94,7 +94,7 @@ def test_cliques_are_what_elimination_node_by_node_gives(
 
 
 @given(graphs())
-@settings(max_examples=300)
+@settings(max_examples=100)
 def test_the_separator_of_a_clique_is_a_part_of_its_parent(
     graph: tuple[int, Pairs, list[list[int]], int],
 ) -> None:
@@ -112,7 +112,7 @@ def test_the_separator_of_a_clique_is_a_part_of_its_parent(
 
 
 @given(graphs())
-@settings(max_examples=200)
+@settings(max_examples=100)
 def test_the_last_nodes_are_eliminated_last_and_in_order(
     graph: tuple[int, Pairs, list[list[int]], int],
 ) -> None:

@@ -287,7 +287,6 @@ def test_a_reversed_edge_adds_the_same_to_the_system_to_first_order() -> None:
 
 # --- Footnote 4: the information may be turned instead of the error --------------------------
 
-@pytest.mark.untraced
 @given(seeds)
 def test_turning_the_information_equals_turning_the_error(seed: int) -> None:
     poses, edges = edges_of_pairs(np.random.default_rng(seed), zero_error=False)

@@ -178,7 +178,7 @@ def files_of_a_line() -> dict[str, bytes]:
 
 @given(st.sampled_from(['g2o', 'json']), st.floats(0.0, 1.0, exclude_max=True),
        st.integers(0, 255), st.booleans())
-@settings(max_examples=300)
+@settings(max_examples=150)
 def test_no_damage_goes_unnoticed(suffix: str, where: float, byte: int, cut: bool) -> None:
     with tempfile.TemporaryDirectory() as folder:
         for name, each in files_of_a_line().items():
@@ -341,9 +341,8 @@ def members_of_a_drive() -> tuple[dict[str, Any], list[tuple[Any, ...]]]:
     return members, leaves(members)
 
 
-@pytest.mark.untraced
 @given(st.data())
-@settings(max_examples=300)
+@settings(max_examples=150)
 def test_with_any_value_of_a_member_a_file_is_refused_or_usable(data: st.DataObject) -> None:
     members, places = members_of_a_drive()
     place = data.draw(st.sampled_from(places))

@@ -136,7 +136,6 @@ def slow_nodes(
     return result
 
 
-@pytest.mark.untraced
 @settings(max_examples=40)
 @given(st.integers(0, 10**6))
 def test_nodes_are_where_a_slow_walk_puts_them(seed: int) -> None:
@@ -163,7 +162,6 @@ def test_nodes_are_where_a_slow_walk_puts_them(seed: int) -> None:
             se2.wrapped(made.poses), se2.wrapped(np.array(poses)[at]), atol=ROUNDING)
 
 
-@pytest.mark.untraced
 @pytest.mark.parametrize('rate', [1, 10])
 def test_an_hour_at_rest_leaves_the_heartbeat(rate: int) -> None:
     nodes, made, _ = grown([
@@ -185,7 +183,6 @@ def test_a_node_that_cannot_be_made_is_made_at_the_next_sample() -> None:
 
 # --- Several sources -------------------------------------------------------------------------
 
-@pytest.mark.untraced
 @settings(max_examples=30)
 @given(st.floats(0.02, 0.4), st.floats(0.02, 0.4), st.floats(-3.0, 3.0), st.floats(-3.0, 3.0))
 def test_another_source_adds_edges_between_the_nodes_that_it_covers(
@@ -360,7 +357,6 @@ SILENCES = st.lists(st.tuples(
     st.sampled_from(list(FRAMES)), st.floats(0.0, 25.0), st.floats(1.7, 9.0)), max_size=5)
 
 
-@pytest.mark.untraced
 @settings(max_examples=60)
 @given(SILENCES, st.data(), st.sampled_from((0.0, 0.02, 0.24)))
 def test_nodes_and_edges_do_not_depend_on_the_order_of_arrival(
@@ -400,7 +396,6 @@ def test_nodes_and_edges_do_not_depend_on_the_order_of_arrival(
                 np.testing.assert_array_equal(one.noise, other.noise)
 
 
-@pytest.mark.untraced
 @settings(max_examples=30)
 @given(SILENCES, st.integers(0, 10**6))
 def test_the_attachment_of_a_stamp_does_not_depend_on_later_samples(

@@ -67,7 +67,6 @@ WIGGLE = drive(np.arange(120) * 0.05, steady(2.0), lambda t: 0.4 * np.sin(t))
 WIGGLE[60:] = [OdometrySample(one.stamp_ns, one.pose - WIGGLE[60].pose) for one in WIGGLE[60:]]
 
 
-@pytest.mark.untraced
 @given(st.data())
 def test_samples_shuffled_within_the_window_give_the_same_bits(data: st.DataObject) -> None:
     delays = data.draw(st.lists(
@@ -379,7 +378,6 @@ def test_without_a_variance_the_noise_is_that_of_the_model() -> None:
 
 # --- Memory ----------------------------------------------------------------------------------
 
-@pytest.mark.untraced
 def test_an_hour_of_standing_still_leaves_nothing() -> None:
     stream = OdometryStream(OdometrySource(noise_from=NoiseFrom.TWIST))
     pose, variance = np.array([1.0, 2.0, 0.3]), np.array([0.1, 0.1, 0.1])

@@ -237,7 +237,6 @@ def test_one_pose_at_a_time_is_the_same_as_arrays(x: float, a: float, b: float) 
     np.testing.assert_allclose(between_one(one, two), se2.between(first, second), atol=1e-11)
 
 
-@pytest.mark.untraced
 @given(st.lists(st.tuples(st.integers(1, 2_000_000_000), st.sampled_from((0, 0, 1))),
                 min_size=1, max_size=40), st.data())
 def test_thinning_changes_nothing_at_the_instants_that_matter_and_after(

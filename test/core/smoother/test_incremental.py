@@ -301,7 +301,6 @@ def test_a_bad_update_leaves_no_trace(name: str, n: int) -> None:
         assert smoother.poses.tobytes() == spared.poses.tobytes()
 
 
-@pytest.mark.untraced
 @pytest.mark.parametrize('fails_in', [1, 2, 3])
 def test_a_failure_in_any_iteration_leaves_no_trace(
     fails_in: int, monkeypatch: pytest.MonkeyPatch,

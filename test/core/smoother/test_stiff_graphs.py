@@ -46,7 +46,7 @@ def replay(made: StiffGraph, at_end: bool) -> IncrementalSmoother:
 
 
 @pytest.mark.parametrize('decades', DECADES)
-@settings(max_examples=6, deadline=None)
+@settings(max_examples=4, deadline=None)
 @given(seed=seeds, from_odometry=st.booleans())
 def test_the_batch_reaches_the_optimum(decades: float, seed: int, from_odometry: bool) -> None:
     made = stiff_graph(seed, decades)
@@ -59,7 +59,7 @@ def test_the_batch_reaches_the_optimum(decades: float, seed: int, from_odometry:
 
 
 @pytest.mark.parametrize('decades', DECADES)
-@settings(max_examples=6, deadline=None)
+@settings(max_examples=4, deadline=None)
 @given(seed=seeds, at_end=st.booleans())
 def test_the_smoother_reaches_the_optimum(decades: float, seed: int, at_end: bool) -> None:
     made = stiff_graph(seed, decades)
@@ -68,7 +68,7 @@ def test_the_smoother_reaches_the_optimum(decades: float, seed: int, at_end: boo
 
 
 @pytest.mark.parametrize('decades', DECADES)
-@settings(max_examples=6, deadline=None)
+@settings(max_examples=4, deadline=None)
 @given(seed=seeds)
 def test_covariances_are_those_of_an_orthogonal_solver(decades: float, seed: int) -> None:
     made = stiff_graph(seed, decades)

@@ -263,7 +263,6 @@ def drive(seed: int) -> list[Measurement]:
           for k in range(10))]
 
 
-@pytest.mark.untraced
 @settings(max_examples=15, deadline=None)
 @given(seed=st.integers(0, 10), data=st.data(), model=st.sampled_from(Correlation),
        loss=st.sampled_from((Loss.NONE, Loss.HUBER, Loss.CAUCHY)))

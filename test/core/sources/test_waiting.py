@@ -100,7 +100,6 @@ def test_a_dropped_measurement_may_be_sent_again(monkeypatch: pytest.MonkeyPatch
     assert backend.add_measurement(ahead, 'compass').reason == 'duplicate_stamp'
 
 
-@pytest.mark.untraced
 def test_measurements_leave_no_objects_behind() -> None:
     backend, n = PoseGraphBackend(), 3000
     for k in range(n):
