@@ -436,5 +436,6 @@ class Session:
         if self.out.transforms is not None and self.active:
             self.out.transforms.check_for_others()
         self.energies.update(self.worker)
-        level, text = diagnostics.health(self)
-        self.out.publish_diagnostics(level, text, diagnostics.values(self))
+        # in this order: the sentence is then at least as new as the values beside it
+        values = diagnostics.values(self)
+        self.out.publish_diagnostics(*diagnostics.health(self), values)

@@ -9,7 +9,6 @@ import math
 from pathlib import Path
 import random
 import signal
-import time
 
 from circle import (
     check_pose,
@@ -206,8 +205,7 @@ def test_what_cannot_be_solved_for_is_set_aside_and_the_node_goes_on(
     client.spin_until(lambda: client.values.get('quarantined') == '1', 'it is set aside')
     assert client.values['solver.failed'] == '1'
     assert client.values['quarantined.1'] == f'global_pose at {START + 2.0:.3f} s near x3'
-    # the level may be older than the values beside it
-    client.spin_until(lambda: client.diagnostics[-1].status[0].level == b'\x02', 'it is an error')
+    assert client.diagnostics[-1].status[0].level == b'\x02'
     assert client.values['alignment'] == 'local'
     client.global_pose.publish(pose(START + 3.0, *true_pose(3.0).tolist()))
     client.spin_until(lambda: client.values['alignment'] == 'aligned', 'it is aligned')
@@ -356,17 +354,6 @@ def test_arguments_that_ros_cannot_read_end_the_node_without_a_traceback(tmp_pat
     for error in errors_of(tmp_path, UNREADABLE, AS_A_USER):
         assert 'pose_graph_node: ' in error
         assert 'Traceback' not in error
-
-
-def test_a_signal_during_the_start_ends_the_node_as_quietly(tmp_path: Path) -> None:
-    for delay in (0.2, 0.4, 0.6, 0.8, 1.0):
-        with NodeProcess(tmp_path, program=AS_A_USER) as node:
-            time.sleep(delay)
-            node.process.send_signal(signal.SIGINT)
-            node.process.wait(PATIENCE)
-            stderr = node.stderr()
-            # before its first line runs, Python itself takes the signal
-            assert 'Traceback' not in stderr or 'pose_graph_ros' not in stderr, stderr
 
 
 @pytest.mark.parametrize(

@@ -16,7 +16,7 @@ import pytest
 pytest.importorskip('rclpy', reason='ROS 2 is not there: no rclpy')
 
 from circle import fix_at, odometry_at, PLANE, true_pose
-from harness import PREPARE_PATIENCE
+from harness import PATIENCE, PREPARE_PATIENCE
 from lifecycle_msgs.msg import Transition
 from lifecycle_msgs.srv import ChangeState
 from local_node import Driver, LocalNode
@@ -198,11 +198,12 @@ def test_a_new_graph_while_it_is_optimised_is_answered(managed: Managed) -> None
     managed.start()
     managed.drive(2.0)
     running, release = threading.Event(), threading.Event()
-    managed.session.worker.call(lambda _: (running.set(), release.wait(10.0)))
-    assert running.wait(10.0)
+    managed.session.worker.call(lambda _: (running.set(), release.wait(PATIENCE)))
+    assert running.wait(PATIENCE)
     answer = managed.request('optimize')
     worker = managed.session.worker
-    managed.wait(lambda: len(worker._jobs) > 0, 'the optimisation waits')
+    managed.wait(lambda: any(what == 'the full optimisation' for what, *_ in worker._jobs),
+                 'the optimisation waits')
     managed.session.reset()
     release.set()
     managed.wait(answer.done, 'it answers')
@@ -414,7 +415,7 @@ def held(
 
     def wait(*given: object) -> object:
         running.set()
-        assert release.wait(10.0)
+        assert release.wait(PATIENCE)
         return function(*given)
     with monkeypatch.context() as patch:
         patch.setattr(module, name, wait)

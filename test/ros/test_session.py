@@ -16,7 +16,7 @@ pytest.importorskip('rclpy', reason='ROS 2 is not there: no rclpy')
 from circle import fix_at, odometry_at, START, true_pose
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
 from geometry_msgs.msg import PoseWithCovarianceStamped
-from harness import LATCHED, odometry, pose, PREPARE_PATIENCE, stamp_ns, TFMessage
+from harness import LATCHED, odometry, PATIENCE, pose, PREPARE_PATIENCE, stamp_ns, TFMessage
 from local_node import Driver, LocalNode
 from nav_msgs.msg import Odometry, Path as PathMessage
 import numpy as np
@@ -105,7 +105,7 @@ def test_measurements_come_in_and_poses_path_and_diagnostics_go_out(
     active.wait(lambda: len(paths) > 0, 'a path comes')
     # from now on only after an optimisation
     active.configure(path_period=1000.0)
-    active.session.worker.call(lambda _: None).result(10.0)
+    active.session.worker.call(lambda _: None).result(PATIENCE)
     newest_ns = active.session.out._path_stamp_ns
     report = active.session.optimize()
     active.wait(report.done, 'it is optimised')
@@ -153,7 +153,7 @@ def test_an_inactive_session_keeps_its_graph_and_grows_it_when_it_is_active_agai
     active.drive(5.0)
     active.session.deactivate()
     # an update that was requested before
-    active.session.worker.call(lambda _: None).result(10.0)
+    active.session.worker.call(lambda _: None).result(PATIENCE)
     before = active.session.worker.estimate
     assert not active.session.active
     assert list(active.local.node.subscriptions) == []
@@ -394,7 +394,7 @@ def test_a_pose_is_said_to_be_set_only_when_the_engine_has_taken_it(
 
         def answered(*given: object, answer=answer, running=running, release=release) -> Answer:
             running.set()
-            assert release.wait(10.0)
+            assert release.wait(PATIENCE)
             return set_pose(*given) if answer is None else answer
         engine.set_pose = answered
         caplog.clear()
@@ -412,8 +412,8 @@ def test_an_earlier_worker_writes_nothing_into_a_new_graph(active: Robot) -> Non
     active.wait(lambda: len(paths) > 0, 'a path comes')
     old, graph = session.worker, session.out.graph
     running, release = threading.Event(), threading.Event()
-    old.call(lambda _: (running.set(), release.wait(10.0)))
-    assert running.wait(10.0)
+    old.call(lambda _: (running.set(), release.wait(PATIENCE)))
+    assert running.wait(PATIENCE)
     session.energies = LargestEnergies()
     session.publish_diagnostics()
     asked, optimisation = session.energies._asked, session.optimize()
@@ -451,20 +451,20 @@ def test_the_graph_is_optimised_once_when_the_stream_ends(active: Robot) -> None
     worker = active.session.worker
     request = worker.request_final_optimization
     worker.request_final_optimization = lambda: finals.append(request())
-    assert worker.call(lambda backend: backend.n_waiting).result(10.0) == 0
+    assert worker.call(lambda backend: backend.n_waiting).result(PATIENCE) == 0
     for _ in range(2):
         active.session._on_silence_timer()
     assert finals == []
     active.send('odom', odometry_at(3.0))
     active.wait(lambda: len(finals) > 0, 'it is optimised again')
-    assert finals[0].result(10.0).status is Status.CONVERGED
+    assert finals[0].result(PATIENCE).status is Status.CONVERGED
 
 
 def test_a_loaded_graph_is_continued_with_its_datum(active: Robot) -> None:
     active.drive(8.0)
     session = active.session
     plane = session.input.reader.datum.plane
-    saved = session.worker.call(lambda backend: backend.saved(plane.origin)).result(10.0)
+    saved = session.worker.call(lambda backend: backend.saved(plane.origin)).result(PATIENCE)
     before = session.worker.estimate
     active.session.reset()
     backend = PoseGraphBackend.restored(backend_config(session.values), saved)
@@ -483,13 +483,13 @@ def test_a_loaded_graph_is_continued_with_its_datum(active: Robot) -> None:
 def test_a_new_graph_cancels_an_optimisation(active: Robot) -> None:
     active.drive(3.0)
     running, release = threading.Event(), threading.Event()
-    active.session.worker.call(lambda _: (running.set(), release.wait(10.0)))
-    assert running.wait(10.0)
+    active.session.worker.call(lambda _: (running.set(), release.wait(PATIENCE)))
+    assert running.wait(PATIENCE)
     optimisation = active.session.optimize()
     active.session.reset()
     release.set()
     with pytest.raises(CancelledError):
-        optimisation.result(10.0)
+        optimisation.result(PATIENCE)
 
 
 @pytest.mark.skipif(TFMessage is None, reason='tf2_msgs is not built: no /tf')
@@ -513,12 +513,12 @@ def test_the_end_waits_only_so_long_for_a_solve(
 
     def solve(_: PoseGraphBackend) -> None:
         running.set()
-        release.wait(10.0)
+        release.wait(PATIENCE)
     with LocalNode(tmp_path) as local:
         robot = Robot(local)
         worker = robot.session.worker
         worker.call(solve)
-        assert running.wait(10.0)
+        assert running.wait(PATIENCE)
         robot.session.close()
         assert worker.alive
         release.set()
@@ -634,7 +634,7 @@ def test_a_graph_that_was_loaded_waits_for_odometry(active: Robot) -> None:
     graphs = active.local.subscribe(MarkerArray, 'graph', LATCHED)
     active.drive(4.0)
     session = active.session
-    saved = session.worker.call(lambda backend: backend.saved()).result(10.0)
+    saved = session.worker.call(lambda backend: backend.saved()).result(PATIENCE)
     active.wait(lambda: len(paths) > 0 and len(graphs) > 0, 'path and markers come')
     session.reset()
     active.wait(lambda: len(paths[-1].poses) == 0, 'the path is taken back')

@@ -122,8 +122,8 @@ def test_two_of_each_from_a_file_and_one_falls_silent(tmp_path: Path) -> None:
         assert len(client.poses) >= 15
         for message in client.poses:
             assert pose_error(message) < 0.05
-        # its frame is not the one that the transform speaks of
-        assert len(client.transforms) == 0
+        # its frame is not the one that the transform speaks of; those of before may come late
+        assert all(stamp_ns(item) < (START + step / 10.0) * 1e9 for item in client.transforms)
 
 
 def test_the_file_of_defaults_is_taken_and_what_is_not_known_is_said(tmp_path: Path) -> None:

@@ -2,12 +2,14 @@
 # SPDX-License-Identifier: Apache-2.0
 """Starts and ends: while kernels are compiled nothing is lost, and any moment can be the last."""
 
+from collections.abc import Callable
+import os
 from pathlib import Path
 import signal
 import time
 
 from circle import fix_at, odometry_at, path_error
-from harness import AS_A_USER, Client, copy_kernels, NodeProcess, PREPARE_PATIENCE
+from harness import AS_A_USER, Client, copy_kernels, NodeProcess, PATIENCE, PREPARE_PATIENCE
 import pytest
 
 
@@ -71,14 +73,38 @@ def catches(pid: int, number: signal.Signals) -> bool:
     return bool(int(line.split()[1], 16) >> (number - 1) & 1)
 
 
+def processor_time(pid: int) -> float:
+    """Return the time of the processor that a process has used [s]."""
+    fields = Path(f'/proc/{pid}/stat').read_text().rpartition(')')[2].split()
+    return (int(fields[11]) + int(fields[12])) / os.sysconf('SC_CLK_TCK')
+
+
+def wait_until(done: Callable[[], bool]) -> None:
+    deadline = time.monotonic() + PATIENCE
+    while not done():
+        assert time.monotonic() < deadline
+        time.sleep(0.001)
+
+
+def wait_until_it_catches(node: NodeProcess, number: signal.Signals) -> None:
+    """Wait until the first lines of the node have run; before, Python itself takes a signal."""
+    wait_until(lambda: catches(node.process.pid, number))
+
+
 @pytest.mark.parametrize('number', [signal.SIGINT, signal.SIGTERM])
 def test_a_signal_while_modules_are_imported_ends_the_node(
     tmp_path: Path, number: signal.Signals,
 ) -> None:
     with NodeProcess(tmp_path, program=AS_A_USER) as node:
-        deadline = time.monotonic() + 20.0
-        while not catches(node.process.pid, signal.SIGTERM):
-            assert time.monotonic() < deadline
-            time.sleep(0.001)
+        wait_until_it_catches(node, signal.SIGTERM)
         assert node.signal_and_wait(number, signal.SIGINT) == 0
         assert node.stderr() == ''
+
+
+@pytest.mark.parametrize('used', [0.4, 0.8, 1.2, 1.6])
+def test_a_signal_at_any_moment_of_the_start_ends_the_node(tmp_path: Path, used: float) -> None:
+    with NodeProcess(tmp_path, program=AS_A_USER) as node:
+        wait_until_it_catches(node, signal.SIGTERM)
+        wait_until(lambda: processor_time(node.process.pid) > used)
+        assert node.signal_and_wait(signal.SIGINT) == 0
+        assert 'Traceback' not in node.stderr()
