@@ -103,11 +103,12 @@ class Process:
 @contextmanager
 def started(
     module: str, parameters: Sequence[str] = (), *, path: bool = False,
+    feeder_type: type[Feeder] = Feeder,
 ) -> Iterator[tuple[Process, Feeder]]:
     """Start a process and a feeder that talk to each other alone."""
     with tempfile.TemporaryDirectory(prefix='pose_graph_') as log, \
             isolated_environment(Path(log)) as environment, \
-            Feeder(environment, listens_to_path=path) as feeder:
+            feeder_type(environment, listens_to_path=path) as feeder:
         process = Process(module, environment, parameters)
         try:
             yield process, feeder

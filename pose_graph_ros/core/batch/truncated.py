@@ -35,8 +35,8 @@ ROUGH = SolverConfig(max_iterations=15, step_tolerance=1e-4)
 # Eigenvalue of an information matrix with unit diagonal above which it counts for the rank.
 _RANK = 1e-9
 
-# Maximum number of sets that a retest leads to.
-RETESTS = 20
+# Maximum number of sets that a retest leads to, and of those whose solution is kept.
+RETESTS, MOST_KEPT = 20, 16
 
 _NONE: Final[IntArray] = np.empty(0, dtype=np.int64)
 
@@ -84,6 +84,8 @@ class TruncatedProblem:
         self.allowed = np.ones(len(self.limits), dtype=bool)
         """Which of them a set may believe, shape (M,)."""
         self._weights = np.concatenate((self.edges.weight, self.observed.weight))
+        self._choices: dict[tuple[bytes, bytes, SolverConfig], Choice] = {}
+        """The last sets that were solved for, the newest last."""
         self._start = graph.poses.copy() if start is None else start
         if start is None and self.solve(np.zeros(len(self)), CONFIG):
             self._start = graph.poses.copy()
@@ -143,6 +145,16 @@ class TruncatedProblem:
         config : SolverConfig
 
         """
+        # retests of different sets often lead to the same one
+        key = believed.tobytes(), self.limits.tobytes(), config
+        choice = self._choices.pop(key, None) or self._solved(believed, config)
+        if choice is not None:
+            self._choices[key] = choice
+            if len(self._choices) > MOST_KEPT:
+                del self._choices[next(iter(self._choices))]
+        return choice
+
+    def _solved(self, believed: BoolArray, config: SolverConfig) -> Choice | None:
         if not self.solve(believed.astype(np.float64), config):
             return None
         squares = self.energies()
