@@ -187,12 +187,10 @@ SOURCE_PARAMETERS: tuple[Parameter, ...] = (
               6.3, kinds=(Kind.IMU,)),
     *(Parameter('robust', robust.value, '', text, choices=choices, kinds=kinds)
       for kinds, robust, choices, text in (
-        *((kinds, defaults.robust, _values(config.Robust), 'Protection from wrong '
-           'measurements: with `judged` each one takes part only while it is believed, and those '
-           'that do have the `robust_loss`; with `loss` all take part, with the `robust_loss`; '
-           'with `none` all take part, without it.')
-          for kinds, defaults in ((_POSITIONS, config.POSITIONS),
-                                  ((Kind.LOOP_CLOSURE,), config.LOOP_CLOSURES))),
+        (_JUDGED, config.POSITIONS.robust, _values(config.Robust), 'Protection from wrong '
+         'measurements: with `judged` each one takes part only while it is believed, and those '
+         'that do have the `robust_loss`; with `loss` all take part, with the `robust_loss`; '
+         'with `none` all take part, without it.'),
         ((Kind.IMU,), config.HEADINGS.robust, _values(config.Robust)[1:], 'Whether the '
          '`robust_loss` is used.'))),
     Parameter('sigma_scale', _MEASUREMENT.sigma_scale, '', 'Factor on the standard deviations of '

@@ -253,7 +253,8 @@ class MeasurementSource:
         return Loss.NONE if self.robust is Robust.NONE else self.loss
 
 
-POSITIONS = MeasurementSource(loss=Loss.HUBER, correlation_time=FOUND)
+POSITIONS = MeasurementSource(
+    robust=Robust.JUDGED, loss=Loss.HUBER, correlation_time=FOUND)
 """Defaults of a source of global poses or positions."""
 HEADINGS = MeasurementSource(minimum_period=0.5)
 """Defaults of a source of headings; thinned, as an IMU sends many redundant ones."""

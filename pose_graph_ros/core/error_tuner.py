@@ -148,9 +148,9 @@ class ErrorTuner:
 
     def tell_scale(self) -> None:
         """Have fixes judged by an odometry that is as uncertain as the sources show."""
-        self._judge.odometry_scale = max((
+        self._judge.set_odometry_scale(max((
             self._factors.constraints(source).odometry_scale
-            for source in self._factors.finding()), default=1.0)
+            for source in self._factors.finding()), default=1.0))
 
     def _next_search(self) -> _Search | None:
         for source in self._factors.due_for_estimate():

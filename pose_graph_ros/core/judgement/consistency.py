@@ -64,6 +64,8 @@ class OdometryChain:
         self._sums = GrowingArray((6,), np.float64)
         self._travel = GrowingArray((), np.float64)
         self._n_edges = 0
+        self.noise_factor = 1.0
+        """On the covariances of odometry."""
 
     def __len__(self) -> int:
         return len(self._rows)
@@ -126,7 +128,7 @@ class OdometryChain:
         adjoint = se2.adjoint(se2.inverse(self._poses.values[at_j]))
         total = full(ahead * (self._sums.values[at_j] - self._sums.values[at_i]))
         return (se2.between(self._poses.values[at_i], self._poses.values[at_j]),
-                adjoint @ total @ np.swapaxes(adjoint, 1, 2))
+                self.noise_factor * adjoint @ total @ np.swapaxes(adjoint, 1, 2))
 
     def squared_distances(
         self, closures: Closures, first: IntArray, second: IntArray,

@@ -42,7 +42,7 @@ def verdicts(states: FixStates, graph: Graph, most_believed: int | None) -> list
     """
     numbers = listed(states.records[:, SOURCE], states.believed,
                      states.records[:, DECISION] != AUTO, most_believed)
-    return [verdict(states, graph, number) for number in numbers.tolist()]
+    return verdicts_on(states, graph, numbers)
 
 
 def drawn_rows(states: FixStates, others: DrawnRows) -> DrawnRows:
@@ -61,17 +61,23 @@ def drawn_rows(states: FixStates, others: DrawnRows) -> DrawnRows:
                            unused_observed=unused[~edge, ROW].tolist())
 
 
-def verdict(states: FixStates, graph: Graph, number: int) -> Verdict:
+def verdicts_on(states: FixStates, graph: Graph, numbers: IntArray) -> list[Verdict]:
     """
-    Return the verdict on one measurement.
+    Return the verdicts on some measurements.
 
     Parameters
     ----------
     states : FixStates
     graph : Graph
-    number : int
+    numbers : ndarray of int, shape (K,)
 
     """
+    residuals = _residuals(graph, *states.records[numbers][:, (ROW, EDGE)].T)
+    return [_verdict(states, number, residual)
+            for number, residual in zip(numbers.tolist(), residuals, strict=True)]
+
+
+def _verdict(states: FixStates, number: int, residual: FloatArray) -> Verdict:
     record = states.records[number]
     believed, edge = bool(record[BELIEVED]), bool(record[EDGE])
     # members of a run follow one another
@@ -84,18 +90,20 @@ def verdict(states: FixStates, graph: Graph, number: int) -> Verdict:
         stamp_ns=int(record[STAMP]), reference_ns=None,
         state=State.BELIEVED if believed else State.DOUBTED, since_ns=int(record[SINCE]),
         decision=DECISIONS[record[DECISION]],
-        residual=_residual(graph, record[ROW:ROW + 1], edge=edge),
+        residual=residual,
         distance=float(states.distances[number]),
         supported_by=tuple(states.name(other) for other in near.tolist()),
         contradicted_by=() if believed else ('odometry',), edge=edge, row=int(record[ROW]))
 
 
-def _residual(graph: Graph, row: IntArray, *, edge: bool) -> FloatArray:
-    """Return the error at the estimate, nan where nothing is measured."""
-    if edge:
-        biased = graph.edges_at(row)
-        error, information = edge_errors(graph.poses, biased), biased.information
-    else:
-        observed = graph.observed_at(row)
-        error, information = observed_errors(graph.poses, observed), observed.information
-    return np.where(np.diagonal(information[0]) > 0.0, error[0], np.nan)
+def _residuals(graph: Graph, rows: IntArray, is_edge: IntArray) -> FloatArray:
+    """Return the errors at the estimate, shape (K, 3), nan where nothing is measured."""
+    residuals = np.empty((len(rows), 3))
+    some = is_edge != 0
+    biased, observed = graph.edges_at(rows[some]), graph.observed_at(rows[~some])
+    for which, error, information in (
+            (some, edge_errors(graph.poses, biased), biased.information),
+            (~some, observed_errors(graph.poses, observed), observed.information)):
+        measured = np.diagonal(information, axis1=1, axis2=2) > 0.0
+        residuals[which] = np.where(measured, error, np.nan)
+    return residuals

@@ -46,14 +46,15 @@ from pose_graph_ros.core.sources.factor_builder import NewConstraint
 MORE_OF_POSE = 2.5
 # A prediction with this many times the variance of the measurement begins a new run.
 WIDE = 9.0
-# Beyond this, the prediction is improved within an update.
-LOOSE = 0.5
 # Sigma of the heading at the beginning of a run, if it is not known better [rad], and variance of
 # the position before the first measurement [m^2].
 BEGIN_HEADING = 0.2
 NOWHERE = 1e6
 # Largest number of measurements that are all judged again at the end of a stream.
 MOST_AGAIN = 100_000
+# Bounds of the factor on the sigmas of odometry while fixes are judged: those that are stated are
+# often too small, and wrong fixes that are believed make them seem smaller than they are.
+LEAST_SCALE, MOST_SCALE = 2.0, 3.0
 # How long what was in the graph before the first measurement counts as a run [s].
 KNOWN_BEFORE = 100.0
 
@@ -65,7 +66,6 @@ class _Before(NamedTuple):
     """Number of records."""
     runs: dict[int, Run]
     main: int
-    stale: bool
     loosened: dict[int, float]
 
 
@@ -88,11 +88,11 @@ class FixJudge:
         self._runs: list[Run] = []
         self._main: Run | None = None
         """The newest run that is believed."""
-        self._live: Track | None = None
-        self._stale = False
         self._n_runs = 0
         self._loosened: dict[int, float] = {}   # weights of odometry edges by row
         """Replaced, never changed, so that no copy is needed to undo it."""
+        self.odometry_scale = 1.0
+        """Factor on the sigmas of odometry that the measurements show."""
         self._restore: _Before | None = None
         self._now_ns, self._again = -1, -1
         """Newest stamp of odometry, and the record that is judged again, -1 for a new one."""
@@ -122,8 +122,7 @@ class FixJudge:
         self._restore, self._now_ns = self._copy(), now_ns
         graph = self._smoother.graph
         solved = not graph.has_touched
-        self._chain.extend(graph)
-        self._live = None if solved or self._main is None else self._main.track
+        self._extend_chain(self.odometry_scale)
         first, loosened = len(self._states), self._loosened
         for one in judged:
             at = one.row - (graph.n_edges if one.is_edge else graph.n_observed)
@@ -135,6 +134,14 @@ class FixJudge:
             if not self._states.believed[number]:
                 self._states.announce(number, None)
         return self._with_weights(change, first, loosened)
+
+    def _extend_chain(self, odometry_scale: float) -> None:
+        self._chain.extend(self._smoother.graph)
+        factor = min(max(odometry_scale, LEAST_SCALE), MOST_SCALE)**2
+        if factor != self._chain.noise_factor:
+            self._chain.noise_factor = factor
+            for run in self._runs:
+                run.prices.clear()
 
     def _with_weights(
         self, change: GraphUpdate, first: int, loosened: Mapping[int, float],
@@ -150,7 +157,7 @@ class FixJudge:
     def _copy(self) -> _Before:
         runs = {run.number: run.copy() for run in self._runs}
         return _Before(len(self._states), runs, -1 if self._main is None else self._main.number,
-                       self._stale, self._loosened)
+                       self._loosened)
 
     def commit(self) -> None:
         """Keep what the last `before` has decided, after its update has succeeded."""
@@ -161,7 +168,7 @@ class FixJudge:
             if before != bool(self._states.records[number, fs.BELIEVED]):
                 self._states.announce(number, State.BELIEVED if before else State.DOUBTED)
         self._states.forget()
-        self._live, self._restore = None, None
+        self._restore = None
 
     def rollback(self) -> None:
         """Forget the last `before`, as its update has failed."""
@@ -171,8 +178,7 @@ class FixJudge:
 
     def _set(self, before: _Before) -> None:
         self._runs, self._main = list(before.runs.values()), before.runs.get(before.main)
-        self._stale, self._loosened = before.stale, before.loosened
-        self._live, self._restore = None, None
+        self._loosened, self._restore = before.loosened, None
 
     def state(self) -> Callable[[], None]:
         """Return what brings the present state back, as long as no measurement is added."""
@@ -202,7 +208,7 @@ class FixJudge:
         late = stamp_ns < main.end_ns
         spread = float(np.trace(predicted.cov[:2, :2]) / np.trace(seen.noise[:2, :2]))
         if fits and (spread < WIDE or late):
-            self._join_main(main, stamp_ns, seen, predicted, mine, late=late, spread=spread)
+            self._join_main(main, stamp_ns, predicted, mine, late=late)
             self._record(one, main, mine.d2)
             return
         run = self._join_other(stamp_ns, seen, mine if fits else None)
@@ -214,41 +220,43 @@ class FixJudge:
 
     def _go_on_from(self, node: int, stamp_ns: int) -> None:
         """Begin the main run with what is in the graph already."""
-        track = Track(node, self._smoother.graph.poses[node].copy(), np.eye(3))
-        self._main = Run(self._next_number(), stamp_ns, track, believed=True)
-        self._main.seconds, self._stale = KNOWN_BEFORE, True
+        self._main = Run(self._next_number(), stamp_ns, self._of_graph(node), believed=True)
+        self._main.seconds = KNOWN_BEFORE
         self._runs.append(self._main)
 
     def _predicted(self, node: int, *, solved: bool) -> Track | None:
-        """Return where the robot is at a node by what is believed."""
-        if self._live is not None and self._live.node <= node:
-            return self._live.moved(self._chain, node)
-        if not solved:
+        """
+        Return where the robot is at a node by what is believed.
+
+        The track of the main run knows nothing of loop closures, and the graph takes the errors
+        of all measurements in it for independent; the one that knows more is returned.
+        """
+        main = self._main
+        if main is None:
             return None
-        track, main = self._of_graph(node), self._main
-        if main is None or main.track.node == node:
+        track = None
+        if main.track.node <= node:
+            track = main.track.moved(self._chain, node).bent(main.track.pose)
+        if not solved:
             return track
-        return track.bent(self._smoother.graph.poses[main.track.node])
+        by_graph = self._of_graph(node)
+        if track is None or np.trace(by_graph.cov[:2, :2]) < np.trace(track.cov[:2, :2]):
+            return by_graph
+        return track
 
     def _of_graph(self, node: int) -> Track:
         return Track(node, self._smoother.graph.poses[node].copy(),
-                     self._smoother.covariance(node))
+                     self._chain.noise_factor * self._smoother.covariance(node))
 
     def _join_main(
-        self, main: Run, stamp_ns: int, seen: Observation, predicted: Track, mine: Innovation, *,
-        late: bool, spread: float,
+        self, main: Run, stamp_ns: int, predicted: Track, mine: Innovation, *, late: bool,
     ) -> None:
         main.n += 1
         if late:
             return
         main.note_state(stamp_ns, predicted)
         main.count_time(stamp_ns)
-        if self._live is not None or spread > LOOSE:
-            self._live = main.track = predicted.updated(mine)
-            self._stale = False
-        else:
-            main.track = main.track._replace(node=seen.node)
-            self._stale = True
+        main.track = predicted.updated(mine)
         for run in self._runs:
             run.contradicted = run.contradicted or not run.believed
 
@@ -279,7 +287,6 @@ class FixJudge:
     def _begin_run(
         self, stamp_ns: int, seen: Observation, predicted: Track, *, believed: bool,
     ) -> Run:
-        self._refresh_main()
         heading = max(float(predicted.cov[2, 2]), BEGIN_HEADING**2)
         alone = predicted._replace(cov=np.diag((NOWHERE, NOWHERE, heading)))
         first = alone.updated(alone.innovation(seen))
@@ -287,17 +294,12 @@ class FixJudge:
         run = Run(self._next_number(), stamp_ns, track, believed=believed)
         run.first = first
         if believed:
-            self._main, self._live, self._stale = run, track, False
+            self._main = run
         elif seen.size == 2:
             run.expected = float(predicted.pose[2]), float(predicted.cov[2, 2])
+            run.members = (seen,)
         self._runs.append(run)
         return run
-
-    def _refresh_main(self) -> None:
-        """Take the track of the main run from the graph."""
-        if self._stale and self._main is not None and not self._smoother.graph.has_touched:
-            self._main.track = self._of_graph(self._main.track.node)
-            self._stale = False
 
     def _next_number(self) -> int:
         self._n_runs += 1
@@ -317,7 +319,6 @@ class FixJudge:
 
     def _decide(self) -> None:
         """Believe the best runs; odometry between them less than claimed, where it must be."""
-        self._refresh_main()
         chosen = best_runs(self._runs, self._chain)
         numbers = {run.number for run, _ in chosen}
         if (all(run.believed == (run.number in numbers) for run in self._runs)
@@ -333,8 +334,7 @@ class FixJudge:
                 self._states.believe(np.flatnonzero(records[:, fs.RUN] == run.number),
                                      believed=run.believed, now_ns=self._now_ns)
         newest = chosen[-1][0]
-        if self._main is not newest:
-            self._main, self._live, self._stale = newest, newest.track, False
+        self._main = newest
         self._loosened = {
             row: 1.0 / way.scale for (before, _), (run, way) in pairwise(chosen) if way.scale > 1.0
             for row in odometry_between(
@@ -357,7 +357,7 @@ class FixJudge:
     def finish(self) -> None:
         """Judge all measurements again in the order of their stamps, by odometry alone."""
         loosened, states = self._loosened, self._states
-        if not self._judge_all(as_claimed=False):
+        if not self._judge_all(self.odometry_scale):
             return
         states.changed = {number: before for number, before in states.changed.items()
                           if before != bool(states.records[number, fs.BELIEVED])}
@@ -369,29 +369,33 @@ class FixJudge:
             self.commit()
 
     def weights_as_claimed(self) -> tuple[FloatArray, FloatArray]:
-        """Return weights of edges and observed nodes if `finish` took errors to be as claimed."""
+        """Return the weights that `finish` would give if odometry were as stated."""
         weights = self._smoother.graph.weights
-        if self._judge_all(as_claimed=True):
+        if self._judge_all(1.0):
             for kind, table in ((1, weights[0]), (0, weights[1])):
                 some = self._states.records[self._states.records[:, fs.EDGE] == kind]
                 table[some[:, fs.ROW]] = some[:, fs.BELIEVED]
             self.rollback()
         return weights
 
-    def _judge_all(self, *, as_claimed: bool) -> bool:
-        """Judge all measurements again, if that can be done; `commit` or `rollback` follows."""
+    def _judge_all(self, odometry_scale: float) -> bool:
+        """
+        Judge all measurements again, if that can be done; `commit` or `rollback` follows.
+
+        Their errors are taken to be as stated, whatever was found since they came.
+        """
         graph, states = self._smoother.graph, self._states
         if not 0 < len(states) <= MOST_AGAIN or graph.has_touched:
             return False
         self._restore = self._copy()
         states.keep(np.arange(len(states)))
-        self._chain.extend(graph)
-        self._runs, self._main, self._live, self._stale, self._loosened = [], None, None, False, {}
+        self._runs, self._main, self._loosened = [], None, {}
+        self._extend_chain(odometry_scale)
         states.records[:, fs.RUN] = fs.LONE
         for self._again in states.by_stamp().tolist():
             row, edge, stamp_ns, observed = states.records[
                 self._again, (fs.ROW, fs.EDGE, fs.STAMP, fs.OBSERVED)].tolist()
-            if as_claimed and observed >= 0:
+            if observed >= 0:
                 row, edge = observed, False
             at = np.array((row,))
             seen = (Observation.of_biased(graph.edges_at(at)) if edge
@@ -429,7 +433,8 @@ class FixJudge:
                 return rejected('failed', 'the solver failed with it')
         self.commit()
         self._states.records[number, fs.DECISION] = fs.DECISIONS.index(decision)
-        verdict = fix_verdicts.verdict(self._states, self._smoother.graph, number)
+        verdict, = fix_verdicts.verdicts_on(
+            self._states, self._smoother.graph, np.array((number,)))
         return Answer(AnswerStatus.ACCEPTED, detail=f'{name}: {sentence(verdict)}')
 
     def saved(self) -> fs.SavedFixes:
@@ -438,12 +443,5 @@ class FixJudge:
 
     def restore(self, saved: fs.SavedFixes) -> None:
         """Restore what `saved` has returned, for a graph with the same rows."""
-        self._chain.extend(self._smoother.graph)
         self._states.restore(saved)
         self._loosened = dict(zip(saved.loosened.tolist(), saved.weights.tolist(), strict=True))
-        believed = np.flatnonzero(self._states.believed)
-        if len(believed) > 0:
-            record, graph = self._states.records[believed[-1]], self._smoother.graph
-            at = record[fs.ROW:fs.ROW + 1]
-            nodes = graph.edges_at(at).i if record[fs.EDGE] else graph.observed_at(at).node
-            self._go_on_from(int(nodes[0]), int(record[fs.STAMP]))

@@ -58,8 +58,6 @@ class Judge:
         self._smoother, self._reweighting, self._config = smoother, reweighting, config
         self._closures = ClosureJudge(smoother, reweighting, config)
         self._fixes = FixJudge(smoother, reweighting, config)
-        self.odometry_scale = 1.0
-        """Factor on the sigmas of odometry that the measurements show, at least 1."""
         self._staged = np.empty(0, dtype=np.int64)
         """The judged closures of the last `before`, by their numbers among its edges."""
 
@@ -68,6 +66,15 @@ class Judge:
         self._config = config
         self._closures.configure(config)
         self._fixes.configure(config)
+
+    @property
+    def odometry_scale(self) -> float:
+        """Factor on the sigmas of odometry that the measurements show, at least 1."""
+        return self._fixes.odometry_scale
+
+    def set_odometry_scale(self, scale: float) -> None:
+        """Set `odometry_scale`, for later measurements and for `finish`."""
+        self._fixes.odometry_scale = scale
 
     def before(
         self, new: Sequence[NewConstraint], change: GraphUpdate, now_ns: int,

@@ -43,7 +43,7 @@ WORSE_BY_WAY = 0.1
 WORSE = 0.5
 WORSE_HEADING = 0.1
 # Squared sigmas of a jump at which its price becomes logarithmic.
-KNEE = 9.0
+KNEE = 6.0
 # Number of states that a run notes, and the time between them [ns].
 NOTED, NOTED_EVERY_NS = 10, 3_000_000_000
 # Price of a transition above which the earlier run may have ended with wrong members.
@@ -54,11 +54,16 @@ SHORT_LIVED_NS = 30_000_000_000
 # Excess of the price of a believed run over that of a hopeless one.
 HOPELESS = 50.0
 # Squared sigmas that the direction of a run may be off for nothing, and the highest price of it.
-TURN_ALLOWED, MOST_OF_TURN = 9.0, 20.0
+TURN_ALLOWED, MOST_OF_TURN = 9.0, 40.0
 # Time for which a run must keep its direction for that, as errors drift as well [s].
 TURN_AFTER = 30.0
 # Least number of measurements of a run that can show a fault of odometry.
 LEAST_MEMBERS = 3
+# Number of the first members of a run that may tell its heading anew, and highest squared
+# deviation of them from odometry, in units of their variance, for each of them.
+FITTED_MEMBERS, FITTED_D2 = 10, 2.5
+# Largest sigma of a heading that is told so [rad].
+FITTED_HEADING = 0.4
 # Number of measurements, and way [m], from which the pose at the beginning of a run is estimated.
 BEGIN_MEMBERS, BEGIN_WAY = 40, 50.0
 
@@ -98,6 +103,8 @@ class Run:
         """The ways to believe it after an earlier run, by the number of that."""
         self.states: list[tuple[int, Track]] = []
         """Stamps [ns] and tracks at some earlier times, the newest last."""
+        self.members: tuple[Observation, ...] = ()
+        """The first ones, while they may tell the heading."""
         self.restart(stamp_ns)
 
     def restart(self, stamp_ns: int) -> None:
@@ -111,6 +118,7 @@ class Run:
         self.contradicted = False
         """Whether something else was believed since its newest member."""
         self.prices.clear()
+        self.members = ()
 
     def copy(self) -> 'Run':
         """Return a copy that does not change with this one."""
@@ -130,6 +138,8 @@ class Run:
         chain : OdometryChain
 
         """
+        if len(self.members) == self.n < FITTED_MEMBERS:
+            self.members += (seen,)
         self.n += 1
         self.count_time(stamp_ns)
         self.track = track
@@ -140,8 +150,8 @@ class Run:
         """
         Return the pose at the begin and that at an observation, and the price of the turn.
 
-        After an outage the heading of odometry may be far off. So where the first two positions
-        are as far from each other as odometry says, they tell the heading.
+        After an outage or a turn of the wheels on the spot the heading of odometry may be far
+        off. So where the first positions lie as odometry says, but turned, they tell the heading.
 
         Parameters
         ----------
@@ -149,19 +159,18 @@ class Run:
         chain : OdometryChain
 
         """
-        begin, end = self.track, self.track.moved(chain, seen.node)
-        if (self.n > 1 or self.expected is None or seen.size == 3
+        end = self.track.moved(chain, seen.node)
+        if (len(self.members) != self.n or self.expected is None or seen.size == 3
                 or end.innovation(seen).d2 <= EVENT):
             return self.first, end, 0.0
-        way, seen_way = end.pose[:2] - begin.pose[:2], seen.mean[:2] - begin.pose[:2]
-        length, seen_length = math.hypot(*way.tolist()), math.hypot(*seen_way.tolist())
-        variance = float(begin.cov[0, 0] + seen.noise[0, 0])
-        if length**2 < 4.0 * variance or (length - seen_length)**2 > 4.0 * variance:
+        begin = fitted((*self.members, seen), chain)
+        if begin is None:
             return self.first, end, 0.0
-        turn = math.atan2(*seen_way[::-1].tolist()) - math.atan2(*way[::-1].tolist())
-        cov = np.diag((begin.cov[0, 0], begin.cov[1, 1], variance / length**2))
-        turned = Track(begin.node, se2.wrapped(begin.pose + np.array((0.0, 0.0, turn))), cov)
-        return turned, turned.moved(chain, seen.node), EVENT
+        end = begin
+        for member in self.members[1:]:
+            end = end.moved(chain, member.node)
+            end = end.updated(end.innovation(member))
+        return begin, end.moved(chain, seen.node), EVENT
 
     def count_time(self, stamp_ns: int) -> None:
         """Let the run last until a stamp [ns]."""
@@ -292,6 +301,38 @@ class Run:
         size2 = float(jump[0]**2 + jump[1]**2)
         along = float(jump[:2] @ gap @ jump[:2]) / max(size2, 1e-12)
         return max(size2 / max(along, 0.03**2), 1.0)
+
+
+def fitted(seen: Sequence[Observation], chain: OdometryChain) -> Track | None:
+    """
+    Return the pose at the first of some positions that puts odometry on them; None if none does.
+
+    The motion is rigid and least squares, as Umeyama (1991) has it, in closed form.
+
+    Parameters
+    ----------
+    seen : sequence of Observation, at least two positions
+    chain : OdometryChain
+
+    """
+    begin = Track(seen[0].node, np.zeros(3), np.zeros((3, 3)))
+    here = np.array([se2.transform(
+        begin.moved(chain, each.node).pose[None], each.offset[None, :2])[0] for each in seen])
+    there = np.array([each.mean[:2] for each in seen])
+    variance = float(np.mean([np.trace(each.noise) for each in seen])) / 2.0
+    a, b = here - here.mean(axis=0), there - there.mean(axis=0)
+    spread = float(np.sum(a**2))
+    if variance > FITTED_HEADING**2 * spread:
+        return None
+    theta = math.atan2(float(np.sum(a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0])), float(np.sum(a * b)))
+    pose = np.array((0.0, 0.0, theta))
+    off = b - se2.transform(pose[None], a)
+    if float(np.sum(off**2)) > FITTED_D2 * len(seen) * variance:
+        return None
+    pose[:2] = there.mean(axis=0) - se2.transform(pose[None], here.mean(axis=0)[None])[0]
+    lever = float(np.sum(here.mean(axis=0)**2)) / spread
+    position = variance * (1.0 / len(seen) + lever)
+    return Track(seen[0].node, pose, np.diag((position, position, variance / spread)))
 
 
 def _way(chain: OdometryChain, begin: int, end: int) -> float:

@@ -17,9 +17,10 @@ from pose_graph_ros.core.graph.constraints import Edges, ObservedKind, ObservedN
 from pose_graph_ros.core.judgement.consistency import OdometryChain
 from pose_graph_ros.core.sources.gauss_markov import STRETCH
 
-# Least sigmas of a measurement while it is judged: those that are stated are often too small
-# [m], [rad].
+# Least sigmas of a measurement while it is judged, and a factor on its covariance: what is stated
+# is often too small [m], [rad].
 LEAST_SIGMA = (0.3, 0.05)
+STATED = 2.0
 
 
 class Observation(NamedTuple):
@@ -39,7 +40,8 @@ class Observation(NamedTuple):
         """Return the observation of a table with one row, which is no heading."""
         mean, information = observed.mean[0], observed.information[0]
         size = 2 if observed.kind[0] == ObservedKind.POSITION else 3
-        noise = covariance.turned(np.linalg.inv(information[:size, :size]), -float(mean[2]))
+        noise = STATED * covariance.turned(
+            np.linalg.inv(information[:size, :size]), -float(mean[2]))
         return cls(int(observed.node[0]), observed.offset[0], mean, _floored(noise))
 
     @classmethod

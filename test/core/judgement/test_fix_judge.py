@@ -2,26 +2,16 @@
 # SPDX-License-Identifier: Apache-2.0
 """Judging fixes over time, in drives in which some fixes, or odometry, are wrong."""
 
-from dataclasses import replace
-
 import numpy as np
 import pytest
 
 from pose_graph_ros.core.alignment.monitor import AlignmentState
 from pose_graph_ros.core.backend import PoseGraphBackend
-from pose_graph_ros.core.config import (
-    BackendConfig,
-    Correlation,
-    MeasurementSource,
-    POSITIONS,
-    Robust,
-)
+from pose_graph_ros.core.config import BackendConfig, Correlation, MeasurementSource, POSITIONS
 from pose_graph_ros.core.geometry import se2
 from pose_graph_ros.core.geometry.se2 import BoolArray, FloatArray
 from pose_graph_ros.core.judgement.verdicts import Decision, State
 from pose_graph_ros.core.measurements import GlobalPose, Measurement, OdometrySample, Position
-
-JUDGED = replace(POSITIONS, robust=Robust.JUDGED)
 
 SECOND = 1_000_000_000
 
@@ -75,7 +65,7 @@ class Driven:
 
     def __init__(
         self, drive: Drive, more: list[tuple[str, Measurement]] | None = None,
-        source: MeasurementSource = JUDGED, final: bool = True,
+        source: MeasurementSource = POSITIONS, final: bool = True,
     ) -> None:
         self.backend = backend = PoseGraphBackend(BackendConfig(
             measurements=dict.fromkeys(('fix', 'other'), source)))
@@ -217,7 +207,7 @@ def test_correlated_errors_are_judged_as_well(correlation: Correlation) -> None:
     drive = Drive(120)
     drive.move(60.0, 80.0, (20.0, 15.0))
     driven = Driven(drive, source=MeasurementSource(
-        robust=JUDGED.robust, loss=JUDGED.loss, correlation_time=5.0,
+        robust=POSITIONS.robust, loss=POSITIONS.loss, correlation_time=5.0,
         correlation=correlation))
     assert ids(drive, 60.0, 80.0) <= driven.doubted
     assert len(driven.doubted) <= 22

@@ -12,15 +12,13 @@ from random_graphs import snapshot
 from pose_graph_ros.core.backend import PoseGraphBackend
 from pose_graph_ros.core.batch import optimizer
 from pose_graph_ros.core.batch.optimizer import BatchResult, Status
-from pose_graph_ros.core.config import BackendConfig, Correlation, POSITIONS, Robust, SolverConfig
+from pose_graph_ros.core.config import BackendConfig, Correlation, POSITIONS, SolverConfig
 from pose_graph_ros.core.geometry import se2
 from pose_graph_ros.core.geometry.se2 import FloatArray
 from pose_graph_ros.core.graph.graph import Graph, GraphUpdate
 from pose_graph_ros.core.judgement.verdicts import Decision, State, Verdict
 from pose_graph_ros.core.measurements import Measurement, OdometrySample, Position
 from pose_graph_ros.core.smoother.incremental import IncrementalSmoother, UpdateResult
-
-JUDGED = replace(POSITIONS, robust=Robust.JUDGED)
 
 SECOND = 1_000_000_000
 Event = OdometrySample | Measurement
@@ -108,7 +106,7 @@ def test_the_end_does_not_depend_on_the_order_of_arrival(
     backends = []
     for those, every in ((events, 8), (late(events, seed), 8), (late(events, seed + 1, 400.0), 3)):
         backends.append(PoseGraphBackend(BackendConfig(
-            measurements={'fix': replace(JUDGED, correlation=correlation)})))
+            measurements={'fix': replace(POSITIONS, correlation=correlation)})))
         feed(backends[-1], those, every)
         assert backends[-1].optimize().status is Status.CONVERGED
     assert bad <= doubted(backends[0])
@@ -119,7 +117,7 @@ def test_the_end_does_not_depend_on_the_order_of_arrival(
 
 def test_what_is_doubted_stays_doubted_when_the_error_model_changes() -> None:
     events, bad = drive(1)
-    backend = PoseGraphBackend(BackendConfig(measurements={'fix': JUDGED}))
+    backend = PoseGraphBackend(BackendConfig(measurements={'fix': POSITIONS}))
     feed(backend, events)
     while not backend.refine().finished:
         pass
@@ -169,7 +167,7 @@ def test_a_failed_update_that_would_turn_a_decision_changes_nothing() -> None:
     events = [replace(event, position=event.position + np.array((40.0, 0.0)))
               if isinstance(event, Position) and event.stamp_ns <= 15 * SECOND else event
               for event in events]
-    config = BackendConfig(measurements={'fix': replace(JUDGED, correlation_time=0.0)})
+    config = BackendConfig(measurements={'fix': replace(POSITIONS, correlation_time=0.0)})
     smoother = Flaky(config.smoother)
     backend, n_turned = PoseGraphBackend(config, smoother=smoother), 0
     judge = backend._judge._fixes
@@ -200,7 +198,7 @@ def test_a_final_optimisation_that_fails_undoes_what_was_decided_for_it() -> Non
         return optimizer.optimize(graph, config)
 
     events, bad = drive(2, n=80)
-    config = BackendConfig(measurements={'fix': replace(JUDGED, correlation_time=0.0)})
+    config = BackendConfig(measurements={'fix': replace(POSITIONS, correlation_time=0.0)})
     backend = PoseGraphBackend(config, solve=solve)
     feed(backend, late(events, 5, 400.0), 5)
     backend.update()
