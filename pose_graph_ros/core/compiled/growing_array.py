@@ -61,3 +61,7 @@ class GrowingArray:
     def truncate(self, size: int) -> None:
         """Remove all rows from an index on."""
         self._size = min(self._size, size)
+
+    def select(self, rows: npt.NDArray[np.int64]) -> None:
+        """Keep some rows, by number, in this order, and give the memory of the others back."""
+        self._data, self._size = self.values[rows], len(rows)

@@ -88,8 +88,6 @@ class ClosureJudge:
         self._table = ClosureTable(self._chain)
         self.states = self._states = ClosureStates()
         self.reports = ClosureReports(self._states, self._table)
-        self._spread = GrowingArray((3, 3), np.float64)
-        """Covariance of the prediction when a closure was tested last; 0 if unknown."""
         self._tested = GrowingArray((), np.int64)
         """The round in which it was tested last."""
         self._final = (0, 0, 0, -1)
@@ -151,7 +149,6 @@ class ClosureJudge:
 
     def _append_unknown(self, n: int) -> None:
         """Append n closures that were not tested yet."""
-        self._spread.append(np.zeros((n, 3, 3)))
         self._tested.append(np.full(n, -1))
         self._corroborated.append(np.zeros(n, dtype=bool))
         for source in self._states.sources[len(self._beliefs.scales):]:
@@ -163,7 +160,7 @@ class ClosureJudge:
         self.reports.forget()
         self._table.drop(self._n_staged)
         self._states.drop(self._n_staged)
-        for array in (self._spread, self._tested, self._corroborated):
+        for array in (self._tested, self._corroborated):
             array.truncate(len(self._states))
         self._n_staged = 0
 
@@ -173,7 +170,9 @@ class ClosureJudge:
         for number in range(begin, len(self._states)):
             self._states.announce(number, -1, self._beliefs.now_ns)
         for source in np.unique(self._states.source[begin:]).tolist():
-            self._states.forget(source, self._corroborated.values)
+            gone = self._states.forget(source, self._corroborated.values)
+            if len(gone) > 0:
+                self._table.forget(gone)
         if np.any(self._states.in_graph[begin:]):
             self._beliefs.round += 1
             self._beliefs.set_base_weights(np.arange(begin, len(self._states)))
@@ -186,7 +185,7 @@ class ClosureJudge:
             np.full(n, int(EdgeKind.LOOP_CLOSURE))))
         total, distance = spread + some.noise, np.empty(n)
         relative.distances(errors, total, distance)
-        self._spread.values[numbers] = spread
+        self._table.set_spread(numbers, spread)
         self._states.distance[numbers] = distance
         self._tested.values[numbers] = self._beliefs.round
         passes = distance < GATE
@@ -249,7 +248,7 @@ class ClosureJudge:
             return False
         self._tested.values[again] = -1
         if self._beliefs.round > before:
-            self._spread.values[:] = 0.0
+            self._table.forget_spread()
         return True
 
     def _part(self, most: int) -> bool:
@@ -266,7 +265,7 @@ class ClosureJudge:
         if len(bad) == 0 or not self._beliefs.apply(dict.fromkeys(bad.tolist(), State.DOUBTED)):
             return False
         # without them the graph is less certain
-        self._spread.values[:] = 0.0
+        self._table.forget_spread()
         return True
 
     def _may_not_fit(self, numbers: IntArray) -> BoolArray:
@@ -285,7 +284,7 @@ class ClosureJudge:
         relative.errors_at(self._smoother.graph.memory.head, some.i, some.j, some.mean,
                            errors)
         # covariances only shrink while more is believed, so this is a lower bound
-        spread, least = self._spread.values[waiting], np.empty(len(waiting))
+        spread, least = self._table.spread(waiting), np.empty(len(waiting))
         relative.distances(errors, spread + some.noise, least)
         known = spread[:, 0, 0] > 0.0
         hopeless = known & ~(least < GATE)
@@ -332,7 +331,8 @@ class ClosureJudge:
             self._beliefs.scales, self._learnt_from = scales, learnt
             self._search = SetSearch(self._states, self._table)
             self._beliefs.trial.end()
-            self._tested.values[:], self._spread.values[:] = -1, 0.0
+            self._tested.values[:] = -1
+            self._table.forget_spread()
         return bring_back
 
     def _fixed_scale(self, source: str) -> float:
@@ -359,7 +359,7 @@ class ClosureJudge:
             if not self._beliefs.apply(dict(zip(numbers.tolist(), (
                     STATES[k] for k in self._states.state[numbers].tolist()), strict=True))):
                 self._beliefs.scales[source] = before
-            self._spread.values[:] = 0.0
+            self._table.forget_spread()
             return True
         return False
 
@@ -383,7 +383,7 @@ class ClosureJudge:
         if not done:
             graph.set_poses(before)
             self._smoother.update(GraphUpdate())
-        self._spread.values[:] = 0.0
+        self._table.forget_spread()
         return done
 
     def saved(self) -> SavedClosures:
@@ -425,7 +425,10 @@ class ClosureJudge:
                  Decision.AUTO: State.WAITING}[decision]
         forced = decision is not Decision.AUTO or before != AUTO
         self._states.decision[number] = DECISIONS.index(decision)
-        self._states.forgotten[number] = False
+        if self._states.forgotten[number]:
+            self._states.forgotten[number] = False
+            self._table.bring_back(np.array([number]), claims(
+                self._smoother.graph.edges_at(self._states.row[number:number + 1])))
         if forced and not self._beliefs.apply({number: state}, at_once=True):
             self._states.decision[number] = before
             return rejected('failed', 'the solver failed with it')

@@ -120,9 +120,9 @@ class ClosureStates:
         """Whether they are judged: no person has decided on them, and they are not forgotten."""
         return (self.decision == AUTO) & ~self.forgotten
 
-    def forget(self, source: int, supported: BoolArray) -> None:
+    def forget(self, source: int, supported: BoolArray) -> IntArray:
         """
-        Forget closures of a source that are not believed, if these are too many.
+        Return which closures of a source are forgotten now, if too many are not believed.
 
         The oldest hopeless ones leave first, then doubted ones, then those that wait.
 
@@ -134,11 +134,13 @@ class ClosureStates:
         """
         kept = np.flatnonzero((self.source == source) & ~self.in_graph & self.judged)
         if len(kept) <= MOST_WAITING:
-            return
+            return kept[:0]
         doubted = self.state[kept] == DOUBTED
         hopeless = doubted & ~supported[kept] & (self.distance[kept] > HOPELESS * GATE)
         order = np.lexsort((self.stamps_ns[kept, 0], ~doubted, ~hopeless))
-        self.forgotten[kept[order[:len(kept) - LEFT]]] = True
+        gone = np.sort(kept[order[:len(kept) - LEFT]])
+        self.forgotten[gone] = True
+        return gone
 
     def changes_to(self, inside: BoolArray) -> dict[int, State]:
         """Return the states of another set of believed ones, also of those that stay in it."""

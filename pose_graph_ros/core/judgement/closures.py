@@ -72,51 +72,113 @@ def chances(covariance: FloatArray, poses: FloatArray) -> FloatArray:
 
 
 class ClosureTable:
-    """Closures in the order of their addition, and where they are along the path."""
+    """
+    Closures in the order of their addition, and where they are along the path.
+
+    They have numbers. Of those that are forgotten, nothing else is kept.
+    """
 
     def __init__(self, chain: OdometryChain) -> None:
         self._chain = chain
+        self._slot = GrowingArray((), np.int64)
+        """Of each number, its row in the arrays below; -1 if it is forgotten."""
         self._i, self._j = (GrowingArray((), np.int64) for _ in range(2))
         self._mean = GrowingArray((3,), np.float64)
         self._noise = GrowingArray((3, 3), np.float64)
         self._travel = GrowingArray((2,), np.float64)
         """Of both ends."""
+        self._spread = GrowingArray((3, 3), np.float64)
+        self._columns = (
+            self._i, self._j, self._mean, self._noise, self._travel, self._spread)
         self._cells: dict[tuple[int, int], list[int]] = defaultdict(list)
         """Numbers of the closures by the places of their ends along the path."""
 
     def __len__(self) -> int:
-        return len(self._i)
-
-    @property
-    def _all(self) -> Closures:
-        return Closures(
-            self._i.values, self._j.values, self._mean.values, self._noise.values)
+        return len(self._slot)
 
     def rows(self, numbers: IntArray) -> Closures:
-        """Return some of them."""
-        i, j, mean, noise = self._all
-        return Closures(i[numbers], j[numbers], mean[numbers], noise[numbers])
+        """Return some of them, none of which is forgotten."""
+        slots = self._slots(numbers)
+        return Closures(*(column.values[slots] for column in self._columns[:4]))
+
+    def _slots(self, numbers: IntArray) -> IntArray:
+        slots: IntArray = self._slot.values[numbers]
+        assert np.all(slots >= 0)
+        return slots
+
+    def spread(self, numbers: IntArray) -> FloatArray:
+        """Return the covariances of the predictions when they were tested; 0 if not known."""
+        return np.asarray(self._spread.values[self._slots(numbers)])
+
+    def set_spread(self, numbers: IntArray, spread: FloatArray) -> None:
+        """
+        Set the covariances of their predictions.
+
+        Parameters
+        ----------
+        numbers : ndarray of int, shape (M,)
+        spread : ndarray, shape (M, 3, 3)
+
+        """
+        self._spread.values[self._slots(numbers)] = spread
+
+    def forget_spread(self) -> None:
+        """Take no covariance of a prediction as known any more."""
+        self._spread.values[:] = 0.0
 
     def append(self, new: Closures) -> None:
         """Append closures between nodes of the chain."""
-        travel = np.column_stack((self._chain.travel(new.i), self._chain.travel(new.j)))
-        for number, cell in enumerate(_cells(travel), len(self)):
+        begin = len(self)
+        self._slot.append(np.full(len(new.i), -1))
+        self.bring_back(np.arange(begin, len(self)), new)
+
+    def bring_back(self, numbers: IntArray, closures: Closures) -> None:
+        """
+        Know closures again that were forgotten.
+
+        Parameters
+        ----------
+        numbers : ndarray of int, shape (M,)
+        closures : Closures, M of them, between nodes of the chain
+
+        """
+        travel = np.column_stack((self._chain.travel(closures.i), self._chain.travel(closures.j)))
+        for number, cell in zip(numbers.tolist(), _cells(travel), strict=True):
             self._cells[cell].append(number)
-        for array, values in zip(
-                (self._i, self._j, self._mean, self._noise, self._travel), (*new, travel),
-                strict=True):
+        begin = len(self._i)
+        for array, values in zip(self._columns, (
+                *closures, travel, np.zeros((len(numbers), 3, 3))), strict=True):
             array.append(values)
+        self._slot.values[numbers] = np.arange(begin, len(self._i))
 
     def drop(self, count: int) -> None:
         """Remove the newest closures again."""
-        size = len(self) - count
+        size = len(self._i) - count
         for cell in _cells(self._travel.values[size:]):
             self._cells[cell].pop()
-        for array in (self._i, self._j, self._mean, self._noise, self._travel):
+        for array in self._columns:
             array.truncate(size)
+        self._slot.truncate(len(self) - count)
+
+    def forget(self, numbers: IntArray) -> None:
+        """Forget closures that are not believed, and give their memory back."""
+        travel = self._travel.values[self._slots(numbers)]
+        for number, cell in zip(numbers.tolist(), _cells(travel), strict=True):
+            self._cells[cell].remove(number)
+            if len(self._cells[cell]) == 0:
+                del self._cells[cell]
+        slots = self._slot.values
+        slots[numbers] = -1
+        kept = np.flatnonzero(slots >= 0)
+        for array in self._columns:
+            array.select(slots[kept])
+        slots[kept] = np.arange(len(kept))
 
     def _cells_around(self, number: int) -> list[Sequence[int]]:
-        (a, b), = _cells(self._travel.values[number:number + 1])
+        slot = int(self._slot.values[number])
+        if slot < 0:
+            return []
+        (a, b), = _cells(self._travel.values[slot:slot + 1])
         return [self._cells.get((i, j), ()) for i in (a - 1, a, a + 1) for j in (b - 1, b, b + 1)]
 
     def crowd(self, number: int) -> int:
@@ -125,11 +187,13 @@ class ClosureTable:
 
     def near(self, number: int) -> IntArray:
         """Return closures whose ends are both near those of one, at most `MOST_COMPARED`."""
-        travel = self._travel.values
         found = [other for cell in self._cells_around(number)
                  for other in cell[-2 * MOST_COMPARED:] if other != number]
         numbers = np.array(found, dtype=np.int64)
-        apart = np.max(np.abs(travel[numbers] - travel[number]), axis=1, initial=0.0)
+        if len(numbers) == 0:
+            return numbers
+        travel = self._travel.values[self._slots(np.append(numbers, number))]
+        apart = np.max(np.abs(travel[:-1] - travel[-1]), axis=1, initial=0.0)
         close = apart <= NEAR
         order = np.argsort(apart[close], kind='stable')[:MOST_COMPARED]
         return numbers[close][order]
@@ -137,7 +201,7 @@ class ClosureTable:
     def neighbours(self, number: int) -> tuple[IntArray, IntArray]:
         """Return which closures near one agree with it, and which do not."""
         near = self.near(number)
-        distance = self._chain.squared_distances(self._all, np.full(len(near), number), near)
+        distance = self._distances(np.full(len(near), number), near)
         return near[distance < GATE], near[distance >= GATE]
 
     def support(self, number: int, usable: BoolArray) -> Support:
@@ -152,18 +216,23 @@ class ClosureTable:
         """
         near = self.near(number)
         near = near[usable[near]]
-        distance = self._chain.squared_distances(self._all, np.full(len(near), number), near)
+        distance = self._distances(np.full(len(near), number), near)
         agree, against = near[distance < GATE], near[distance >= GATE]
         m = len(agree)
-        pairs = self._chain.squared_distances(
-            self._all, np.repeat(agree, m), np.tile(agree, m)).reshape(m, m) < GATE
+        pairs = self._distances(np.repeat(agree, m), np.tile(agree, m)).reshape(m, m) < GATE
         # those that agree with most are taken first
         clique: list[int] = []
         for k in np.argsort(-np.sum(pairs, axis=1), kind='stable').tolist():
             if len(clique) + 1 < MOST_IN_CLIQUE and np.all(pairs[k, clique]):
                 clique.append(k)
         members = np.append(agree[clique], number)
-        return Support(members, float(np.ptp(self._travel.values[members, 1])), against)
+        travel = self._travel.values[self._slots(members), 1]
+        return Support(members, float(np.ptp(travel)), against)
+
+    def _distances(self, a: IntArray, b: IntArray) -> FloatArray:
+        """Return squared Mahalanobis distances between closures, by number."""
+        every = Closures(*(column.values for column in self._columns[:4]))
+        return self._chain.squared_distances(every, self._slot.values[a], self._slot.values[b])
 
 
 def _cells(travel: FloatArray) -> list[tuple[int, int]]:

@@ -75,8 +75,13 @@ class SetSearch:
             other = self._table.support(number, ~states.in_graph & states.judged).clique
             clique = other if len(other) > len(clique) else clique
             yield
-        swap = Swap(graph, self._table.rows(np.arange(len(states))), states.row.copy(),
-                    states.in_graph, states.judged)
-        while swap.step(clique):
+        known, n = np.flatnonzero(~states.forgotten), len(states)
+        swap = Swap(graph, self._table.rows(known), states.row[known], states.in_graph[known],
+                    states.judged[known])
+        while swap.step(np.searchsorted(known, clique)):
             yield
-        return swap.found
+        if swap.found is None:
+            return None
+        inside = np.zeros(n, dtype=bool)
+        inside[known] = swap.found.inside
+        return Found(inside, swap.found.poses)

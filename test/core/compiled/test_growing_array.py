@@ -38,3 +38,14 @@ def test_it_grows_in_few_steps() -> None:
     assert len(places) < 20
     np.testing.assert_array_equal(array.values[:, 0], np.arange(10_000))
 
+
+
+def test_rows_are_selected_and_others_follow() -> None:
+    array = GrowingArray((2,), np.int64)
+    array.append(np.arange(80).reshape(40, 2))
+    array.select(np.array([7, 3]))
+    array.append_one((0, 1))
+    np.testing.assert_array_equal(array.values, [(14, 15), (6, 7), (0, 1)])
+    array.select(np.empty(0, dtype=np.int64))
+    array.append_one((8, 9))
+    np.testing.assert_array_equal(array.values, [(8, 9)])

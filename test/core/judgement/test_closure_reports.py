@@ -185,6 +185,11 @@ def test_of_many_hopeless_closures_the_oldest_are_forgotten(
     # the first one is the nearest to the gate: not hopeless
     assert math.sqrt(10.0 * GATE) > backend.verdicts()[0].distance > math.sqrt(GATE)
     assert np.flatnonzero(judge.states.forgotten).tolist() == list(range(1, 7))
+    # nothing is kept of them that could be computed again, and they support no other
+    kept = [number for cell in judge._table._cells.values() for number in cell]
+    assert sorted(kept) == [0, *range(7, 13)]
+    assert {len(column) for column in judge._table._columns} == {7}
+    assert judge._table.crowd(1) == 0
     assert not np.any(backend.graph.edges.weight[judge.states.row[:9]])
     # whom a person decides on is judged again when that is taken back
     for decision in (Decision.OUT, Decision.AUTO):
