@@ -17,6 +17,7 @@ from pathlib import Path
 import signal
 import subprocess
 import sys
+import threading
 
 import pytest
 
@@ -77,7 +78,14 @@ def _run(arguments: list[str], env: Mapping[str, str], stderr: str) -> None:
     os.environ.update(env)
     os.dup2(os.open(stderr, os.O_WRONLY | os.O_APPEND), 2)
     sys.argv = ['pose_graph_node', *arguments]
+    threading.Thread(target=_end_with_the_tests, daemon=True).start()
 
     from pose_graph_ros.ros.main import main  # noqa: PLC0415  the node's only
 
     main()
+
+
+def _end_with_the_tests() -> None:
+    """End the node in whichever way the process of the tests has ended."""
+    multiprocessing.parent_process().join()
+    os.kill(os.getpid(), signal.SIGKILL)
