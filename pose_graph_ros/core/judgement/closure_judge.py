@@ -66,6 +66,9 @@ MOST_NEW, IN_UPDATE, IN_PART, NODES_IN_PART = 32, 16, 64, 160_000
 # Number of nodes above which an update adds closures with weight 0 and leaves all tests to the
 # work after it, so that it has nothing to solve for but what is new.
 LARGE = 5000
+# How often a closure is thrown out before it waits for the next closure to come: those that
+# contradict one another could otherwise take turns for ever.
+MOST_TURNS = 2
 
 
 class ClosureJudge:
@@ -90,6 +93,8 @@ class ClosureJudge:
         self.reports = ClosureReports(self._states, self._table)
         self._tested = GrowingArray((), np.int64)
         """The round in which it was tested last."""
+        self._turns = GrowingArray((), np.int64)
+        """How often it was thrown out since the last closure came."""
         self._final = (0, 0, 0, -1)
         """Sizes of the graph and round at the last final decision."""
         self._n_staged = 0
@@ -150,6 +155,7 @@ class ClosureJudge:
     def _append_unknown(self, n: int) -> None:
         """Append n closures that were not tested yet."""
         self._tested.append(np.full(n, -1))
+        self._turns.append(np.zeros(n, dtype=np.int64))
         self._corroborated.append(np.zeros(n, dtype=bool))
         for source in self._states.sources[len(self._beliefs.scales):]:
             self._beliefs.scales.append(self._fixed_scale(source) or 1.0)
@@ -160,13 +166,15 @@ class ClosureJudge:
         self.reports.forget()
         self._table.drop(self._n_staged)
         self._states.drop(self._n_staged)
-        for array in (self._tested, self._corroborated):
+        for array in (self._tested, self._turns, self._corroborated):
             array.truncate(len(self._states))
         self._n_staged = 0
 
     def commit(self) -> None:
         """Keep the closures of the last `before`."""
         begin, self._n_staged = len(self._states) - self._n_staged, 0
+        if begin < len(self._states):
+            self._turns.values[:] = 0
         for number in range(begin, len(self._states)):
             self._states.announce(number, -1, self._beliefs.now_ns)
         for source in np.unique(self._states.source[begin:]).tolist():
@@ -264,6 +272,7 @@ class ClosureJudge:
         bad = inside[fit > GATE]
         if len(bad) == 0 or not self._beliefs.apply(dict.fromkeys(bad.tolist(), State.DOUBTED)):
             return False
+        self._turns.values[bad] += 1
         # without them the graph is less certain
         self._table.forget_spread()
         return True
@@ -277,7 +286,8 @@ class ClosureJudge:
     def _test_again(self, most: int) -> bool:
         """Test some closures that wait; tell whether some are left."""
         waiting = np.flatnonzero(~self._states.in_graph & self._states.judged
-                                 & (self._tested.values < self._beliefs.round))
+                                 & (self._tested.values < self._beliefs.round)
+                                 & (self._turns.values < MOST_TURNS))
         if len(waiting) == 0:
             return False
         some, errors = self._table.rows(waiting), np.empty((len(waiting), 3))

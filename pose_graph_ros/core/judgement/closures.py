@@ -8,6 +8,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from pose_graph_ros.core.batch.truncated import LIMITS
 from pose_graph_ros.core.compiled.growing_array import GrowingArray
 from pose_graph_ros.core.config import CLOSURE_FLOORS
 from pose_graph_ros.core.geometry import se2
@@ -16,7 +17,7 @@ from pose_graph_ros.core.graph.constraints import Edges
 from pose_graph_ros.core.judgement.consistency import Closures, OdometryChain
 
 # Squared Mahalanobis distance that 99 % of errors with three components are within.
-GATE = 11.34
+GATE = float(LIMITS[3])
 # Closures are compared whose ends are within this of each other, along the path [m].
 NEAR = 10.0
 # Largest number of closures that one is compared with, and of a clique.

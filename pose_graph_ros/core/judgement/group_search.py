@@ -15,6 +15,7 @@ from scipy.sparse.csgraph import connected_components
 
 from pose_graph_ros.core.batch.truncated import Choice, ROUGH, TruncatedProblem
 from pose_graph_ros.core.geometry.se2 import IntArray
+from pose_graph_ros.core.judgement.closures import GATE
 from pose_graph_ros.core.judgement.surest_first import agreeing_pairs
 
 # Limits of the search: rounds, trials of groups to take in and to take out in one, and nodes times
@@ -23,7 +24,7 @@ ROUNDS, MOST_IN, MOST_OUT, WORK = 4, 30, 10, 60_000
 # Maximum number of retests of a trial.
 RETESTS = 4
 # Least reduction of the truncated cost, that of one constraint [sigma^2].
-LEAST_GAIN = 11.345
+LEAST_GAIN = GATE
 
 
 def improved(problem: TruncatedProblem, choice: Choice) -> Choice:

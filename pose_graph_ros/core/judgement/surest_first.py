@@ -10,16 +10,22 @@ believed in the order of this volume: first those that span little odometry, the
 make sure. Wrong ones meet a narrow gate in the end, also where many of them agree with each other.
 Closures that no neighbour agrees with come later than others of the same volume.
 
+None is believed where those that fit odometry could be wrong ones that fit by chance.
+
 What is believed also shows how large errors really are. Where covariances are far too large, the
 limits are lowered; else a wrong constraint would fit wherever the graph is claimed to be soft.
 """
 
 import numpy as np
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import connected_components
+from scipy.special import gammainc
 
-from pose_graph_ros.core.batch.truncated import LIMITS, TruncatedProblem
+from pose_graph_ros.core.batch.truncated import TruncatedProblem
 from pose_graph_ros.core.geometry import se2
 from pose_graph_ros.core.geometry.se2 import BoolArray, FloatArray, IntArray
 from pose_graph_ros.core.graph.constraints import EdgeKind
+from pose_graph_ros.core.judgement.closures import GATE, NEAR
 from pose_graph_ros.core.judgement.consistency import Closures, OdometryChain
 from pose_graph_ros.core.smoother import innovations
 from pose_graph_ros.core.smoother.innovations import Innovations
@@ -30,8 +36,6 @@ ROUND = 4.0
 ROUNDS = 200
 # Factor on the volume by the number of neighbours that agree: none, one, more.
 ALONE = (1000.0, 30.0, 1.0)
-# Closures are neighbours if both ends are within this of each other, along the path [m].
-NEAR = 10.0
 # Maximum number of closures that one is compared with, in one direction.
 MOST_COMPARED = 200
 # A constraint that was thrown out this often is doubted.
@@ -47,6 +51,12 @@ REACH = 20.0
 SOME, SOME_SHARE = 200, 1.0 / 16.0
 # Largest odds that a constraint is wrong which no neighbours support, where these are counted.
 WRONG_ODDS = 0.02
+# Number of closures that agree from which on they are a group, and the chance that wrong groups
+# alone, or wrong ones without a group alone, would give as many that fit odometry, above which
+# nothing is believed.
+GROUP, BY_CHANCE = 3, 0.1
+# Largest chance to fit that a candidate is said to have had.
+MOST_CHANCE = 0.95
 # What is not measured of an error could be anything within this [m, m, rad].
 EXTENT = np.array([100.0, 100.0, 2.0 * np.pi])
 
@@ -62,13 +72,17 @@ def select(problem: TruncatedProblem, *, insured: bool = False) -> BoolArray | N
     problem : TruncatedProblem
     insured : bool
         Whether a constraint that no two neighbours agree with must be one that a wrong one would
-        hardly pass the gate of. Those that could not show it are not allowed any more.
+        hardly pass the gate of. Those that could not show it are not allowed any more, and none
+        if those that fit odometry could be wrong.
 
     """
     believed = np.zeros(len(problem), dtype=bool)
     if not problem.solve(believed.astype(np.float64)):
         return None
     gates = _Gates(problem)
+    if insured and not gates.show_more_than_chance():
+        problem.allowed[:] = False
+        return believed
     thrown = np.zeros(len(problem), dtype=np.int64)
     seen, scale, level, more = np.zeros(len(problem)), 1.0, 0.0, 1
     kept_out = np.zeros(len(problem), dtype=bool)
@@ -97,7 +111,7 @@ def select(problem: TruncatedProblem, *, insured: bool = False) -> BoolArray | N
         seen[new] = gates.share[new]
         believed[new] = True
         if np.sum(believed) >= ENOUGH:
-            shown = float(np.quantile(seen[believed], SHARE)) * LIMITS[3] / SHARE_LIMIT
+            shown = float(np.quantile(seen[believed], SHARE)) * GATE / SHARE_LIMIT
             scale = min(max(MARGIN * shown, LEAST_SCALE), 1.0)
         if not problem.solve(believed.astype(np.float64), go_on=True):
             return None
@@ -115,7 +129,7 @@ def select(problem: TruncatedProblem, *, insured: bool = False) -> BoolArray | N
 
 def n_supported(problem: TruncatedProblem) -> int:
     """Return the number of closures that at least two neighbours agree with."""
-    return int(np.sum(_agreeing(problem) >= 2))
+    return int(np.sum(_n_agreeing(problem, agreeing_pairs(problem)) >= 2))
 
 
 class _Gates:
@@ -130,7 +144,8 @@ class _Gates:
         with np.errstate(divide='ignore'):
             own = np.prod(np.where(measured, 1.0, EXTENT), axis=1) / np.sqrt(
                 np.abs(np.linalg.det(filled)))
-        self._agreeing = np.minimum(_agreeing(problem), 2)
+        self._pairs = agreeing_pairs(problem)
+        self._agreeing = np.minimum(_n_agreeing(problem, self._pairs), 2)
         self._own = own * np.asarray(ALONE)[self._agreeing]
         self._covariances = np.full((len(problem), 3, 3), np.nan)
         """J P J^T of each; they never grow while more is believed."""
@@ -203,16 +218,46 @@ class _Gates:
         scale : float, factor on the limits
 
         """
-        alone = np.asarray(ALONE)[self._agreeing[numbers]]
-        extent = np.maximum(np.ptp(self._problem.graph.poses[:, :2], axis=0), 1.0)
-        ball = 4.0 / 3.0 * np.pi * self._problem.limits[numbers] ** 1.5
-        chance = np.minimum(
-            ball * self.volume[numbers] / alone / (np.prod(extent) * 2.0 * np.pi), 1.0)
+        chance = self._chances(numbers)
         n_believed, rest = np.sum(believed), ~believed
         passing = rest & (self.volume > 0.0) & (self.share <= scale)
         n_wrong = int(np.sum(rest)) - int(np.sum(passing))
         return (self._agreeing[numbers] >= 2) | (
             (n_wrong + 1.0) * chance < WRONG_ODDS * (n_believed + 1.0))
+
+    def _chances(self, numbers: IntArray) -> FloatArray:
+        """Return the chances of wrong constraints to pass their gates, shape (K,)."""
+        alone = np.asarray(ALONE)[self._agreeing[numbers]]
+        extent = np.maximum(np.ptp(self._problem.graph.poses[:, :2], axis=0), 1.0)
+        ball = 4.0 / 3.0 * np.pi * self._problem.limits[numbers] ** 1.5
+        return np.asarray(np.minimum(
+            ball * self.volume[numbers] / alone / (np.prod(extent) * 2.0 * np.pi), 1.0))
+
+    def show_more_than_chance(self) -> bool:
+        """
+        Tell whether more closures fit odometry than if all of them were wrong.
+
+        Those that agree with one another are one candidate. Beside a wrong one that does not fit,
+        and had the chance p to do so, p / (1 - p) others are expected that do.
+        """
+        numbers = np.arange(len(self._problem.edges))
+        if len(numbers) == 0:
+            return True
+        squared = self._squared(numbers, self._problem.errors(numbers))
+        fits = ~(squared > self._problem.limits[numbers])
+        _, group = connected_components(coo_array(
+            (np.ones(len(self._pairs[0])), self._pairs), shape=(len(numbers), len(numbers))),
+            directed=False)
+        size = np.bincount(group)
+        chance = np.minimum(np.bincount(group, self._chances(numbers)) / size, MOST_CHANCE)
+        candidate_fits = 2 * np.bincount(group, fits) >= size
+        for of_kind in (size >= GROUP, size < GROUP):
+            n_fit = int(np.sum(candidate_fits & of_kind))
+            odds = (chance / (1.0 - chance))[~candidate_fits & of_kind]
+            # the chance of a Poisson distribution to reach n_fit
+            if n_fit > 0 and gammainc(n_fit, float(np.sum(odds))) < BY_CHANCE:
+                return True
+        return False
 
     def _squared(self, numbers: IntArray, errors: FloatArray) -> FloatArray:
         return Innovations(errors, self._covariances[numbers]).squared_distances(
@@ -244,10 +289,10 @@ class _Gates:
         self.volume[numbers] = self._own[numbers] * np.sqrt(np.maximum(grown, 1.0))
 
 
-def _agreeing(problem: TruncatedProblem) -> IntArray:
+def _n_agreeing(problem: TruncatedProblem, pairs: tuple[IntArray, IntArray]) -> IntArray:
     """Return for each constraint the number of neighbouring closures that agree with it."""
     count = np.zeros(len(problem), dtype=np.int64)
-    for numbers in agreeing_pairs(problem):
+    for numbers in pairs:
         np.add.at(count, numbers, 1)
     return count
 
@@ -276,5 +321,5 @@ def agreeing_pairs(problem: TruncatedProblem) -> tuple[IntArray, IntArray]:
     a, b = np.concatenate(pairs).T
     noise = np.asarray(np.linalg.inv(closures.information[usable]), dtype=np.float64)
     table = Closures(closures.i[usable], closures.j[usable], closures.mean[usable], noise)
-    agree = chain.squared_distances(table, a, b) <= LIMITS[3]
+    agree = chain.squared_distances(table, a, b) <= GATE
     return usable[a[agree]], usable[b[agree]]
