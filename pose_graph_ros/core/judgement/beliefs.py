@@ -106,17 +106,19 @@ class Beliefs:
         trial, states = self.trial, self._states
         if not trial.work():
             return None
-        later: set[int] = set()
-        if trial.is_finished:
-            later = trial.later
-            if trial.weights == self.weights_with(trial.changes) and bool(
-                    np.all(states.judged[[*trial.changes]])):
-                bad = trial.misfits(self._table)
-                if len(bad) == 0 and trial.adopt():
-                    self._keep(trial.changes)
-                for number in bad:
-                    before, states.state[number] = int(states.state[number]), DOUBTED
-                    states.announce(number, before, self.now_ns)
-                later |= set(trial.changes) - set(bad) if len(bad) > 0 else set()
-            trial.end()
+        if not trial.is_finished:
+            return []
+        changes, later = trial.changes, trial.later
+        if trial.is_outdated or trial.weights != self.weights_with(changes) or not np.all(
+                states.judged[[*changes]]):
+            later |= set(changes)
+        else:
+            bad = trial.misfits(self._table)
+            if len(bad) == 0 and trial.adopt():
+                self._keep(changes)
+            for number in bad:
+                before, states.state[number] = int(states.state[number]), DOUBTED
+                states.announce(number, before, self.now_ns)
+            later |= set(changes) - set(bad) if len(bad) > 0 else set()
+        trial.end()
         return sorted(later)

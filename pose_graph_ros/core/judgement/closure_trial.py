@@ -76,20 +76,27 @@ class ClosureTrial:
         """Whether a trial has come to its end, and waits to be adopted or dropped."""
         return self._trial is not None and self._trial.result is not None
 
+    @property
+    def is_outdated(self) -> bool:
+        """Whether the poses of the graph were set since, as an alignment with the map does."""
+        return self._trial is not None and self._trial.is_outdated
+
     def misfits(self, table: ClosureTable) -> list[int]:
         """Return which of the closures that would be believed do not fit into the copy."""
         assert self._trial is not None
+        assert self._trial.result is not None
+        if self._is_set or self._trial.result.status is Status.FAILED:
+            return []
         wanted = np.array(
             [k for k, state in self.changes.items() if state.in_graph], dtype=np.int64)
         fit = relative.residuals(self._trial.graph, table.rows(wanted))
-        return [] if self._is_set else wanted[~(fit <= GATE)].tolist()
+        return list(map(int, wanted[~(fit <= GATE)]))
 
     def adopt(self) -> bool:
         """Replace the graph by the copy; tell whether that was possible."""
         assert self._trial is not None
         return self._smoother.adopt(self._trial).status is not Status.FAILED
 
-    def end(self) -> set[int]:
-        """Forget the trial; return the numbers of those that have waited."""
-        later, self._trial, self.later = self.later, None, set()
-        return later
+    def end(self) -> None:
+        """Forget the trial, and who has waited."""
+        self._trial, self.later = None, set()

@@ -132,6 +132,19 @@ def test_what_comes_while_it_is_tried_is_kept() -> None:
     assert smoother.chi2() <= best_chi2(backend.graph) * (1.0 + 1e-6)
 
 
+def test_what_was_tried_from_other_poses_is_tried_again() -> None:
+    backend, smoother, poses = driven(600)
+    add_group(backend, poses, DIVERGING, 6)
+    backend.update()
+    for _ in range(4):
+        backend.refine()
+    backend.graph.set_poses(se2.compose(np.array([5.0, 0.0, 0.3]), backend.graph.poses))
+    smoother.update(GraphUpdate())
+    work(backend)
+    assert states(backend) == {State.BELIEVED}
+    assert smoother.fallbacks == 0
+
+
 @pytest.mark.parametrize('parts', [1, 8])
 def test_a_person_who_decides_meanwhile_wins(parts: int) -> None:
     backend, _, poses = driven(600)
