@@ -9,17 +9,45 @@ out of this, as its tests use signals themselves; those marked `untraced` have n
 """
 
 from collections.abc import Iterator
+from contextlib import suppress
+import importlib
 import os
+import pkgutil
 import signal
 import sys
 
 import pytest
 
+import pose_graph_ros
+
+OTHERS = ('numba', 'scipy.optimize', 'hypothesis', 'matplotlib', 'rosbags.highlevel', 'rclpy.node')
+"""Modules whose imports take long."""
 TRACED = 0.25
 """Time of the processor for which a test is traced [s]."""
 
 if 'PYTEST_XDIST_WORKER' in os.environ:
     os.environ.pop('COVERAGE_PROCESS_CONFIG', None)
+
+
+@pytest.hookimpl(hookwrapper=True)
+def pytest_collection() -> Iterator[None]:
+    """Trace the imports of our modules, and not those of others nor what pytest does."""
+    tracer = sys.gettrace()
+    if tracer is not None:
+        sys.settrace(None)
+        for name in OTHERS:
+            _import(name)
+        sys.settrace(tracer)
+        for module in pkgutil.walk_packages(pose_graph_ros.__path__, 'pose_graph_ros.'):
+            _import(module.name)
+        sys.settrace(None)
+    yield
+    sys.settrace(tracer)
+
+
+def _import(name: str) -> None:
+    with suppress(ImportError):
+        importlib.import_module(name)
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
