@@ -317,8 +317,8 @@ LIMITS = Section(
     'of its truth. Times are those of one machine that may have had other work; ratios in '
     '*Beside GTSAM* are of runs right after one another. Other tools were looked for in PyPI and '
     'Debian: g2o-python 0.0.12 crashes where an information matrix is set (Python 3.11, NumPy 2), '
-    'the solvers of Ceres and SciPy have losses but no graduated non-convexity, and Kimera-RPGO, '
-    'riSAM and IPC have no package. What cannot be decided stays wrong here too: closures that '
+    'pyceres 2.6 has losses but nothing that chooses closures, and there is no kimera-rpgo. '
+    'What cannot be decided stays wrong here too: closures that '
     'agree with one another within the error that odometry could have, and fixes that are dragged '
     'away no faster than odometry may drift.')
 
