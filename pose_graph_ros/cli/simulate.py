@@ -7,8 +7,11 @@ The car of `circuit` drives along some streets twice, on the second lap along al
 
 - wheel odometry: two wheels with wrong radii, a wrong track width, slip in turns and in a few
   events, and a drifting heading; the odometry frame is rotated by about 2 rad against the map;
-- fixes: a slow (Gauss-Markov) and a white error, and an outage of 70 s around the start of lap 2;
-- loop closures at places that are visited again in the same direction.
+- fixes: a slow (Gauss-Markov) and a white error, an outage of 70 s around the start of lap 2, and
+  a stretch with reflected signals (multipath), which put them to one side while they claim to be
+  as good as ever;
+- loop closures at places that are visited again in the same direction, and false ones: a stretch
+  of one street is taken for one of another, and single pictures for any that look alike.
 
 The frame `map` is east and north on the plane that touches the ellipsoid at the measured position
 of the *first fix of the bag*, including its error, because a localisation that starts from fixes
@@ -32,7 +35,7 @@ from pose_graph_ros.cli.bag_messages import (
 from pose_graph_ros.cli.circuit import drive_circuit, gauss_markov, PERIOD_S
 from pose_graph_ros.core.geometry import se2
 from pose_graph_ros.core.geometry.geodesy import TangentPlane
-from pose_graph_ros.core.geometry.se2 import FloatArray, IntArray
+from pose_graph_ros.core.geometry.se2 import BoolArray, FloatArray, IntArray
 from pose_graph_ros.core.geometry.trajectory import Trajectory
 
 START_NS = 1_746_518_400_250_000_000  # stamp of the start [ns]
@@ -51,6 +54,9 @@ FIX_SIGMA_SLOW = 1.2  # standard deviation of the time-correlated error of fixes
 FIX_SIGMA_WHITE = 0.4  # and of their white error [m]
 FIX_SIGMA = float(np.hypot(FIX_SIGMA_SLOW, FIX_SIGMA_WHITE))
 FIX_CORRELATION_S = 60.0  # time constant of the time-correlated error [s]
+MULTIPATH_S = (150.0, 175.0)  # start and end of the reflections, from the start of the drive [s]
+MULTIPATH_OFFSET = (14.0, -9.0)  # what they add to the fixes, to the east and to the north [m]
+MULTIPATH_SIGMA = 1.5  # standard deviation of its changes from fix to fix [m]
 OUTAGE_S = (-40.0, 30.0)  # start and end of the outage of fixes from the second lap on [s]
 LATENCIES_NS = {'/odom': 4_000_000, '/ground_truth': 4_000_000, '/gps/fix': 130_000_000,
                 '/loop_closure': 800_000_000}
@@ -61,6 +67,11 @@ LOOP_SPACING = 25.0  # length of the stretches of the path with at most one loop
 # [s] and driven distance [m] between them.
 LOOP_RADIUS, LOOP_ANGLE = 2.0, np.deg2rad(20.0)
 LOOP_MIN_TIME_S, LOOP_MIN_DISTANCE = 15.0, 50.0
+# False loop closures: single ones, and ones in a group along two streets; smallest distance of the
+# two places, spacing of the group [m], and when they begin [s].
+FALSE_SINGLE, FALSE_GROUP = 4, 4
+FALSE_MIN_DISTANCE, FALSE_SPACING, FALSE_FROM_S = 40.0, 6.0, 100.0
+FALSE_TRIES = 10_000  # of pairs of places; a short drive has none that look alike
 
 
 @dataclass(frozen=True, slots=True)
@@ -73,6 +84,8 @@ class SimulatedDrive:
     fixes: FloatArray  # latitude, longitude and ellipsoidal height, shape (M, 3) [deg, deg, m]
     loop_stamps_ns: IntArray  # of the earlier and later pose of loop closures, shape (L, 2) [ns]
     loop_poses: FloatArray  # measured later pose in the earlier one, shape (L, 3) [m, m, rad]
+    fix_is_wrong: BoolArray  # whether a fix is a reflected one, shape (M,)
+    loop_is_false: BoolArray  # whether a loop closure ties two different places, shape (L,)
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -108,6 +121,11 @@ def simulate_drive(seed: int = 1, duration_s: float = 440.0) -> SimulatedDrive:
     fix_stamps, fix_positions = _fixes(generator, truth, motion.lap_time)
     loop_stamps, loop_poses = _loop_closures(generator, truth, motion.distance)
 
+    wrong = _reflect(generator, fix_stamps, fix_positions)
+    false_stamps, false_poses = _false_loop_closures(generator, truth, motion.distance)
+    order = np.argsort(np.append(loop_stamps[:, 1], false_stamps[:, 1]), kind='stable')
+    is_false = order >= len(loop_stamps)
+
     fixes = CITY.to_geodetic(fix_positions)
     truth_stamps = _jittered_stamps(generator, truth, ODOMETRY_PERIOD_S)
     poses = truth.at(truth_stamps)
@@ -115,7 +133,9 @@ def simulate_drive(seed: int = 1, duration_s: float = 440.0) -> SimulatedDrive:
     poses[:, :2] = plane.to_map(*CITY.to_geodetic(poses[:, :2]).T)
     return SimulatedDrive(
         truth=Trajectory(truth_stamps, poses), odometry=odometry,
-        fix_stamps_ns=fix_stamps, fixes=fixes, loop_stamps_ns=loop_stamps, loop_poses=loop_poses)
+        fix_stamps_ns=fix_stamps, fixes=fixes, fix_is_wrong=wrong, loop_is_false=is_false,
+        loop_stamps_ns=np.concatenate((loop_stamps, false_stamps))[order],
+        loop_poses=np.concatenate((loop_poses, false_poses))[order])
 
 
 def write_drive(drive: SimulatedDrive, folder: str | Path, *, overwrite: bool = False) -> None:
@@ -193,6 +213,42 @@ def _fixes(
     time = (stamps - truth.stamps_ns[0]) * 1e-9 - lap_time
     received = (time < OUTAGE_S[0]) | (time > OUTAGE_S[1])
     return stamps[received], (truth.at(stamps)[:, :2] + errors)[received]
+
+
+def _reflect(
+    generator: np.random.Generator, stamps_ns: IntArray, positions: FloatArray,
+) -> BoolArray:
+    """Move the fixes of a stretch to one side, in place; return which ones."""
+    time = (stamps_ns - START_NS) * 1e-9
+    wrong: BoolArray = (time > MULTIPATH_S[0]) & (time < MULTIPATH_S[1])
+    positions[wrong] += MULTIPATH_OFFSET + generator.normal(
+        0.0, MULTIPATH_SIGMA, (int(np.sum(wrong)), 2))
+    return wrong
+
+
+def _false_loop_closures(
+    generator: np.random.Generator, truth: Trajectory, distance: FloatArray,
+) -> tuple[IntArray, FloatArray]:
+    """Return stamps (L, 2) and measured poses (L, 3) of loop closures between two places."""
+    begin = int(np.searchsorted(truth.stamps_ns, START_NS + round(FALSE_FROM_S * 1e9)))
+    stretch = FALSE_GROUP * FALSE_SPACING
+    last = int(np.searchsorted(distance, distance[-1] - stretch))
+    pairs: list[tuple[int, int]] = []
+    for _ in range(FALSE_TRIES if last > begin else 0):
+        if len(pairs) == FALSE_SINGLE + FALSE_GROUP:
+            break
+        new = int(generator.integers(begin, last))
+        old = int(generator.integers(0, new))
+        along = FALSE_SPACING * np.arange(FALSE_GROUP if len(pairs) == 0 else 1)
+        at = np.searchsorted(distance, distance[[old, new]][:, None] + along)
+        places = truth.poses[at]
+        away = np.hypot(*(places[1] - places[0])[:, :2].T)
+        alike = np.abs(se2.wrap(places[1, :, 2] - places[0, :, 2])) < LOOP_ANGLE
+        if np.all(away > FALSE_MIN_DISTANCE) and np.all(alike) and at[0, -1] < at[1, 0]:
+            pairs += list(zip(*at.tolist(), strict=True))
+    ends = truth.stamps_ns[np.array(pairs, dtype=np.int64).reshape(-1, 2)]
+    poses = generator.normal(0.0, (1.0, 0.5, 0.05), (len(pairs), 3))
+    return ends, poses
 
 
 def _loop_closures(

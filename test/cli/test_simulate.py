@@ -9,8 +9,14 @@ import pytest
 
 from pose_graph_ros.adapters.bags import open_bag
 from pose_graph_ros.cli.simulate import (
+    FALSE_GROUP,
+    FALSE_MIN_DISTANCE,
+    FALSE_SINGLE,
+    FIX_PERIOD_S,
     FIX_SIGMA,
     LOOP_SIGMAS,
+    MULTIPATH_OFFSET,
+    MULTIPATH_S,
     simulate_drive,
     SimulatedDrive,
     write_drive,
@@ -58,35 +64,59 @@ def test_odometry_is_good_over_seconds_and_drifts_over_minutes(drive: SimulatedD
     assert abs(se2.wrap(truth[0, 2] - odometry[0, 2] - 2.0)) < 0.05
 
 
-def test_fixes_err_by_their_sigma_and_pause_once(drive: SimulatedDrive) -> None:
+def test_fixes_err_by_their_sigma_but_for_reflected_ones(drive: SimulatedDrive) -> None:
     errors = []
     for seed in range(1, 6):
         other = simulate_drive(seed)
-        inside = other.truth.covers(other.fix_stamps_ns)
+        inside = other.truth.covers(other.fix_stamps_ns) & ~other.fix_is_wrong
         positions = TangentPlane(*other.fixes[0].tolist()).to_map(*other.fixes.T)
         errors.append(positions[inside]
                        - other.truth.at(other.fix_stamps_ns[inside])[:, :2])
     rms = np.sqrt(np.mean(np.concatenate(errors) ** 2))
     assert rms == pytest.approx(FIX_SIGMA, rel=0.25)
 
+    positions = TangentPlane(*drive.fixes[0].tolist()).to_map(*drive.fixes.T)
+    wrong = drive.fix_is_wrong
+    off = positions[wrong] - drive.truth.at(drive.fix_stamps_ns[wrong])[:, :2]
+    assert len(off) == pytest.approx((MULTIPATH_S[1] - MULTIPATH_S[0]) / FIX_PERIOD_S, abs=1)
+    assert np.all(np.hypot(*off.T) > 5.0 * FIX_SIGMA)
+    assert np.all(np.hypot(*(off - MULTIPATH_OFFSET).T) < 10.0)    # to one side
+
+
+def test_fixes_pause_once(drive: SimulatedDrive) -> None:
     gaps = np.diff(drive.fix_stamps_ns) * 1e-9
     assert 68.0 < gaps.max() < 72.0
     assert np.sum(gaps > 1.0) == 1
 
 
 def test_loop_closures_are_true_up_to_their_noise(drive: SimulatedDrive) -> None:
-    old, new = drive.loop_stamps_ns.T
-    assert len(drive.loop_poses) >= 24
+    true = ~drive.loop_is_false
+    old, new = drive.loop_stamps_ns[true].T
+    assert np.sum(true) >= 24
     assert np.all(new - old >= 15e9)
     truth = se2.between(drive.truth.at(old), drive.truth.at(new))
     assert np.linalg.norm(truth[:, :2], axis=1).max() < 2.2
-    error = se2.between(truth, drive.loop_poses)
+    error = se2.between(truth, drive.loop_poses[true])
     sigmas = np.array(LOOP_SIGMAS)
     assert np.std(error / sigmas) == pytest.approx(1.0, rel=0.25)
 
     gap = np.argmax(np.diff(drive.fix_stamps_ns))
     outage = drive.fix_stamps_ns[gap:gap + 2]
     assert np.sum((new > outage[0]) & (new < outage[1])) >= 4
+
+
+def test_false_loop_closures_tie_places_that_are_far_apart(drive: SimulatedDrive) -> None:
+    ends = drive.loop_stamps_ns[drive.loop_is_false]
+    assert len(ends) == FALSE_SINGLE + FALSE_GROUP
+    assert np.all(np.diff(drive.loop_stamps_ns[:, 1]) >= 0)
+    true = se2.between(drive.truth.at(ends[:, 0]), drive.truth.at(ends[:, 1]))
+    measured = drive.loop_poses[drive.loop_is_false]
+    assert np.all(np.hypot(*true[:, :2].T) > FALSE_MIN_DISTANCE)
+    assert np.all(np.hypot(*measured[:, :2].T) < 5.0)
+    # some of them agree: the car seems to drive along the same street again
+    new = np.argsort(ends[:, 1])
+    seconds = np.diff(ends[new], axis=0) * 1e-9
+    assert np.sum(np.all((seconds > 0.0) & (seconds < 10.0), axis=1)) >= FALSE_GROUP - 1
 
 
 def test_a_short_drive_needs_no_second_lap() -> None:
