@@ -175,7 +175,10 @@ def evaluate(drive: Drive) -> list[ErrorRow]:
         for name, path in paths.items():
             _, errors = distances(path, truth.stamps_ns, truth.poses[:, :2])
             rows += error_rows(f'{name} to truth', errors)
-        rows[1:1] = error_rows('fixes to truth', distances(truth, stamps, positions)[1])
+        doubted = drive.fix_kinds['doubted']
+        rows[1:1] = [row for name, chosen in (('fixes', ~doubted), ('doubted fixes', doubted))
+                     for row in error_rows(f'{name} to truth', distances(
+                         truth, stamps[chosen], positions[chosen])[1])]
         inside = drive.corrected.covers(truth.stamps_ns)
         turns = se2.wrap(
             drive.corrected.at(truth.stamps_ns[inside])[:, 2] - truth.poses[inside, 2])

@@ -36,8 +36,10 @@ UNUSED = (State.DOUBTED, State.WAITING)
 LOOPS = (
     ('loop closures', (State.BELIEVED,), GREEN, '-', 5),
     ('loop closures\nbelieved weakly', (State.WEAKLY_BELIEVED,), GREEN, '--', 5),
-    ('loop closures\nthat are doubted', UNUSED, GREY, ':', 2))
+    ('doubted loop closures,\nnot used', UNUSED, GREY, '--', 2))
 """Names of loop closures in the legend, states, colours, lines, and their order in depth."""
+DOUBTED_FIXES = {'color': GREY, 'marker': 'x', 'linestyle': 'none', 'markersize': 5.5,
+                 'markeredgewidth': 1.1}
 LOG_FLOOR = 0.05  # lower end of a logarithmic error axis [m]
 
 
@@ -162,8 +164,8 @@ def _draw_map(axes: Axes, drive: Drive, odometry: Trajectory) -> None:
         axes.plot(*used.T, 'o', color=ORANGE, markersize=4.5, markeredgewidth=0, alpha=0.55,
                   zorder=2, label=label('fixes'))
     if len(doubted):
-        axes.plot(*doubted.T, 'x', color=GREY, markersize=5.5, markeredgewidth=1.1, zorder=2,
-                  label='fixes that are doubted')
+        axes.plot(*doubted.T, **DOUBTED_FIXES, zorder=2, label=label('doubted fixes').replace(
+            'doubted fixes', 'doubted fixes, not used'))
     if len(held_out):
         axes.plot(*held_out.T, 'D', color='none', markeredgecolor=VERMILION, markersize=4.5,
                   markeredgewidth=0.9, zorder=2, label='fixes held out')
@@ -207,11 +209,13 @@ def _draw_errors(axes: Axes, drive: Drive, odometry: Trajectory) -> None:
                      'markersize': 4, 'linestyle': 'none', 'zorder': 4}
     truth, result, held_out = drive.truth, drive.corrected, drive.fix_held_out
     stamps, positions = drive.fix_stamps_ns, drive.fix_positions
+    doubted = drive.fix_kinds['doubted']
     lines: list[tuple[Trajectory, IntArray, FloatArray, dict[str, Any]]]
     if truth is not None:
         target = 'the truth'
         lines = [(odometry, truth.stamps_ns, truth.poses[:, :2], odometry_style),
-                 (truth, stamps, positions, fixes_style),
+                 (truth, stamps[~doubted], positions[~doubted], fixes_style),
+                 (truth, stamps[doubted], positions[doubted], {**DOUBTED_FIXES, 'zorder': 1}),
                  (result, truth.stamps_ns, truth.poses[:, :2], corrected_style)]
     elif len(stamps) == 0:
         target = 'the corrected path'

@@ -156,6 +156,7 @@ def test_what_is_doubted_is_no_reference_and_counted_apart() -> None:
     rows = {row.name: row for row in evaluate(drive)}
     assert rows['corrected path to fixes used'].count == 1
     assert rows['corrected path to fixes doubted'].count == 1
+    assert (rows['fixes to truth'].count, rows['doubted fixes to truth'].count) == (3, 1)
     assert rows['corrected path to fixes held out'].count == 2
     result = summary(drive, [], {})
     assert (result['fixes_used'], result['fixes_doubted'], result['fixes_held_out']) == (2, 1, 2)
