@@ -38,8 +38,8 @@ LOOPS = (
     ('loop closures\nbelieved weakly', (State.WEAKLY_BELIEVED,), GREEN, '--', 5),
     ('doubted loop closures,\nnot used', UNUSED, GREY, '--', 2))
 """Names of loop closures in the legend, states, colours, lines, and their order in depth."""
-DOUBTED_FIXES = {'color': GREY, 'marker': 'x', 'linestyle': 'none', 'markersize': 5.5,
-                 'markeredgewidth': 1.1}
+DOUBTED_FIXES: dict[str, Any] = {
+    'color': GREY, 'marker': 'x', 'linestyle': 'none', 'markersize': 5.5, 'markeredgewidth': 1.1}
 LOG_FLOOR = 0.05  # lower end of a logarithmic error axis [m]
 
 
