@@ -38,7 +38,7 @@ from pose_graph_ros.core.judgement.closure_states import (
 )
 from pose_graph_ros.core.judgement.closures import chances, claims, ClosureTable, GATE
 from pose_graph_ros.core.judgement.consistency import OdometryChain
-from pose_graph_ros.core.judgement.residual_scale import MOST, residual_scale
+from pose_graph_ros.core.judgement.scale_learner import ScaleLearner
 from pose_graph_ros.core.judgement.set_search import SetSearch
 from pose_graph_ros.core.judgement.texts import sentence
 from pose_graph_ros.core.judgement.verdicts import (
@@ -46,7 +46,7 @@ from pose_graph_ros.core.judgement.verdicts import (
     SourceVerdicts,
     State,
 )
-from pose_graph_ros.core.measurements import Answer, AnswerStatus, LoopClosure, rejected
+from pose_graph_ros.core.measurements import Answer, AnswerStatus, rejected
 from pose_graph_ros.core.smoother.incremental import IncrementalSmoother
 from pose_graph_ros.core.smoother.trial import continued
 from pose_graph_ros.core.sources.factor_builder import NewConstraint
@@ -86,7 +86,7 @@ class ClosureJudge:
     def __init__(
         self, smoother: IncrementalSmoother, reweighting: Reweighting, config: BackendConfig,
     ) -> None:
-        self._smoother, self._reweighting, self._config = smoother, reweighting, config
+        self._smoother, self._reweighting = smoother, reweighting
         self._chain = OdometryChain()
         self._table = ClosureTable(self._chain)
         self.states = self._states = ClosureStates()
@@ -103,12 +103,11 @@ class ClosureJudge:
         self._search = SetSearch(self._states, self._table)
         self._beliefs = Beliefs(smoother, reweighting, self._states, self._table)
         self._tries = False
-        self._learnt_from: list[int] = []
-        """Number of believed closures of each source when its scale was learnt."""
+        self._scales = ScaleLearner(smoother, self._states, self._table, self._beliefs, config)
 
     def configure(self, config: BackendConfig) -> None:
         """Set the settings."""
-        self._config = config
+        self._scales.configure(config)
 
     def before(
         self, new: Sequence[NewConstraint], edges: Edges, now_ns: int,
@@ -157,9 +156,7 @@ class ClosureJudge:
         self._tested.append(np.full(n, -1))
         self._turns.append(np.zeros(n, dtype=np.int64))
         self._corroborated.append(np.zeros(n, dtype=bool))
-        for source in self._states.sources[len(self._beliefs.scales):]:
-            self._beliefs.scales.append(self._fixed_scale(source) or 1.0)
-            self._learnt_from.append(0)
+        self._scales.add_sources()
 
     def rollback(self) -> None:
         """Forget the closures of the last `before`."""
@@ -322,10 +319,9 @@ class ClosureJudge:
         if choice is None:
             return
         inside[judged] = choice.believed
-        self._beliefs.scales = [self._fixed_scale(name) or 1.0 for name in states.sources]
+        self._scales.begin()
         if not self._change_to(inside, choice.poses):
             return
-        self._learnt_from = [0] * len(self._beliefs.scales)
         self._learn_scales()
         # nothing is to be tested again until something changes
         self._tested.values[:] = self._beliefs.round
@@ -333,45 +329,23 @@ class ClosureJudge:
 
     def state(self) -> Callable[[], None]:
         """Return what brings the present state back, as long as no closure is added."""
-        states, scales, learnt = (
-            self._states.state_of_all(), [*self._beliefs.scales], [*self._learnt_from])
+        states, scales = self._states.state_of_all(), self._scales.state()
 
         def bring_back() -> None:
             self._states.set_state_of_all(*states)
-            self._beliefs.scales, self._learnt_from = scales, learnt
+            self._scales.set_state(*scales)
             self._search = SetSearch(self._states, self._table)
             self._beliefs.trial.end()
             self._tested.values[:] = -1
             self._table.forget_spread()
         return bring_back
 
-    def _fixed_scale(self, source: str) -> float:
-        """Return the factor that is set for a source, 0 if it is learnt."""
-        return self._config.measurement_source(source, LoopClosure).sigma_scale
-
     def _learn_scales(self) -> bool:
-        """Learn the scales of sources of which many more closures are believed than before."""
-        believed = np.flatnonzero(self._states.in_graph)
-        for source, name in enumerate(self._states.sources):
-            numbers = believed[self._states.source[believed] == source]
-            if len(numbers) < 1.25 * self._learnt_from[source] + 5 or self._fixed_scale(name):
-                continue
-            self._learnt_from[source] = len(numbers)
-            some = numbers[np.lexsort(self._states.stamps_ns[numbers].T)]
-            some = some[np.linspace(0, len(some) - 1, min(len(some), MOST)).astype(np.int64)]
-            edges = self._smoother.graph.edges_at(self._states.row[some])
-            scale, before = residual_scale(
-                *self._smoother.edge_innovations(edges), edges.information,
-                self._beliefs.scales[source]), self._beliefs.scales[source]
-            if scale == before:
-                continue
-            self._beliefs.scales[source] = scale
-            if not self._beliefs.apply(dict(zip(numbers.tolist(), (
-                    STATES[k] for k in self._states.state[numbers].tolist()), strict=True))):
-                self._beliefs.scales[source] = before
-            self._table.forget_spread()
-            return True
-        return False
+        """Learn the scale of a source; tell whether one has changed."""
+        if not self._scales.learn():
+            return False
+        self._table.forget_spread()
+        return True
 
     def _look_for_another_set(self) -> bool:
         """Do a part of the search of another set; tell whether there was anything to do."""
@@ -405,8 +379,7 @@ class ClosureJudge:
         self._chain.extend(self._smoother.graph)
         self._table.append(claims(self._smoother.graph.edges_at(saved.rows)))
         self._states.restore(saved)
-        self._beliefs.scales = saved.scales.tolist()
-        self._learnt_from = [0] * len(self._beliefs.scales)
+        self._scales.set_state(saved.scales.tolist(), [0] * len(saved.scales))
         self._append_unknown(len(saved.rows))
 
     def totals(self) -> dict[str, SourceVerdicts]:

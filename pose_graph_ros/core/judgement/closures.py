@@ -37,12 +37,20 @@ class Support(NamedTuple):
     """Those that contradict it, by number."""
 
 
-def claims(edges: Edges) -> Closures:
-    """Return closures for decisions: from the earlier to the later node, covariances floored."""
+def claims(edges: Edges, floors: Sequence[float] = CLOSURE_FLOORS) -> Closures:
+    """
+    Return closures from the earlier to the later node, with covariances to decide by.
+
+    Parameters
+    ----------
+    edges : Edges
+    floors : sequence of three floats, least sigmas [m, m, rad]
+
+    """
     covariance = np.asarray(
         np.linalg.inv(edges.information + _LEAST_INFORMATION * np.eye(3)), dtype=np.float64)
     diagonal = np.einsum('mii->mi', covariance)
-    np.maximum(diagonal, np.square(CLOSURE_FLOORS), out=diagonal)
+    np.maximum(diagonal, np.square(floors), out=diagonal)
     first, second, mean = edges.i.copy(), edges.j.copy(), edges.mean.copy()
     back = np.flatnonzero(first > second)
     if len(back) == 0:
@@ -204,6 +212,20 @@ class ClosureTable:
         near = self.near(number)
         distance = self._distances(np.full(len(near), number), near)
         return near[distance < GATE], near[distance >= GATE]
+
+    def squared_distances(
+        self, closures: Closures, first: IntArray, second: IntArray,
+    ) -> FloatArray:
+        """
+        Return the squared Mahalanobis distances of pairs, as `OdometryChain` does, shape (P,).
+
+        Parameters
+        ----------
+        closures : Closures
+        first, second : ndarray of int, shape (P,), rows of `closures`
+
+        """
+        return self._chain.squared_distances(closures, first, second)
 
     def support(self, number: int, usable: BoolArray) -> Support:
         """

@@ -322,3 +322,13 @@ def test_the_scale_of_the_sigmas_is_found_in_the_residuals(factor: float) -> Non
         scale = residual_scale(
             errors, scale**2 * np.tile(np.diag(sigmas**2 / 8.0), (80, 1, 1)), information, scale)
     assert scale == pytest.approx(max(factor, 1.0), rel=0.2)
+
+
+@pytest.mark.parametrize('factor', [0.5, 1.0, 2.5])
+def test_the_scale_of_the_sigmas_is_found_in_the_agreement_of_neighbours(factor: float) -> None:
+    rng = np.random.default_rng(18)
+    backend = run([
+        closure(j - LAP, j, se2.between(TRUTH[j - LAP], TRUTH[j])
+                + rng.normal(0.0, factor * SIGMAS)) for j in range(LAP + 2, LAP * LAPS)])
+    backend.optimize()
+    assert backend.verdict_totals()['scan'].scale == pytest.approx(max(factor, 1.0), rel=0.1)
