@@ -196,6 +196,10 @@ SOURCE_PARAMETERS: tuple[Parameter, ...] = (
     Parameter('sigma_scale', _MEASUREMENT.sigma_scale, '', 'Factor on the standard deviations of '
               'what is believed, if `robust` is `judged`. If 0, it is learnt from the residuals.',
               0.0, 1e3, kinds=_JUDGED),
+    Parameter('sigma_scale', _ODOMETRY.sigma_scale, '', 'Factor on the standard deviations of the '
+              'primary odometry. If 0, it is at least 1, and more where global poses or fixes '
+              'with a `correlation_time` of -1 show that odometry drifts more than it claims.',
+              0.0, 1e3, kinds=_WHEELS),
     *(Parameter('robust_loss', loss.value, '', 'Robust loss applied to the errors. The last four '
                 'are bounded: very wrong measurements have no influence, and the start matters.',
                 choices=_values(config.Loss), kinds=kinds) for kinds, loss in (

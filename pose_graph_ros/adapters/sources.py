@@ -124,6 +124,7 @@ def _odometry_source(own: Mapping[str, Any]) -> config.OdometrySource:
             sigma_heading_turn=own['sigma_heading_turn'],
             sigma_floor_position=position, sigma_floor_heading=heading),
         noise_from=config.NoiseFrom(own['noise']), covariance_scale=own['covariance_scale'],
+        sigma_scale=own['sigma_scale'],
         reorder_window=own['reorder_window'], maximum_speed=own['maximum_speed'],
         loss=config.Loss(own['robust_loss']), rejection_threshold=own['rejection_threshold'])
 

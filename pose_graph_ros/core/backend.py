@@ -48,6 +48,9 @@ from pose_graph_ros.core.sources.pipeline import MeasurementPipeline
 from pose_graph_ros.core.sources.source_report import SourceReport
 from pose_graph_ros.core.transaction import Transaction
 
+# Number of edges of a graph up to which an update may change the weights of all odometry.
+MOST_IN_UPDATE = 1000
+
 
 class PoseGraphBackend:
     """
@@ -100,7 +103,7 @@ class PoseGraphBackend:
         self._config = self._config.changed_to(config)
         self._nodes.configure(config)
         self._pipeline.configure(config)
-        self._factors.configure(config)
+        self._factors.config = config
         self._judge.configure(config)
         self._alignment.configure(config)
 
@@ -212,7 +215,7 @@ class PoseGraphBackend:
         if information is None:
             self._smoother.update(GraphUpdate(hidden=mean[None], fix=(0,)))
             return 0
-        result = self._smoother.extend(mean, information)
+        result = self._smoother.extend(mean, information, self._tuner.odometry_weight)
         if result.status is Status.FAILED:
             # the next sample tries again, with a longer motion
             self.counts['solver', 'failed'] += 1
@@ -222,6 +225,7 @@ class PoseGraphBackend:
         settings = self._config.odometry_source(source)
         self._reweighting.add(
             self.graph.n_edges - 1, settings.loss, settings.rejection_threshold, edge=True)
+        self._reweighting.scale_base_weights(self.graph.n_edges - 1, self._tuner.odometry_weight)
         return self.graph.newest_pose
 
     def add_measurement(self, measurement: Measurement, source: str) -> Answer:
@@ -319,7 +323,7 @@ class PoseGraphBackend:
         self._alignment.add(queue.observed)
         self._refiner.restart()
         result, self._settled = self._refiner.reweight(transaction.result, self._transaction)
-        self._tuner.step()
+        self._tuner.step(MOST_IN_UPDATE)
         self._recheck_alignment()
         self._evaluate()
         return UpdateReport(
@@ -414,7 +418,8 @@ class PoseGraphBackend:
             return None
         noise = self._config.odometry_source(self._nodes.primary).noise
         return newest_estimate.estimate(
-            self._parts(), noise, self._newest_node_covariance, self._chi2, with_path=with_path)
+            self._parts(), noise, self._newest_node_covariance, self._chi2,
+            self._tuner.odometry_scale, with_path=with_path)
 
     def saved(self, datum: MapOrigin | None = None) -> SavedGraph:
         """Return the graph with its state since the last update; see `io.capture.capture`."""
@@ -434,7 +439,7 @@ class PoseGraphBackend:
         """
         backend = cls(config)
         restore(backend._parts(), saved)
-        backend._tuner.tell_scale()
+        backend._tuner.restored()
         backend._newest_node_covariance = np.array(saved.newest_covariance)
         backend._chi2 = saved.chi2
         backend._settled = False    # the next update eliminates all nodes

@@ -8,7 +8,7 @@ here. All constructors raise ConfigError if a value is out of range.
 """
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, fields
 from enum import Enum
 import math
 
@@ -147,6 +147,10 @@ class OdometryNoise:
                  'sigma_heading_turn')
         require(self, 'sigma_floor_position', 'sigma_floor_heading', positive=True)
 
+    def scaled(self, factor: float) -> 'OdometryNoise':
+        """Return the noise with all sigmas times a factor."""
+        return OdometryNoise(*(factor * getattr(self, each.name) for each in fields(self)))
+
 
 @dataclass(frozen=True, slots=True)
 class OdometrySource:
@@ -156,6 +160,8 @@ class OdometrySource:
     noise_from: NoiseFrom = NoiseFrom.MODEL
     covariance_scale: float = 1.0
     """Factor on the covariance of every increment."""
+    sigma_scale: float = 0.0
+    """Factor on the sigmas of the primary odometry; 0 for one that fixes and poses show."""
     reorder_window: float = 0.25
     """A sample that is older by stamp than the newest one by up to this is still used [s]."""
     maximum_speed: float = 60.0
@@ -166,7 +172,7 @@ class OdometrySource:
 
     def __post_init__(self) -> None:
         require(self, 'covariance_scale', 'maximum_speed', 'rejection_threshold', positive=True)
-        require(self, 'reorder_window')
+        require(self, 'reorder_window', 'sigma_scale')
         require_member(self, 'noise_from', NoiseFrom)
         require_member(self, 'loss', Loss)
 
@@ -374,6 +380,11 @@ class BackendConfig:
     def odometry_source(self, name: str) -> OdometrySource:
         """Return the settings of a source of odometry."""
         return self.odometry.get(name, OdometrySource())
+
+    @property
+    def odometry_scale(self) -> float:
+        """Factor on the sigmas of odometry of the preferred source; 0 for one that is found."""
+        return next((source.sigma_scale for source in self.odometry.values()), 0.0)
 
     def measurement_source(self, name: str, kind: type[Measurement]) -> MeasurementSource:
         """

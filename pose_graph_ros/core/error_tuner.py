@@ -6,8 +6,9 @@ Estimates of the errors of sources, and the change of the graph to new ones.
 When a source with `correlation_time` of -1 has sent enough measurements, the statistics of its
 errors are estimated (`sources.error_estimate`), and again whenever there are some more. If they
 differ much from those in use, the source gets a new bias, and all its measurements get edges to
-it, the newest first. All that is done in steps of a bounded time. At the end of a stream the
-statistics are those that all measurements show, whatever was in use.
+it, the newest first. Where odometry drifts more than it claims, its edges get a lower weight, all
+in one step, outside the timer if the graph is large. All else is done in bounded steps.
+At the end of a stream the statistics are those that all measurements show, whatever was in use.
 """
 
 from dataclasses import dataclass
@@ -18,6 +19,9 @@ import numpy as np
 from pose_graph_ros.core.batch.optimizer import Status
 from pose_graph_ros.core.config import Correlation
 from pose_graph_ros.core.geometry.se2 import FloatArray, IntArray
+from pose_graph_ros.core.graph import tables as tb
+from pose_graph_ros.core.graph.constraints import EdgeKind
+from pose_graph_ros.core.graph.graph import GraphUpdate
 from pose_graph_ros.core.graph.reweighting import Reweighting
 from pose_graph_ros.core.judgement.judge import Judge
 from pose_graph_ros.core.smoother.incremental import IncrementalSmoother
@@ -38,6 +42,8 @@ MORE = 1.3
 PART, WHOLE = 100, 5000
 # Estimates that differ by less than this factor from what is in use change nothing online.
 SIMILAR = 1.9
+# The same of the scale of odometry.
+SCALE_STEP = 1.2
 
 
 @dataclass(slots=True)
@@ -87,15 +93,33 @@ class ErrorTuner:
         self._change: _Change | None = None
         self.n_failures = 0
         """Number of changes that were undone because the solver failed."""
+        self.odometry_scale = 1.0
+        """Factor on the sigmas of the primary odometry in the graph."""
+        self._failed_scale = 0.0    # with which the solver failed
 
-    def step(self) -> float:
-        """Do a bounded part of the work that is due; return how far a node has moved [m]."""
+    @property
+    def odometry_weight(self) -> float:
+        """Weight of the primary odometry in the graph."""
+        return self.odometry_scale**-2
+
+    def step(self, most_edges: float = math.inf) -> float:
+        """
+        Do a bounded part of the work that is due; return how far a node has moved [m].
+
+        Parameters
+        ----------
+        most_edges : float, of a graph in which all odometry may get another weight
+
+        """
         graph = self._smoother.graph
         if graph.has_touched:
             return 0.0  # an update has failed
-        if self._change is not None:
+        if self._change is not None or (self._scale_is_due() and graph.n_edges <= most_edges):
             before = graph.poses.copy()
-            self._move(PART)
+            if self._change is not None:
+                self._move(PART)
+            else:
+                self._weigh_odometry()
             moved = np.abs(graph.poses[:len(before)] - before)[~graph.is_bias[:len(before)], :2]
             return float(np.max(moved, initial=0.0))
         if self._search is None:
@@ -108,8 +132,9 @@ class ErrorTuner:
                 constraints = self._factors.constraints(search.source)
                 constraints.next_estimate = math.ceil(MORE * search.n)
                 found: error_estimate.Estimate = end.value
-                constraints.odometry_scale = found.odometry_scale
-                self.tell_scale()
+                if _far(constraints.odometry_scale, found.odometry_scale):
+                    constraints.odometry_scale = found.odometry_scale
+                self._judge.set_odometry_scale(self._wanted_scale())
                 if _differ(self._factors.errors_in_use(search.source), found.errors):
                     self._begin(search.source, found.errors)
         return 0.0
@@ -117,13 +142,15 @@ class ErrorTuner:
     @property
     def is_idle(self) -> bool:
         """Whether `step` has nothing to do."""
-        return (self._change is None and self._search is None
+        return (self._change is None and self._search is None and not self._scale_is_due()
                 and len(self._factors.due_for_estimate()) == 0)
 
     def finish_change(self) -> None:
         """Do all that is left of a change that is under way."""
         while self._change is not None and self._move(WHOLE):
             pass
+        if self._scale_is_due() and not self._smoother.graph.has_touched:
+            self._weigh_odometry()
 
     def decide(self) -> None:
         """Give all sources the errors that their measurements show; for the end of a stream."""
@@ -141,16 +168,60 @@ class ErrorTuner:
             constraints.next_estimate = max(
                 constraints.next_estimate, math.ceil(MORE * len(constraints)))
             constraints.odometry_scale = found.odometry_scale
-            self.tell_scale()
             if found.errors != self._factors.errors_in_use(source):
                 self._begin(source, found.errors)
                 self.finish_change()
+        self._judge.set_odometry_scale(self._wanted_scale())
+        self.finish_change()
 
-    def tell_scale(self) -> None:
-        """Have fixes judged by an odometry that is as uncertain as the sources show."""
-        self._judge.set_odometry_scale(max((
+    def restored(self) -> None:
+        """Follow the graph, which was loaded."""
+        graph = self._smoother.graph
+        # what a loss or the judge has changed has less weight
+        weight = np.max(graph.weights[0][self._primary_edges()], initial=0.0)
+        if weight > 0.0:
+            self._use_scale(float(weight)**-0.5)
+        self._judge.set_odometry_scale(self._wanted_scale())
+
+    def _wanted_scale(self) -> float:
+        """Return the factor on the sigmas of odometry that is given, or that sources show."""
+        return self._factors.config.odometry_scale or max((
             self._factors.constraints(source).odometry_scale
-            for source in self._factors.finding()), default=1.0))
+            for source in self._factors.finding()), default=1.0)
+
+    def _scale_is_due(self) -> bool:
+        """Tell whether the odometry in the graph is to have another weight."""
+        wanted = self._wanted_scale()
+        return not math.isclose(wanted, self.odometry_scale) and wanted != self._failed_scale
+
+    def _weigh_odometry(self) -> None:
+        """Give all primary odometry in the graph the weight that is wanted; all or nothing."""
+        graph, wanted = self._smoother.graph, self._wanted_scale()
+        ratio = (self.odometry_scale / wanted)**2
+        rows = self._primary_edges()
+        update = GraphUpdate(weigh_edges=dict(zip(
+            rows.tolist(), (ratio * graph.weights[0][rows]).tolist(), strict=True)))
+        try:
+            failed = self._smoother.update(update).status is Status.FAILED
+        except Exception:
+            failed = True   # the smoother has rolled it back
+        if failed:
+            self.n_failures += 1
+            self._failed_scale = wanted
+            return
+        self._reweighting.scale_base_weights(rows, ratio)
+        self._use_scale(wanted)
+
+    def _primary_edges(self) -> IntArray:
+        """Return the rows of the edges that the hidden nodes were made with."""
+        graph = self._smoother.graph
+        primary = graph.memory['edge_i'][:graph.n_edges, tb.EDGE_KIND] == EdgeKind.ODOMETRY
+        primary[np.concatenate([[], *self._factors.pose_edges()]).astype(np.int64)] = False
+        return np.flatnonzero(primary)
+
+    def _use_scale(self, scale: float) -> None:
+        self.odometry_scale = scale
+        self._judge.weigh_odometry(self.odometry_weight)
 
     def _next_search(self) -> _Search | None:
         for source in self._factors.due_for_estimate():
@@ -252,6 +323,11 @@ class ErrorTuner:
                 after.is_edge.tolist(), strict=True):
             self._reweighting.move(row, to_row, edge=is_edge, to_edge=to_edge)
         return True
+
+
+def _far(one: float, other: float) -> bool:
+    """Tell whether two scales of odometry differ by more than the factor `SCALE_STEP`."""
+    return max(one, other) > SCALE_STEP * min(one, other)
 
 
 def _differ(one: CorrelatedErrors | None, other: CorrelatedErrors | None) -> bool:

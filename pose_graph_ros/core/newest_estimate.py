@@ -19,7 +19,7 @@ from pose_graph_ros.core.io.capture import Parts
 
 def estimate(
     parts: Parts, noise: OdometryNoise, newest_covariance: FloatArray, chi2: float,
-    *, with_path: bool,
+    scale: float = 1.0, *, with_path: bool,
 ) -> Estimate:
     """
     Return the present estimate.
@@ -30,6 +30,7 @@ def estimate(
     noise : OdometryNoise, of the primary odometry
     newest_covariance : ndarray, shape (3, 3), of the newest hidden node, in map axes
     chi2 : float
+    scale : float, factor on the sigmas of odometry
     with_path : bool, whether with the path, which takes time and memory linear in the graph
 
     """
@@ -37,7 +38,7 @@ def estimate(
     node = graph.poses[nodes.rows[-1]]
     motion, motion_noise, odometry = nodes.newest()
     newest = se2.compose(node, motion)
-    cov = covariance.propagated(node, newest_covariance, motion, motion_noise)
+    cov = covariance.propagated(node, newest_covariance, motion, scale**2 * motion_noise)
     state, sigma = parts.alignment.copy()
     shift = np.zeros(3)
     if state is AlignmentState.UNALIGNED:
@@ -54,6 +55,6 @@ def estimate(
             math.sqrt(cov[2, 2]) if state is AlignmentState.ALIGNED else sigma),
         n_hidden=len(nodes), n_edges=graph.n_edges - factors.n_bias_edges,
         n_observed=factors.n_measurements, n_biases=graph.n_nodes - len(nodes),
-        primary=nodes.primary, noise=noise,
+        primary=nodes.primary, noise=noise if scale == 1.0 else noise.scaled(scale),
         trajectory=None if not with_path else Trajectory(
             nodes.stamps_ns, graph.poses[nodes.rows] + shift).continued(stamp_ns, newest))

@@ -14,6 +14,7 @@ from pose_graph_ros.core.config import (
     BackendConfig,
     Correlation,
     MeasurementSource,
+    OdometrySource,
     POSITIONS,
 )
 from pose_graph_ros.core.geometry import se2
@@ -203,12 +204,70 @@ def test_a_change_that_fails_is_undone_as_a_whole(
     np.testing.assert_allclose(path(backend), white, atol=1e-9)
 
 
-def test_an_odometry_that_drifts_more_than_it_claims_is_noticed_and_saved() -> None:
-    backend = fed(drive(8, 1e-3, drift=4.0))
-    assert backend._judge.odometry_scale > 2.0
+def weights_of_odometry(backend: PoseGraphBackend) -> np.ndarray:
+    edges = backend.graph.edges
+    return edges.weight[edges.kind == EdgeKind.ODOMETRY]
+
+
+def test_an_odometry_that_drifts_more_than_it_claims_gets_a_lower_weight() -> None:
+    events = drive(8, 1e-3, drift=4.0)
+    backend = fed(events[:240])
+    assert backend._tuner.odometry_scale > 2.0
+    assert np.ptp(weights_of_odometry(backend)) < 1e-12     # those that came later as well
+    for each in (backend, PoseGraphBackend.restored(backend._config, backend.saved())):
+        go_on(each, events[230:])   # again what waited for odometry when it was saved
+        each.optimize()
+        scale = each._tuner.odometry_scale
+        assert 2.0 < scale < 6.0
+        np.testing.assert_allclose(weights_of_odometry(each), scale**-2)
+    claimed = PoseGraphBackend(BackendConfig(
+        measurements={'fix': SOURCE}, odometry={'odom': OdometrySource(sigma_scale=scale)}))
+    go_on(claimed, events)
+    claimed.optimize()
+    np.testing.assert_allclose(path(claimed), path(each), atol=1e-6)
+
+
+@pytest.mark.parametrize('scale', [0.0, 1.0])
+def test_an_odometry_as_it_claims_or_whose_scale_is_given_keeps_its_weight(scale: float) -> None:
+    """The paths are those without a scale, to the bit."""
+    source = OdometrySource(sigma_scale=scale)
+    backend = PoseGraphBackend(BackendConfig(
+        measurements={'fix': SOURCE}, odometry={'odom': source}))
+    go_on(backend, drive(8, 1e-3, drift=4.0 if scale > 0.0 else 1.0))
     backend.optimize()
-    scale = backend._judge.odometry_scale
-    assert 2.0 < scale < 6.0
-    restored = PoseGraphBackend.restored(backend._config, backend.saved())
-    assert restored._judge.odometry_scale == scale
-    assert fed(drive(8, 1e-3))._judge.odometry_scale == 1.0
+    assert backend._tuner.odometry_scale == 1.0
+    assert set(weights_of_odometry(backend)) == {1.0}
+
+
+def test_the_weight_of_odometry_stays_if_the_solver_fails_with_another_one(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    backend = fed(drive(9, 1e-3, n=60))
+    backend.optimize()
+    before = path(backend)
+    monkeypatch.setattr(backend._smoother, 'update', lambda _: UpdateResult(
+        Status.FAILED, 'for once', 0, 0, 0, 0))
+    backend._factors.constraints('fix').odometry_scale = 3.0
+    backend._tuner.step()
+    monkeypatch.undo()
+    assert backend._tuner.n_failures == 1
+    assert backend._tuner.is_idle
+    assert set(weights_of_odometry(backend)) == {1.0}
+    np.testing.assert_array_equal(path(backend), before)
+
+
+def test_a_step_moves_a_bounded_number_of_fixes(monkeypatch: pytest.MonkeyPatch) -> None:
+    """So that the past of a long drive changes its model in many updates, not in one."""
+    monkeypatch.setattr(error_tuner, 'PART', 7)
+    backend = fed(drive(5, TAU, n=60), replace(SOURCE, correlation_time=0.0))
+    backend._tuner._begin('fix', CorrelatedErrors(TAU, 1.0, 0.05))
+    held, graph, n_steps = backend._factors.constraints('fix').edges, backend.graph, 0
+    while not backend._tuner.is_idle:
+        moved, size = int(np.sum(held.values >= 0)), graph.n_nodes + graph.n_edges
+        backend._tuner.step()
+        n_steps += 1
+        assert np.sum(held.values >= 0) - moved <= 7
+        # an edge to the bias for each; at most a state for each, with the edges on both sides
+        assert graph.n_nodes + graph.n_edges - size <= 4 * 7
+    assert np.all(held.values >= 0)
+    assert n_steps == -(-len(held) // 7)

@@ -183,6 +183,19 @@ class Reweighting:
         new.base_weights.values[to] = old.base_weights.values[at]
         old.base_weights.values[at] = 0.0
 
+    def scale_base_weights(self, rows: IntArray | int, factor: float) -> None:
+        """
+        Multiply the base weights of edges, where they have a loss.
+
+        Parameters
+        ----------
+        rows : ndarray of int64 or int, of edges in the graph
+        factor : float
+
+        """
+        table = self._edges
+        table.base_weights.values[np.isin(table.rows.values, rows)] *= factor
+
     def base_weight(self, row: int) -> float | None:
         """Return the base weight of an observed node, by its row; None without a loss."""
         table = self._observed

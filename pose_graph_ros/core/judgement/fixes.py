@@ -93,6 +93,7 @@ class FixJudge:
         """Replaced, never changed, so that no copy is needed to undo it."""
         self.odometry_scale = 1.0
         """Factor on the sigmas of odometry that the measurements show."""
+        self.odometry_weight = 1.0  # in the graph, where it is not loosened
         self._restore: _Before | None = None
         self._now_ns, self._again = -1, -1
         """Newest stamp of odometry, and the record that is judged again, -1 for a new one."""
@@ -150,7 +151,7 @@ class FixJudge:
         edges, observed = self._states.weights(first, self._reweighting)
         for row in () if loosened is self._loosened else {*loosened, *self._loosened}:
             if loosened.get(row) != self._loosened.get(row):
-                edges[row] = self._loosened.get(row, 1.0)
+                edges[row] = self.odometry_weight * self._loosened.get(row, 1.0)
         return change._replace(weigh_edges={**change.weigh_edges, **edges},
                                weigh_observed={**change.weigh_observed, **observed})
 

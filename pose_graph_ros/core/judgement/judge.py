@@ -175,6 +175,10 @@ class Judge:
         self._closures.restore(saved.closures)
         self._fixes.restore(saved.fixes)
 
+    def weigh_odometry(self, weight: float) -> None:
+        """Tell the weight that the odometry has in the graph where it is not loosened."""
+        self._fixes.odometry_weight = weight
+
     def moved(self, before: Held, after: Held) -> None:
         """
         Follow measurements that other rows of the graph hold now, with the same weights.

@@ -11,7 +11,7 @@ other node moves.
 
 import math
 
-from pose_graph_ros.core.compiled.jit import kernel, NUMBERS, ROWS
+from pose_graph_ros.core.compiled.jit import kernel, NUMBER, NUMBERS, ROWS
 from pose_graph_ros.core.elimination.fronts import LEAST_PIVOT
 from pose_graph_ros.core.graph import factors, pools, rows, tables as tb, transaction_log
 from pose_graph_ros.core.graph.editing import scale_by_edge
@@ -98,8 +98,8 @@ def _copy_rows(front, ld, begin, end, at, pool_f):  # type: ignore[no-untyped-de
             at += 1
 
 
-@kernel(signature=(tb.HEAD, NUMBERS, ROWS))
-def extend(head, mean, information):  # type: ignore[no-untyped-def]
+@kernel(signature=(tb.HEAD, NUMBERS, ROWS, NUMBER))
+def extend(head, mean, information, weight):  # type: ignore[no-untyped-def]
     """
     Return EXTENDED after appending a node to the newest pose by an edge, or why that failed.
 
@@ -109,6 +109,7 @@ def extend(head, mean, information):  # type: ignore[no-untyped-def]
     Parameters
     ----------
     mean, information : ndarray, shapes (3,) and (3, 3), of the edge
+    weight : float, of the edge
 
     """
     clique_f, node_f, edge_f = tb.clique_f(head), tb.node_f(head), tb.edge_f(head)
@@ -129,7 +130,7 @@ def extend(head, mean, information):  # type: ignore[no-untyped-def]
     old = clique_i[c]
     if old[tb.N_FRONTAL] != 1 or old[tb.N_SEPARATOR] != 0:
         return NOT_A_CHAIN
-    if not rows.write_edge(head, e, last, v, mean, information, 0, 1.0):
+    if not rows.write_edge(head, e, last, v, mean, information, 0, weight):
         return NOT_A_CHAIN
     transaction_log.begin(head)
     _write_node(head, v, last, mean)

@@ -183,7 +183,9 @@ class IncrementalSmoother:
         """Let the running or the next `refine` end early, without effect; any thread may call."""
         self._memory.head[tb.INTERRUPT] = 1
 
-    def extend(self, mean: FloatArray, information: FloatArray) -> UpdateResult:
+    def extend(
+        self, mean: FloatArray, information: FloatArray, weight: float = 1.0,
+    ) -> UpdateResult:
         """
         Return the result of appending a hidden node to the newest pose by an odometry edge.
 
@@ -195,11 +197,12 @@ class IncrementalSmoother:
         ----------
         mean : ndarray, shape (3,), pose of the new node in the newest one [m, m, rad]
         information : ndarray, shape (3, 3), in the frame of the new node
+        weight : float, of the edge
 
         """
         head = self._memory.head
         try:
-            code = chain.extend(head, mean, information)
+            code = chain.extend(head, mean, information, weight)
         except TypeError:
             # the kernel is compiled for contiguous arrays of float64 only
             mean, information = (np.array(argument, dtype=np.float64, order='C')
@@ -214,13 +217,14 @@ class IncrementalSmoother:
         if code == chain.NO_ROOM:
             self.graph.ensure(*(int(count) + 1 for count in head[tb.N_NODES:tb.N_OBSERVED + 1]))
             self._make_room(int(head[tb.POOL_F_END]) + 256, int(head[tb.POOL_I_END]) + 8, 256)
-            return self.extend(mean, information)
+            return self.extend(mean, information, weight)
         node, last = self.graph.n_nodes, self.graph.newest_pose
         if last < 0:
             raise GraphUpdateError('extend: expected a graph with a hidden node to go on from')
         return self.update(GraphUpdate(
             hidden=se2.compose(self.graph.poses[last], mean)[None],
-            edges=Edges([last], [node], mean[None], information[None], [EdgeKind.ODOMETRY])))
+            edges=Edges([last], [node], mean[None], information[None], [EdgeKind.ODOMETRY],
+                        [weight])))
 
     def newest_covariance(self) -> FloatArray:
         """Return the covariance of the newest pose in map axes, shape (3, 3)."""

@@ -15,7 +15,7 @@ from pose_graph_ros.core.config import (
     MeasurementSource,
     OdometrySource,
 )
-from pose_graph_ros.core.geometry.se2 import FloatArray
+from pose_graph_ros.core.geometry.se2 import FloatArray, IntArray
 from pose_graph_ros.core.graph import tables as tb
 from pose_graph_ros.core.graph.constraints import EdgeKinds, Edges, ObservedNodes
 from pose_graph_ros.core.graph.graph import Graph, GraphUpdate
@@ -155,7 +155,7 @@ class FactorBuilder:
     """
 
     def __init__(self, config: BackendConfig, reweighting: Reweighting) -> None:
-        self._config = config
+        self.config = config    # for later updates; error models keep their own settings
         self._reweighting = reweighting
         self._error_models: dict[str, ErrorModel] = {}
         """Of the sources whose errors are correlated in time."""
@@ -169,10 +169,6 @@ class FactorBuilder:
         """Weights of observed nodes, by row, that the update sets."""
         self.n_bias_edges = 0
         """Number of edges of the graph that end at a bias."""
-
-    def configure(self, config: BackendConfig) -> None:
-        """Set the settings for later updates; error models that exist keep their own."""
-        self._config = config
 
     @property
     def n_measurements(self) -> int:
@@ -215,7 +211,7 @@ class FactorBuilder:
         """Add a measurement to an update, as the errors of its source ask for."""
         source, observed, measurement, attachment = attached
         kind, stamp_ns = type(measurement), measurement.stamp_ns
-        settings = self._config.measurement_source(source, kind)
+        settings = self.config.measurement_source(source, kind)
         model, noise = self._error_model(source, settings), NO_NOISE
         if settings.correlation_time != 0.0:
             noise = motion_noise(measurement, attachment)
@@ -271,6 +267,10 @@ class FactorBuilder:
         """Return the constraints of a source that has some."""
         return self._constraints[source]
 
+    def pose_edges(self) -> list[IntArray]:
+        """Return the rows of all edges between poses but those of the primary odometry."""
+        return [edges.values for edges in self._pose_edges.values()]
+
     def correlation(self, source: str) -> Correlation:
         """Return how correlated errors of a source are treated."""
         return self._settings(source).correlation
@@ -319,8 +319,8 @@ class FactorBuilder:
         """Record the constraints of the update that was built last."""
         self.n_bias_edges += self._n_new_bias_edges
         for is_edge, row, source, stamp_ns, kind, _, noise, held_by in self.new:
-            odometry = self._config.odometry.get(source) if stamp_ns < 0 else None
-            settings = odometry or self._config.measurement_source(source, kind)
+            odometry = self.config.odometry.get(source) if stamp_ns < 0 else None
+            settings = odometry or self.config.measurement_source(source, kind)
             loss = (settings.loss if isinstance(settings, OdometrySource)
                     else settings.applied_loss)
             threshold = settings.rejection_threshold
@@ -426,7 +426,7 @@ class FactorBuilder:
 
     def _settings(self, source: str) -> MeasurementSource:
         """Return the settings of a source; without any, headings are white."""
-        return self._config.measurement_source(source, GlobalPose)
+        return self.config.measurement_source(source, GlobalPose)
 
     def _has_given_bias(self, source: str) -> bool:
         """Tell whether measurements of a source are edges to a bias from the beginning."""
