@@ -200,12 +200,16 @@ def _report(
         'seconds': seconds, 'alignment': estimate.alignment.value,
         'hidden_nodes': estimate.n_hidden, 'edges': estimate.n_edges,
         'observed_nodes': estimate.n_observed, 'biases': estimate.n_biases,
-        'chi2': estimate.chi2, 'status': report.status.value, 'counts': counts,
+        'chi2': estimate.chi2, 'odometry_scale': estimate.odometry_scale,
+        'status': report.status.value, 'counts': counts,
         'judged': judgement(totals, verdicts)})
     write_g2o(backend.graph, options.out / 'graph.g2o')
     print(f'{estimate.n_hidden} hidden nodes, {estimate.n_edges} edges, {estimate.n_observed} '
           f'observed nodes in {seconds:.2f} s; {report.status.value}, chi2 {report.chi2:.6g}; '
           f'{estimate.alignment.value}')
+    if estimate.odometry_scale != 1.0:
+        print(f'{estimate.primary}: weighed with {estimate.odometry_scale:.3g} times the sigmas '
+              'that it claims')
     for source, fit in sorted(backend.reports().items()):
         text = f'{source}: squared residual {fit.energy:.3g} sigma^2'
         if fit.errors.significant:

@@ -69,7 +69,9 @@ class Estimate:
     primary: str
     """Source of the odometry in `T_odom_base`."""
     noise: OdometryNoise
-    """Noise settings of that source."""
+    """Noise of that source, by its settings and `odometry_scale`."""
+    odometry_scale: float = 1.0
+    """Factor on the sigmas of the primary odometry."""
     trajectory: Trajectory | None = None
     """The value of `path`; None if the estimate was made without it."""
 

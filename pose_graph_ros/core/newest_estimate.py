@@ -56,5 +56,6 @@ def estimate(
         n_hidden=len(nodes), n_edges=graph.n_edges - factors.n_bias_edges,
         n_observed=factors.n_measurements, n_biases=graph.n_nodes - len(nodes),
         primary=nodes.primary, noise=noise if scale == 1.0 else noise.scaled(scale),
+        odometry_scale=scale,
         trajectory=None if not with_path else Trajectory(
             nodes.stamps_ns, graph.poses[nodes.rows] + shift).continued(stamp_ns, newest))
