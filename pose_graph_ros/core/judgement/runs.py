@@ -44,8 +44,9 @@ WORSE = 0.5
 WORSE_HEADING = 0.1
 # Squared sigmas of a jump at which its price becomes logarithmic.
 KNEE = 6.0
-# Number of states that a run notes, and the time between them [ns].
-NOTED, NOTED_EVERY_NS = 10, 3_000_000_000
+# Time between states that a run notes [ns], and factor on their age from one to the one before,
+# of which the last `NOTED` are kept: 13 of them reach 5 minutes back.
+NOTED_EVERY_NS, NOTED_RATIO, NOTED = 3_000_000_000, 1.4, 20
 # Price of a transition above which the earlier run may have ended with wrong members.
 CUT_ABOVE = 6.0
 # Number of runs that are remembered; time after which those of few members are forgotten [ns].
@@ -212,7 +213,7 @@ class Run:
 
     def note_state(self, stamp_ns: int, track: Track) -> None:
         """
-        Note where the robot was, if it was not noted lately.
+        Note where the robot was, if it was not noted lately, and fewer of the older times.
 
         Parameters
         ----------
@@ -221,7 +222,7 @@ class Run:
 
         """
         if len(self.states) == 0 or stamp_ns - self.states[-1][0] >= NOTED_EVERY_NS:
-            self.states = [*self.states[1 - NOTED:], (stamp_ns, track)]
+            self.states = [*_thinned(self.states, stamp_ns)[1 - NOTED:], (stamp_ns, track)]
 
     def ways_after(self, other: 'Run', chain: OdometryChain) -> Sequence[Transition]:
         """
@@ -301,6 +302,17 @@ class Run:
         size2 = float(jump[0]**2 + jump[1]**2)
         along = float(jump[:2] @ gap @ jump[:2]) / max(size2, 1e-12)
         return max(size2 / max(along, 0.03**2), 1.0)
+
+
+def _thinned(states: list[tuple[int, Track]], now_ns: int) -> list[tuple[int, Track]]:
+    """Return states of which none is much nearer to the next than that is to the present."""
+    kept: list[tuple[int, Track]] = []
+    for k, state in enumerate(states):
+        after = states[k + 1][0] if k + 1 < len(states) else now_ns
+        before = kept[-1][0] if len(kept) > 0 else None
+        if before is None or now_ns - before > NOTED_RATIO * (now_ns - after):
+            kept.append(state)
+    return kept
 
 
 def fitted(seen: Sequence[Observation], chain: OdometryChain) -> Track | None:
