@@ -25,6 +25,7 @@ from pose_graph_ros.core.judgement.consistency import OdometryChain
 from pose_graph_ros.core.judgement.runs import (
     best_runs,
     EVENT,
+    LEAST_MEMBERS,
     odometry_between,
     remembered,
     Run,
@@ -55,6 +56,11 @@ MOST_AGAIN = 100_000
 # Bounds of the factor on the sigmas of odometry while fixes are judged: those that are stated are
 # often too small, and wrong fixes that are believed make them seem smaller than they are.
 LEAST_SCALE, MOST_SCALE = 2.0, 3.0
+# The factor on the covariances of a source while it is judged follows the median of the squared
+# distances of what is believed: by so much in its logarithm for each one, up to a limit.
+EXCESS_STEP, MOST_EXCESS = 0.03, 4.0
+# Median of chi2 with 2 and 3 degrees of freedom.
+MEDIAN = {2: 1.386, 3: 2.366}
 # How long what was in the graph before the first measurement counts as a run [s].
 KNOWN_BEFORE = 100.0
 
@@ -67,6 +73,7 @@ class _Before(NamedTuple):
     runs: dict[int, Run]
     main: int
     loosened: dict[int, float]
+    excess: dict[str, float]
 
 
 class FixJudge:
@@ -91,6 +98,8 @@ class FixJudge:
         self._n_runs = 0
         self._loosened: dict[int, float] = {}   # weights of odometry edges by row
         """Replaced, never changed, so that no copy is needed to undo it."""
+        self._excess: dict[str, float] = {}
+        """Factors on the covariances by source."""
         self.odometry_scale = 1.0
         """Factor on the sigmas of odometry that the measurements show."""
         self.odometry_weight = 1.0  # in the graph, where it is not loosened
@@ -158,7 +167,7 @@ class FixJudge:
     def _copy(self) -> _Before:
         runs = {run.number: run.copy() for run in self._runs}
         return _Before(len(self._states), runs, -1 if self._main is None else self._main.number,
-                       self._loosened)
+                       self._loosened, self._excess.copy())
 
     def commit(self) -> None:
         """Keep what the last `before` has decided, after its update has succeeded."""
@@ -179,7 +188,8 @@ class FixJudge:
 
     def _set(self, before: _Before) -> None:
         self._runs, self._main = list(before.runs.values()), before.runs.get(before.main)
-        self._loosened, self._restore = before.loosened, None
+        self._loosened, self._excess = before.loosened, before.excess
+        self._restore = None
 
     def state(self) -> Callable[[], None]:
         """Return what brings the present state back, as long as no measurement is added."""
@@ -195,6 +205,8 @@ class FixJudge:
         """Give a measurement to a run, and decide again on the runs if one may have won."""
         if seen is None:
             return      # a heading alone
+        source = self._source(one)
+        seen = seen._replace(noise=self._excess.get(source, 1.0) * seen.noise)
         if self._main is None and solved and not np.any(self._smoother.graph.fixed):
             self._go_on_from(seen.node, stamp_ns)
         predicted = self._predicted(seen.node, solved=solved)
@@ -208,16 +220,27 @@ class FixJudge:
         fits = mine.d2 <= EVENT + MORE_OF_POSE * (seen.size - 2)
         late = stamp_ns < main.end_ns
         spread = float(np.trace(predicted.cov[:2, :2]) / np.trace(seen.noise[:2, :2]))
-        if fits and (spread < WIDE or late):
+        run = None if late else self._join_other(stamp_ns, seen, mine if fits else None)
+        if run is None and fits and (spread < WIDE or late):
             self._join_main(main, stamp_ns, predicted, mine, late=late)
+            self._note_distance(source, mine.d2, seen.size)
             self._record(one, main, mine.d2)
             return
-        run = self._join_other(stamp_ns, seen, mine if fits else None)
         if run is None and not late:
             run = self._begin_run(stamp_ns, seen, predicted, believed=fits)
         self._record(one, run, mine.d2)
         self._decide()
         self._runs = remembered(self._runs, stamp_ns)
+
+    def _source(self, one: NewConstraint | None) -> str:
+        if one is not None:
+            return one.source
+        return self._states.sources[self._states.records[self._again, fs.SOURCE]]
+
+    def _note_distance(self, source: str, d2: float, size: int) -> None:
+        step = EXCESS_STEP if d2 > MEDIAN[size] else -EXCESS_STEP
+        factor = self._excess.get(source, 1.0) * math.exp(step)
+        self._excess[source] = min(max(factor, 1.0), MOST_EXCESS)
 
     def _go_on_from(self, node: int, stamp_ns: int) -> None:
         """Begin the main run with what is in the graph already."""
@@ -264,11 +287,18 @@ class FixJudge:
     def _join_other(
         self, stamp_ns: int, seen: Observation, mine: Innovation | None,
     ) -> Run | None:
-        """Add an observation to the doubted run that predicts it best, if better than `mine`."""
+        """
+        Add an observation to the doubted run that predicts it best.
+
+        Where the run that is believed predicts it as well, with `mine`, another one must be more
+        than a few measurements, go on at present, and predict it better.
+        """
         best = np.inf if mine is None else mine.d2 + mine.spread
         chosen: tuple[Run, Track, Track] | None = None
         for run in self._runs:
             if run.believed or stamp_ns < run.end_ns or run.track.node > seen.node:
+                continue
+            if mine is not None and (run.n < LEAST_MEMBERS or run.contradicted):
                 continue
             begin, track, turned = run.predicted(seen, self._chain)
             innovation = track.innovation(seen)
@@ -390,7 +420,7 @@ class FixJudge:
             return False
         self._restore = self._copy()
         states.keep(np.arange(len(states)))
-        self._runs, self._main, self._loosened = [], None, {}
+        self._runs, self._main, self._loosened, self._excess = [], None, {}, {}
         self._extend_chain(odometry_scale)
         states.records[:, fs.RUN] = fs.LONE
         for self._again in states.by_stamp().tolist():
