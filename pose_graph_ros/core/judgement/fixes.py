@@ -3,10 +3,9 @@
 """
 Judge positions and poses in the map over time, and odometry where they contradict it.
 
-Each is compared with the graph as it is, by the covariance of its hidden node. What agrees
-becomes a member of the newest run that is believed; what does not, of another run that it agrees
-with, or begins one. `runs` decides which runs to believe; odometry between two of them that it
-does not explain is believed less than claimed.
+Each is compared with where the robot is by what is believed. What agrees becomes a member of the
+newest run that is believed; what does not, of another run that it agrees with, or begins one.
+`runs` decides which to believe; odometry that does not explain the way between is believed less.
 """
 
 from collections.abc import Callable, Mapping, Sequence
@@ -30,8 +29,9 @@ from pose_graph_ros.core.judgement.runs import (
     remembered,
     Run,
 )
+from pose_graph_ros.core.judgement.stated_noise import StatedNoise
 from pose_graph_ros.core.judgement.texts import sentence
-from pose_graph_ros.core.judgement.tracks import Innovation, Observation, Track
+from pose_graph_ros.core.judgement.tracks import Innovation, Observation, seen_in, Track
 from pose_graph_ros.core.judgement.verdicts import Decision, State
 from pose_graph_ros.core.measurements import (
     Answer,
@@ -56,24 +56,18 @@ MOST_AGAIN = 100_000
 # Bounds of the factor on the sigmas of odometry while fixes are judged: those that are stated are
 # often too small, and wrong fixes that are believed make them seem smaller than they are.
 LEAST_SCALE, MOST_SCALE = 2.0, 3.0
-# The factor on the covariances of a source while it is judged follows the median of the squared
-# distances of what is believed: by so much in its logarithm for each one, up to a limit.
-EXCESS_STEP, MOST_EXCESS = 0.03, 4.0
-# Median of chi2 with 2 and 3 degrees of freedom.
-MEDIAN = {2: 1.386, 3: 2.366}
-# How long what was in the graph before the first measurement counts as a run [s].
+# How long what is in the graph before the first measurement counts as a run [s].
 KNOWN_BEFORE = 100.0
 
 
 class _Before(NamedTuple):
-    """The state before an update, but for the records."""
+    """The state before an update, but for the records, of which there were `size`."""
 
     size: int
-    """Number of records."""
     runs: dict[int, Run]
     main: int
     loosened: dict[int, float]
-    excess: dict[str, float]
+    noise: StatedNoise
 
 
 class FixJudge:
@@ -96,10 +90,9 @@ class FixJudge:
         self._main: Run | None = None
         """The newest run that is believed."""
         self._n_runs = 0
-        self._loosened: dict[int, float] = {}   # weights of odometry edges by row
-        """Replaced, never changed, so that no copy is needed to undo it."""
-        self._excess: dict[str, float] = {}
-        """Factors on the covariances by source."""
+        self._loosened: dict[int, float] = {}
+        """Weights of odometry edges by row; replaced, never changed, so that it is not copied."""
+        self._noise = StatedNoise()
         self.odometry_scale = 1.0
         """Factor on the sigmas of odometry that the measurements show."""
         self.odometry_weight = 1.0  # in the graph, where it is not loosened
@@ -137,9 +130,8 @@ class FixJudge:
         for one in judged:
             at = one.row - (graph.n_edges if one.is_edge else graph.n_observed)
             row = slice(at, at + 1)
-            seen = (Observation.of_biased(change.edges.rows(row)) if one.is_edge
-                    else Observation.of(change.observed.rows(row)))
-            self._judge(one.stamp_ns, seen, one, solved=solved)
+            self._judge(one.stamp_ns, Observation.of_biased(change.edges.rows(row)) if one.is_edge
+                        else Observation.of(change.observed.rows(row)), one, solved=solved)
         for number in range(first, len(self._states)):
             if not self._states.believed[number]:
                 self._states.announce(number, None)
@@ -167,7 +159,7 @@ class FixJudge:
     def _copy(self) -> _Before:
         runs = {run.number: run.copy() for run in self._runs}
         return _Before(len(self._states), runs, -1 if self._main is None else self._main.number,
-                       self._loosened, self._excess.copy())
+                       self._loosened, self._noise.copy())
 
     def commit(self) -> None:
         """Keep what the last `before` has decided, after its update has succeeded."""
@@ -188,7 +180,7 @@ class FixJudge:
 
     def _set(self, before: _Before) -> None:
         self._runs, self._main = list(before.runs.values()), before.runs.get(before.main)
-        self._loosened, self._excess = before.loosened, before.excess
+        self._loosened, self._noise = before.loosened, before.noise
         self._restore = None
 
     def state(self) -> Callable[[], None]:
@@ -205,15 +197,20 @@ class FixJudge:
         """Give a measurement to a run, and decide again on the runs if one may have won."""
         if seen is None:
             return      # a heading alone
-        source = self._source(one)
-        seen = seen._replace(noise=self._excess.get(source, 1.0) * seen.noise)
+        source = (self._states.sources[self._states.records[self._again, fs.SOURCE]]
+                  if one is None else one.source)
+        seen = seen._replace(noise=self._noise.factor(source) * seen.noise)
         if self._main is None and solved and not np.any(self._smoother.graph.fixed):
-            self._go_on_from(seen.node, stamp_ns)
+            # with what is in the graph already
+            track = self._of_graph(seen.node)
+            self._main = Run(self._next_number(), stamp_ns, track, believed=True)
+            self._main.seconds = KNOWN_BEFORE
+            self._runs.append(self._main)
         predicted = self._predicted(seen.node, solved=solved)
         main = self._main
         if main is None or predicted is None:
-            prior = Track(seen.node, self._smoother.graph.poses[seen.node].copy(),
-                          np.diag((NOWHERE, NOWHERE, 0.3**2)))
+            pose = self._smoother.graph.poses[seen.node].copy()
+            prior = Track(seen.node, pose, np.diag((NOWHERE, NOWHERE, 0.3**2)))
             self._record(one, self._begin_run(stamp_ns, seen, prior, believed=True), 0.0)
             return
         mine = predicted.innovation(seen)
@@ -222,31 +219,21 @@ class FixJudge:
         spread = float(np.trace(predicted.cov[:2, :2]) / np.trace(seen.noise[:2, :2]))
         run = None if late else self._join_other(stamp_ns, seen, mine if fits else None)
         if run is None and fits and (spread < WIDE or late):
-            self._join_main(main, stamp_ns, predicted, mine, late=late)
-            self._note_distance(source, mine.d2, seen.size)
+            self._noise.note(source, mine.d2, seen.size)
             self._record(one, main, mine.d2)
+            main.n += 1
+            if not late:
+                main.note_state(stamp_ns, predicted)
+                main.count_time(stamp_ns)
+                main.track = predicted.updated(mine)
+                for other in self._runs:
+                    other.contradicted = other.contradicted or not other.believed
             return
         if run is None and not late:
             run = self._begin_run(stamp_ns, seen, predicted, believed=fits)
         self._record(one, run, mine.d2)
         self._decide()
         self._runs = remembered(self._runs, stamp_ns)
-
-    def _source(self, one: NewConstraint | None) -> str:
-        if one is not None:
-            return one.source
-        return self._states.sources[self._states.records[self._again, fs.SOURCE]]
-
-    def _note_distance(self, source: str, d2: float, size: int) -> None:
-        step = EXCESS_STEP if d2 > MEDIAN[size] else -EXCESS_STEP
-        factor = self._excess.get(source, 1.0) * math.exp(step)
-        self._excess[source] = min(max(factor, 1.0), MOST_EXCESS)
-
-    def _go_on_from(self, node: int, stamp_ns: int) -> None:
-        """Begin the main run with what is in the graph already."""
-        self._main = Run(self._next_number(), stamp_ns, self._of_graph(node), believed=True)
-        self._main.seconds = KNOWN_BEFORE
-        self._runs.append(self._main)
 
     def _predicted(self, node: int, *, solved: bool) -> Track | None:
         """
@@ -272,18 +259,6 @@ class FixJudge:
         return Track(node, self._smoother.graph.poses[node].copy(),
                      self._chain.noise_factor * self._smoother.covariance(node))
 
-    def _join_main(
-        self, main: Run, stamp_ns: int, predicted: Track, mine: Innovation, *, late: bool,
-    ) -> None:
-        main.n += 1
-        if late:
-            return
-        main.note_state(stamp_ns, predicted)
-        main.count_time(stamp_ns)
-        main.track = predicted.updated(mine)
-        for run in self._runs:
-            run.contradicted = run.contradicted or not run.believed
-
     def _join_other(
         self, stamp_ns: int, seen: Observation, mine: Innovation | None,
     ) -> Run | None:
@@ -296,9 +271,8 @@ class FixJudge:
         best = np.inf if mine is None else mine.d2 + mine.spread
         chosen: tuple[Run, Track, Track] | None = None
         for run in self._runs:
-            if run.believed or stamp_ns < run.end_ns or run.track.node > seen.node:
-                continue
-            if mine is not None and (run.n < LEAST_MEMBERS or run.contradicted):
+            if (run.believed or stamp_ns < run.end_ns or run.track.node > seen.node or (
+                    mine is not None and (run.n < LEAST_MEMBERS or run.contradicted))):
                 continue
             begin, track, turned = run.predicted(seen, self._chain)
             innovation = track.innovation(seen)
@@ -420,7 +394,8 @@ class FixJudge:
             return False
         self._restore = self._copy()
         states.keep(np.arange(len(states)))
-        self._runs, self._main, self._loosened, self._excess = [], None, {}, {}
+        self._runs, self._main, self._loosened = [], None, {}
+        self._noise = StatedNoise()
         self._extend_chain(odometry_scale)
         states.records[:, fs.RUN] = fs.LONE
         for self._again in states.by_stamp().tolist():
@@ -428,10 +403,7 @@ class FixJudge:
                 self._again, (fs.ROW, fs.EDGE, fs.STAMP, fs.OBSERVED)].tolist()
             if observed >= 0:
                 row, edge = observed, False
-            at = np.array((row,))
-            seen = (Observation.of_biased(graph.edges_at(at)) if edge
-                    else Observation.of(graph.observed_at(at)))
-            self._judge(stamp_ns, seen, None)
+            self._judge(stamp_ns, seen_in(graph, row, edge=bool(edge)), None)
         self._again = -1
         return True
 

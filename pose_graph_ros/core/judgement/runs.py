@@ -370,8 +370,11 @@ def best_runs(runs: list[Run], chain: OdometryChain) -> list[tuple[Run, Transiti
         for m, other in enumerate(ordered[:k]):
             for way in run.ways_after(other, chain):
                 price = total[m] + way.price
-                if way.cut >= 0 and not any(wrong.n > 1 for wrong in ordered[m + 1:k]):
-                    price += EVENT  # no wrong run follows that the last members could belong to
+                if way.cut >= 0:
+                    lasted = (other.end_ns - other.states[way.cut][0]) * 1e-9
+                    if not any(wrong.n > 1 and wrong.seconds >= lasted
+                               for wrong in ordered[m + 1:k]):
+                        price += EVENT  # no wrong run follows that they could be the beginning of
                 if price < cost:
                     cost, best = price, (m, way)
         total.append(cost - run.price)

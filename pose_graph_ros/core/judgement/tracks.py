@@ -14,6 +14,7 @@ import numpy as np
 from pose_graph_ros.core.geometry import covariance, se2
 from pose_graph_ros.core.geometry.se2 import FloatArray
 from pose_graph_ros.core.graph.constraints import Edges, ObservedKind, ObservedNodes
+from pose_graph_ros.core.graph.graph import Graph
 from pose_graph_ros.core.judgement.consistency import OdometryChain
 from pose_graph_ros.core.sources.gauss_markov import STRETCH
 
@@ -134,6 +135,23 @@ class Track(NamedTuple):
         pose = se2.wrapped(self.pose + gain @ innovation.error)
         cov = self.cov - gain @ innovation.cov @ gain.T
         return Track(self.node, pose, 0.5 * (cov + cov.T))
+
+
+def seen_in(graph: Graph, row: int, *, edge: bool) -> Observation | None:
+    """
+    Return the observation that a row of a graph holds; None for a heading.
+
+    Parameters
+    ----------
+    graph : Graph
+    row : int
+    edge : bool, whether it is one of an edge, to a bias
+
+    """
+    at = np.array((row,))
+    if edge:
+        return Observation.of_biased(graph.edges_at(at))
+    return Observation.of(graph.observed_at(at))
 
 
 def motion_between(

@@ -248,3 +248,40 @@ def test_a_failed_update_changes_no_verdict(monkeypatch: pytest.MonkeyPatch) -> 
     before = state()
     judge.rollback()
     assert state() == before
+
+
+def test_odometry_that_turns_far_more_than_the_robot_is_found_out() -> None:
+    drive = Drive(150)
+    drive.noise[300, 2] += 2.0
+    driven = Driven(drive)
+    assert max(driven.newest[at] for at in range(125, 150)) < 2.0
+    assert len(driven.doubted) <= 2
+    assert driven.rms < 1.0
+
+
+@pytest.mark.parametrize('noisier', [2.0, 4.0])
+def test_right_fixes_are_believed_beside_odometry_that_is_worse_than_it_claims(
+    noisier: float,
+) -> None:
+    drive = Drive(200)
+    drive.noise *= noisier
+    driven = Driven(drive)
+    assert len(driven.doubted) <= 2
+    assert driven.rms < 1.0
+
+
+def test_right_fixes_are_believed_that_claim_too_small_a_sigma() -> None:
+    drive = Drive(200)
+    drive.fixes += 1.4 * drive.rng.standard_normal(drive.fixes.shape)
+    driven = Driven(drive)
+    assert len(driven.doubted) <= 10
+    assert driven.rms < 1.0
+
+
+def test_an_error_that_grows_for_a_minute_is_taken_back_when_it_ends() -> None:
+    drive = Drive(250)
+    since = np.where(drive.between(60.0, 130.0), drive.fix_time - 60.0, 0.0)
+    drive.fixes += since[:, None] * np.array((0.0, 0.25))
+    driven = Driven(drive)
+    assert ids(drive, 105.0, 130.0) <= driven.doubted
+    assert driven.newest[249] < 2.0
