@@ -188,14 +188,14 @@ SOURCE_PARAMETERS: tuple[Parameter, ...] = (
     *(Parameter('robust', robust.value, '', text, choices=choices, kinds=kinds)
       for kinds, robust, choices, text in (
         (_JUDGED, config.POSITIONS.robust, _values(config.Robust), 'Protection from wrong '
-         'measurements: with `judged` each one takes part only while it is believed, and those '
-         'that do have the `robust_loss`; with `loss` all take part, with the `robust_loss`; '
-         'with `none` all take part, without it.'),
+         'measurements: `judged` uses only those that the others do not contradict, with the '
+         '`robust_loss`; `loss` uses all, with the `robust_loss`; `none` uses all, without it.'),
         ((Kind.IMU,), config.HEADINGS.robust, _values(config.Robust)[1:], 'Whether the '
          '`robust_loss` is used.'))),
     Parameter('sigma_scale', _MEASUREMENT.sigma_scale, '', 'Factor on the standard deviations of '
-              'what is believed, if `robust` is `judged`. If 0, it is learnt from the residuals.',
-              0.0, 1e3, kinds=_JUDGED),
+              'the loop closures that are used, if `robust` is `judged`. If 0, it is learnt from '
+              'their residuals and from how well neighbours agree, and at least 1.', 0.0, 1e3,
+              kinds=(Kind.LOOP_CLOSURE,)),
     Parameter('sigma_scale', _ODOMETRY.sigma_scale, '', 'Factor on the standard deviations of the '
               'primary odometry. If 0, it is at least 1, and more where global poses or fixes '
               'with a `correlation_time` of -1 show that odometry drifts more than it claims.',

@@ -227,7 +227,7 @@ class MeasurementSource:
     rejection_threshold: float = 3.0
     """Threshold k of the loss [sigma]."""
     sigma_scale: float = 0.0
-    """Factor on the sigmas of what is judged; 0 for one that its residuals show."""
+    """Factor on the sigmas of judged loop closures; 0 for one that they show themselves."""
     minimum_period: float = 0.0
     """Of measurements with stamps closer than this only the first to arrive is used [s]."""
     correlation_time: float = 0.0
