@@ -10,7 +10,7 @@ Measure what wrong loop closures and wrong fixes do to the path, with default se
 Paths with loop closures alone are compared with the truth after the best rigid motion. A closure
 is wrong if it is more than 3 m off; odometry has the noise of the default model, in M3500 and its
 kind that of the edges of the file. Of the settings, only `robust` is changed, where a column says
-so.
+so. Each section can be made alone, and says at its end by which command it was.
 """
 
 import argparse
@@ -82,6 +82,10 @@ class Options:
     out: Path
     fix_robust: Robust | None
     cases: tuple[str, ...]
+
+    def wants(self, name: str) -> bool:
+        """Return whether a drive or a graph is to be measured."""
+        return len(self.cases) == 0 or any(case in name for case in self.cases)
 
 
 @dataclass(frozen=True, slots=True)
@@ -265,6 +269,8 @@ def grids(options: Options) -> Section:
     else:
         section.notes.append('M3500: the data is not there, skipped.')
     for base, seeds in bases:
+        if not options.wants(base.name):
+            continue
         clean = judge(table, replace(base, name=f'{base.name}, none wrong'), everything=False)
         section.metrics.append(Metric(
             f'{base.name}: rms over that of what the file says', clean.rms / clean.right,
@@ -300,7 +306,8 @@ def peers(options: Options) -> Section:
     found += [replace(with_false(base, share, group, 0), name=f'{base.name}, {100 * share:.0f} % '
                       f'{"groups" if group > 1 else "single"}') for share, group in mixes]
     found.append(place_recognition(OUTDOORS, LOOSE, 2.5, 0))
-    return robust_peers.section(found, limit=options.limit)
+    return robust_peers.section(
+        [recording for recording in found if options.wants(recording.name)], limit=options.limit)
 
 
 SECTIONS: dict[str, Callable[[Options], Section]] = {
@@ -348,7 +355,8 @@ def main(arguments: list[str]) -> int:
                         help='`robust` of fixes and poses: judged, loss or none, if not the '
                         'default')
     parser.add_argument('--case', action='append', default=[], metavar='TEXT',
-                        help='of the section fixes, only drives whose names hold one of these')
+                        help='of the sections fixes, grids and peers, only what has one of these '
+                        'in its name; other rows of the page stay')
     parser.add_argument('--limit', type=float, default=60.0, metavar='S',
                         help='cut other tools after so many seconds (default: %(default)s)')
     parser.add_argument('--out', type=Path, default=Path('build/benchmark/robust'), metavar='DIR')
@@ -362,9 +370,11 @@ def main(arguments: list[str]) -> int:
         section = SECTIONS[name](options)
         section.notes.append(f'Made on {date.today().isoformat()} by `python -m '
                              f'benchmark.robust {shlex.join(_shown(arguments))}`.')
-        sections = kept_sections.merged(options.out, {name: section}, tuple(SECTIONS))
-    return report.conclude([*sections, LIMITS], options.out, 'benchmark.robust', _shown(arguments),
-                           title='Wrong measurements', about=__doc__)
+        sections = kept_sections.merged(
+            options.out, {name: section}, tuple(SECTIONS), rows=len(options.cases) > 0)
+    return report.conclude(
+        [*sections, LIMITS], options.out, 'benchmark.robust', ['--data', 'DATA', '--out', 'OUT'],
+        title='Wrong measurements', about=__doc__)
 
 
 if __name__ == '__main__':
