@@ -1,7 +1,7 @@
 # Copyright 2026 The pose_graph_ros authors
 # SPDX-License-Identifier: Apache-2.0
 """
-Least squares with some constraints that may be wrong: which of them to believe.
+Least squares with some edges that may be wrong: which of them to believe.
 
 The *truncated cost* of a set of believed constraints is
 
@@ -24,7 +24,7 @@ from pose_graph_ros.core.batch.optimizer import chi2_of, optimize, Status
 from pose_graph_ros.core.config import SolverConfig
 from pose_graph_ros.core.elimination import symbolic
 from pose_graph_ros.core.geometry.se2 import BoolArray, FloatArray, IntArray
-from pose_graph_ros.core.graph.error_functions import edge_errors, energies, observed_errors
+from pose_graph_ros.core.graph.error_functions import edge_errors, energies
 from pose_graph_ros.core.graph.graph import Graph, GraphUpdate
 
 # Value that 99 % of the energies of right constraints are below, by the rank of the information.
@@ -34,11 +34,8 @@ CONFIG = SolverConfig(max_iterations=60, step_tolerance=1e-6)
 ROUGH = SolverConfig(max_iterations=15, step_tolerance=1e-4)
 # Eigenvalue of an information matrix with unit diagonal above which it counts for the rank.
 _RANK = 1e-9
-
 # Maximum number of sets that a retest leads to, and of those whose solution is kept.
 RETESTS, MOST_KEPT = 20, 16
-
-_NONE: Final[IntArray] = np.empty(0, dtype=np.int64)
 
 
 @dataclass(frozen=True, slots=True)
@@ -46,7 +43,7 @@ class Choice:
     """A set of believed constraints."""
 
     believed: BoolArray
-    """Of the constraints that may be wrong, shape (M,)."""
+    """Of the edges that may be wrong, shape (M,)."""
     energies: FloatArray
     """r^2 of the same at the poses, shape (M,) [sigma^2]."""
     cost: float
@@ -57,13 +54,13 @@ class Choice:
 
 class TruncatedProblem:
     """
-    A graph with constraints that may be wrong. Their weights and its poses are for trying.
+    A graph with M edges that may be wrong. Their weights and its poses are for trying.
 
     Parameters
     ----------
     graph : Graph
         It is changed. The information of what may be wrong is that to decide by.
-    edges, observed : ndarray of int, shape (K,), rows of what may be wrong, without repetition
+    rows : ndarray of int, shape (M,), the edges that may be wrong, without repetition
     start : ndarray, shape (N, 3), optional
         Where each solution starts; by default the minimum of chi2 of all that is right, from the
         poses of the graph.
@@ -71,19 +68,16 @@ class TruncatedProblem:
     """
 
     def __init__(
-        self, graph: Graph, edges: IntArray, observed: IntArray = _NONE,
-        start: FloatArray | None = None,
+        self, graph: Graph, rows: IntArray, start: FloatArray | None = None,
     ) -> None:
-        self.graph = graph
-        self._edge_rows, self._observed_rows = edges, observed
-        self.edges, self.observed = graph.edges_at(edges), graph.observed_at(observed)
+        self.graph, self._rows = graph, rows
+        self.edges = graph.edges_at(rows)
         """What may be wrong; their weights have no meaning."""
-        self.limits = LIMITS[_ranks(np.concatenate(
-            (self.edges.information, self.observed.information)))]
-        """c^2 of each constraint, edges first, shape (M,)."""
+        self.limits = LIMITS[_ranks(self.edges.information)]
+        """c^2 of each, shape (M,)."""
         self.allowed = np.ones(len(self.limits), dtype=bool)
         """Which of them a set may believe, shape (M,)."""
-        self._weights = np.concatenate((self.edges.weight, self.observed.weight))
+        self._weights = self.edges.weight
         self._choices: dict[tuple[bytes, bytes, SolverConfig], Choice] = {}
         """The last sets that were solved for, the newest last."""
         self._start = graph.poses.copy() if start is None else start
@@ -118,22 +112,15 @@ class TruncatedProblem:
 
     def energies(self) -> FloatArray:
         """Return r^2 at the present poses, shape (M,)."""
-        poses = self.graph.poses
-        return np.concatenate((
-            energies(edge_errors(poses, self.edges), self.edges.information),
-            energies(observed_errors(poses, self.observed), self.observed.information)))
+        return energies(edge_errors(self.graph.poses, self.edges), self.edges.information)
 
     def shares(self) -> FloatArray:
         """Return r^2 / c^2 at the present poses, infinite for those that may not be believed."""
         return np.where(self.allowed, self.energies() / self.limits, np.inf)
 
     def errors(self, numbers: IntArray) -> FloatArray:
-        """Return the errors of some constraints at the present poses, shape (K, 3)."""
-        poses, n = self.graph.poses, len(self.edges)
-        is_edge, errors = numbers < n, np.empty((len(numbers), 3))
-        errors[is_edge] = edge_errors(poses, self.edges.rows(numbers[is_edge]))
-        errors[~is_edge] = observed_errors(poses, self.observed.rows(numbers[~is_edge] - n))
-        return errors
+        """Return the errors of some of the edges at the present poses, shape (K, 3)."""
+        return edge_errors(self.graph.poses, self.edges.rows(numbers))
 
     def choice(self, believed: BoolArray, config: SolverConfig = CONFIG) -> Choice | None:
         """
@@ -190,14 +177,8 @@ class TruncatedProblem:
 
     def _weigh(self, weights: FloatArray) -> None:
         changed = np.flatnonzero(weights != self._weights)
-        n = len(self._edge_rows)
-        edges, observed = changed[changed < n], changed[changed >= n]
-        self.graph.apply(GraphUpdate(
-            weigh_edges=dict(zip(
-                self._edge_rows[edges].tolist(), weights[edges].tolist(), strict=True)),
-            weigh_observed=dict(zip(
-                self._observed_rows[observed - n].tolist(), weights[observed].tolist(),
-                strict=True))))
+        self.graph.apply(GraphUpdate(weigh_edges=dict(zip(
+            self._rows[changed].tolist(), weights[changed].tolist(), strict=True))))
         self._weights = weights.copy()
 
 

@@ -2,7 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """What is decided on each loop closure: columns, in the order in which closures were added."""
 
-from collections import Counter, deque
+from collections import deque
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Annotated
@@ -10,7 +10,7 @@ from typing import Annotated
 import numpy as np
 
 from pose_graph_ros.core.compiled.growing_array import GrowingArray
-from pose_graph_ros.core.geometry.se2 import BoolArray, IntArray
+from pose_graph_ros.core.geometry.se2 import BoolArray, FloatArray, IntArray
 from pose_graph_ros.core.judgement.closures import GATE
 from pose_graph_ros.core.judgement.verdicts import Change, Decision, Judged, State
 from pose_graph_ros.core.saved_columns import Choices, Integers, Numbers, Pairs
@@ -59,8 +59,6 @@ class ClosureStates:
         self._stamps_ns = GrowingArray((2,), np.int64)
         self._distance = GrowingArray((), np.float64)
         self._forgotten = GrowingArray((), np.bool_)
-        self.counts: Counter[tuple[str, str]] = Counter()
-        """How often closures of a source became believed, doubted, ..., or were thrown out."""
         self._changes: deque[Change] = deque(maxlen=MOST_CHANGES)
 
     def __len__(self) -> int:
@@ -97,7 +95,7 @@ class ClosureStates:
         return self._decision.values
 
     @property
-    def distance(self) -> np.ndarray:
+    def distance(self) -> FloatArray:
         """Squared Mahalanobis distances when they were tested last; nan if they were not."""
         return self._distance.values
 
@@ -195,7 +193,7 @@ class ClosureStates:
 
     def announce(self, number: int, before: int, now_ns: int) -> None:
         """
-        Count a state, and note its change.
+        Note a change of the state of a closure.
 
         Parameters
         ----------
@@ -209,9 +207,6 @@ class ClosureStates:
         if before == after:
             return
         self.since_ns[number] = now_ns
-        self.counts[source, new.value] += 1
-        if before >= 0 and _IN_GRAPH[before] and not new.in_graph:
-            self.counts[source, 'thrown out'] += 1
         if before >= 0 or not new.in_graph:
             self._changes.append(Change(
                 self.name(number), Judged.LOOP_CLOSURE, source, int(self.stamps_ns[number, 0]),
@@ -223,12 +218,12 @@ class ClosureStates:
         self._changes.clear()
         return changes
 
-    def state_of_all(self) -> tuple[IntArray, IntArray, np.ndarray, list[Change]]:
+    def state_of_all(self) -> tuple[IntArray, IntArray, FloatArray, list[Change]]:
         """Return copies of states, stamps, distances, and the changes to be announced."""
         return self.state.copy(), self.since_ns.copy(), self.distance.copy(), list(self._changes)
 
     def set_state_of_all(
-        self, state: IntArray, since_ns: IntArray, distance: np.ndarray, changes: list[Change],
+        self, state: IntArray, since_ns: IntArray, distance: FloatArray, changes: list[Change],
     ) -> None:
         """
         Set what `state_of_all` has returned; there are as many closures.

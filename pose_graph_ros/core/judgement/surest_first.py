@@ -137,8 +137,7 @@ class _Gates:
 
     def __init__(self, problem: TruncatedProblem) -> None:
         self._problem = problem
-        self._information = np.concatenate(
-            (problem.edges.information, problem.observed.information))
+        self._information = problem.edges.information
         measured = np.einsum('mii->mi', self._information) > 0.0
         filled = self._information + np.einsum('mi,ij->mij', ~measured, np.eye(3))
         with np.errstate(divide='ignore'):
@@ -240,7 +239,7 @@ class _Gates:
         Those that agree with one another are one candidate. Beside a wrong one that does not fit,
         and had the chance p to do so, p / (1 - p) others are expected that do.
         """
-        numbers = np.arange(len(self._problem.edges))
+        numbers = np.arange(len(self._problem))
         if len(numbers) == 0:
             return True
         squared = self._squared(numbers, self._problem.errors(numbers))
@@ -265,20 +264,10 @@ class _Gates:
 
     def _compute(self, numbers: IntArray) -> None:
         """Compute gates by the present cliques."""
-        problem, n_edges = self._problem, len(self._problem.edges)
-        head = problem.graph.memory.head
+        problem, edges = self._problem, self._problem.edges.rows(numbers)
         errors, covariances = np.empty((len(numbers), 3)), np.zeros((len(numbers), 3, 3))
-        is_edge = numbers < n_edges
-        edges = problem.edges.rows(numbers[is_edge])
-        part = np.empty((len(edges), 3)), np.zeros((len(edges), 3, 3))
-        innovations.of_edges(head, *map(np.ascontiguousarray, (
-            edges.i, edges.j, edges.mean, edges.kind, edges.bias)), *part)
-        errors[is_edge], covariances[is_edge] = part
-        observed = problem.observed.rows(numbers[~is_edge] - n_edges)
-        part = np.empty((len(observed), 3)), np.zeros((len(observed), 3, 3))
-        innovations.of_observed(head, *map(np.ascontiguousarray, (
-            observed.node, observed.offset, observed.mean)), *part)
-        errors[~is_edge], covariances[~is_edge] = part
+        innovations.of_edges(problem.graph.memory.head, *map(np.ascontiguousarray, (
+            edges.i, edges.j, edges.mean, edges.kind, edges.bias)), errors, covariances)
         self._present[numbers] = True
         self._set(numbers, covariances)
         self.share[numbers] = self._squared(numbers, errors) / problem.limits[numbers]

@@ -99,8 +99,8 @@ class SourceVerdicts(NamedTuple):
     counts: Mapping[State, int]
     """Number of its constraints by state; states without any may be missing."""
     scale: float
-    """Learnt factor on its sigmas; 1 where they are right, or where too little is known."""
+    """Factor on its sigmas in the graph, learnt or set; 1 where too little is known."""
     doubting: bool
     """Whether its newest measurements are doubted or wait, while the estimate goes on."""
     n_forgotten: int = 0
-    """Number of hopeless constraints that are not judged again."""
+    """Number of hopeless loop closures that are not judged again."""

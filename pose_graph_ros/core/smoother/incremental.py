@@ -12,7 +12,7 @@ from pose_graph_ros.core.exceptions import GraphUpdateError
 from pose_graph_ros.core.geometry import se2
 from pose_graph_ros.core.geometry.se2 import FloatArray
 from pose_graph_ros.core.graph import tables as tb
-from pose_graph_ros.core.graph.constraints import EdgeKind, Edges, ObservedNodes
+from pose_graph_ros.core.graph.constraints import EdgeKind, Edges
 from pose_graph_ros.core.graph.graph import Graph, GraphUpdate
 from pose_graph_ros.core.smoother import (
     batch_fallback,
@@ -276,15 +276,6 @@ class IncrementalSmoother:
         result = Innovations(np.empty((len(edges), 3)), np.zeros((len(edges), 3, 3)))
         columns = edges.i, edges.j, edges.mean, edges.kind, edges.bias
         innovations.of_edges(
-            self._memory.head, *map(np.ascontiguousarray, columns), *result)
-        return result
-
-    def observed_innovations(self, observed: ObservedNodes) -> Innovations:
-        """Return the same of observed nodes."""
-        self._require_eliminated(*observed.node)
-        result = Innovations(np.empty((len(observed), 3)), np.zeros((len(observed), 3, 3)))
-        columns = observed.node, observed.offset, observed.mean
-        innovations.of_observed(
             self._memory.head, *map(np.ascontiguousarray, columns), *result)
         return result
 

@@ -1,11 +1,11 @@
 # Copyright 2026 The pose_graph_ros authors
 # SPDX-License-Identifier: Apache-2.0
 """
-Errors that constraints would have at the present estimate, with their covariances.
+Errors that edges would have at the present estimate, with their covariances.
 
 With J the Jacobian of the error and `P = H^-1` the covariance of all nodes, `H = R^T R`, that is
-`J P J^T = Y^T Y` with `R^T Y = J^T`. J^T has nonzero rows at the one or two nodes of a constraint
-alone, so Y has them in the cliques from there to the roots. The right-hand sides of the two nodes
+`J P J^T = Y^T Y` with `R^T Y = J^T`. J^T has nonzero rows at the two nodes of an edge alone, so
+Y has them in the cliques from there to the roots. The right-hand sides of the two nodes
 of an edge are added in the lowest clique that is above both; the large cliques near the root are
 solved for once, and what is common to both nodes cancels before it is squared: the covariance
 between two neighbours is exact however uncertain both are in the map.
@@ -35,7 +35,7 @@ _FAST = {'reassoc', 'contract', 'nsz'}
 
 
 class Innovations(NamedTuple):
-    """What K constraints disagree with the estimate by, in the axes of their errors."""
+    """What K edges disagree with the estimate by, in the axes of their errors."""
 
     errors: FloatArray
     """At the present estimate, shape (K, 3) [m, m, rad]."""
@@ -83,26 +83,6 @@ def of_edges(head, i, j, mean, kind, bias, error, out):  # type: ignore[no-untyp
         _mirror(out[k])
 
 
-@kernel(signature=(tb.HEAD, INTEGERS, ROWS, ROWS, ROWS, MATRICES), allocates=True)
-def of_observed(head, node, offset, mean, error, out):  # type: ignore[no-untyped-def]
-    """
-    Write the errors of observed nodes, which need not be in the graph, and their covariances.
-
-    Parameters
-    ----------
-    node, offset, mean : ndarray, columns of `ObservedNodes`, K rows
-    error, out : ndarray, shapes (K, 3) and (K, 3, 3), output; `out` holds zeros
-
-    """
-    node_f = tb.node_f(head)
-    jacobian = np.empty((3, 3))
-    here, spare = np.empty((3, 96)), np.empty((3, 96))
-    for k in range(len(node)):
-        _observed_jacobian(node_f[node[k]], offset[k], mean[k], error[k], jacobian)
-        here, spare, _ = _begin(head, node[k], jacobian, -1, here, spare, out[k])
-        _mirror(out[k])
-
-
 @kernel
 def _edge_jacobians(  # type: ignore[no-untyped-def]
     start, end, mean, kind, bias, error, start_j, end_j,
@@ -146,31 +126,6 @@ def _edge_jacobians(  # type: ignore[no-untyped-def]
         for n in range(2):
             start_j[m, n] = -end_j[m, n]
     start_j[0, 2], start_j[1, 2] = qy, -qx
-
-
-@kernel
-def _observed_jacobian(node, offset, mean, error, jacobian):  # type: ignore[no-untyped-def]
-    """
-    Write the error of an observed node and its Jacobian, in map axes.
-
-    Parameters
-    ----------
-    node : ndarray, row of its hidden node in node_f
-    offset, mean : ndarray, values of the columns of `ObservedNodes`
-    error, jacobian : ndarray, shapes (3,) and (3, 3), output
-
-    """
-    c, s = math.cos(node[tb.POSE + 2]), math.sin(node[tb.POSE + 2])
-    ax, ay = c * offset[0] - s * offset[1], s * offset[0] + c * offset[1]
-    dx, dy = node[tb.POSE] + ax - mean[0], node[tb.POSE + 1] + ay - mean[1]
-    c, s = math.cos(mean[2]), math.sin(mean[2])
-    error[0], error[1] = c * dx + s * dy, c * dy - s * dx
-    error[2] = factors.wrap(node[tb.POSE + 2] + offset[2] - mean[2])
-    jacobian[:] = 0.0
-    jacobian[0, 0] = jacobian[1, 1] = c
-    jacobian[0, 1], jacobian[1, 0] = s, -s
-    jacobian[0, 2], jacobian[1, 2] = s * ax - c * ay, s * ay + c * ax
-    jacobian[2, 2] = 1.0
 
 
 @kernel

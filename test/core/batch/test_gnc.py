@@ -15,7 +15,7 @@ from pose_graph_ros.core.batch import gnc
 from pose_graph_ros.core.batch.gnc import Surrogate
 from pose_graph_ros.core.batch.truncated import LIMITS, TruncatedProblem
 from pose_graph_ros.core.geometry.se2 import FloatArray
-from pose_graph_ros.core.graph.constraints import Edges, ObservedKind, ObservedNodes
+from pose_graph_ros.core.graph.constraints import Edges
 from pose_graph_ros.core.graph.graph import Graph, GraphUpdate
 
 
@@ -175,22 +175,6 @@ def test_what_leaves_a_node_undetermined_is_no_set() -> None:
     problem = TruncatedProblem(graph, np.array([1]))
     assert problem.choice(np.array([False])) is None
     assert problem.choice(np.array([True])).cost == pytest.approx(0.0, abs=1e-12)
-
-
-def test_observed_nodes_may_be_wrong_with_limits_by_what_they_measure() -> None:
-    drive = laps(6, n_laps=1)
-    n = drive.graph.n_nodes
-    mean = drive.truth + np.random.default_rng(6).normal(0.0, [0.2, 0.2, 0.0], (n, 3))
-    mean[::5, :2] += 15.0
-    mean[:, 2] = 0.0
-    drive.graph.apply(GraphUpdate(observed=ObservedNodes(
-        np.arange(n), None, mean, np.tile(np.diag([25.0, 25.0, 0.0]), (n, 1, 1)),
-        [ObservedKind.POSITION] * n)))
-    problem = TruncatedProblem(drive.graph, np.empty(0, dtype=np.int64), np.arange(n))
-    assert set(problem.limits.tolist()) == {LIMITS[2]}
-    choice = problem.improved(gnc.select(problem, Surrogate.TRUNCATED))
-    assert not np.any(choice.believed[::5])
-    assert np.mean(choice.believed) > 0.75
 
 
 def test_a_graph_whose_factorisation_is_nearly_dense_is_left_alone(

@@ -8,7 +8,7 @@ import pytest
 
 from pose_graph_ros.core.batch.truncated import TruncatedProblem
 from pose_graph_ros.core.geometry import se2
-from pose_graph_ros.core.graph.constraints import Edges, ObservedKind, ObservedNodes
+from pose_graph_ros.core.graph.constraints import Edges
 from pose_graph_ros.core.graph.error_functions import edge_errors, energies
 from pose_graph_ros.core.graph.graph import Graph, GraphUpdate
 from pose_graph_ros.core.judgement import selection, surest_first
@@ -42,26 +42,6 @@ def test_the_order_of_the_rows_does_not_matter(seed: int) -> None:
     place = np.argsort(order)
     problem = TruncatedProblem(shuffled, place[drive.closures])
     assert list(surest_first.select(problem)) == believed(drive)
-
-
-def test_wrong_fixes_are_found_as_well() -> None:
-    drive = laps(2, n_laps=2, n_wrong=4)
-    n = drive.graph.n_nodes
-    nodes = np.arange(0, n, 3)
-    mean = drive.truth[nodes] + np.random.default_rng(2).normal(
-        0.0, [0.3, 0.3, 0.0], (len(nodes), 3))
-    wrong = np.arange(len(nodes)) % 4 == 1
-    mean[wrong, 0] += 12.0
-    mean[:, 2] = 0.0
-    drive.graph.apply(GraphUpdate(observed=ObservedNodes(
-        nodes, None, mean, np.tile(np.diag([11.0, 11.0, 0.0]), (len(nodes), 1, 1)),
-        [ObservedKind.POSITION] * len(nodes))))
-    problem = TruncatedProblem(drive.graph, drive.closures, np.arange(len(nodes)))
-    choice = selection.best(problem)
-    found = choice.believed[len(drive.closures):]
-    assert not np.any(found & wrong)
-    assert np.mean(found[~wrong]) > 0.9
-    np.testing.assert_array_equal(choice.believed[:len(drive.closures)], drive.right)
 
 
 def test_a_gate_is_that_of_the_smoother() -> None:

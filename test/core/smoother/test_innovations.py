@@ -11,15 +11,13 @@ from test_covariances import chain, dense, driven, off, RELATIVE, seeds
 
 from pose_graph_ros.core.geometry import se2
 from pose_graph_ros.core.graph import error_functions
-from pose_graph_ros.core.graph.constraints import EdgeKind, Edges, ObservedKind, ObservedNodes
+from pose_graph_ros.core.graph.constraints import EdgeKind, Edges
 from pose_graph_ros.core.graph.graph import GraphUpdate
 from pose_graph_ros.core.smoother.incremental import IncrementalSmoother
 
 
-def candidates(
-    smoother: IncrementalSmoother, rng: np.random.Generator, n: int,
-) -> tuple[Edges, ObservedNodes]:
-    """Return random edges, also to biases, and observed nodes with offsets, of any consistency."""
+def candidates(smoother: IncrementalSmoother, rng: np.random.Generator, n: int) -> Edges:
+    """Return random edges, also to biases, of any consistency."""
     graph, sigma = smoother.graph, (2.0, 2.0, 1.0)
     poses, biases = np.flatnonzero(~graph.is_bias), np.flatnonzero(graph.is_bias)
     pairs = [rng.choice(poses, 2, replace=False) for _ in range(n if len(poses) > 1 else 0)]
@@ -28,14 +26,9 @@ def candidates(
         pairs += [(rng.choice(poses), rng.choice(biases)) for _ in range(n)]
         kinds += [EdgeKind.BIAS] * n
     i, j = np.reshape(pairs, (-1, 2)).T.astype(np.int64)
-    root = rng.normal(size=(len(i) + n, 3, 3))
-    information = root @ np.swapaxes(root, 1, 2)
-    edges = Edges(i, j, rng.normal(size=(len(i), 3)) * sigma, information[:len(i)], kinds,
-                  bias=rng.normal(size=(len(i), 4)))
-    node = rng.choice(poses, n)
-    return edges, ObservedNodes(
-        node, rng.normal(size=(n, 3)), graph.poses[node] + rng.normal(size=(n, 3)) * sigma,
-        information[len(i):], [ObservedKind.GLOBAL_POSE] * n)
+    root = rng.normal(size=(len(i), 3, 3))
+    return Edges(i, j, rng.normal(size=(len(i), 3)) * sigma, root @ np.swapaxes(root, 1, 2), kinds,
+                 bias=rng.normal(size=(len(i), 4)))
 
 
 @given(seeds, st.integers(0, 25))
@@ -43,7 +36,7 @@ def candidates(
 def test_they_are_those_of_the_dense_inverse(seed: int, steps: int) -> None:
     smoother = driven(seed, steps)
     poses, P = smoother.poses, dense(smoother).reshape(len(smoother.poses), 3, -1, 3)
-    edges, observed = candidates(smoother, np.random.default_rng(seed), 5)
+    edges = candidates(smoother, np.random.default_rng(seed), 5)
     linear = jacobians.linearize_edges(poses, edges)
     errors, actual = smoother.edge_innovations(edges)
     np.testing.assert_allclose(errors, error_functions.edge_errors(poses, edges), atol=1e-12)
@@ -52,13 +45,6 @@ def test_they_are_those_of_the_dense_inverse(seed: int, steps: int) -> None:
         joint = np.block([[P[i, :, i], P[i, :, j]], [P[j, :, i], P[j, :, j]]])
         assert off(actual[k], J @ joint @ J.T) < RELATIVE
         np.testing.assert_array_equal(actual[k], actual[k].T)
-    single = jacobians.linearize_observed(poses, observed)
-    errors, actual = smoother.observed_innovations(observed)
-    np.testing.assert_allclose(
-        errors, error_functions.observed_errors(poses, observed), atol=1e-12)
-    for k, i in enumerate(observed.node):
-        expected = single.jacobian[k] @ P[i, :, i] @ single.jacobian[k].T
-        assert off(actual[k], expected) < RELATIVE
 
 
 @given(seeds)
@@ -69,16 +55,12 @@ def test_they_are_those_of_joint_covariances_whatever_is_linearized_where(seed: 
     for _ in range(30):
         smoother.update(here.new_nodes(2))
     smoother.update(GraphUpdate(edges=here.edges(here.pairs(3))))
-    edges, observed = candidates(smoother, here.rng, 5)
+    edges = candidates(smoother, here.rng, 5)
     linear = jacobians.linearize_edges(smoother.poses, edges)
     for k, actual in enumerate(smoother.edge_innovations(edges).covariances):
         J = np.hstack((linear.jacobian_i[k], linear.jacobian_j[k]))
         joint = smoother.joint_covariance(edges.i[k], edges.j[k])
         assert off(actual, J @ joint @ J.T) < 1e-8
-    single = jacobians.linearize_observed(smoother.poses, observed)
-    for k, actual in enumerate(smoother.observed_innovations(observed).covariances):
-        J = single.jacobian[k]
-        assert off(actual, J @ smoother.covariance(observed.node[k]) @ J.T) < RELATIVE
 
 
 @given(seeds)
@@ -87,17 +69,17 @@ def test_distances_are_those_by_the_inverse_also_without_information_on_the_head
     seed: int,
 ) -> None:
     smoother = driven(seed, 10)
-    _, observed = candidates(smoother, np.random.default_rng(seed), 5)
-    found = smoother.observed_innovations(observed)
-    total = found.covariances + np.linalg.inv(observed.information)
+    edges = candidates(smoother, np.random.default_rng(seed), 5)
+    found = smoother.edge_innovations(edges)
+    total = found.covariances + np.linalg.inv(edges.information)
     np.testing.assert_allclose(
-        found.squared_distances(observed.information),
+        found.squared_distances(edges.information),
         np.einsum('mi,mij,mj->m', found.errors, np.linalg.inv(total), found.errors), rtol=1e-7)
-    observed.information[:, 2, :] = observed.information[:, :, 2] = 0.0
+    edges.information[:, 2, :] = edges.information[:, :, 2] = 0.0
     position = np.linalg.inv(
-        found.covariances[:, :2, :2] + np.linalg.inv(observed.information[:, :2, :2]))
+        found.covariances[:, :2, :2] + np.linalg.inv(edges.information[:, :2, :2]))
     np.testing.assert_allclose(
-        found.squared_distances(observed.information),
+        found.squared_distances(edges.information),
         np.einsum('mi,mij,mj->m', found.errors[:, :2], position, found.errors[:, :2]), rtol=1e-7)
 
 
