@@ -268,20 +268,22 @@ def grids(options: Options) -> Section:
         bases.insert(0, (read_recording(*files), 1 if options.quick else 5))
     else:
         section.notes.append('M3500: the data is not there, skipped.')
+    mixes = ((0.1, 1), (0.3, 1), (0.5, 1), (0.1, 10), (0.3, 10), (0.5, 10))
     for base, seeds in bases:
-        if not options.wants(base.name):
+        wrong = {f'{base.name}, {100 * share:.0f} % {"groups" if group > 1 else "single"}':
+                 (share, group) for share, group in (mixes[2:5:2] if options.quick else mixes)}
+        wrong = {name: mix for name, mix in wrong.items() if options.wants(name)}
+        if len(wrong) == 0:
             continue
         clean = judge(table, replace(base, name=f'{base.name}, none wrong'), everything=False)
         section.metrics.append(Metric(
             f'{base.name}: rms over that of what the file says', clean.rms / clean.right,
             target=1.05))
-        mixes = ((0.1, 1), (0.3, 1), (0.5, 1), (0.1, 10), (0.3, 10), (0.5, 10))
-        for share, group in mixes[2:5:2] if options.quick else mixes:
+        for name, (share, group) in wrong.items():
             runs = [judge(table, replace(
                 with_false(base, share, group, seed),
-                name=f'{base.name}, {100 * share:.0f} % {"groups" if group > 1 else "single"}, '
-                f'seed {seed}'), everything=False, clean=clean.right) for seed in range(seeds)]
-            name = f'{base.name}, {100 * share:.0f} % {"groups" if group > 1 else "single"}'
+                name=f'{name}, seed {seed}'), everything=False, clean=clean.right)
+                    for seed in range(seeds)]
             section.metrics += [
                 Metric(f'{name}: rms over that without', max(
                     run.rms for run in runs) / clean.rms, target=1.05),
