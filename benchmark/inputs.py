@@ -10,6 +10,7 @@ the covariance that was claimed for it: 1 in the mean if the claim is right.
 """
 
 import argparse
+from collections.abc import Sequence
 from pathlib import Path
 import sys
 import time
@@ -57,8 +58,16 @@ FURTHER = tuple(
     for duration, tau in ((600.0, 10.0), (600.0, 60.0), (900.0, 300.0)) for period in (1.0, 5.0))
 
 
-def uncertainty(runs: int) -> Section:
-    """Measure the NEES of the newest pose."""
+def uncertainty(runs: int, cases: Sequence[str] = ()) -> Section:
+    """
+    Measure the NEES of the newest pose.
+
+    Parameters
+    ----------
+    runs : int, seeded ones of each drive
+    cases : sequence of str, only drives and treatments whose names hold one of these; all if empty
+
+    """
     section = Section(
         'Is the claimed uncertainty right?',
         f'The newest pose at the end of a drive, over {runs} seeded runs. Asked for: NEES of '
@@ -72,6 +81,8 @@ def uncertainty(runs: int) -> Section:
             (SHORT, _treatments(SHORT)), (GNSS, _treatments(GNSS)),
             *((kind, defaults) for kind in FURTHER)):
         for name, source in treatments.items():
+            if len(cases) > 0 and not any(case in f'{kind.name}, {name}' for case in cases):
+                continue
             nees, error, claimed, taus, missing = [], [], [], [], 0
             for seed in range(runs):
                 drive = drives.simulate(kind, seed, OdometryNoise())
@@ -93,7 +104,7 @@ def uncertainty(runs: int) -> Section:
             mean = float(np.mean(nees))
             table.add(kind.name, name, f'{mean:.2f}', f'{np.sqrt(np.mean(error)):.2f}',
                       f'{np.sqrt(np.mean(claimed)):.2f}', str(missing), f'{np.median(taus):.1f}')
-            say(f'{kind.name}, {name}: NEES {mean:.2f}')
+            say('  ' + ' | '.join(table.rows[-1]))
             if (name == 'white' and kind.tau > 0.0) or name == 'inflated':
                 continue
             section.metrics += [

@@ -174,17 +174,17 @@ def timing(*, quick: bool) -> Section:
     count = FLOOD // 10 if quick else FLOOD
     grown, updates = flood(runs[0], recording, count)
     section.notes.append(
-        f'{count} further wrong closures, {BATCH} with each update, take {grown:.0f} MB, '
-        f'{1e3 * grown / count:.2f} kB each; an update takes {_ms(np.median(updates))} ms, '
-        f'{_ms(np.max(updates))} at most.')
+        f'{count} further wrong closures, {BATCH} with each update: the process grows by '
+        f'{grown:.0f} MB (below 0: less than it gave back); an update takes '
+        f'{_ms(np.median(updates))} ms, {_ms(np.max(updates))} at most.')
     return section
 
 
 def _asked(name: str, runs: Sequence[Timed], *, large: bool) -> list[Metric]:
     """Return the figures that something is asked of, in a large graph."""
     first, slower = runs[0], SLOWER if large else None
-    metrics = [Metric(f'{name}: longest update', max(first.updates), 's', target=LONGEST),
-               Metric(f'{name}: longest slice', max(first.slices), 's', target=LONGEST)]
+    metrics = [Metric(f'{name}: longest update', max(first.updates), ' s', target=LONGEST),
+               Metric(f'{name}: longest slice', max(first.slices), ' s', target=LONGEST)]
     for other in runs[1:]:
         metrics += [
             Metric(f'{name}: steps slower by', float(
