@@ -13,7 +13,7 @@ from dataclasses import dataclass
 import logging
 import math
 
-from pose_graph_ros.core.judgement.texts import listed, number_of, seconds
+from pose_graph_ros.core.judgement.texts import joined, number_of, seconds
 from pose_graph_ros.core.judgement.verdicts import Change, Judged, SourceVerdicts, State
 
 # Time between two lines on changes of the same source [s]; the log repeats nothing within 10 s.
@@ -162,4 +162,4 @@ def _which(changes: Sequence[Change]) -> str:
     stamps = [change.stamp_ns for change in changes]
     if changes[0].kind is Judged.FIX and len(changes) > 1:
         return f'from {seconds(min(stamps))} to {seconds(max(stamps))}'
-    return listed([change.id for change in changes])
+    return joined([change.id for change in changes])

@@ -7,7 +7,7 @@ A closure passes the *gate* if its error at the estimate is plausible: `e^T (J P
 below the 99 % quantile, with P the joint covariance of both nodes in the graph of what is believed
 and R the claimed covariance, floored. It is *believed* if it passes and a clique of closures that
 agree along the path supports it, or if a random one of its source would hardly pass: q p is small
-against 1 - q, with p the chance to pass and q the share of its source that is not believed. One
+against 1 - q, with p the chance to pass and q the share of its source that is doubted. One
 that is believed and does not fit any more is thrown out: back to weight 0, from where it may come
 again. If p is large, only the record q of the source speaks for it: it is believed weakly.
 """
@@ -77,9 +77,7 @@ class ClosureJudge:
 
     Parameters
     ----------
-    smoother : IncrementalSmoother
-    reweighting : Reweighting, of its constraints with a robust loss
-    config : BackendConfig
+    smoother, reweighting, config : as in `Judge`
 
     """
 
@@ -103,6 +101,7 @@ class ClosureJudge:
         self._search = SetSearch(self._states, self._table)
         self._beliefs = Beliefs(smoother, reweighting, self._states, self._table)
         self._tries = False
+        """Whether the present part of the work began with a trial."""
         self._scales = ScaleLearner(smoother, self._states, self._table, self._beliefs, config)
 
     def configure(self, config: BackendConfig) -> None:

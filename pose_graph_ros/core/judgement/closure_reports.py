@@ -21,10 +21,15 @@ from pose_graph_ros.core.judgement.closure_states import (
 )
 from pose_graph_ros.core.judgement.closures import ClosureTable
 from pose_graph_ros.core.judgement.listing import listed
-from pose_graph_ros.core.judgement.verdicts import Judged, SourceVerdicts, State, Verdict
+from pose_graph_ros.core.judgement.verdicts import (
+    Judged,
+    MOST_NAMED,
+    SourceVerdicts,
+    State,
+    Verdict,
+)
 
 WEAK, BELIEVED = STATES.index(State.WEAKLY_BELIEVED), STATES.index(State.BELIEVED)
-NAMED = 5  # number of closures that are named as a reason
 
 
 class ClosureReports:
@@ -89,8 +94,9 @@ class ClosureReports:
             reference_ns=reference, state=STATES[states.state[number]],
             since_ns=int(states.since_ns[number]), decision=DECISIONS[states.decision[number]],
             residual=residual, distance=math.sqrt(states.distance[number]),
-            supported_by=tuple(states.name(other) for other in agree[:NAMED]),
-            contradicted_by=tuple(contradicted[:NAMED]), edge=True, row=int(states.row[number]))
+            supported_by=tuple(states.name(other) for other in agree[:MOST_NAMED]),
+            contradicted_by=tuple(contradicted[:MOST_NAMED]), edge=True,
+            row=int(states.row[number]))
 
     def _neighbours(self, number: int) -> tuple[list[int], list[int]]:
         """Return which closures agree with one and which do not; kept until there are more."""

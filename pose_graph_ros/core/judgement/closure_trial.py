@@ -48,7 +48,7 @@ class ClosureTrial:
         poses: FloatArray | None = None,
     ) -> None:
         """
-        Begin a trial; while another one goes on, only note whose.
+        Begin a trial; while another one goes on, only note the closures for later.
 
         Parameters
         ----------

@@ -84,7 +84,7 @@ class ClosureTable:
     """
     Closures in the order of their addition, and where they are along the path.
 
-    They have numbers. Of those that are forgotten, nothing else is kept.
+    Each has a number, its place in this order, which is all that is kept of forgotten ones.
     """
 
     def __init__(self, chain: OdometryChain) -> None:

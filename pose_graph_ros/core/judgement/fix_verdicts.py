@@ -23,21 +23,18 @@ from pose_graph_ros.core.judgement.fix_states import (
     STAMP,
 )
 from pose_graph_ros.core.judgement.listing import listed
-from pose_graph_ros.core.judgement.verdicts import Judged, State, Verdict
-
-# Number of others that a verdict names.
-MOST_NAMED = 5
+from pose_graph_ros.core.judgement.verdicts import Judged, MOST_NAMED, State, Verdict
 
 
 def verdicts(states: FixStates, graph: Graph, most_believed: int | None) -> list[Verdict]:
     """
-    Return all verdicts, but of those that are believed only the newest of each source.
+    Return the verdicts that are listed; see `listing.listed`.
 
     Parameters
     ----------
     states : FixStates
     graph : Graph
-    most_believed : int, optional, number of believed ones of each source; None for all
+    most_believed : int or None
 
     """
     numbers = listed(states.records[:, SOURCE], states.believed,

@@ -135,7 +135,7 @@ class Judge:
         return self._closures.work()
 
     def verdicts(self, most_believed: int | None = None) -> list[Verdict]:
-        """Return all verdicts, but of those that are believed only the newest of each source."""
+        """Return the verdicts that are listed; see `listing.listed`."""
         graph = self._smoother.graph
         return [*self._closures.reports.verdicts(graph, most_believed),
                 *fix_verdicts.verdicts(self._fixes.states, graph, most_believed)]

@@ -13,7 +13,8 @@ from pose_graph_ros.core.judgement.residual_scale import agreement_scale, MOST, 
 from pose_graph_ros.core.measurements import LoopClosure
 from pose_graph_ros.core.smoother.incremental import IncrementalSmoother
 
-# A source is looked at again when so much more of its closures are believed, and so many more.
+# A source is looked at again when this many times as many of its closures are believed as the
+# last time, and this many more.
 MORE, AND_MORE = 1.25, 5
 
 

@@ -51,9 +51,8 @@ REACH = 20.0
 SOME, SOME_SHARE = 200, 1.0 / 16.0
 # Largest odds that a constraint is wrong which no neighbours support, where these are counted.
 WRONG_ODDS = 0.02
-# Number of closures that agree from which on they are a group, and the chance that wrong groups
-# alone, or wrong ones without a group alone, would give as many that fit odometry, above which
-# nothing is believed.
+# Least size of a group of closures that agree. If wrong groups give as many that fit odometry with
+# more than this chance, and so do wrong ones outside of groups, nothing is believed.
 GROUP, BY_CHANCE = 3, 0.1
 # Largest chance to fit that a candidate is said to have had.
 MOST_CHANCE = 0.95
@@ -71,9 +70,9 @@ def select(problem: TruncatedProblem, *, insured: bool = False) -> BoolArray | N
     ----------
     problem : TruncatedProblem
     insured : bool
-        Whether a constraint that no two neighbours agree with must be one that a wrong one would
-        hardly pass the gate of. Those that could not show it are not allowed any more, and none
-        if those that fit odometry could be wrong.
+        Whether more is asked: a constraint with fewer than two neighbours that agree is believed
+        only if a wrong one would hardly pass its gate, and none if chance explains all that fit
+        odometry. What is kept out so is not allowed in later sets either.
 
     """
     believed = np.zeros(len(problem), dtype=bool)
@@ -236,8 +235,8 @@ class _Gates:
         """
         Tell whether more closures fit odometry than if all of them were wrong.
 
-        Those that agree with one another are one candidate. Beside a wrong one that does not fit,
-        and had the chance p to do so, p / (1 - p) others are expected that do.
+        Those that agree with one another are one candidate. For each candidate that does not fit,
+        and had the chance p to do so, p / (1 - p) wrong ones are expected that do.
         """
         numbers = np.arange(len(self._problem))
         if len(numbers) == 0:

@@ -8,6 +8,7 @@ import math
 from pose_graph_ros.core.judgement.verdicts import (
     Decision,
     Judged,
+    MOST_NAMED,
     SourceVerdicts,
     State,
     Verdict,
@@ -19,7 +20,6 @@ PLURALS = {Judged.LOOP_CLOSURE: 'closures', Judged.FIX: 'fixes',
            Judged.ODOMETRY: 'odometry edges'}
 ORDER = (State.DOUBTED, State.WAITING, State.WEAKLY_BELIEVED, State.BELIEVED)
 """States in the order in which people want to read of them."""
-NAMED = 5  # number of ids that a sentence names
 
 
 def seconds(stamp_ns: int, digits: int = 3) -> str:
@@ -55,18 +55,10 @@ def number_of(n: int, kind: Judged) -> str:
     return f'{n} {NOUNS[kind] if n == 1 else PLURALS[kind]}'
 
 
-def listed(names: Sequence[str], most: int = NAMED) -> str:
-    """
-    Return names separated by commas, and how many more there are.
-
-    Parameters
-    ----------
-    names : sequence of str
-    most : int, number of names
-
-    """
-    more = len(names) - most
-    return ', '.join(names[:most]) + (f' and {more} more' if more > 0 else '')
+def joined(names: Sequence[str]) -> str:
+    """Return names separated by commas, and how many there are above `MOST_NAMED`."""
+    more = len(names) - MOST_NAMED
+    return ', '.join(names[:MOST_NAMED]) + (f' and {more} more' if more > 0 else '')
 
 
 def sentence(verdict: Verdict) -> str:
@@ -77,9 +69,9 @@ def sentence(verdict: Verdict) -> str:
     if verdict.decision is Decision.OUT:
         return f'Not used since {since}, as a person has decided; {far}.'
     supported = '' if len(verdict.supported_by) == 0 else (
-        f'; {listed(verdict.supported_by)} {_agree(verdict.supported_by)} with it')
+        f'; {joined(verdict.supported_by)} {_agree(verdict.supported_by)} with it')
     contradicted = '' if len(verdict.contradicted_by) == 0 else (
-        f'; it contradicts {listed(verdict.contradicted_by)}')
+        f'; it contradicts {joined(verdict.contradicted_by)}')
     match verdict.state:
         case State.BELIEVED:
             return f'Believed and used since {since}: {far}{supported}{contradicted}.'

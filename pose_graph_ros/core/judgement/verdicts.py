@@ -9,6 +9,9 @@ from typing import NamedTuple
 
 from pose_graph_ros.core.geometry.se2 import FloatArray
 
+# Number of ids that a verdict has as a reason, or a sentence names.
+MOST_NAMED = 5
+
 
 class State(Enum):
     """Whether a constraint takes part in the estimate."""

@@ -14,7 +14,7 @@ import pytest
 from pose_graph_ros.core.judgement.texts import (
     as_json,
     details,
-    listed,
+    joined,
     nanoseconds,
     number_of,
     seconds,
@@ -94,8 +94,8 @@ def test_totals_name_the_states_that_occur() -> None:
 
 
 def test_lists_are_bounded_and_nouns_are_counted() -> None:
-    assert listed(['a', 'b']) == 'a, b'
-    assert listed([str(k) for k in range(7)]) == '0, 1, 2, 3, 4 and 2 more'
+    assert joined(['a', 'b']) == 'a, b'
+    assert joined([str(k) for k in range(7)]) == '0, 1, 2, 3, 4 and 2 more'
     assert number_of(1, Judged.FIX) == '1 fix'
     assert number_of(2, Judged.FIX) == '2 fixes'
 
