@@ -19,8 +19,8 @@ TRIES = 5
 
 
 @dataclass(frozen=True, slots=True)
-class Beliefs:
-    """What is believed of a graph."""
+class BelievedEdges:
+    """Which edges of a graph are believed."""
 
     closures: IntArray
     """Rows of all edges that may be doubted, shape (M,)."""
@@ -32,7 +32,7 @@ class Beliefs:
     """Of all nodes, shape (N, 3) [m, m, rad]."""
 
 
-def believe(graph: Graph, sigmas: FloatArray) -> Beliefs | None:
+def believe(graph: Graph, sigmas: FloatArray) -> BelievedEdges | None:
     """
     Return which edges of a graph to believe, and poses at which they agree; None if it fails.
 
@@ -64,7 +64,7 @@ def believe(graph: Graph, sigmas: FloatArray) -> Beliefs | None:
     if best is None:
         return None
     doubted = best_rows[~best.believed]
-    return Beliefs(closures, ~np.isin(closures, doubted), n_parts, best.poses)
+    return BelievedEdges(closures, ~np.isin(closures, doubted), n_parts, best.poses)
 
 
 def _choice(graph: Graph, edges: Edges, closures: IntArray) -> Choice | None:
