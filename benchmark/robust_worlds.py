@@ -236,11 +236,13 @@ def with_false(recording: Recording, share: float, group: int, seed: int) -> Rec
     recording : Recording
     share : float
         Of all closures then.
-    group : int
+    group : int, at least 1
         So many agree with one another: they lead from consecutive poses to consecutive poses.
     seed : int
 
     """
+    if group < 1:
+        raise ValueError(f'with_false: expected a group of at least 1 closure, got {group}')
     rng = np.random.default_rng(seed)
     right, n = len(recording.ends), len(recording.stamps_ns)
     truth, odometry = recording.truth.at(recording.stamps_ns), recording.odometry

@@ -36,12 +36,7 @@ from pose_graph_ros.core.measurements import (
 from pose_graph_ros.core.odometry.hidden_nodes import HiddenNodes
 from pose_graph_ros.core.refiner import Refiner
 from pose_graph_ros.core.relocation import relocate
-from pose_graph_ros.core.smoother.incremental import (
-    DIVERGED,
-    IncrementalSmoother,
-    Refinement,
-    UpdateResult,
-)
+from pose_graph_ros.core.smoother.incremental import IncrementalSmoother, Refinement
 from pose_graph_ros.core.sources import constraint_names
 from pose_graph_ros.core.sources.factor_builder import FactorBuilder, Queue, QueuedEdge
 from pose_graph_ros.core.sources.pipeline import MeasurementPipeline
@@ -313,7 +308,7 @@ class PoseGraphBackend:
             freed = () if T_map_graph is None else (0,)
             change = self._factors.build(queue, self.graph)._replace(free=freed)
             change = self._judge.before(self._factors.new, change, self._nodes.newest_ns)
-            transaction.solved(self._solved(change))
+            transaction.solved(self._judge.solve(change))
         if transaction.failure != '':
             self._settled = self._settled and not transaction.moved_back
             return (UpdateReport(Status.FAILED, transaction.failure, 0, 0, self._chi2),
@@ -329,13 +324,6 @@ class PoseGraphBackend:
         return UpdateReport(
             result.status, '', len(queue), result.iterations, self._chi2, result.relinearized,
             result.eliminated, result.visited), Queue()
-
-    def _solved(self, change: GraphUpdate) -> UpdateResult:
-        """Return the result of an update; if it diverges, it is without the judged closures."""
-        result = self._smoother.update(change, fall_back=False)
-        if result.reason == DIVERGED:
-            return self._smoother.update(self._judge.withhold(change))
-        return result
 
     def refine(self) -> Refinement:
         """Do an iteration from the estimate of an update to the optimum; `optimize` needs none."""

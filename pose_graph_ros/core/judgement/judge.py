@@ -14,6 +14,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from pose_graph_ros.core.batch.optimizer import Status
 from pose_graph_ros.core.config import BackendConfig, Robust
 from pose_graph_ros.core.geometry.se2 import FloatArray, IntArray
 from pose_graph_ros.core.graph.constraints import EdgeKind, Edges
@@ -27,7 +28,11 @@ from pose_graph_ros.core.judgement.fix_states import SavedFixes
 from pose_graph_ros.core.judgement.fixes import FixJudge
 from pose_graph_ros.core.judgement.verdicts import Change, Decision, SourceVerdicts, Verdict
 from pose_graph_ros.core.measurements import Answer, LoopClosure
-from pose_graph_ros.core.smoother.incremental import IncrementalSmoother
+from pose_graph_ros.core.smoother.incremental import (
+    DIVERGED,
+    IncrementalSmoother,
+    UpdateResult,
+)
 from pose_graph_ros.core.sources.factor_builder import NewConstraint
 from pose_graph_ros.core.sources.source_constraints import Held
 
@@ -99,14 +104,25 @@ class Judge:
         return _weighed(change, self._staged, self._closures.before(
             closures, change.edges.rows(self._staged), now_ns))
 
-    def withhold(self, change: GraphUpdate) -> GraphUpdate:
+    def solve(self, change: GraphUpdate) -> UpdateResult:
         """
-        Return the update of the last `before` with the new closures doubted for the moment.
+        Return the result of the update of the last `before`.
 
-        With them the iterations of the smoother diverge, so they are tried between two updates.
+        If its iterations diverge, the new closures are doubted for the moment, and tried between
+        two updates. If they diverge without them and nothing else that is new has a weight, it is
+        because of what earlier updates have left over: that is solved for between two updates.
         """
-        weights = self._closures.withhold()
-        return change if weights is None else _weighed(change, self._staged, weights)
+        result = self._smoother.update(change, fall_back=False)
+        weights = self._closures.withhold() if result.reason == DIVERGED else None
+        if weights is not None:
+            change = _weighed(change, self._staged, weights)
+            result = self._smoother.update(change, fall_back=False)
+        if result.reason != DIVERGED:
+            return result
+        if self._smoother.append(change):
+            self._closures.solve_later()
+            return UpdateResult(Status.MAX_ITERATIONS, '', 0, 0, 0, 0)
+        return self._smoother.update(change)
 
     def _is_judged_closure(self, one: NewConstraint, change: GraphUpdate, first: int) -> bool:
         number = one.row - first

@@ -118,6 +118,24 @@ class IncrementalSmoother:
             raise
         return result
 
+    def append(self, update: GraphUpdate) -> bool:
+        """
+        Add rows with weight 0 without a step; tell whether that was possible.
+
+        It is not, and nothing has changed, if the update asks for anything to be eliminated.
+        Raises GraphUpdateError as `update` does.
+        """
+        self.graph.begin()
+        try:
+            self.graph.apply(update)
+        except BaseException:
+            self.graph.rollback()
+            raise
+        if self.graph.has_touched:
+            self.graph.rollback()
+            return False
+        return True     # no step has replaced values that a commit would give back
+
     def refine(self) -> Refinement:
         """
         Do one iteration from the estimate, which is within a budget of it, to the minimum of chi2.

@@ -204,7 +204,7 @@ def test_of_many_hopeless_closures_the_oldest_are_forgotten(
 def test_of_many_new_closures_an_update_tests_some_and_the_work_the_others(
     monkeypatch: pytest.MonkeyPatch, *, large: bool,
 ) -> None:
-    monkeypatch.setattr(closure_judge, 'LARGE', 0 if large else 5000)
+    monkeypatch.setattr(closure_judge, 'LARGE', 0 if large else 500)
     backend = driven()
     n = 60
     for k in range(n):
