@@ -24,7 +24,6 @@ from pose_graph_ros.core.judgement.consistency import OdometryChain
 from pose_graph_ros.core.judgement.runs import (
     best_runs,
     EVENT,
-    LEAST_MEMBERS,
     odometry_between,
     remembered,
     Run,
@@ -266,13 +265,13 @@ class FixJudge:
         Add an observation to the doubted run that predicts it best.
 
         Where the run that is believed predicts it as well, with `mine`, another one must be more
-        than a few measurements, go on at present, and predict it better.
+        than a single measurement, go on at present, and predict it better.
         """
         best = np.inf if mine is None else mine.d2 + mine.spread
         chosen: tuple[Run, Track, Track] | None = None
         for run in self._runs:
             if (run.believed or stamp_ns < run.end_ns or run.track.node > seen.node or (
-                    mine is not None and (run.n < LEAST_MEMBERS or run.contradicted))):
+                    mine is not None and (run.n == 1 or run.contradicted))):
                 continue
             begin, track, turned = run.predicted(seen, self._chain)
             innovation = track.innovation(seen)
