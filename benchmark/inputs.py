@@ -17,7 +17,7 @@ import time
 
 import numpy as np
 
-from benchmark import drives, report
+from benchmark import drives, kept_sections, report
 from benchmark.drives import Kind
 from benchmark.metrics import Metric
 from benchmark.section import say, Section, Table
@@ -42,6 +42,7 @@ from pose_graph_ros.core.measurements import (
 )
 from pose_graph_ros.core.sources.validation import validate
 
+SECTIONS = 'nees', 'arrival', 'outliers', 'plaza', 'door', 'stamps', 'cost'
 NEES = 0.8, 1.3
 """What is asked for."""
 UPDATE_EVERY = 0.5
@@ -379,11 +380,20 @@ def main(arguments: list[str]) -> int:
     parser.add_argument('--runs', type=int, default=100, metavar='N',
                         help='seeded runs of each drive (default %(default)s)')
     parser.add_argument('--out', type=Path, default=Path('build/benchmark/inputs'), metavar='DIR')
+    parser.add_argument('--only', choices=SECTIONS, action='append',
+                        help='only these sections; others of the page stay')
+    parser.add_argument('--case', action='append', default=[], metavar='TEXT',
+                        help='of the section nees, only drives and treatments with one of these '
+                        'in their names; other rows of the page stay')
     options = parser.parse_args(arguments)
     few = max(options.runs // 20, 1)
-    sections = [uncertainty(options.runs), arrival(few), outliers(few), plaza(few), door(),
-                stamps(), cost()]
-    return report.conclude(sections, options.out, 'benchmark.inputs', arguments,
+    made = {'nees': lambda: uncertainty(options.runs, options.case),
+            'arrival': lambda: arrival(few), 'outliers': lambda: outliers(few),
+            'plaza': lambda: plaza(few), 'door': door, 'stamps': stamps, 'cost': cost}
+    for name in options.only or SECTIONS:
+        sections = kept_sections.merged(options.out, {name: made[name]()}, SECTIONS,
+                                        rows=len(options.case) > 0)
+    return report.conclude(sections, options.out, 'benchmark.inputs', ['--out', str(options.out)],
                            title='Measurements as they come', about=__doc__)
 
 
