@@ -27,7 +27,7 @@ from pose_graph_ros.core.graph.graph import Graph
 from pose_graph_ros.core.sources.error_likelihood import (
     chain_motions,
     filtered,
-    Track,
+    MeasuredPath,
     UNKNOWN,
 )
 from pose_graph_ros.core.sources.gauss_markov import CorrelatedErrors
@@ -86,7 +86,7 @@ class _Minimum(NamedTuple):
     point: Point
 
 
-def track(graph: Graph, stamps_ns: IntArray, rows: IntArray) -> Track:
+def measured_path(graph: Graph, stamps_ns: IntArray, rows: IntArray) -> MeasuredPath:
     """
     Return the positions of a source along the path by odometry, sorted by stamp.
 
@@ -109,7 +109,7 @@ def track(graph: Graph, stamps_ns: IntArray, rows: IntArray) -> Track:
     chain_motions(motion, noise, until, joined, spread)
     covariance = np.linalg.inv(observed.information[:, :2, :2])
     seconds = np.asarray((stamps_ns - stamps_ns[:1]) * 1e-9, dtype=np.float64)
-    return Track(
+    return MeasuredPath(
         seconds, observed.mean[:, :2].copy(), 0.5 * np.trace(covariance, axis1=1, axis2=2),
         observed.offset[:, :2].copy(), joined, spread)
 
@@ -143,8 +143,8 @@ def _odometry(graph: Graph, nodes: IntArray) -> tuple[IntArray, FloatArray, Floa
     return poses, motion, noise
 
 
-def search(positions: Track) -> Search:
-    """Search for the statistics of the errors of a track."""
+def search(positions: MeasuredPath) -> Search:
+    """Search for the statistics of the errors of the positions on a path."""
     if len(positions.seconds) < LEAST_POSITIONS:
         return NOTHING
     evaluate = _Evaluation(positions)
@@ -184,8 +184,8 @@ def _odometry_scale(
 class _Evaluation:
     """Evaluates points of the lattice, at most once each."""
 
-    def __init__(self, positions: Track) -> None:
-        self._track = positions
+    def __init__(self, positions: MeasuredPath) -> None:
+        self._path = positions
         self._heading = 0.0
         self._values: dict[Point, float] = {}
         self.lost: dict[Point, int] = {}
@@ -198,7 +198,7 @@ class _Evaluation:
         """Find the heading at the first position that makes white errors the most likely."""
         best = math.inf
         for angle in (2.0 * math.pi / HEADINGS * np.arange(HEADINGS)).tolist():
-            value, _ = filtered(*self._track, 1.0, 0.0, 1.0, 1.0, angle)
+            value, _ = filtered(*self._path, 1.0, 0.0, 1.0, 1.0, angle)
             if value < best:
                 best, self._heading = value, angle
             yield from self._pause()
@@ -215,7 +215,7 @@ class _Evaluation:
                 (1.0, 0.0) if len(point) == 2 else (2.0 ** point[0], 2.0 ** point[1]))
             odometry, white = 2.0 ** point[-2], 2.0 ** point[-1]
             value, self.lost[point] = filtered(
-                *self._track, tau, correlated, odometry, white, self._heading)
+                *self._path, tau, correlated, odometry, white, self._heading)
             self._values[point] = (
                 value + (math.log(correlated + white) / SPREAD) ** 2
                 + (math.log(odometry) / ODOMETRY_SPREAD) ** 2)
@@ -223,7 +223,7 @@ class _Evaluation:
         return self._values[point]
 
     def _pause(self) -> Generator[None, None, None]:
-        self._left -= len(self._track.seconds)
+        self._left -= len(self._path.seconds)
         if self._left < 0:
             self._left = PER_STEP
             yield

@@ -44,7 +44,7 @@ START_VARIANCE, RESTART_VARIANCE = 0.1, 1.0
 START_SPREAD = 1e4
 
 
-class Track(NamedTuple):
+class MeasuredPath(NamedTuple):
     """K measured positions in the order of their stamps, and the motion by odometry between."""
 
     seconds: FloatArray
@@ -198,7 +198,7 @@ def filtered(  # type: ignore[no-untyped-def]
 
     Parameters
     ----------
-    seconds, position, variance, offset, motion, noise : ndarray, columns of a `Track`
+    seconds, position, variance, offset, motion, noise : ndarray, columns of a `MeasuredPath`
     tau : float, time constant of the correlated error [s]
     correlated, white : float, variances of the two parts, in units of the claimed variance
     odometry : float, factor on the noise of the motions

@@ -9,8 +9,8 @@ from pose_graph_ros.core.geometry import se2
 from pose_graph_ros.core.graph.constraints import EdgeKind, Edges, ObservedKind, ObservedNodes
 from pose_graph_ros.core.graph.graph import Graph, GraphUpdate
 from pose_graph_ros.core.sources import error_estimate
-from pose_graph_ros.core.sources.error_estimate import finished, search, track
-from pose_graph_ros.core.sources.error_likelihood import chain_motions, filtered, Track
+from pose_graph_ros.core.sources.error_estimate import finished, measured_path, search
+from pose_graph_ros.core.sources.error_likelihood import chain_motions, filtered, MeasuredPath
 
 SECOND = 1_000_000_000
 
@@ -31,7 +31,7 @@ def errors(
 def a_drive(
     seed: int, *, n: int = 200, period: float = 1.0, tau: float = 0.0, white: float = 0.05,
     sigma: float = 1.0, drift: float = 1.0, wrong: float = 0.0,
-) -> Track:
+) -> MeasuredPath:
     """Return a drive at 1 m/s with positions of a claimed sigma of 1 m."""
     rng = np.random.default_rng(seed)
     steps = np.column_stack((np.full(n, period), np.zeros(n), 0.1 * np.sin(np.arange(n))))
@@ -44,8 +44,8 @@ def a_drive(
     seen = true[:, :2] + sigma * errors(rng, n, period, tau, white)
     jumps = rng.random(n) < wrong
     seen[jumps] += rng.uniform(-50.0, 50.0, (np.sum(jumps), 2))
-    return Track(period * np.arange(n), seen, np.ones(n), np.zeros((n, 2)), steps,
-                 np.tile(cov, (n, 1, 1)))
+    return MeasuredPath(period * np.arange(n), seen, np.ones(n), np.zeros((n, 2)), steps,
+                        np.tile(cov, (n, 1, 1)))
 
 
 def test_the_likelihood_is_that_of_the_full_covariance() -> None:
@@ -56,8 +56,8 @@ def test_the_likelihood_is_that_of_the_full_covariance() -> None:
     seconds = np.cumsum(rng.uniform(0.5, 2.0, n))
     variance = rng.uniform(0.5, 2.0, n)
     position = np.column_stack((np.arange(n), np.zeros(n))) + 0.3 * rng.standard_normal((n, 2))
-    given = Track(seconds, position, variance, np.zeros((n, 2)),
-                  np.tile((1.0, 0.0, 0.0), (n, 1)), np.tile(cov, (n, 1, 1)))
+    given = MeasuredPath(seconds, position, variance, np.zeros((n, 2)),
+                         np.tile((1.0, 0.0, 0.0), (n, 1)), np.tile(cov, (n, 1, 1)))
     sigma = np.sqrt(variance)
     bias = correlated * np.outer(sigma, sigma) * np.exp(
         -np.abs(np.subtract.outer(seconds, seconds)) / tau)
@@ -157,11 +157,11 @@ def line(n: int) -> Graph:
     return graph
 
 
-def test_a_track_has_the_motions_of_the_primary_odometry_in_the_order_of_stamps() -> None:
+def test_a_path_has_the_motions_of_the_primary_odometry_in_the_order_of_stamps() -> None:
     graph, rng = line(30), np.random.default_rng(0)
     rows = np.sort(rng.choice(30, 12, replace=False))
     some = rng.permutation(rows)
-    found = track(graph, SECOND * (some + 5), some)
+    found = measured_path(graph, SECOND * (some + 5), some)
     np.testing.assert_allclose(found.seconds, rows - rows[0])
     np.testing.assert_allclose(found.position, np.column_stack((rows + 0.2, np.full(12, 0.1))))
     np.testing.assert_allclose(found.variance, 0.25)
@@ -192,6 +192,6 @@ def test_of_many_positions_the_newest_and_a_sample_of_the_others_are_used(
 ) -> None:
     monkeypatch.setattr(error_estimate, 'NEWEST', 10)
     monkeypatch.setattr(error_estimate, 'OLDER', 5)
-    found = track(line(40), SECOND * np.arange(40), np.arange(40))
+    found = measured_path(line(40), SECOND * np.arange(40), np.arange(40))
     assert len(found.seconds) == 15
     np.testing.assert_allclose(found.seconds[-10:], np.arange(30, 40))
