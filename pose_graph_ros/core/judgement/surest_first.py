@@ -54,8 +54,10 @@ WRONG_ODDS = 0.02
 # Least size of a group of closures that agree. If wrong groups give as many that fit odometry with
 # more than this chance, and so do wrong ones outside of groups, nothing is believed.
 GROUP, BY_CHANCE = 3, 0.1
-# Largest chance to fit that a candidate is said to have had.
-MOST_CHANCE = 0.95
+# Size of a place [m]; a candidate with more than this chance to fit tells nothing, and fewer than
+# so many candidates tell too little.
+PLACE = 20.0
+MOST_CHANCE, ENOUGH_TELL = 0.5, 8
 # What is not measured of an error could be anything within this [m, m, rad].
 EXTENT = np.array([100.0, 100.0, 2.0 * np.pi])
 
@@ -235,27 +237,36 @@ class _Gates:
         """
         Tell whether more closures fit odometry than if all of them were wrong.
 
-        Those that agree with one another are one candidate. For each candidate that does not fit,
-        and had the chance p to do so, p / (1 - p) wrong ones are expected that do.
+        Those of one place that agree with one another are one candidate. For each candidate that
+        does not fit, and had the chance p to do so, p / (1 - p) wrong ones are expected that do.
+        Where most gates are too wide to tell, nothing is held against those that fit.
         """
         numbers = np.arange(len(self._problem))
-        if len(numbers) == 0:
-            return True
         squared = self._squared(numbers, self._problem.errors(numbers))
         fits = ~(squared > self._problem.limits[numbers])
-        _, group = connected_components(coo_array(
-            (np.ones(len(self._pairs[0])), self._pairs), shape=(len(numbers), len(numbers))),
-            directed=False)
+        group = self._places_that_agree()
         size = np.bincount(group)
-        chance = np.minimum(np.bincount(group, self._chances(numbers)) / size, MOST_CHANCE)
+        chance = np.bincount(group, self._chances(numbers)) / size
+        tells = chance < MOST_CHANCE
+        if np.sum(tells) < max(ENOUGH_TELL, 0.5 * len(size)):
+            return True
         candidate_fits = 2 * np.bincount(group, fits) >= size
-        for of_kind in (size >= GROUP, size < GROUP):
+        for of_kind in (tells & (size >= GROUP), tells & (size < GROUP)):
             n_fit = int(np.sum(candidate_fits & of_kind))
             odds = (chance / (1.0 - chance))[~candidate_fits & of_kind]
             # the chance of a Poisson distribution to reach n_fit
             if n_fit > 0 and gammainc(n_fit, float(np.sum(odds))) < BY_CHANCE:
                 return True
         return False
+
+    def _places_that_agree(self) -> IntArray:
+        """Return to which group each closure belongs, of those that agree within one place."""
+        n = len(self._problem)
+        _, agreeing = connected_components(coo_array(
+            (np.ones(len(self._pairs[0])), self._pairs), shape=(n, n)), directed=False)
+        place = np.floor(self._problem.graph.poses[self._problem.edges.i, :2] / PLACE)
+        _, group = np.unique(np.column_stack((agreeing, place)), axis=0, return_inverse=True)
+        return np.asarray(group.ravel())
 
     def _squared(self, numbers: IntArray, errors: FloatArray) -> FloatArray:
         return Innovations(errors, self._covariances[numbers]).squared_distances(
