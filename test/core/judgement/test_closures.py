@@ -249,6 +249,22 @@ def test_one_group_of_right_closures_is_believed_beside_a_few_wrong_ones() -> No
     assert found == {each.stamp_ns // SECOND - 1 for each in right}
 
 
+def test_right_closures_that_agree_all_the_way_are_believed_beside_wrong_groups() -> None:
+    rng = np.random.default_rng(18)
+    right, wrong = true_ones(rng), []
+    for begin, end in ((5, 70), (12, 55), (24, 120), (40, 145), (66, 200), (31, 225)):
+        z = rng.normal(0.0, (1.0, 1.0, 1.0))
+        wrong += [closure(begin + k, end + k, se2.compose(
+            se2.inverse(se2.between(TRUTH[begin], TRUTH[begin + k])), se2.compose(
+                z, se2.between(TRUTH[end], TRUTH[end + k])))) for k in range(0, 8, 2)]
+    wrong = [each for each in wrong
+             if each.stamp_ns not in {other.stamp_ns for other in right}]
+    backend = run([*right, *wrong])
+    backend.optimize()
+    found = {k for k, state in states(backend).items() if state.in_graph}
+    assert found == {each.stamp_ns // SECOND - 1 for each in right}
+
+
 def test_robust_none_believes_everything() -> None:
     rng = np.random.default_rng(7)
     config = BackendConfig(
