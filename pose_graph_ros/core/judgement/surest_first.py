@@ -242,6 +242,8 @@ class _Gates:
         Where most gates are too wide to tell, nothing is held against those that fit.
         """
         numbers = np.arange(len(self._problem))
+        if len(numbers) == 0:
+            return True
         squared = self._squared(numbers, self._problem.errors(numbers))
         fits = ~(squared > self._problem.limits[numbers])
         group = self._places_that_agree()
@@ -253,9 +255,9 @@ class _Gates:
         candidate_fits = 2 * np.bincount(group, fits) >= size
         for of_kind in (tells & (size >= GROUP), tells & (size < GROUP)):
             n_fit = int(np.sum(candidate_fits & of_kind))
-            odds = (chance / (1.0 - chance))[~candidate_fits & of_kind]
+            fell = chance[~candidate_fits & of_kind]
             # the chance of a Poisson distribution to reach n_fit
-            if n_fit > 0 and gammainc(n_fit, float(np.sum(odds))) < BY_CHANCE:
+            if n_fit > 0 and gammainc(n_fit, np.sum(fell / (1.0 - fell))) < BY_CHANCE:
                 return True
         return False
 
