@@ -69,6 +69,8 @@ LARGE = 500
 # How often a closure is thrown out before it waits for the next closure to come: those that
 # contradict one another could otherwise take turns for ever.
 MOST_TURNS = 2
+# Number of times that throwing some out diverges, and is tried on a copy, until a closure comes.
+MOST_ATTEMPTS = 20
 
 
 class ClosureJudge:
@@ -92,6 +94,7 @@ class ClosureJudge:
         self._tested = GrowingArray((), np.int64)
         """The round in which it was tested last."""
         self._turns = GrowingArray((), np.int64)
+        self._n_diverged = 0
         """How often it was thrown out since the last closure came."""
         self._final = (0, 0, 0, -1)
         """Sizes of the graph and round at the last final decision."""
@@ -175,6 +178,7 @@ class ClosureJudge:
         begin, self._n_staged = len(self._states) - self._n_staged, 0
         if begin < len(self._states):
             self._turns.values[:] = 0
+            self._n_diverged = 0
         for number in range(begin, len(self._states)):
             self._states.announce(number, -1, self._beliefs.now_ns)
         for source in np.unique(self._states.source[begin:]).tolist():
@@ -270,7 +274,11 @@ class ClosureJudge:
         inside = inside[self._may_not_fit(inside)]
         fit = relative.residuals(self._smoother.graph, self._table.rows(inside))
         bad = inside[fit > GATE]
-        if len(bad) == 0 or not self._beliefs.apply(dict.fromkeys(bad.tolist(), State.DOUBTED)):
+        # where the graph cannot be solved without them, that is not tried for ever
+        if len(bad) == 0 or self._n_diverged >= MOST_ATTEMPTS:
+            return False
+        if not self._beliefs.apply(dict.fromkeys(bad.tolist(), State.DOUBTED)):
+            self._n_diverged += 1
             return False
         self._turns.values[bad] += 1
         # without them the graph is less certain
