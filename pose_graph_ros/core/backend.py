@@ -220,7 +220,8 @@ class PoseGraphBackend:
         settings = self._config.odometry_source(source)
         self._reweighting.add(
             self.graph.n_edges - 1, settings.loss, settings.rejection_threshold, edge=True)
-        self._reweighting.scale_base_weights(self.graph.n_edges - 1, self._tuner.odometry_weight)
+        self._reweighting.set_base_weight(
+            self.graph.n_edges - 1, self._tuner.odometry_weight, edge=True)
         return self.graph.newest_pose
 
     def add_measurement(self, measurement: Measurement, source: str) -> Answer:

@@ -183,13 +183,13 @@ class Reweighting:
         new.base_weights.values[to] = old.base_weights.values[at]
         old.base_weights.values[at] = 0.0
 
-    def scale_base_weights(self, rows: IntArray | int, factor: float) -> None:
+    def scale_base_weights(self, rows: IntArray, factor: float) -> None:
         """
         Multiply the base weights of edges, where they have a loss.
 
         Parameters
         ----------
-        rows : ndarray of int64 or int, of edges in the graph
+        rows : ndarray of int64, of edges in the graph
         factor : float
 
         """
