@@ -44,8 +44,8 @@ WORSE = 0.5
 WORSE_HEADING = 0.1
 # Squared sigmas of a jump at which its price becomes logarithmic.
 KNEE = 6.0
-# Time between states that a run notes [ns], and factor on their age from one to the one before,
-# of which the last `NOTED` are kept: 13 of them reach 5 minutes back.
+# Time between the states that a run notes [ns]; one is dropped when its neighbours' ages differ by
+# less than this factor; the newest so many are kept, which reach back about 7 minutes.
 NOTED_EVERY_NS, NOTED_RATIO, NOTED = 3_000_000_000, 1.4, 20
 # Price of a transition above which the earlier run may have ended with wrong members.
 CUT_ABOVE = 6.0
@@ -305,7 +305,7 @@ class Run:
 
 
 def _thinned(states: list[tuple[int, Track]], now_ns: int) -> list[tuple[int, Track]]:
-    """Return states of which none is much nearer to the next than that is to the present."""
+    """Return the states without those whose neighbours' ages differ by less than a factor."""
     kept: list[tuple[int, Track]] = []
     for k, state in enumerate(states):
         after = states[k + 1][0] if k + 1 < len(states) else now_ns
