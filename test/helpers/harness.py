@@ -209,6 +209,11 @@ class Client:
         self.spin_until(lambda: int(self.values['processed']) >= count,
                         f'{count} messages are processed')
 
+    def wait_level(self, level: bytes) -> None:
+        """Wait for a level: that of an update may come after its values and its path."""
+        self.spin_until(lambda: self.diagnostics[-1].status[0].level == level,
+                        f'the level is {level!r}')
+
     def wait_answered(self, seconds: float) -> None:
         """Wait until pose, odometry and transform at the stamp of an odometry [s] have come."""
         last = round(seconds * NANOSECONDS)
