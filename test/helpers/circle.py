@@ -63,11 +63,11 @@ def drive(
         if fixes and step % 5 == 0:
             client.fix.publish(fix_at(seconds))
             count += 1
-        if step < 5:
+        if step == 3:
             # from the first estimate on every odometry message is answered; it comes when the
             # reorder window of 0.25 s is over
             client.wait_processed(already + count)
-        elif paced:
+        elif paced and step > 3:
             client.wait_answered(START + seconds)
         client.spin_for(0.002)
     client.wait_processed(already + count)

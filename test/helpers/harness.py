@@ -24,8 +24,10 @@ from prepared_node import PreparedNode
 from rcl_interfaces.srv import SetParameters
 import rclpy
 from rclpy.context import Context
+from rclpy.duration import Duration
 from rclpy.executors import SingleThreadedExecutor
 from rclpy.parameter import Parameter as RosParameter
+from rclpy.publisher import Publisher
 from rclpy.qos import QoSDurabilityPolicy, QoSProfile, QoSReliabilityPolicy
 from sensor_msgs.msg import Imu, NavSatFix
 from std_srvs.srv import Trigger
@@ -149,6 +151,7 @@ class Client:
         self.paths: list[PathMessage] = []
         self.transforms: list[object] = []
         self.diagnostics: list[DiagnosticArray] = []
+        self._sent_ns = 0   # when the newest of them was sent
         subscribe = self.node.create_subscription
         subscribe(PoseWithCovarianceStamped, 'pose', self.poses.append, RELIABLE)
         subscribe(Odometry, 'odometry/filtered', self.filtered.append, RELIABLE)
@@ -174,7 +177,7 @@ class Client:
                         'the node listens')
         self.spin_until(lambda: self.values['prepared'] == '1', 'the node has compiled',
                         PREPARE_PATIENCE)
-        self._wait_matched()
+        self.wait_matched()
 
     def __exit__(self, *_: object) -> None:
         self.close()
@@ -197,9 +200,10 @@ class Client:
         while (left := end - time.monotonic()) > 0.0:
             self._executor.spin_once(timeout_sec=left)
 
-    def _diagnose(self, message: DiagnosticArray) -> None:
+    def _diagnose(self, message: DiagnosticArray, info: Mapping[str, int]) -> None:
         if message.status[0].name == self._status:
             self.diagnostics.append(message)
+            self._sent_ns = info['source_timestamp']
 
     @property
     def values(self) -> dict[str, str]:
@@ -208,6 +212,15 @@ class Client:
     def wait_processed(self, count: int) -> None:
         self.spin_until(lambda: int(self.values['processed']) >= count,
                         f'{count} messages are processed')
+
+    def wait_current(self) -> None:
+        """Wait for diagnostics that were sent after all that has come so far."""
+        now = time.time_ns()
+        self.spin_until(lambda: self._sent_ns > now, 'newer diagnostics come')
+
+    def wait_received(self, publisher: Publisher) -> None:
+        """Wait until the node has what was published: before what is published from now on."""
+        assert publisher.wait_for_all_acked(Duration(seconds=PATIENCE))
 
     def wait_level(self, level: bytes) -> None:
         """Wait for a level: that of an update may come after its values and its path."""
@@ -226,13 +239,13 @@ class Client:
         """Call a service and return its answer."""
         self.spin_until(service.service_is_ready, 'the service is there')
         if service not in self._matched:
-            self._wait_matched()
+            self.wait_matched()
             self._matched.append(service)
         future = service.call_async(request)
         self.spin_until(future.done, 'the service answers')
         return future.result()
 
-    def _wait_matched(self) -> None:
+    def wait_matched(self) -> None:
         """
         Wait until the node knows all publishers, subscribers and clients created before.
 
@@ -301,10 +314,7 @@ class Client:
     def optimize(self) -> Trigger.Response:
         """Have the node optimise; return when its outputs after that have come."""
         response = self.trigger('optimize')
-        # one may have been sent before
-        count = len(self.diagnostics) + 2
-        self.spin_until(lambda: len(self.diagnostics) >= count,
-                        'diagnostics come that were made after the answer')
+        self.wait_current()
         if response.success:
             self.spin_until(self._has_whole_path, 'the whole path comes')
         return response

@@ -194,6 +194,7 @@ def test_every_malformed_message_is_counted_and_none_shows(node: NodeProcess) ->
             assert client.values[f'received.{topic}'] == str(COUNT + (topic == 'odom'))
 
         drive(client, DRIVE)
+        client.wait_answered(START + DRIVE - 0.1)
         answer = client.optimize()
         assert answer.success, answer.message
         values = client.values

@@ -89,10 +89,7 @@ def test_the_transform_times_odometry_is_the_pose(client: Client) -> None:
     drive(client, 1.0)
     client.spin_until(lambda: len(client.paths) > 0, 'the first estimate comes')
     drive(client, 15.0, begin=1.0)
-    last = round((START + 14.9) * 1e9)
-    client.spin_until(
-        lambda: min(stamp_ns(item[-1]) for item in (client.poses, client.transforms)) >= last,
-        'the last pose and transform come')
+    client.wait_answered(START + 14.9)
     poses = {stamp_ns(message): message.pose.pose for message in client.poses}
     compared = 0
     for transform in client.transforms:
@@ -191,7 +188,8 @@ def test_the_path_is_current_without_an_optimisation(client: Client) -> None:
             START + later, *seen.tolist(), frame=f'@{START + later - 64.0:.9f}',
             variances=(1e-4, 1e-4, 1e-6)))
     client.spin_until(lambda: path_error(client) < 0.3 * drifted, 'the loop is closed')
-    client.spin_until(lambda: int(client.values['updates']) == 2, 'the updates are counted')
+    # the three may be in as many updates
+    client.spin_until(lambda: 2 <= int(client.values['updates']) <= 4, 'the updates are counted')
     assert 0.0 < float(client.values['solve_mean_ms']) <= float(client.values['solve_max_ms'])
 
 
@@ -287,7 +285,7 @@ def test_a_signal_that_the_system_hands_to_another_thread_ends_the_node(
     for thread in sorted(int(path.name) for path in Path(f'/proc/{process}/task').iterdir())[1:]:
         if node.process.poll() is None:
             ctypes.CDLL(None).tgkill(process, thread, signal.SIGINT)
-    assert node.process.wait(20.0) == 0
+    assert node.process.wait(PATIENCE) == 0
 
 
 def test_what_the_thread_of_the_engine_logs_reaches_rosout(
@@ -365,6 +363,7 @@ def test_a_namespace_a_remap_and_a_frame(node: NodeProcess) -> None:
     with Client(int(node.env['ROS_DOMAIN_ID']), namespace='robot1', odom='wheels') as client:
         drive(client, 5.0)
         client.spin_until(lambda: len(client.paths) > 0, 'a path comes')
+        client.wait_answered(START + 4.9)
         assert client.paths[-1].header.frame_id == 'world'
         assert client.filtered[-1].header.frame_id == 'world'
         names = {name for name, _ in client.node.get_topic_names_and_types()}

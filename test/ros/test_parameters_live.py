@@ -79,7 +79,8 @@ def test_the_rate_of_the_diagnostics_changes_while_it_runs(
         return (stamp_ns(client.diagnostics[-1]) - stamp_ns(client.diagnostics[-1 - of])) * 1e-9
 
     assert client.set_parameter('diagnostics_period', 1.5) == (True, '')
-    client.spin_until(lambda: duration(of=1) > 1.0, 'they come rarely')
+    client.spin_until(lambda: len(client.diagnostics) > 1 and duration(of=1) > 1.0,
+                      'they come rarely')
     assert client.set_parameter('diagnostics_period', 0.05) == (True, '')
     client.spin_until(lambda: len(client.diagnostics) > 10 and duration(of=10) < 1.5,
                       'they come often')

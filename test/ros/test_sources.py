@@ -6,6 +6,7 @@ from collections.abc import Callable
 import math
 from pathlib import Path
 import random
+import re
 
 from circle import fix_at, odometry_at, odometry_pose, path_error, PLANE, START, true_pose
 from harness import (
@@ -14,6 +15,7 @@ from harness import (
     imu,
     NodeProcess,
     odometry,
+    PATIENCE,
     pose,
     stamp_ns,
     TFMessage,
@@ -103,13 +105,15 @@ def test_two_of_each_from_a_file_and_one_falls_silent(tmp_path: Path) -> None:
         # more edges than one between two nodes
         assert int(values['edges']) > 1.5 * int(values['hidden_nodes'])
         assert path_error(client) < EXACT
-        assert float(values['odom.silence_s']) < 5.0
+        assert float(values['odom.silence_s']) < PATIENCE
         assert values['loop_closure.silence_s'] == 'never received'
 
         play(client, range(150, 300), visual, front, rear)
         client.spin_until(lambda: client.values['odometry'] == 'visual', 'visual is primary')
         step = 300
-        while 'odom is silent' not in client.diagnostics[-1].status[0].message:
+        # soon rear is silent as well
+        while not re.search('odom (and rear are|is) silent',
+                            client.diagnostics[-1].status[0].message):
             play(client, range(step, step + 1), visual, front)
             step += 1
             assert step < 2000
@@ -208,20 +212,22 @@ def test_a_reset_of_the_odometry_shows_in_no_output(client: Client) -> None:
         since = se2.between(odometry_pose(10.0), odometry_pose(seconds))
         return odometry(START + seconds, *since.tolist(), speed=2.0)
 
-    def send(step: int) -> int:
+    def wait_for_the_jump(step: int) -> int:
+        if step == 105:     # until there is an estimate no message is answered
+            client.spin_until(lambda: client.values.get('odom.jump') == '1', 'it is counted')
         client.spin_for(0.01)
         return 0
 
     play(client, range(200), every(1, client.odom, reset_odometry),
-         every(5, client.fix, fix_at), send)
-    client.spin_until(lambda: client.values.get('odom.jump') == '1', 'the jump is counted')
+         every(5, client.fix, fix_at), wait_for_the_jump)
+    client.wait_answered(START + 19.9)
     assert client.optimize().success
     assert path_error(client) < 0.5
     errors = {stamp_ns(message) * 1e-9 - START: pose_error(message) for message in client.poses}
     settled = {at: error for at, error in errors.items() if at > 8.0}
     assert max(settled.values()) < 0.6, settled
     # at most a few messages go without an answer
-    assert len([at for at in settled if at > 10.0]) > 80
+    assert len([at for at in settled if at > 10.0]) > 90
 
 
 @pytest.mark.skipif(TFMessage is None, reason='tf2_msgs is not built: no /tf_static')
@@ -240,7 +246,7 @@ def test_the_lever_arm_comes_from_tf_static(node: NodeProcess) -> None:
         static.publish(TFMessage(transforms=[
             transform('robot', 'mast', (0.5, 0.0, 1.0), (0.0, 0.0, half, half)),
             transform('mast', 'gps', (1.0, 0.25, 1.0))]))
-        client.spin_for(0.3)
+        client.wait_received(static)
         lever_arm = (0.25, 1.0)
         play(client, range(150), every(1, client.odom, odometry_at),
              every(5, client.fix, lambda seconds: fix_at(seconds, lever_arm)))
@@ -263,8 +269,9 @@ def test_the_pose_comes_back_in_latitude_and_longitude(node: NodeProcess, client
     play(client, range(150), every(1, client.odom, odometry_at), every(2, client.fix, unequal))
     client.optimize()
     play(client, range(150, 160), every(1, client.odom, odometry_at))
-    client.spin_until(lambda: len(client.poses) > 0 and stamp_ns(client.fixes[-1])
-                      == stamp_ns(client.poses[-1]), 'the last ones come')
+    client.wait_answered(START + 15.9)
+    client.spin_until(lambda: len(client.fixes) > 0 and stamp_ns(client.fixes[-1])
+                      == stamp_ns(client.poses[-1]), 'the last fix comes')
     assert {stamp_ns(message) for message in client.fixes} <= {
         stamp_ns(message) for message in client.poses}
     for message in client.fixes[-5:]:
@@ -364,8 +371,8 @@ def test_a_loop_closure_waits_until_odometry_has_reached_both_ends(
         START + 3.0, *seen.tolist(), frame=f'@{START + 66.0:.9f}', variances=(1e-4, 1e-4, 1e-6)))
     client.loop_closure.publish(pose(
         START + 66.0, *seen.tolist(), frame=f'@{START + 3.0:.9f}', variances=(0.0, 0.0, 0.0)))
-    client.spin_until(lambda: client.values['pending'] == '1', 'it waits')
-    assert client.values['loop_closure.covariance_not_positive'] == '1'
+    client.spin_until(lambda: client.values['pending'] == '1' and client.values.get(
+        'loop_closure.covariance_not_positive') == '1', 'the first waits')
     play(client, range(0, 500), every(1, client.odom, drifting))
     assert client.values['pending'] == '1'
     play(client, range(500, 680), every(1, client.odom, drifting))

@@ -89,9 +89,10 @@ def test_no_exception_of_a_callback_ends_it(
         heard.append(message.data)
         raise ValueError(f'{message.data} is wrong')
 
-    spun.node.create_subscription(String, 'word', hear, RELIABLE)
+    subscription = spun.node.create_subscription(String, 'word', hear, RELIABLE)
     publisher = spun.node.create_publisher(String, 'word', RELIABLE)
-    spun.wait(lambda: publisher.get_subscription_count() > 0, 'it listens')
+    spun.wait(lambda: publisher.get_subscription_count() > 0
+              and subscription.get_publisher_count() > 0, 'it listens')
     for k in range(3):
         publisher.publish(String(data=f'w{k}'))
         spun.wait(lambda k=k: len(heard) > k, 'the next one comes')

@@ -114,7 +114,9 @@ def test_it_is_not_sent_when_it_is_not_wanted(client: Client) -> None:
     client.transforms.clear()
     drive(client, 5.0, begin=3.0)
     assert client.transforms == []
+    client.spin_until(lambda: client.node.count_publishers('/tf') == 0, 'nobody publishes it')
     assert client.set_parameter('publish_tf', value=True) == (True, '')
+    client.spin_until(lambda: client.node.count_publishers('/tf') == 1, 'it is published')
     drive(client, 6.0, begin=5.0)
     client.spin_until(lambda: len(client.transforms) > 5, 'transforms come')
 
@@ -128,9 +130,11 @@ def test_another_publisher_of_it_is_warned_of(node: NodeProcess, client: Client)
         client.spin_for(0.01)
     client.spin_for(0.5)
     assert 'publishes' not in client.diagnostics[-1].status[0].message
+    # a new publisher is listened to at once, and one that is known already only now and then
+    other = client.node.create_publisher(TFMessage, '/tf', RELIABLE)
 
     def warned() -> bool:
-        broadcaster.publish(broadcast('map', 'odom', 10.0))
+        other.publish(broadcast('map', 'odom', 10.0))
         return 'nother node publishes map -> odom' in client.diagnostics[-1].status[0].message
     client.spin_until(warned, 'it warns')
     assert client.diagnostics[-1].status[0].level == b'\x01'
@@ -143,7 +147,7 @@ def test_without_tf2_msgs_it_warns_once_and_all_else_runs(tmp_path: Path) -> Non
         with Client(int(node.env['ROS_DOMAIN_ID'])) as client:
             drive(client, 6.0)
             assert client.optimize().success
-            assert len(client.poses) > 50
+            client.spin_until(lambda: len(client.poses) > 50, 'poses come')
             assert client.transforms == []
             assert client.set_parameter('publish_tf', value=False) == (True, '')
         assert node.signal_and_wait(signal.SIGINT) == 0

@@ -144,6 +144,7 @@ def test_a_person_forces_closures_in_or_out_and_it_survives_a_file(
     said: list[str] = []
     client.node.create_subscription(
         Log, '/rosout', lambda message: said.append(message.msg), RELIABLE)
+    client.wait_matched()
     verdicts.wait(2, 'believed')
     verdicts.decide(2, 'out', 'doubted')
     assert 'a person' in verdicts.statuses['loop_closure/2'].message
