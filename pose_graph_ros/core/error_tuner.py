@@ -134,7 +134,6 @@ class ErrorTuner:
                 found: error_estimate.Estimate = end.value
                 if _far(constraints.odometry_scale, found.odometry_scale):
                     constraints.odometry_scale = found.odometry_scale
-                self._judge.set_odometry_scale(self._wanted_scale())
                 if _differ(self._factors.errors_in_use(search.source), found.errors):
                     self._begin(search.source, found.errors)
         return 0.0
@@ -160,7 +159,7 @@ class ErrorTuner:
         if len(sources) == 0:
             return
         # moving the measurements of one source changes no rows of another one
-        weights = self._judge.weights_as_claimed()
+        weights = self._judge.final_weights()
         for source in sources:
             constraints = self._factors.constraints(source)
             found = error_estimate.finished(
@@ -171,7 +170,6 @@ class ErrorTuner:
             if found.errors != self._factors.errors_in_use(source):
                 self._begin(source, found.errors)
                 self.finish_change()
-        self._judge.set_odometry_scale(self._wanted_scale())
         self.finish_change()
 
     def restored(self) -> None:
@@ -181,7 +179,6 @@ class ErrorTuner:
         weight = np.max(graph.weights[0][self._primary_edges()], initial=0.0)
         if weight > 0.0:
             self._use_scale(float(weight)**-0.5)
-        self._judge.set_odometry_scale(self._wanted_scale())
 
     def _wanted_scale(self) -> float:
         """Return the factor on the sigmas of odometry that is given, or that sources show."""

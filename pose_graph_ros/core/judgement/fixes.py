@@ -52,9 +52,9 @@ BEGIN_HEADING = 0.2
 NOWHERE = 1e6
 # Largest number of measurements that are all judged again at the end of a stream.
 MOST_AGAIN = 100_000
-# Bounds of the factor on the sigmas of odometry while fixes are judged: those that are stated are
-# often too small, and wrong fixes that are believed make them seem smaller than they are.
-LEAST_SCALE, MOST_SCALE = 2.0, 3.0
+# Factor on the sigmas of odometry while fixes are judged, as those that are stated are often too
+# small. What sources show of them is not used: it depends on the fixes that are believed.
+ODOMETRY_SCALE = 2.0
 # How long what is in the graph before the first measurement counts as a run [s].
 KNOWN_BEFORE = 100.0
 
@@ -84,6 +84,7 @@ class FixJudge:
     ) -> None:
         self._smoother, self._reweighting, self._config = smoother, reweighting, config
         self._chain = OdometryChain()
+        self._chain.noise_factor = ODOMETRY_SCALE**2
         self.states = self._states = fs.FixStates()
         self._runs: list[Run] = []
         self._main: Run | None = None
@@ -92,8 +93,6 @@ class FixJudge:
         self._loosened: dict[int, float] = {}
         """Weights of odometry edges by row; replaced, never changed, so that it is not copied."""
         self._noise = StatedNoise()
-        self.odometry_scale = 1.0
-        """Factor on the sigmas of odometry that the measurements show."""
         self.odometry_weight = 1.0  # in the graph, where it is not loosened
         self._restore: _Before | None = None
         self._now_ns, self._again = -1, -1
@@ -124,7 +123,7 @@ class FixJudge:
         self._restore, self._now_ns = self._copy(), now_ns
         graph = self._smoother.graph
         solved = not graph.has_touched
-        self._extend_chain(self.odometry_scale)
+        self._chain.extend(graph)
         first, loosened = len(self._states), self._loosened
         for one in judged:
             at = one.row - (graph.n_edges if one.is_edge else graph.n_observed)
@@ -135,14 +134,6 @@ class FixJudge:
             if not self._states.believed[number]:
                 self._states.announce(number, None)
         return self._with_weights(change, first, loosened)
-
-    def _extend_chain(self, odometry_scale: float) -> None:
-        self._chain.extend(self._smoother.graph)
-        factor = min(max(odometry_scale, LEAST_SCALE), MOST_SCALE)**2
-        if factor != self._chain.noise_factor:
-            self._chain.noise_factor = factor
-            for run in self._runs:
-                run.prices.clear()
 
     def _with_weights(
         self, change: GraphUpdate, first: int, loosened: Mapping[int, float],
@@ -361,7 +352,7 @@ class FixJudge:
     def finish(self) -> None:
         """Judge all measurements again in the order of their stamps, by odometry alone."""
         loosened, states = self._loosened, self._states
-        if not self._judge_all(self.odometry_scale):
+        if not self._judge_all():
             return
         states.changed = {number: before for number, before in states.changed.items()
                           if before != bool(states.records[number, fs.BELIEVED])}
@@ -372,17 +363,17 @@ class FixJudge:
         else:
             self.commit()
 
-    def weights_as_claimed(self) -> tuple[FloatArray, FloatArray]:
-        """Return the weights that `finish` would give if odometry were as stated."""
+    def final_weights(self) -> tuple[FloatArray, FloatArray]:
+        """Return the weights that `finish` would give."""
         weights = self._smoother.graph.weights
-        if self._judge_all(1.0):
+        if self._judge_all():
             for kind, table in ((1, weights[0]), (0, weights[1])):
                 some = self._states.records[self._states.records[:, fs.EDGE] == kind]
                 table[some[:, fs.ROW]] = some[:, fs.BELIEVED]
             self.rollback()
         return weights
 
-    def _judge_all(self, odometry_scale: float) -> bool:
+    def _judge_all(self) -> bool:
         """
         Judge all measurements again, if that can be done; `commit` or `rollback` follows.
 
@@ -395,7 +386,7 @@ class FixJudge:
         states.keep(np.arange(len(states)))
         self._runs, self._main, self._loosened = [], None, {}
         self._noise = StatedNoise()
-        self._extend_chain(odometry_scale)
+        self._chain.extend(graph)
         states.records[:, fs.RUN] = fs.LONE
         for self._again in states.by_stamp().tolist():
             row, edge, stamp_ns, observed = states.records[

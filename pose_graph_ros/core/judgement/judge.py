@@ -72,15 +72,6 @@ class Judge:
         self._closures.configure(config)
         self._fixes.configure(config)
 
-    @property
-    def odometry_scale(self) -> float:
-        """Factor on the sigmas of odometry that the measurements show, at least 1."""
-        return self._fixes.odometry_scale
-
-    def set_odometry_scale(self, scale: float) -> None:
-        """Set `odometry_scale`, for later measurements and for `finish`."""
-        self._fixes.odometry_scale = scale
-
     def before(
         self, new: Sequence[NewConstraint], change: GraphUpdate, now_ns: int,
     ) -> GraphUpdate:
@@ -206,14 +197,14 @@ class Judge:
         """
         self._fixes.states.moved(before, after)
 
-    def weights_as_claimed(self) -> tuple[FloatArray, FloatArray]:
+    def final_weights(self) -> tuple[FloatArray, FloatArray]:
         """
         Return weights of edges and observed nodes by which the errors of sources are estimated.
 
-        Measurements in the map have those that the end would give them if errors were as claimed,
-        which does not depend on what was decided before.
+        Measurements in the map have those that the end gives them, which do not depend on what was
+        decided before.
         """
-        return self._fixes.weights_as_claimed()
+        return self._fixes.final_weights()
 
     def finish(self) -> Callable[[], None]:
         """
