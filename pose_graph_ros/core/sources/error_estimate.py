@@ -35,15 +35,17 @@ from pose_graph_ros.core.sources.gauss_markov import CorrelatedErrors
 # Number of measurements that are used: the newest ones, and as many of all older ones.
 NEWEST = OLDER = 2000
 # Minimum number of measurements for an estimate.
-LEAST_POSITIONS = 20
+LEAST_POSITIONS = 10
 # Number of filtered measurements in one step of a search, of 0.4 us each.
 PER_STEP = 5000
-# How much more likely correlated errors must be: twice the difference of the logarithms.
-SIGNIFICANT = 15.0
+# How much more likely correlated errors must be: twice the difference of the logarithms. White
+# ones exceed it in one search of a hundred, which costs a few per cent of accuracy until the next;
+# correlated ones that are missed make the claimed covariances up to ten times too small.
+SIGNIFICANT = 5.0
 # The same for each time that the filter was lost: then odometry was wrong, or many positions.
 PER_LOST = 100.0
 # The same of a scale of the noise of odometry other than 1.
-SIGNIFICANT_SCALE = 6.0
+SIGNIFICANT_SCALE = 4.0
 # Smallest correlation of consecutive measurements that matters.
 LEAST_CORRELATION = 0.2
 # Sigma of the logarithm of the total variance in units of the claimed one, before it is seen.

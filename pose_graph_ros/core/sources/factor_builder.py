@@ -24,6 +24,7 @@ from pose_graph_ros.core.measurements import Absolute, GlobalPose, LoopClosure, 
 from pose_graph_ros.core.odometry.motion import Attachment
 from pose_graph_ros.core.saved_columns import Integers, Pairs, Rows3, Rows6
 from pose_graph_ros.core.sources import source_report
+from pose_graph_ros.core.sources.error_estimate import LEAST_POSITIONS
 from pose_graph_ros.core.sources.gauss_markov import (
     Additions,
     CorrelatedErrors,
@@ -35,11 +36,7 @@ from pose_graph_ros.core.sources.gauss_markov import (
     new_error_model,
 )
 from pose_graph_ros.core.sources.measurement_constraints import motion_noise
-from pose_graph_ros.core.sources.source_constraints import (
-    FIRST_ESTIMATE,
-    SavedSource,
-    SourceConstraints,
-)
+from pose_graph_ros.core.sources.source_constraints import SavedSource, SourceConstraints
 from pose_graph_ros.core.sources.source_report import SourceReport
 
 NO_NOISE: Final[FloatArray] = np.zeros(2)
@@ -256,7 +253,8 @@ class FactorBuilder:
     def finding(self) -> list[str]:
         """Return the sources whose errors are estimated and that have measurements."""
         return [source for source, constraints in self._constraints.items()
-                if len(constraints) >= FIRST_ESTIMATE and self._settings(source).finds_correlation]
+                if len(constraints) >= LEAST_POSITIONS
+                and self._settings(source).finds_correlation]
 
     def due_for_estimate(self) -> list[str]:
         """Return those of `finding` with enough new measurements for another estimate."""

@@ -10,11 +10,9 @@ import numpy as np
 from pose_graph_ros.core.compiled.growing_array import GrowingArray
 from pose_graph_ros.core.geometry.se2 import BoolArray, FloatArray, IntArray
 from pose_graph_ros.core.saved_columns import Integers, Pairs, Rows2
+from pose_graph_ros.core.sources.error_estimate import LEAST_POSITIONS
 from pose_graph_ros.core.sources.gauss_markov import CorrelatedErrors, SavedBins
 from pose_graph_ros.core.sources.source_report import SourceReport
-
-# A source with at least so many measurements has its errors estimated.
-FIRST_ESTIMATE = 20
 
 
 @dataclass(frozen=True, slots=True)
@@ -42,7 +40,7 @@ class SavedSource:
     """What the motion since the node adds to the variances, or empty; see `motion_noise`."""
     edges: Integers = field(default_factory=lambda: np.empty(0, dtype=np.int64))
     """With estimated statistics, rows of the edges that hold the measurements, or empty."""
-    next_estimate: int = FIRST_ESTIMATE
+    next_estimate: int = LEAST_POSITIONS
     """Number of measurements at which its errors are estimated next."""
     odometry_scale: float = 1.0
     """Factor on the sigmas of odometry that its measurements show."""
@@ -74,7 +72,7 @@ class SourceConstraints:
         """The newest report."""
         self.n_otherwise = 0
         """Constraints of a loaded graph that were added under other settings."""
-        self.next_estimate = FIRST_ESTIMATE
+        self.next_estimate = LEAST_POSITIONS
         """Number of measurements at which the errors are estimated next."""
         self.odometry_scale = 1.0
         """Factor on the sigmas of odometry that the measurements show."""

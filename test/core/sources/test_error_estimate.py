@@ -92,8 +92,17 @@ def test_the_time_constant_is_found_within_a_factor(tau: float, period: float, n
     {'drift': 0.3}, {'drift': 3.0}, {'wrong': 0.2}], ids=str)
 def test_white_errors_are_not_taken_for_correlated_ones(settings: dict[str, float]) -> None:
     """Nor the drift of odometry that is better or worse than it says, nor wrong positions."""
-    for seed in range(12):
-        assert finished(search(a_drive(seed, **settings))).errors is None
+    taken = [finished(search(a_drive(seed, **settings))).errors for seed in range(12)]
+    assert sum(errors is not None for errors in taken) <= 1     # by chance in one of a hundred
+
+
+@pytest.mark.parametrize(('n', 'period', 'tau'), [
+    (12, 1.0, 60.0), (30, 1.0, 10.0), (30, 1.0, 60.0), (30, 1.0, 300.0), (30, 5.0, 30.0)])
+def test_correlated_errors_show_in_few_positions(n: int, period: float, tau: float) -> None:
+    """Even where all of them are within one time constant: they scatter less than is claimed."""
+    found = [finished(search(a_drive(seed, n=n, period=period, tau=tau))).errors
+             for seed in range(12)]
+    assert sum(errors is not None for errors in found) >= 10
 
 
 def test_correlated_errors_are_found_among_wrong_positions() -> None:
