@@ -45,11 +45,13 @@ class Refiner:
         self._judge, self._tuner = judge, tuner
         self.finished = True
         """Whether there is nothing to refine until the next update."""
+        self._tests = False
+        """Whether closures may wait for a test since the last update."""
         self._cursor = self._unchanged = self._reweightings = 0
 
     def restart(self) -> None:
         """Begin again, after an update."""
-        self.finished = False
+        self.finished, self._tests = False, True
         self._unchanged = self._reweightings = 0
 
     def reweight(
@@ -81,9 +83,10 @@ class Refiner:
 
     def refine(self) -> Refinement:
         """
-        Do one step of the tuner, or one iteration.
+        Do one step of the tuner, test closures that wait, or do one iteration.
 
-        Where there is nothing to iterate any more, weigh and judge again.
+        The estimate of an update is good enough for tests, and what is found changes it more than
+        iterations do. Where there is nothing to iterate any more, weigh and judge again.
         """
         if self._smoother.graph.has_touched:
             self.finished = True    # an update that failed; the next one eliminates all nodes
@@ -94,6 +97,10 @@ class Refiner:
             if moved > 0.0:
                 self.restart()
             return Refinement(finished=False, moved=moved)
+        self._tests = self._tests and self._judge.test()
+        if self._tests:
+            self.restart()
+            return Refinement(finished=False, moved=0.0)
         result = self._smoother.refine()
         if result.finished:
             result = self._reweight(result.moved)

@@ -76,6 +76,7 @@ class Beliefs:
             if result.reason == DIVERGED:
                 self.trial.begin(changes, weights)
             return False
+        self.trial.was_not_needed()
         self._keep(changes)
         return True
 
@@ -116,6 +117,7 @@ class Beliefs:
             bad = trial.misfits(self._table)
             if len(bad) == 0 and trial.adopt():
                 self._keep(changes)
+                later |= set(changes)
             for number in bad:
                 before, states.state[number] = int(states.state[number]), DOUBTED
                 states.announce(number, before, self.now_ns)

@@ -38,6 +38,7 @@ from pose_graph_ros.core.judgement.closure_states import (
 )
 from pose_graph_ros.core.judgement.closures import chances, claims, ClosureTable, GATE
 from pose_graph_ros.core.judgement.consistency import OdometryChain
+from pose_graph_ros.core.judgement.retests import Retests
 from pose_graph_ros.core.judgement.scale_learner import ScaleLearner
 from pose_graph_ros.core.judgement.set_search import SetSearch
 from pose_graph_ros.core.judgement.texts import sentence
@@ -66,11 +67,6 @@ MOST_NEW, IN_UPDATE, IN_PART, NODES_IN_PART = 32, 16, 64, 160_000
 # Number of nodes above which an update adds closures with weight 0 and leaves all tests to the
 # work after it, so that it has nothing to solve for but what is new.
 LARGE = 500
-# How often a closure is thrown out before it waits for the next closure to come: those that
-# contradict one another could otherwise take turns for ever.
-MOST_TURNS = 2
-# Number of times that throwing some out diverges, and is tried on a copy, until a closure comes.
-MOST_ATTEMPTS = 20
 
 
 class ClosureJudge:
@@ -91,11 +87,7 @@ class ClosureJudge:
         self._table = ClosureTable(self._chain)
         self.states = self._states = ClosureStates()
         self.reports = ClosureReports(self._states, self._table)
-        self._tested = GrowingArray((), np.int64)
-        """The round in which it was tested last."""
-        self._turns = GrowingArray((), np.int64)
-        self._n_diverged = 0
-        """How often it was thrown out since the last closure came."""
+        self._retests = Retests()
         self._final = (0, 0, 0, -1)
         """Sizes of the graph and round at the last final decision."""
         self._n_staged = 0
@@ -103,8 +95,6 @@ class ClosureJudge:
         """Whether a clique of closures outside of the graph supports one that is doubted."""
         self._search = SetSearch(self._states, self._table)
         self._beliefs = Beliefs(smoother, reweighting, self._states, self._table)
-        self._tries = False
-        """Whether the present part of the work began with a trial."""
         self._scales = ScaleLearner(smoother, self._states, self._table, self._beliefs, config)
 
     def configure(self, config: BackendConfig) -> None:
@@ -146,7 +136,7 @@ class ClosureJudge:
         if not np.any(self._states.in_graph[numbers]):
             return None
         self._states.state[numbers] = WAITING
-        self._tested.values[numbers] = -1
+        self._retests.again(numbers.tolist())
         return self._beliefs.weights(numbers)
 
     def solve_later(self) -> None:
@@ -159,8 +149,7 @@ class ClosureJudge:
 
     def _append_unknown(self, n: int) -> None:
         """Append n closures that were not tested yet."""
-        self._tested.append(np.full(n, -1))
-        self._turns.append(np.zeros(n, dtype=np.int64))
+        self._retests.append(n)
         self._corroborated.append(np.zeros(n, dtype=bool))
         self._scales.add_sources()
 
@@ -169,16 +158,15 @@ class ClosureJudge:
         self.reports.forget()
         self._table.drop(self._n_staged)
         self._states.drop(self._n_staged)
-        for array in (self._tested, self._turns, self._corroborated):
-            array.truncate(len(self._states))
+        self._retests.truncate(len(self._states))
+        self._corroborated.truncate(len(self._states))
         self._n_staged = 0
 
     def commit(self) -> None:
         """Keep the closures of the last `before`."""
         begin, self._n_staged = len(self._states) - self._n_staged, 0
         if begin < len(self._states):
-            self._turns.values[:] = 0
-            self._n_diverged = 0
+            self._retests.begin_turns()
         for number in range(begin, len(self._states)):
             self._states.announce(number, -1, self._beliefs.now_ns)
         for source in np.unique(self._states.source[begin:]).tolist():
@@ -199,7 +187,7 @@ class ClosureJudge:
         relative.distances(errors, total, distance)
         self._table.set_spread(numbers, spread)
         self._states.distance[numbers] = distance
-        self._tested.values[numbers] = self._beliefs.round
+        self._retests.tested(numbers, self._beliefs.round)
         passes = distance < GATE
         for number, state in zip(
                 numbers.tolist(), np.where(passes, WAITING, DOUBTED).tolist(), strict=True):
@@ -213,10 +201,21 @@ class ClosureJudge:
         return numbers[passes], chances(total[passes], self._smoother.poses)
 
     def _choose(self, passed: IntArray, chance: FloatArray) -> dict[int, State]:
-        """Return which closures that have passed are believed now; of wide gates only one."""
+        """
+        Return which closures that have passed are believed now.
+
+        Of wide gates only one is, and of those that have failed before.
+
+        Parameters
+        ----------
+        passed : ndarray of int, shape (M,)
+        chance : ndarray, shape (M,)
+
+        """
         chosen: dict[int, State] = {}
-        for k in np.argsort(chance, kind='stable').tolist():
-            if chance[k] > NARROW and len(chosen) > 0:
+        failures = self._retests.failures(passed)
+        for k in np.lexsort((chance, failures)).tolist():
+            if (chance[k] > NARROW or failures[k] > 0) and len(chosen) > 0:
                 break
             state = self._belief(int(passed[k]), float(chance[k]))
             if state.in_graph:
@@ -245,20 +244,20 @@ class ClosureJudge:
 
     def work(self) -> bool:
         """Do a bounded part of what is left; tell whether there is more."""
-        graph = self._smoother.graph
-        if graph.has_touched:
-            return False
-        self._tries = not self._tries   # a trial and the tests take turns
-        most = max(min(IN_PART, NODES_IN_PART // max(graph.n_nodes, 1)), 1)
-        return ((self._tries and self._try()) or self._part(most) or self._try()
-                or self._learn_scales() or self._look_for_another_set())
+        return not self._smoother.graph.has_touched and (
+            self.test() or self._try() or self._learn_scales() or self._look_for_another_set())
+
+    def test(self) -> bool:
+        """Do a bounded part of the tests that are left; tell whether there was any."""
+        n_nodes = max(self._smoother.graph.n_nodes, 1)
+        return self._part(max(min(IN_PART, NODES_IN_PART // n_nodes), 1))
 
     def _try(self) -> bool:
         """Do a part of a trial; tell whether there is any."""
         before, again = self._beliefs.round, self._beliefs.try_part()
         if again is None:
             return False
-        self._tested.values[again] = -1
+        self._retests.again(again)
         if self._beliefs.round > before:
             self._table.forget_spread()
         return True
@@ -270,17 +269,15 @@ class ClosureJudge:
 
     def _throw_out(self) -> bool:
         """Take out of the graph what does not fit any more; tell whether there was any."""
-        inside = np.flatnonzero(self._states.in_graph & self._states.judged)
+        # where the graph cannot be solved without them, that is not tried for ever
+        resting = self._retests.resting(self._smoother.graph.n_nodes)
+        inside = np.flatnonzero(self._states.in_graph & self._states.judged & ~resting)
         inside = inside[self._may_not_fit(inside)]
         fit = relative.residuals(self._smoother.graph, self._table.rows(inside))
         bad = inside[fit > GATE]
-        # where the graph cannot be solved without them, that is not tried for ever
-        if len(bad) == 0 or self._n_diverged >= MOST_ATTEMPTS:
+        if not self._change(dict.fromkeys(bad.tolist(), State.DOUBTED)):
             return False
-        if not self._beliefs.apply(dict.fromkeys(bad.tolist(), State.DOUBTED)):
-            self._n_diverged += 1
-            return False
-        self._turns.values[bad] += 1
+        self._retests.thrown_out(bad)
         # without them the graph is less certain
         self._table.forget_spread()
         return True
@@ -293,9 +290,10 @@ class ClosureJudge:
 
     def _test_again(self, most: int) -> bool:
         """Test some closures that wait; tell whether some are left."""
-        waiting = np.flatnonzero(~self._states.in_graph & self._states.judged
-                                 & (self._tested.values < self._beliefs.round)
-                                 & (self._turns.values < MOST_TURNS))
+        waiting = np.flatnonzero(
+            ~self._states.in_graph & self._states.judged
+            & self._retests.due(self._beliefs.round, self._smoother.graph.n_nodes,
+                                failed=not self._beliefs.trial.is_pausing))
         if len(waiting) == 0:
             return False
         some, errors = self._table.rows(waiting), np.empty((len(waiting), 3))
@@ -306,11 +304,26 @@ class ClosureJudge:
         relative.distances(errors, spread + some.noise, least)
         known = spread[:, 0, 0] > 0.0
         hopeless = known & ~(least < GATE)
-        self._tested.values[waiting[hopeless]] = self._beliefs.round
+        self._retests.tested(waiting[hopeless], self._beliefs.round)
         rest = waiting[~hopeless]
         rest = rest[np.argsort(np.where(known, least, 0.0)[~hopeless], kind='stable')]
-        chosen = self._choose(*self._test(rest[:most]))
-        return (len(chosen) > 0 and self._beliefs.apply(chosen)) or len(rest) > most
+        passed, chance = self._test(rest[:most])
+        chosen = self._choose(passed, chance)
+        if self._change(chosen):
+            return True
+        # what the update diverges with does not keep out the others
+        others = np.setdiff1d(passed, [*chosen]) if len(chosen) > 0 else passed[:0]
+        self._retests.again(others.tolist())
+        return len(rest) > most or len(others) > 0
+
+    def _change(self, states: dict[int, State]) -> bool:
+        """Change states; tell whether there were any, and the update has not diverged."""
+        if len(states) == 0:
+            return False
+        done = self._beliefs.apply(states)
+        if not done:
+            self._retests.failed(states, self._smoother.graph.n_nodes)
+        return done
 
     def decide_finally(self) -> None:
         """
@@ -335,7 +348,7 @@ class ClosureJudge:
             return
         self._learn_scales()
         # nothing is to be tested again until something changes
-        self._tested.values[:] = self._beliefs.round
+        self._retests.tested(slice(None), self._beliefs.round)
         self._final = *present[:-1], self._beliefs.round
 
     def state(self) -> Callable[[], None]:
@@ -347,7 +360,7 @@ class ClosureJudge:
             self._scales.set_state(*scales)
             self._search = SetSearch(self._states, self._table)
             self._beliefs.trial.end()
-            self._tested.values[:] = -1
+            self._retests.again(slice(None))
             self._table.forget_spread()
         return bring_back
 

@@ -4,10 +4,13 @@
 Beliefs that an update cannot change in its time, as its iterations diverge with them.
 
 The graph is solved with them as a copy, part by part, between the updates (`smoother/trial.py`).
-The result is adopted if they fit there.
+The result is adopted if they fit there. Trials that follow one another, with no update between
+that could do without, have longer and longer pauses: also where nothing else succeeds any more,
+they take a time in proportion to the drive.
 """
 
 from collections.abc import Mapping
+import math
 
 import numpy as np
 
@@ -19,6 +22,10 @@ from pose_graph_ros.core.judgement.closures import ClosureTable, GATE
 from pose_graph_ros.core.judgement.verdicts import State
 from pose_graph_ros.core.smoother.incremental import IncrementalSmoother
 from pose_graph_ros.core.smoother.trial import Trial
+
+# Number of trials without a pause. After each further one the graph has to grow by this share of
+# its size until the next one, doubled so many times.
+WITHOUT_PAUSE, PAUSE, MOST_DOUBLINGS = 3, 0.01, 5
 
 
 class ClosureTrial:
@@ -42,6 +49,10 @@ class ClosureTrial:
         """Whether it is a whole set, whose residuals were compared already."""
         self.later: set[int] = set()
         """Numbers of closures that another update has diverged with meanwhile."""
+        self._n_needed = 0
+        """How many more updates have diverged than succeeded, of those that change beliefs."""
+        self._next_at = 0
+        """Size of the graph from which on there may be another trial."""
 
     def begin(
         self, changes: Mapping[int, State], weights: Mapping[int, float],
@@ -49,6 +60,8 @@ class ClosureTrial:
     ) -> None:
         """
         Begin a trial; while another one goes on, only note the closures for later.
+
+        Nothing happens during a pause, which does not hold for a whole set.
 
         Parameters
         ----------
@@ -60,9 +73,26 @@ class ClosureTrial:
         if self._trial is not None:
             self.later.update(changes)
             return
+        n_nodes = self._smoother.graph.n_nodes
+        if poses is None:
+            if self.is_pausing:
+                return
+            self._n_needed += 1
+            doublings = min(self._n_needed - WITHOUT_PAUSE, MOST_DOUBLINGS)
+            if doublings >= 0:
+                self._next_at = n_nodes + math.ceil(PAUSE * n_nodes * 2**doublings)
         self.changes, self.weights = dict(changes), dict(weights)
         self._is_set = poses is not None
         self._trial = self._smoother.trial(GraphUpdate(weigh_edges=self.weights), poses)
+
+    @property
+    def is_pausing(self) -> bool:
+        """Whether the graph has to grow until the next trial."""
+        return self._smoother.graph.n_nodes < self._next_at
+
+    def was_not_needed(self) -> None:
+        """Shorten the next pause, as an update has changed beliefs without a trial."""
+        self._n_needed = max(self._n_needed - 1, 0)
 
     def work(self) -> bool:
         """Do a part; tell whether there was any."""

@@ -137,6 +137,10 @@ class Judge:
         """Judge again what an update may have changed, in bounded time."""
         self._closures.after()
 
+    def test(self) -> bool:
+        """Do a bounded part of the tests of closures that wait; tell whether there was any."""
+        return self._closures.test()
+
     def work(self) -> bool:
         """Do a bounded part of what is left to be judged; tell whether there is more."""
         return self._closures.work()

@@ -4,7 +4,8 @@
 A trial: the graph with other weights, optimised as a copy while the graph itself goes on.
 
 The batch optimisation of a large graph takes much longer than an update may, so a trial is worked
-on in parts of at most an iteration; the last one eliminates the copy. The result can be compared
+on in parts of at most an iteration; the last one eliminates the copy. It fails where it takes many
+iterations: every update after it would take as many, or diverge. The result can be compared
 with the graph, and adopted by the smoother with all that was added meanwhile
 (`IncrementalSmoother.adopt`); or it is dropped, without a trace.
 """
@@ -21,7 +22,9 @@ from pose_graph_ros.core.geometry import se2
 from pose_graph_ros.core.geometry.se2 import FloatArray
 from pose_graph_ros.core.graph.graph import Graph, GraphUpdate
 
-_CONFIG = SolverConfig(max_iterations=50, step_tolerance=1e-6)
+# With more iterations it would converge where an update does not: at a minimum with errors so
+# large that Gauss-Newton leads away from it.
+_CONFIG = SolverConfig(max_iterations=optimizer.TRUSTED_ITERATIONS, step_tolerance=1e-6)
 # The others take longer than a part may.
 _STARTS = (Start.CHORDAL, Start.PRESENT)
 
@@ -73,7 +76,7 @@ class Trial:
                              if start is None else optimizer.in_parts(copy, _CONFIG))
         yield
         copy.set_poses(copy.poses)
-        if result.status is Status.FAILED or self._eliminate():
+        if result.status is Status.CONVERGED and self._eliminate():
             return result
         return replace(result, status=Status.FAILED)
 

@@ -78,6 +78,29 @@ class LeftOver(Counting):
         return super().adopt(trial)
 
 
+class Stuck(Counting):
+    """One whose steps diverge with any other weights, as those of a graph that is bent do."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.is_stuck, self.trials = True, 0
+
+    def update(self, update: GraphUpdate, *, fall_back: bool = True) -> UpdateResult:
+        if self.is_stuck and not fall_back and len(update.weigh_edges) > 0:
+            self.diverged += 1
+            return UpdateResult(Status.FAILED, DIVERGED, 0, 0, 0, 0)
+        return super().update(update, fall_back=fall_back)
+
+    def trial(self, update: GraphUpdate, poses: FloatArray | None = None) -> Trial:
+        self.trials += 1
+        return super().trial(update, poses)
+
+    def adopt(self, trial: Trial) -> UpdateResult:
+        if self.is_stuck:
+            return UpdateResult(Status.FAILED, 'a test wants it to fail', 0, 0, 0, 0)
+        return super().adopt(trial)
+
+
 def driven(
     n: int, smoother: Counting | None = None,
 ) -> tuple[PoseGraphBackend, Counting, FloatArray]:
@@ -194,6 +217,56 @@ def test_what_earlier_updates_have_left_over_is_solved_for_after_an_update() -> 
     assert states(backend) == {State.BELIEVED}
     assert (smoother.fallbacks, smoother.adopted) == (0, 1)
     assert smoother.chi2() <= best_chi2(backend.graph) * (1.0 + 1e-6)
+
+
+def test_where_every_update_diverges_the_work_is_in_proportion_to_the_drive() -> None:
+    smoother = Stuck()
+    backend, _, poses = driven(600, smoother)
+    for k in range(600, 1000):
+        pose = se2.compose(poses[-1], np.array([1.0, 0.0, 0.02]))
+        poses = np.concatenate((poses, pose[None]))
+        backend.add_odometry(OdometrySample((k + 1) * SECOND, pose))
+        if k % 10 == 0:
+            place = se2.between(poses[10], poses[-6]) + np.array([0.5, 0.3, 0.01])
+            add_group(backend, poses, place, 3)
+            backend.update()
+            work(backend)
+    # without pauses, all that wait would be tried again after each update, and on a copy
+    assert smoother.trials <= 8
+    assert smoother.diverged <= 150     # of 120 closures
+    assert State.BELIEVED not in states(backend)
+    smoother.is_stuck = False
+    for k in range(1000, 1400):
+        pose = se2.compose(poses[-1], np.array([1.0, 0.0, 0.02]))
+        poses = np.concatenate((poses, pose[None]))
+        backend.add_odometry(OdometrySample((k + 1) * SECOND, pose))
+    add_group(backend, poses, se2.between(poses[10], poses[-6]) + np.array([0.5, 0.3, 0.01]), 3)
+    backend.update()
+    work(backend)
+    assert states(backend) == {State.BELIEVED}
+
+
+def test_the_work_ends_where_the_graph_cannot_be_solved_without_what_does_not_fit() -> None:
+    smoother = Stuck()
+    smoother.is_stuck = False
+    backend, _, poses = driven(600, smoother)
+    place = se2.between(poses[10], poses[-12]) + np.array([0.5, 0.3, 0.01])
+    add_group(backend, poses, place, 6)
+    backend.update()
+    work(backend)
+    assert states(backend) == {State.BELIEVED}
+    place = se2.between(poses[10], poses[-16]) + np.array([0.0, 8.0, 0.0])
+    add_group(backend, poses, place, 8)
+    smoother.is_stuck = True
+    backend.update()
+    # a person believes what contradicts them, and the update that throws them out diverges
+    for number in range(6, 14):
+        backend.decide(f'scan/{number}', Decision.IN)
+    smoother.diverged = 0
+    work(backend)
+    assert 1 <= smoother.diverged <= 3
+    assert [each.state for each in backend.verdicts()[:6]] == [State.BELIEVED] * 6
+    assert backend.optimize().status is not Status.FAILED
 
 
 @pytest.mark.parametrize('parts', [1, 8])

@@ -145,3 +145,21 @@ def test_an_update_that_diverges_can_be_left_to_a_trial() -> None:
     again.graph.fill(smoother.graph.rows())
     assert again.update(GraphUpdate()).status is not Status.FAILED
     assert again.chi2() <= there * (1.0 + 1e-6)
+
+
+def test_a_minimum_that_later_updates_would_diverge_at_is_not_adopted() -> None:
+    # wrong closures bend a chain until Gauss-Newton leads away from the minimum
+    smoother, rng, n = IncrementalSmoother(), np.random.default_rng(4), 6
+    smoother.update(GraphUpdate(hidden=np.zeros((1, 3)), fix=[0]))
+    for _ in range(300):
+        smoother.extend(np.array([1.0, 0.0, 0.02]), np.diag([100.0, 100.0, 400.0]))
+    i = rng.integers(0, 140, n)
+    edges = Edges(i, i + rng.integers(100, 160, n), rng.uniform(-1.0, 1.0, (n, 3)) * (30, 30, 3),
+                  [np.diag([1e4, 1e4, 1e4])] * n, [EdgeKind.LOOP_CLOSURE] * n, weight=[0.0] * n)
+    smoother.update(GraphUpdate(edges=edges))
+    before = state(smoother.graph)
+    trial = smoother.trial(GraphUpdate(weigh_edges=dict.fromkeys(range(300, 300 + n), 1.0)))
+    assert finished(trial) < 100
+    assert status(trial) is Status.FAILED
+    assert smoother.adopt(trial).status is Status.FAILED
+    assert differences(before, state(smoother.graph)) == []
