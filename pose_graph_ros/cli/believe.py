@@ -13,6 +13,7 @@ from pose_graph_ros.core.geometry.se2 import BoolArray, FloatArray, IntArray
 from pose_graph_ros.core.graph.constraints import EdgeKind, Edges
 from pose_graph_ros.core.graph.graph import Graph, GraphUpdate
 from pose_graph_ros.core.judgement import selection
+from pose_graph_ros.core.judgement.residual_scale import give_scale
 
 # Number of sets of closures that are tried to join parts that no odometry joins.
 TRIES = 5
@@ -30,6 +31,8 @@ class BelievedEdges:
     """Number of parts that odometry does not join."""
     poses: FloatArray
     """Of all nodes, shape (N, 3) [m, m, rad]."""
+    scale: float
+    """Factor on the sigmas of closures that those believed show, at least 1."""
 
 
 def believe(graph: Graph, sigmas: FloatArray) -> BelievedEdges | None:
@@ -48,8 +51,8 @@ def believe(graph: Graph, sigmas: FloatArray) -> BelievedEdges | None:
     edges = selection.forward(graph.edges)
     is_closure = np.abs(edges.j - edges.i) != 1
     kind = np.where(is_closure, EdgeKind.LOOP_CLOSURE, EdgeKind.ODOMETRY).astype(np.uint8)
-    softened = selection.floored(edges, sigmas).information
-    information = np.where(is_closure[:, None, None], softened, edges.information)
+    given, softened = edges.information, selection.floored(edges, sigmas).information
+    information = np.where(is_closure[:, None, None], softened, given)
     edges = Edges(edges.i, edges.j, edges.mean, information, kind, edges.weight, edges.bias)
     closures = np.flatnonzero(is_closure & (edges.weight > 0.0) & (edges.i != edges.j))
     parts = _Parts(graph.n_nodes)
@@ -64,7 +67,14 @@ def believe(graph: Graph, sigmas: FloatArray) -> BelievedEdges | None:
     if best is None:
         return None
     doubted = best_rows[~best.believed]
-    return BelievedEdges(closures, ~np.isin(closures, doubted), n_parts, best.poses)
+    believed = ~np.isin(closures, doubted)
+    copy = Graph()
+    copy.fill(graph.rows()._replace(edges=Edges(
+        edges.i, edges.j, edges.mean, given, kind, edges.weight, edges.bias)))
+    copy.apply(GraphUpdate(remove_edges=doubted.tolist()))
+    copy.set_poses(best.poses)
+    scale = give_scale(copy, closures[believed])
+    return BelievedEdges(closures, believed, n_parts, copy.poses.copy(), scale)
 
 
 def _choice(graph: Graph, edges: Edges, closures: IntArray) -> Choice | None:

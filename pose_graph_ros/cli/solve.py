@@ -46,7 +46,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument('--closure-sigma', nargs=2, type=float, metavar=('M', 'RAD'),
                         default=(CLOSURE_FLOORS[0], CLOSURE_FLOORS[2]),
                         help='least standard deviations of loop closures for this decision '
-                             '(default: %(default)s); the result has those of the file')
+                             '(default: %(default)s); the result has those of the file, '
+                             'times what the residuals show')
     parser.add_argument('--edge2', choices=EDGE2_ORDERS,
                         help='format of the tag EDGE2 in this file')
 
@@ -105,6 +106,11 @@ def _doubt(file: GraphFile, sigma: Sequence[float]) -> IntArray:
           f'{len(doubted)} doubted')
     graph.set_poses(beliefs.poses)
     graph.apply(GraphUpdate(remove_edges=doubted.tolist()))
+    if beliefs.scale > 1.0:
+        print(f'by their residuals, sigmas of loop closures are {beliefs.scale:.2g} times those '
+              f'of the file, and count so')
+        graph.apply(GraphUpdate(weigh_edges=dict.fromkeys(
+            beliefs.closures[beliefs.believed].tolist(), beliefs.scale**-2.0)))
     edges = graph.edges_at(doubted)
     errors = edge_errors(graph.poses, edges)
     squares = energies_of(errors, edges.information)

@@ -346,7 +346,8 @@ class ClosureJudge:
         self._scales.begin()
         if not self._change_to(inside, choice.poses):
             return
-        self._learn_scales()
+        if self._scales.learn_all():
+            self._table.forget_spread()
         # nothing is to be tested again until something changes
         self._retests.tested(slice(None), self._beliefs.round)
         self._final = *present[:-1], self._beliefs.round

@@ -110,6 +110,10 @@ class ClosureTable:
         slots = self._slots(numbers)
         return Closures(*(column.values[slots] for column in self._columns[:4]))
 
+    def travel(self, nodes: IntArray) -> FloatArray:
+        """Return the lengths of the path to nodes by odometry, shape (K,) [m]."""
+        return self._chain.travel(nodes)
+
     def _slots(self, numbers: IntArray) -> IntArray:
         slots: IntArray = self._slot.values[numbers]
         assert np.all(slots >= 0)

@@ -5,17 +5,25 @@
 import numpy as np
 
 from pose_graph_ros.core.config import BackendConfig
-from pose_graph_ros.core.geometry.se2 import IntArray
+from pose_graph_ros.core.geometry.se2 import BoolArray, IntArray
 from pose_graph_ros.core.judgement.beliefs import Beliefs
 from pose_graph_ros.core.judgement.closure_states import ClosureStates, STATES
 from pose_graph_ros.core.judgement.closures import ClosureTable
-from pose_graph_ros.core.judgement.residual_scale import agreement_scale, MOST, residual_scale
+from pose_graph_ros.core.judgement.residual_scale import (
+    agreement_scale,
+    MOST,
+    places,
+    residual_scale,
+    ROUNDS,
+)
 from pose_graph_ros.core.measurements import LoopClosure
 from pose_graph_ros.core.smoother.incremental import IncrementalSmoother
 
 # A source is looked at again when this many times as many of its closures are believed as the
 # last time, and this many more.
 MORE, AND_MORE = 1.25, 5
+# Largest number of closures that are looked at at the end.
+MOST_AT_END = 1000
 
 
 class ScaleLearner:
@@ -79,30 +87,68 @@ class ScaleLearner:
 
     def learn(self) -> bool:
         """Learn the factor of a source with many more closures; tell whether one has changed."""
-        believed = np.flatnonzero(self._states.in_graph)
-        for source, name in enumerate(self._states.sources):
-            numbers = believed[self._states.source[believed] == source]
-            if self._fixed(name) or len(numbers) < MORE * self._learnt_from[source] + AND_MORE:
-                continue
-            self._learnt_from[source] = len(numbers)
-            scale, before = self._shown(source, numbers), self._beliefs.scales[source]
-            if scale == before:
-                continue
-            self._beliefs.scales[source] = scale
-            if not self._beliefs.apply({
-                    k: STATES[self._states.state[k]] for k in numbers.tolist()}):
-                self._beliefs.scales[source] = before
-            return True
+        for source in range(len(self._states.sources)):
+            n_believed = int(np.sum(self._of(source)))
+            if n_believed >= MORE * self._learnt_from[source] + AND_MORE:
+                self._learnt_from[source] = n_believed
+                if self._learn(source):
+                    return True
         return False
 
-    def _shown(self, source: int, numbers: IntArray) -> float:
+    def learn_all(self) -> bool:
+        """
+        Learn all factors from 1, which they are to be; tell whether one has changed.
+
+        Residuals are those with the present factor, so a source is looked at until it shows none
+        that is larger.
+        """
+        changed = False
+        for source in range(len(self._states.sources)):
+            self._learnt_from[source] = int(np.sum(self._of(source)))
+            if self._learnt_from[source] >= AND_MORE:
+                for _ in range(ROUNDS):
+                    if not self._learn(source, larger=True):
+                        break
+                    changed = True
+        return changed
+
+    def _of(self, source: int) -> BoolArray:
+        """Tell which closures of a source are believed, shape (M,)."""
+        return np.asarray(self._states.in_graph & (self._states.source == source))
+
+    def _learn(self, source: int, *, larger: bool = False) -> bool:
+        """Learn the factor of a source, if it is a `larger` one; tell whether it has changed."""
+        before = self._beliefs.scales[source]
+        if self._fixed(self._states.sources[source]):
+            return False
+        numbers = np.flatnonzero(self._of(source))
+        scale = self._shown(source, numbers, MOST_AT_END if larger else MOST)
+        if scale == before or (larger and scale < before):
+            return False
+        self._beliefs.scales[source] = scale
+        if self._beliefs.apply({k: STATES[self._states.state[k]] for k in numbers.tolist()}):
+            return True
+        self._beliefs.scales[source] = before
+        return not larger
+
+    def _shown(self, source: int, numbers: IntArray, most: int) -> float:
         """Return the factor that the believed closures of a source show."""
         states, graph = self._states, self._smoother.graph
-        some = numbers[np.lexsort(states.stamps_ns[numbers].T)]
-        some = some[np.linspace(0, len(some) - 1, min(len(some), MOST)).astype(np.int64)]
-        edges = graph.edges_at(states.row[some])
-        inside = states.in_graph & (states.source == source)
+        some, group = self._sample(numbers, most)
+        edges, inside = graph.edges_at(states.row[some]), self._of(source)
         return max(
-            residual_scale(*self._smoother.edge_innovations(edges), edges.information,
+            residual_scale(*self._smoother.edge_innovations(edges), edges.information, group,
                            self._beliefs.scales[source]),
             agreement_scale(self._table, some, inside, graph.edges_at(states.row[inside])))
+
+    def _sample(self, numbers: IntArray, most: int) -> tuple[IntArray, IntArray]:
+        """Return at most so many closures, from all along the path, and the group of each."""
+        group = places(self._table, self._smoother.graph.edges_at(self._states.row[numbers]))
+        n_groups = int(group.max()) + 1
+        n_chosen = min(max(n_groups * most // len(numbers), 1), n_groups)
+        chosen = np.linspace(0, n_groups - 1, n_chosen).astype(np.int64)
+        some = np.flatnonzero(np.isin(group, chosen))
+        # by their stamps, as numbers depend on the order of arrival
+        some = some[np.lexsort((*self._states.stamps_ns[numbers[some]].T, group[some]))][:most]
+        _, of_each = np.unique(group[some], return_inverse=True)
+        return numbers[some], of_each.ravel()

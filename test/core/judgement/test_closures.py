@@ -24,7 +24,6 @@ from pose_graph_ros.core.graph.graph import GraphUpdate
 from pose_graph_ros.core.io.graph_files import read_graph, write_graph
 from pose_graph_ros.core.judgement import relative
 from pose_graph_ros.core.judgement.closures import claims, GATE
-from pose_graph_ros.core.judgement.residual_scale import residual_scale
 from pose_graph_ros.core.judgement.verdicts import Decision, State, Verdict
 from pose_graph_ros.core.measurements import AnswerStatus, LoopClosure, OdometrySample
 
@@ -323,21 +322,6 @@ def test_claims_are_floored_and_lead_from_the_earlier_to_the_later_node() -> Non
     floored = np.diag(np.square(CLOSURE_FLOORS))
     assert error @ np.linalg.solve(claim.noise[0], error) == pytest.approx(
         back @ np.linalg.solve(floored, back), rel=1e-4)
-
-
-@pytest.mark.parametrize('factor', [0.5, 1.0, 2.5])
-def test_the_scale_of_the_sigmas_is_found_in_the_residuals(factor: float) -> None:
-    """Linear world: M noisy measurements each of 10 vectors, with the optimum as the estimate."""
-    rng = np.random.default_rng(11)
-    sigmas = np.array([0.2, 0.3, 0.05])
-    measured = factor * sigmas * rng.normal(size=(10, 8, 3))
-    errors = (measured.mean(axis=1, keepdims=True) - measured).reshape(-1, 3)
-    information = np.tile(np.diag(sigmas**-2.0), (80, 1, 1))
-    scale = 1.0
-    for _ in range(5):
-        scale = residual_scale(
-            errors, scale**2 * np.tile(np.diag(sigmas**2 / 8.0), (80, 1, 1)), information, scale)
-    assert scale == pytest.approx(max(factor, 1.0), rel=0.2)
 
 
 @pytest.mark.parametrize('factor', [0.5, 1.0, 2.5])
