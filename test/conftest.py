@@ -4,8 +4,10 @@
 Coverage is measured in the processes that run tests, and not in the nodes that these start.
 
 Nodes would take twice as long under a tracer, and what they run has tests without a process. A
-long test repeats the same lines, so it is traced at its beginning alone. The folder ros is left
-out of this, as its tests use signals themselves; those marked `untraced` have no tracer at all.
+long test repeats the same lines, and so do the cases of one that is parametrized: each function is
+traced for a while only, all its cases together. In the folder ros it is the threads of a file
+that are traced for a while only. Those marked `untraced`, as all with a node in another process,
+have no tracer at all.
 """
 
 from collections.abc import Iterator
@@ -15,6 +17,8 @@ import os
 import pkgutil
 import signal
 import sys
+import threading
+import time
 
 import pytest
 
@@ -22,8 +26,11 @@ import pose_graph_ros
 
 OTHERS = ('numba', 'scipy.optimize', 'hypothesis', 'matplotlib', 'rosbags.highlevel', 'rclpy.node')
 """Modules whose imports take long."""
-TRACED = 0.25
-"""Time of the processor for which a test is traced [s]."""
+TRACED, TRACED_THREADS = 0.15, 6.0
+"""Time of the processor for which a function is traced, and the threads of a file [s]."""
+
+_left: dict[object, float] = {}
+"""Rest of that time, by file or function."""
 
 if 'PYTEST_XDIST_WORKER' in os.environ:
     os.environ.pop('COVERAGE_PROCESS_CONFIG', None)
@@ -57,15 +64,31 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
 
 @pytest.fixture(autouse=True)
 def _tracer(request: pytest.FixtureRequest) -> Iterator[None]:
-    tracer = sys.gettrace()
+    tracer, threads = sys.gettrace(), threading.gettrace()
     if tracer is None:
         yield
         return
-    if request.node.get_closest_marker('untraced') is not None:
+
+    def stop(*_: object) -> None:
         sys.settrace(None)
-    elif request.path.parent.name != 'ros':
-        signal.signal(signal.SIGVTALRM, lambda *_: sys.settrace(None))
-        signal.setitimer(signal.ITIMER_VIRTUAL, TRACED)
+        threading.settrace(None)
+
+    in_process = request.path.parent.name == 'ros'
+    key = request.path if in_process else (request.path, request.cls, request.function.__name__)
+    left = _left.get(key, TRACED_THREADS if in_process else TRACED)
+    began = time.process_time()
+    if request.node.get_closest_marker('untraced') is not None:
+        stop()
+    elif in_process:
+        if left <= 0.0:
+            threading.settrace(None)
+    elif left <= 0.0:
+        stop()
+    else:
+        signal.signal(signal.SIGVTALRM, stop)
+        signal.setitimer(signal.ITIMER_VIRTUAL, left)
     yield
     signal.setitimer(signal.ITIMER_VIRTUAL, 0.0)
+    _left[key] = left - (time.process_time() - began)
+    threading.settrace(threads)
     sys.settrace(tracer)

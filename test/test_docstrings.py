@@ -4,6 +4,7 @@
 
 import ast
 from collections.abc import Iterator
+import functools
 from pathlib import Path
 import re
 
@@ -21,10 +22,14 @@ FRAMEWORK = re.compile(r'on_(configure|activate|deactivate|cleanup|shutdown|erro
 Function = ast.FunctionDef | ast.AsyncFunctionDef
 
 
+@functools.cache
+def parsed(path: Path) -> ast.Module:
+    return ast.parse((PACKAGE / path).read_text(encoding='utf-8'))
+
+
 def public_functions(path: Path) -> Iterator[tuple[str, Function, str | None]]:
     """Yield name, definition and docstring; that of a class stands for its `__init__`."""
-    tree = ast.parse((PACKAGE / path).read_text(encoding='utf-8'))
-    for node in tree.body:
+    for node in parsed(path).body:
         if isinstance(node, Function) and not node.name.startswith('_'):
             yield node.name, node, ast.get_docstring(node)
         elif isinstance(node, ast.ClassDef) and not node.name.startswith('_'):
@@ -96,8 +101,7 @@ def test_docstrings_say_what_goes_in_and_what_comes_out(path: Path) -> None:
 
 @pytest.mark.parametrize('path', MODULES, ids=str)
 def test_no_docstring_goes_on_in_the_next(path: Path) -> None:
-    tree = ast.parse((PACKAGE / path).read_text(encoding='utf-8'))
-    for node in ast.walk(tree):
+    for node in ast.walk(parsed(path)):
         if isinstance(node, ast.Expr) and isinstance(node.value, ast.Constant) and isinstance(
                 node.value.value, str):
             text = node.value.value.strip()
@@ -108,6 +112,6 @@ def test_no_docstring_goes_on_in_the_next(path: Path) -> None:
 @pytest.mark.parametrize('path', MODULES, ids=str)
 def test_a_package_says_what_happens_in_it(path: Path) -> None:
     if path.name == '__init__.py' and len(path.parts) > 1:
-        docstring = ast.get_docstring(ast.parse((PACKAGE / path).read_text(encoding='utf-8')))
+        docstring = ast.get_docstring(parsed(path))
         assert docstring is not None
         assert docstring.count('. ') + docstring.count('.\n') + docstring.endswith('.') >= 3, path

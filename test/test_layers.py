@@ -3,7 +3,7 @@
 """Which package may import which, read from the imports themselves."""
 
 import ast
-from collections.abc import Iterator
+import functools
 from graphlib import TopologicalSorter
 from pathlib import Path
 import subprocess
@@ -50,14 +50,17 @@ LOGIC = ('announcements', 'decisions', 'input', 'liveness', 'log', 'memory', 'po
 MOST_LINES = 450
 
 
-def imports(path: Path) -> Iterator[str]:
-    """Yield the full names of all that a module imports; `from a import b` counts as `a.b`."""
+@functools.cache
+def imports(path: Path) -> list[str]:
+    """Return the full names of all that a module imports; `from a import b` counts as `a.b`."""
+    found: list[str] = []
     for node in ast.walk(ast.parse((PACKAGE / path).read_text(encoding='utf-8'))):
         if isinstance(node, ast.Import):
-            yield from (alias.name for alias in node.names)
+            found += [alias.name for alias in node.names]
         elif isinstance(node, ast.ImportFrom):
             assert node.level == 0, f'{path}:{node.lineno}: a relative import'
-            yield from (f'{node.module}.{alias.name}' for alias in node.names)
+            found += [f'{node.module}.{alias.name}' for alias in node.names]
+    return found
 
 
 def package_of(module: str) -> str:

@@ -12,6 +12,8 @@ from lifecycle_msgs.msg import State, Transition
 from lifecycle_msgs.srv import ChangeState, GetState
 import pytest
 
+pytestmark = pytest.mark.untraced
+
 
 class Manager:
     """Asks for states and transitions, as a lifecycle manager does."""

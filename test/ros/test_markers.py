@@ -159,7 +159,7 @@ def test_markers_are_byte_for_byte_what_rclpy_makes(
     assert_same(random_view(counts), frame)
 
 
-@settings(deadline=None, derandomize=True)
+@settings(deadline=None, derandomize=True, max_examples=40)
 @given(frames, st.tuples(*[counts] * 8), st.integers(0, 100))
 def test_the_same_for_any_frame_and_graph(
     frame: str, counts: tuple[int, ...], seed: int,

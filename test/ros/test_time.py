@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from rosgraph_msgs.msg import Clock
 
+pytestmark = pytest.mark.untraced
 LOOPS = 10
 DATUM = ('-p', 'datum:=[48.1, 11.6]')
 
