@@ -75,6 +75,16 @@ class OdometryChain:
         """Rows of the nodes in the graph, in their order."""
         return self._rows.values
 
+    @property
+    def poses(self) -> FloatArray:
+        """Their poses by odometry, in the first one, shape (M, 3)."""
+        return self._poses.values
+
+    @property
+    def sums(self) -> FloatArray:
+        """Upper triangles of the summed covariances of the edges up to them, shape (M, 6)."""
+        return self._sums.values
+
     def extend(self, graph: Graph) -> None:
         """Append the nodes that were added to the graph since; the work is linear in these."""
         if len(self) == 0:

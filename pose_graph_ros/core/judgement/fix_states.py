@@ -61,6 +61,15 @@ class SavedFixes:
     """Their weights."""
 
 
+class _Tally:
+    """What is believed of one source."""
+
+    def __init__(self) -> None:
+        self.n = self.n_believed = 0
+        self.newest: deque[int] = deque(maxlen=NEWEST)
+        """Numbers of its newest records."""
+
+
 class FixStates:
     """Records of what is decided, and the changes that are to be announced."""
 
@@ -68,7 +77,7 @@ class FixStates:
         self._records = GrowingArray((10,), np.int64)
         self._distances = GrowingArray((), np.float64)
         self.sources: list[str] = []
-        self._counts: list[int] = []
+        self._tallies: list[_Tally] = []
         self._changes: deque[Change] = deque(maxlen=MOST_CHANGES)
         self._before: list[tuple[IntArray, IntArray]] = []
         """Numbers of records that were changed, and what they were, for `undo`."""
@@ -110,14 +119,28 @@ class FixStates:
         """
         if one.source not in self.sources:
             self.sources.append(one.source)
-            self._counts.append(0)
+            self._tallies.append(_Tally())
         index = self.sources.index(one.source)
         held = (one.held_by, True) if one.held_by >= 0 else (one.row, one.is_edge)
-        self._records.append_one((
-            *held, index, self._counts[index], one.stamp_ns, run, believed, now_ns, AUTO,
-            -1 if one.is_edge else one.row))
-        self._counts[index] += 1
+        self._append((*held, index, self._tallies[index].n, one.stamp_ns, run, believed, now_ns,
+                      AUTO, -1 if one.is_edge else one.row), distance)
+
+    def _append(self, record: tuple[int, ...], distance: float) -> None:
+        tally = self._tallies[record[SOURCE]]
+        tally.n += 1
+        tally.n_believed += record[BELIEVED]
+        tally.newest.append(len(self))
+        self._records.append_one(record)
         self._distances.append_one(distance)
+
+    def _count(self) -> None:
+        """Count the records anew."""
+        self._tallies = [_Tally() for _ in self.sources]
+        for index, tally in enumerate(self._tallies):
+            numbers = np.flatnonzero(self.records[:, SOURCE] == index)
+            tally.n = len(numbers)
+            tally.n_believed = int(np.count_nonzero(self.records[numbers, BELIEVED]))
+            tally.newest.extend(numbers[-NEWEST:].tolist())
 
     def keep(self, numbers: IntArray) -> None:
         """Remember some records that are about to be changed, until `forget` or `undo`."""
@@ -133,10 +156,9 @@ class FixStates:
         for numbers, records in reversed(self._before):
             self.records[numbers] = records
         self.forget()
-        for index in self._records.values[size:, SOURCE].tolist():
-            self._counts[index] -= 1
         self._records.truncate(size)
         self._distances.truncate(size)
+        self._count()
 
     def by_stamp(self) -> IntArray:
         """Return the numbers of all records, by stamp, then by the name of the source."""
@@ -158,8 +180,9 @@ class FixStates:
         which = which[(records[which, DECISION] == AUTO)
                       & (records[which, BELIEVED] != int(believed))]
         self.keep(which)
-        for number in which.tolist():
+        for number, source in zip(which.tolist(), records[which, SOURCE].tolist(), strict=True):
             self.changed.setdefault(number, not believed)
+            self._tallies[source].n_believed += 1 if believed else -1
         records[which, BELIEVED], records[which, SINCE] = int(believed), now_ns
 
     def weights(
@@ -282,14 +305,10 @@ class FixStates:
 
     def totals(self) -> dict[str, SourceVerdicts]:
         """Return what is believed of each source."""
-        totals = {}
-        for index, source in enumerate(self.sources):
-            believed = self.believed[self.records[:, SOURCE] == index]
-            n = int(np.count_nonzero(believed))
-            totals[source] = SourceVerdicts(
-                {State.BELIEVED: n, State.DOUBTED: len(believed) - n}, 1.0,
-                len(believed) > 0 and not bool(np.any(believed[-NEWEST:])))
-        return totals
+        return {source: SourceVerdicts(
+            {State.BELIEVED: tally.n_believed, State.DOUBTED: tally.n - tally.n_believed}, 1.0,
+            tally.n > 0 and not any(self.records[number, BELIEVED] for number in tally.newest))
+            for source, tally in zip(self.sources, self._tallies, strict=True)}
 
     def state(self) -> tuple[IntArray, list[Change]]:
         """Return copies of all records and of the changes that are to be announced."""
@@ -306,6 +325,7 @@ class FixStates:
 
         """
         self.records[:] = records
+        self._count()
         self._changes.clear()
         self._changes.extend(changes)
 
@@ -322,11 +342,10 @@ class FixStates:
     def restore(self, saved: SavedFixes) -> None:
         """Fill empty records with saved ones; they belong to no run."""
         self.sources = list(saved.sources)
-        self._counts = [0] * len(self.sources)
-        for k, source in enumerate(saved.source.tolist()):
-            self._records.append_one((
-                saved.rows[k], saved.edges[k], source, self._counts[source], saved.stamps_ns[k],
-                LONE, saved.believed[k], saved.since_ns[k], saved.decision[k],
-                saved.observed[k]))
-            self._counts[source] += 1
-        self._distances.append(saved.distance)
+        self._tallies = [_Tally() for _ in self.sources]
+        columns = (saved.rows, saved.edges, saved.source, saved.stamps_ns, saved.believed,
+                   saved.since_ns, saved.decision, saved.observed, saved.distance)
+        for row, edge, source, stamp_ns, believed, since_ns, decision, observed, distance in zip(
+                *(column.tolist() for column in columns), strict=True):
+            self._append((row, edge, source, self._tallies[source].n, stamp_ns, LONE, believed,
+                          since_ns, decision, observed), distance)

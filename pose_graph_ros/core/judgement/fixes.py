@@ -16,7 +16,8 @@ from typing import NamedTuple
 import numpy as np
 
 from pose_graph_ros.core.config import BackendConfig, Robust
-from pose_graph_ros.core.geometry.se2 import FloatArray
+from pose_graph_ros.core.geometry.se2 import BoolArray, FloatArray
+from pose_graph_ros.core.graph.constraints import Edges, ObservedNodes
 from pose_graph_ros.core.graph.graph import GraphUpdate
 from pose_graph_ros.core.graph.reweighting import Reweighting
 from pose_graph_ros.core.judgement import fix_states as fs, fix_verdicts
@@ -30,7 +31,13 @@ from pose_graph_ros.core.judgement.runs import (
 )
 from pose_graph_ros.core.judgement.stated_noise import StatedNoise
 from pose_graph_ros.core.judgement.texts import sentence
-from pose_graph_ros.core.judgement.tracks import Innovation, Observation, seen_in, Track
+from pose_graph_ros.core.judgement.tracks import (
+    biased_observations,
+    Innovation,
+    Observation,
+    observations,
+    Track,
+)
 from pose_graph_ros.core.judgement.verdicts import Decision, State
 from pose_graph_ros.core.measurements import (
     Answer,
@@ -125,11 +132,12 @@ class FixJudge:
         solved = not graph.has_touched
         self._chain.extend(graph)
         first, loosened = len(self._states), self._loosened
-        for one in judged:
-            at = one.row - (graph.n_edges if one.is_edge else graph.n_observed)
-            row = slice(at, at + 1)
-            self._judge(one.stamp_ns, Observation.of_biased(change.edges.rows(row)) if one.is_edge
-                        else Observation.of(change.observed.rows(row)), one, solved=solved)
+        is_edge = np.array([one.is_edge for one in judged])
+        rows = np.array([one.row for one in judged])
+        seen = _both(change.edges.rows(rows[is_edge] - graph.n_edges),
+                     change.observed.rows(rows[~is_edge] - graph.n_observed), is_edge)
+        for one, each in zip(judged, seen, strict=True):
+            self._judge(one.stamp_ns, each, one, solved=solved)
         for number in range(first, len(self._states)):
             if not self._states.believed[number]:
                 self._states.announce(number, None)
@@ -247,7 +255,8 @@ class FixJudge:
 
     def _of_graph(self, node: int) -> Track:
         return Track(node, self._smoother.graph.poses[node].copy(),
-                     self._chain.noise_factor * self._smoother.covariance(node))
+                     np.ascontiguousarray(
+            self._chain.noise_factor * self._smoother.covariance(node)))
 
     def _join_other(
         self, stamp_ns: int, seen: Observation, mine: Innovation | None,
@@ -303,11 +312,10 @@ class FixJudge:
     def _record(self, one: NewConstraint | None, run: Run | None, d2: float) -> None:
         number, believed = (fs.LONE, False) if run is None else (run.number, run.believed)
         if one is None:
-            record = self._states.records[self._again]
-            record[fs.RUN] = number
-            if record[fs.DECISION] == fs.AUTO and bool(record[fs.BELIEVED]) != believed:
-                self._states.changed.setdefault(self._again, bool(record[fs.BELIEVED]))
-                record[fs.BELIEVED], record[fs.SINCE] = int(believed), self._now_ns
+            self._states.records[self._again, fs.RUN] = number
+            if bool(self._states.records[self._again, fs.BELIEVED]) != believed:
+                self._states.believe(
+                    np.array((self._again,)), believed=believed, now_ns=self._now_ns)
             return
         self._states.append(
             one, run=number, believed=believed, distance=math.sqrt(d2), now_ns=self._now_ns)
@@ -388,12 +396,13 @@ class FixJudge:
         self._noise = StatedNoise()
         self._chain.extend(graph)
         states.records[:, fs.RUN] = fs.LONE
-        for self._again in states.by_stamp().tolist():
-            row, edge, stamp_ns, observed = states.records[
-                self._again, (fs.ROW, fs.EDGE, fs.STAMP, fs.OBSERVED)].tolist()
-            if observed >= 0:
-                row, edge = observed, False
-            self._judge(stamp_ns, seen_in(graph, row, edge=bool(edge)), None)
+        order = states.by_stamp()
+        rows, observed, stamps_ns = states.records[order][:, (fs.ROW, fs.OBSERVED, fs.STAMP)].T
+        is_edge = observed < 0
+        seen = _both(graph.edges_at(rows[is_edge]), graph.observed_at(observed[~is_edge]), is_edge)
+        for self._again, stamp_ns, one in zip(
+                order.tolist(), stamps_ns.tolist(), seen, strict=True):
+            self._judge(stamp_ns, one, None)
         self._again = -1
         return True
 
@@ -438,3 +447,9 @@ class FixJudge:
         """Restore what `saved` has returned, for a graph with the same rows."""
         self._states.restore(saved)
         self._loosened = dict(zip(saved.loosened.tolist(), saved.weights.tolist(), strict=True))
+
+
+def _both(edges: Edges, observed: ObservedNodes, is_edge: BoolArray) -> list[Observation | None]:
+    """Return the observations of two tables, in the order that `is_edge` tells."""
+    tables = iter(observations(observed)), iter(biased_observations(edges))
+    return [next(tables[edge]) for edge in is_edge.tolist()]

@@ -29,7 +29,7 @@ from pose_graph_ros.core.graph import tables as tb
 from pose_graph_ros.core.graph.constraints import EdgeKind
 from pose_graph_ros.core.graph.graph import Graph
 from pose_graph_ros.core.judgement.consistency import OdometryChain
-from pose_graph_ros.core.judgement.tracks import Observation, Track
+from pose_graph_ros.core.judgement.tracks import Innovation, Observation, Track
 
 # Price of one run of wrong measurements, or of one fault of odometry; a single measurement is in
 # doubt beyond this squared distance (chi2 with 2 degrees of freedom, 99.9 %).
@@ -67,6 +67,8 @@ FITTED_MEMBERS, FITTED_D2 = 10, 2.5
 FITTED_HEADING = 0.4
 # Number of measurements, and way [m], from which the pose at the beginning of a run is estimated.
 BEGIN_MEMBERS, BEGIN_WAY = 40, 50.0
+
+NO_OFFSET = np.zeros(3)
 
 
 class Transition(NamedTuple):
@@ -247,22 +249,19 @@ class Run:
         # the last members may be the beginning of an error that grows
         cuts = []
         for cut, (stamp_ns, track) in enumerate(other.states):
-            d2, _, _ = self._jump(track, chain)
+            d2 = self._jump(track, chain).d2
             if d2 <= EVENT:
                 cuts.append(Transition(
                     d2 + RATE * (other.end_ns - stamp_ns) * 1e-9, 1.0, cut))
         return [*ways, min(cuts)] if len(cuts) > 0 else ways
 
-    def _jump(self, track: Track, chain: OdometryChain) -> tuple[float, FloatArray, FloatArray]:
-        """Return the jump from a track, its squared distance first, and its covariance."""
-        predicted = track.moved(chain, self.first.node)
-        jump = self.first.pose - predicted.pose
-        jump[2] = se2.wrap(jump[2])
-        cov = predicted.bent(track.pose).cov + self.first.cov
-        return float(jump @ np.linalg.solve(cov, jump)), jump, cov
+    def _jump(self, track: Track, chain: OdometryChain) -> Innovation:
+        """Return the jump to the beginning of the run from what odometry predicts."""
+        begin = Observation(self.first.node, NO_OFFSET, self.first.pose, self.first.cov)
+        return track.moved(chain, begin.node).bent(track.pose).innovation(begin)
 
     def _price_of_jump(self, track: Track, chain: OdometryChain) -> Transition:
-        d2, jump, cov = self._jump(track, chain)
+        jump, _, cov, d2, _ = self._jump(track, chain)
         if d2 <= EVENT:
             return Transition(d2)
         if self.n < LEAST_MEMBERS:

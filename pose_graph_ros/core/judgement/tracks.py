@@ -7,14 +7,16 @@ A *track* is the pose at one hidden node with its covariance in map axes: an ext
 that moves along the odometry chain and takes in measurements one by one.
 """
 
-from typing import NamedTuple
+import math
+from typing import Any, NamedTuple
 
 import numpy as np
+import numpy.typing as npt
 
-from pose_graph_ros.core.geometry import covariance, se2
+from pose_graph_ros.core.compiled.jit import INTEGER, INTEGERS, kernel, NUMBER, NUMBERS, ROWS
 from pose_graph_ros.core.geometry.se2 import FloatArray
+from pose_graph_ros.core.graph import factors
 from pose_graph_ros.core.graph.constraints import Edges, ObservedKind, ObservedNodes
-from pose_graph_ros.core.graph.graph import Graph
 from pose_graph_ros.core.judgement.consistency import OdometryChain
 from pose_graph_ros.core.sources.gauss_markov import STRETCH
 
@@ -35,26 +37,6 @@ class Observation(NamedTuple):
     """Shape (3,) [m, m, rad]; of a position, the heading is 0."""
     noise: FloatArray
     """Covariance in map axes, shape (2, 2) of a position, (3, 3) of a pose."""
-
-    @classmethod
-    def of(cls, observed: ObservedNodes) -> 'Observation':
-        """Return the observation of a table with one row, which is no heading."""
-        mean, information = observed.mean[0], observed.information[0]
-        size = 2 if observed.kind[0] == ObservedKind.POSITION else 3
-        noise = STATED * covariance.turned(
-            np.linalg.inv(information[:size, :size]), -float(mean[2]))
-        return cls(int(observed.node[0]), observed.offset[0], mean, _floored(noise))
-
-    @classmethod
-    def of_biased(cls, edge: Edges) -> 'Observation | None':
-        """Return that of an edge to a bias, a table with one row; None for a heading."""
-        information, (x, y, factor, turn_factor) = edge.information[0], edge.bias[0].tolist()
-        if information[0, 0] == 0.0:
-            return None
-        size = 3 if information[2, 2] > 0.0 else 2
-        correlated = (factor**2, factor**2, (turn_factor / STRETCH)**2)
-        noise = np.linalg.inv(information[:size, :size]) + np.diag(correlated[:size])
-        return cls(int(edge.i[0]), np.array((x, y, 0.0)), edge.mean[0], _floored(noise))
 
     @property
     def size(self) -> int:
@@ -98,9 +80,11 @@ class Track(NamedTuple):
         """
         if node == self.node:
             return self
-        motion, noise = motion_between(chain, self.node, node)
-        return Track(node, se2.compose(self.pose, motion),
-                     covariance.propagated(self.pose, self.cov, motion, noise))
+        pose, cov = np.empty(3), np.empty((3, 3))
+        if not _move(chain.nodes, chain.poses, chain.sums, self.node, node, chain.noise_factor,
+                     self.pose, self.cov, pose, cov):
+            raise KeyError('expected nodes that are chained by odometry')
+        return Track(node, pose, cov)
 
     def bent(self, begin: FloatArray) -> 'Track':
         """
@@ -108,68 +92,227 @@ class Track(NamedTuple):
 
         `begin` is the pose where it was last measured, shape (3,).
         """
-        chord2 = float((self.pose[0] - begin[0])**2 + (self.pose[1] - begin[1])**2)
-        more = 0.25 * chord2 * min(float(self.cov[2, 2]), 1.0)**2
-        return self._replace(cov=self.cov + np.diag((more, more, 0.0)))
+        x, y, _ = (self.pose - begin).tolist()
+        more = 0.25 * (x * x + y * y) * min(float(self.cov[2, 2]), 1.0)**2
+        cov = self.cov.copy()
+        cov[0, 0] += more
+        cov[1, 1] += more
+        return Track(self.node, self.pose, cov)
 
     def innovation(self, seen: Observation) -> Innovation:
         """Return the innovation of an observation at the node of the track."""
-        x, y, theta = self.pose.tolist()
-        c, s = np.cos(theta), np.sin(theta)
-        ox, oy, turn = seen.offset.tolist()
-        rx, ry = c * ox - s * oy, s * ox + c * oy
-        size = seen.size
-        jacobian = np.eye(size, 3)
-        jacobian[0, 2], jacobian[1, 2] = -ry, rx
-        error = np.empty(size)
-        error[0], error[1] = seen.mean[0] - x - rx, seen.mean[1] - y - ry
-        if size == 3:
-            error[2] = float(se2.wrap(seen.mean[2] - theta - turn))
-        cov = jacobian @ self.cov @ jacobian.T + seen.noise
-        d2 = float(error @ np.linalg.solve(cov, error))
-        return Innovation(error, jacobian, cov, d2, float(np.log(np.linalg.det(cov))))
+        size = len(seen.noise)
+        error, jacobian, cov = np.empty(size), np.empty((size, 3)), np.empty((size, size))
+        d2, spread = _innovate(self.pose, self.cov, seen.offset, seen.mean, seen.noise,
+                               error, jacobian, cov)
+        return Innovation(error, jacobian, cov, d2, spread)
 
     def updated(self, innovation: Innovation) -> 'Track':
         """Return the track after taking in an observation."""
-        gain = np.linalg.solve(innovation.cov, innovation.jacobian @ self.cov).T
-        pose = se2.wrapped(self.pose + gain @ innovation.error)
-        cov = self.cov - gain @ innovation.cov @ gain.T
-        return Track(self.node, pose, 0.5 * (cov + cov.T))
+        pose, cov = np.empty(3), np.empty((3, 3))
+        _update(self.pose, self.cov, innovation.error, innovation.jacobian, innovation.cov,
+                pose, cov)
+        return Track(self.node, pose, cov)
 
 
-def seen_in(graph: Graph, row: int, *, edge: bool) -> Observation | None:
-    """
-    Return the observation that a row of a graph holds; None for a heading.
-
-    Parameters
-    ----------
-    graph : Graph
-    row : int
-    edge : bool, whether it is one of an edge, to a bias
-
-    """
-    at = np.array((row,))
-    if edge:
-        return Observation.of_biased(graph.edges_at(at))
-    return Observation.of(graph.observed_at(at))
+def observations(observed: ObservedNodes) -> list[Observation]:
+    """Return the observations of a table of positions and poses in the map."""
+    size = np.where(observed.kind == ObservedKind.POSITION, 2, 3)
+    noises = {}
+    for n in np.unique(size).tolist():
+        of_size = size == n
+        noise = STATED * np.linalg.inv(observed.information[of_size, :n, :n])
+        noises[n] = iter(_floored(_turned(noise, observed.mean[of_size, 2])))
+    return [Observation(node, offset, mean, next(noises[n])) for node, offset, mean, n in zip(
+        observed.node.tolist(), observed.offset, observed.mean, size.tolist(), strict=True)]
 
 
-def motion_between(
-    chain: OdometryChain, begin: int, end: int,
-) -> tuple[FloatArray, FloatArray]:
-    """
-    Return the motion by odometry between two nodes, and its covariance in the frame of the later.
+def biased_observations(edges: Edges) -> list[Observation | None]:
+    """Return those of a table of edges to biases; None for a heading."""
+    found: list[Observation | None] = []
+    for node, mean, information, (x, y, factor, turn_factor) in zip(
+            edges.i.tolist(), edges.mean, edges.information, edges.bias.tolist(), strict=True):
+        if information[0, 0] == 0.0:
+            found.append(None)
+            continue
+        size = 3 if information[2, 2] > 0.0 else 2
+        correlated = (factor**2, factor**2, (turn_factor / STRETCH)**2)
+        noise = np.linalg.inv(information[:size, :size]) + np.diag(correlated[:size])
+        found.append(Observation(node, np.array((x, y, 0.0)), mean, _floored(noise[None])[0]))
+    return found
 
-    Parameters
-    ----------
-    chain : OdometryChain
-    begin, end : int, rows of the nodes in the graph
 
-    """
-    motion, noise = chain.between(np.array((begin,)), np.array((end,)))
-    return motion[0], noise[0]
+def _turned(noise: npt.NDArray[Any], theta: FloatArray) -> FloatArray:
+    """Return covariances in the axes of poses with headings theta, shape (M,), in map axes."""
+    axes = np.zeros(noise.shape)
+    axes[:, -1, -1] = 1.0
+    axes[:, 0, 0] = axes[:, 1, 1] = np.cos(theta)
+    axes[:, 1, 0] = np.sin(theta)
+    axes[:, 0, 1] = -axes[:, 1, 0]
+    return np.asarray(axes @ noise @ np.swapaxes(axes, 1, 2))
 
 
 def _floored(noise: FloatArray) -> FloatArray:
-    least = np.square((LEAST_SIGMA[0], LEAST_SIGMA[0], LEAST_SIGMA[1]))[:len(noise)]
-    return noise + np.diag(np.maximum(least - noise.diagonal(), 0.0))
+    """Return covariances, shape (M, n, n), with the least variances; the argument is changed."""
+    least = np.square((LEAST_SIGMA[0], LEAST_SIGMA[0], LEAST_SIGMA[1]))
+    for k in range(noise.shape[1]):
+        noise[:, k, k] = np.maximum(noise[:, k, k], least[k])
+    return noise
+
+
+@kernel
+def _place(rows, node):  # type: ignore[no-untyped-def]
+    """Return the place of a node in ascending rows, -1 if it is not one of them."""
+    low, high = 0, len(rows)
+    while low < high:
+        middle = (low + high) // 2
+        if rows[middle] < node:
+            low = middle + 1
+        else:
+            high = middle
+    return low if low < len(rows) and rows[low] == node else -1
+
+
+@kernel(signature=(
+    INTEGERS, ROWS, ROWS, INTEGER, INTEGER, NUMBER, NUMBERS, ROWS, NUMBERS, ROWS))
+def _move(  # type: ignore[no-untyped-def]
+    rows, poses, sums, begin, end, factor, pose, cov, pose_out, cov_out,
+):
+    """
+    Move a pose and its covariance in map axes along odometry; return whether both nodes are in it.
+
+    As `covariance.propagated` does, with what `OdometryChain.between` returns.
+
+    Parameters
+    ----------
+    rows, poses, sums : ndarray, nodes, poses and prefix sums of the covariances of the chain
+    begin, end : int, nodes
+    factor : float, on the covariance of odometry
+    pose, cov : ndarray, at the first node
+    pose_out, cov_out : ndarray, output
+
+    """
+    i, j = _place(rows, begin), _place(rows, end)
+    if i < 0 or j < 0:
+        return False
+    turn = pose[2] - poses[i, 2]
+    c, s = math.cos(turn), math.sin(turn)
+    x, y = poses[j, 0] - poses[i, 0], poses[j, 1] - poses[i, 1]
+    dx, dy = c * x - s * y, s * x + c * y
+    pose_out[0], pose_out[1] = pose[0] + dx, pose[1] + dy
+    pose_out[2] = factors.wrap(turn + poses[j, 2])
+    # the noise of odometry at the second node, in the axes of the chain, then of the map
+    ahead = factor if j > i else -factor
+    x, y = poses[j, 0], poses[j, 1]
+    xx, xy, xt, yy, yt, tt = (ahead * (sums[j, 0] - sums[i, 0]), ahead * (sums[j, 1] - sums[i, 1]),
+                              ahead * (sums[j, 2] - sums[i, 2]), ahead * (sums[j, 3] - sums[i, 3]),
+                              ahead * (sums[j, 4] - sums[i, 4]), ahead * (sums[j, 5] - sums[i, 5]))
+    xx, xy, yy = (xx - 2.0 * y * xt + y * y * tt, xy + x * xt - y * yt - x * y * tt,
+                  yy + 2.0 * x * yt + x * x * tt)
+    xt, yt = xt - y * tt, yt + x * tt
+    xt, yt = c * xt - s * yt, s * xt + c * yt
+    xx, xy, yy = (c * c * xx - 2.0 * c * s * xy + s * s * yy,
+                  c * s * (xx - yy) + (c * c - s * s) * xy,
+                  s * s * xx + 2.0 * c * s * xy + c * c * yy)
+    # and that of the pose at the first one
+    t = cov[2, 2]
+    cov_out[0, 0] = xx + cov[0, 0] - 2.0 * dy * cov[0, 2] + dy * dy * t
+    cov_out[0, 1] = xy + cov[0, 1] + dx * cov[0, 2] - dy * cov[1, 2] - dx * dy * t
+    cov_out[1, 1] = yy + cov[1, 1] + 2.0 * dx * cov[1, 2] + dx * dx * t
+    cov_out[0, 2] = xt + cov[0, 2] - dy * t
+    cov_out[1, 2] = yt + cov[1, 2] + dx * t
+    cov_out[2, 2] = tt + t
+    cov_out[1, 0], cov_out[2, 0], cov_out[2, 1] = cov_out[0, 1], cov_out[0, 2], cov_out[1, 2]
+    return True
+
+
+@kernel
+def _factor(cov, n):  # type: ignore[no-untyped-def]
+    """Return the factors l10, l20, l21 and d0, d1, d2 of `L D L^T`, shape (n, n), n 2 or 3."""
+    d0 = cov[0, 0]
+    l10 = cov[1, 0] / d0
+    d1 = cov[1, 1] - l10 * cov[1, 0]
+    if n == 2:
+        return l10, 0.0, 0.0, d0, d1, 1.0
+    l20 = cov[2, 0] / d0
+    l21 = (cov[2, 1] - l20 * cov[1, 0]) / d1
+    return l10, l20, l21, d0, d1, cov[2, 2] - l20 * cov[2, 0] - l21 * l21 * d1
+
+
+@kernel(signature=(NUMBERS, ROWS, NUMBERS, NUMBERS, ROWS, NUMBERS, ROWS, ROWS))
+def _innovate(  # type: ignore[no-untyped-def]
+    pose, cov, offset, mean, noise, error, jacobian, cov_out,
+):
+    """
+    Write an innovation; return its squared Mahalanobis distance and log determinant.
+
+    Parameters
+    ----------
+    pose, cov : ndarray, of the track
+    offset, mean, noise : ndarray, of the observation
+    error, jacobian, cov_out : ndarray, output
+
+    """
+    n = len(noise)
+    c, s = math.cos(pose[2]), math.sin(pose[2])
+    rx, ry = c * offset[0] - s * offset[1], s * offset[0] + c * offset[1]
+    error[0], error[1] = mean[0] - pose[0] - rx, mean[1] - pose[1] - ry
+    for i in range(n):
+        for j in range(3):
+            jacobian[i, j] = 1.0 if i == j else 0.0
+    jacobian[0, 2], jacobian[1, 2] = -ry, rx
+    if n == 3:
+        error[2] = factors.wrap(mean[2] - pose[2] - offset[2])
+    for i in range(n):
+        for j in range(n):
+            total = noise[i, j]
+            for k in range(3):
+                for m in range(3):
+                    total += jacobian[i, k] * cov[k, m] * jacobian[j, m]
+            cov_out[i, j] = total
+    l10, l20, l21, d0, d1, d2 = _factor(cov_out, n)
+    y = error[1] - l10 * error[0]
+    distance2 = error[0] * error[0] / d0 + y * y / d1
+    if n == 3:
+        z = error[2] - l20 * error[0] - l21 * y
+        distance2 += z * z / d2
+    return distance2, math.log(d0 * d1 * d2)
+
+
+@kernel(signature=(NUMBERS, ROWS, NUMBERS, ROWS, ROWS, NUMBERS, ROWS))
+def _update(  # type: ignore[no-untyped-def]
+    pose, cov, error, jacobian, innovation, pose_out, cov_out,
+):
+    """
+    Write the pose and the covariance after taking in an observation, as a Kalman filter.
+
+    Parameters
+    ----------
+    pose, cov : ndarray, before it
+    error, jacobian, innovation : ndarray, of the innovation; the last is its covariance
+    pose_out, cov_out : ndarray, output
+
+    """
+    n = len(error)
+    l10, l20, l21, d0, d1, d2 = _factor(innovation, n)
+    for i in range(3):
+        pose_out[i] = pose[i]
+        for j in range(3):
+            cov_out[i, j] = cov[i, j]
+    # the rows of `L^-1 J P` are independent observations
+    for k in range(n):
+        d = d0 if k == 0 else d1 if k == 1 else d2
+        a = 1.0 if k == 0 else -l10 if k == 1 else l10 * l21 - l20
+        b = 0.0 if k == 0 else 1.0 if k == 1 else -l21
+        e = a * error[0] + b * error[1] + (error[2] if k == 2 else 0.0)
+        h = (a * jacobian[0, 0] + b * jacobian[1, 0] + (jacobian[2, 0] if k == 2 else 0.0),
+             a * jacobian[0, 1] + b * jacobian[1, 1] + (jacobian[2, 1] if k == 2 else 0.0),
+             a * jacobian[0, 2] + b * jacobian[1, 2] + (jacobian[2, 2] if k == 2 else 0.0))
+        g = (h[0] * cov[0, 0] + h[1] * cov[1, 0] + h[2] * cov[2, 0],
+             h[0] * cov[0, 1] + h[1] * cov[1, 1] + h[2] * cov[2, 1],
+             h[0] * cov[0, 2] + h[1] * cov[1, 2] + h[2] * cov[2, 2])
+        for i in range(3):
+            pose_out[i] += g[i] * e / d
+            for j in range(3):
+                cov_out[i, j] -= g[i] * g[j] / d
+    pose_out[2] = factors.wrap(pose_out[2])
