@@ -85,7 +85,7 @@ class MessageReader:
         # the engine rejects stamps of zero or less
         if (source.kind is Kind.ODOMETRY and stamp_ns > 0
                 and not self._guards[name].accepts(stamp_ns)):
-            return rejected('stamp_leap', f'{stamp_ns} ns is far from those before')
+            return rejected('stamp_leap', f'{1e-9 * stamp_ns:.3f} s is far from those before')
         return measurement
 
     def _read(self, source: Source, message: Message) -> OdometrySample | Measurement | Answer:

@@ -18,7 +18,7 @@ from pose_graph_ros.core.exceptions import PoseGraphError
 
 SUMMARIES = {
     'demo': 'play a bag to the node over DDS',
-    'replay': 'run a bag through the engine of the node, without ROS',
+    'replay': 'run a bag or a g2o file through the engine of the node, without ROS',
     'solve': 'optimise a g2o file',
     'simulate': 'write a simulated drive as a rosbag2',
     'parameters': 'print the parameters of the node',

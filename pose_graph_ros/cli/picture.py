@@ -32,11 +32,12 @@ SECOND = 10**9  # one second [ns]
 TICK_SPACING = 1.6  # largest spacing of the grid of the map [inch]
 TWO_DIGITS = 10.0  # errors below this are shown with two digits after the point [m]
 LOG_RATIO = 4.0  # if errors of odometry exceed others by this factor, the axis is logarithmic
-UNUSED = (State.DOUBTED, State.WAITING)
+SKY = '#56B4E9'  # also after Okabe and Ito; markers that wait are blue as well
 LOOPS = (
     ('loop closures', (State.BELIEVED,), GREEN, '-', 5),
     ('loop closures\nbelieved weakly', (State.WEAKLY_BELIEVED,), GREEN, '--', 5),
-    ('doubted loop closures,\nnot used', UNUSED, GREY, '--', 2))
+    ('loop closures that wait,\nnot used', (State.WAITING,), SKY, '--', 2),
+    ('doubted loop closures,\nnot used', (State.DOUBTED,), GREY, '--', 2))
 """Names of loop closures in the legend, states, colours, lines, and their order in depth."""
 DOUBTED_FIXES: dict[str, Any] = {
     'color': GREY, 'marker': 'x', 'linestyle': 'none', 'markersize': 5.5, 'markeredgewidth': 1.1}
@@ -125,11 +126,13 @@ def _facts(drive: Drive) -> str:
     path = max(drive.corrected, drive.odometry, key=len)
     steps = np.diff(path.poses[:, :2], axis=0)
     numbers = {kind: int(np.sum(chosen)) for kind, chosen in drive.fix_kinds.items()}
-    left_out = int(np.sum(drive.loops(*UNUSED)))
+    doubted, waiting = (
+        int(np.sum(drive.loops(state))) for state in (State.DOUBTED, State.WAITING))
     parts = [f'{numbers.pop("used")} fixes used' + ''.join(
         f', {number} {kind}' for kind, number in numbers.items() if number > 0),
-        f'{len(drive.loop_stamps_ns) - left_out} loop closures' + (
-            f', {left_out} doubted' if left_out > 0 else '')]
+        f'{len(drive.loop_stamps_ns) - doubted - waiting} loop closures' + ''.join(
+            f', {number} {what}' for number, what in ((doubted, 'doubted'), (waiting, 'waiting'))
+            if number > 0)]
     if len(path) > 1:
         parts[:0] = (f'{(path.stamps_ns[-1] - path.stamps_ns[0]) / SECOND:.0f} s',
                      f'{np.sum(np.hypot(steps[:, 0], steps[:, 1])):.0f} m')

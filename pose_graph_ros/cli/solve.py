@@ -4,7 +4,7 @@
 Optimise a g2o file, and print the constraints with the largest energies.
 
 With `--robust` wrong loop closures are found first. A file that is written then has them as
-comments, so that other programs read the graph without them.
+comments, `# not used EDGE_SE2 ...`, so that other programs read the graph without them.
 """
 
 import argparse
@@ -41,15 +41,23 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
                         help='start from the constraints or from the poses in the file '
                              '(default: %(default)s)')
     parser.add_argument('--robust', action='store_true',
-                        help='decide which loop closures (edges between ids that are no '
-                             'neighbours) to believe, and leave the others out')
-    parser.add_argument('--closure-sigma', nargs=2, type=float, metavar=('M', 'RAD'),
+                        help='decide which loop closures to believe, and leave the others out; '
+                             'an edge is odometry if no id of a vertex lies between its two')
+    parser.add_argument('--closure-sigma', nargs=2, type=_sigma, metavar=('M', 'RAD'),
                         default=(CLOSURE_FLOORS[0], CLOSURE_FLOORS[2]),
                         help='least standard deviations of loop closures for this decision '
-                             '(default: %(default)s); the result has those of the file, '
-                             'times what the residuals show')
+                             f'(default: {CLOSURE_FLOORS[0]} {CLOSURE_FLOORS[2]}); the result '
+                             'has those of the file, times what the residuals show')
     parser.add_argument('--edge2', choices=EDGE2_ORDERS,
                         help='format of the tag EDGE2 in this file')
+
+
+def _sigma(text: str) -> float:
+    """Return a standard deviation, 0 included."""
+    value = float(text)
+    if not 0.0 <= value < np.inf:
+        raise argparse.ArgumentTypeError(f'expected a finite number of at least 0, got {text}')
+    return value
 
 
 def execute(options: argparse.Namespace) -> int:
@@ -83,7 +91,7 @@ def execute(options: argparse.Namespace) -> int:
         print(f'  observed node on {file.ids[graph.observed.node[k]]}: '
               f'energy {energies.observed[k]:.4g}')
     if options.out is not None:
-        write_g2o(graph, options.out, file.ids, doubted)
+        write_g2o(graph, options.out, file.ids)
     return 0 if result.status is Status.CONVERGED else 1
 
 
@@ -119,6 +127,9 @@ def _doubt(file: GraphFile, sigma: Sequence[float]) -> IntArray:
         print(f'  doubted edge {file.ids[edges.i[k]]} -> {file.ids[edges.j[k]]}: '
               f'{np.hypot(x, y):.3g} m and {abs(theta):.3g} rad off, {np.sqrt(squares[k]):.3g} '
               f'sigma')
+    if len(doubted) > N_LARGEST:
+        print(f'  and {len(doubted) - N_LARGEST} more; a file written with --out has them all as '
+              f'comments')
     return doubted
 
 

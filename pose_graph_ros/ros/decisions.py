@@ -9,6 +9,7 @@ from pose_graph_ros.adapters.conversions import Message
 from pose_graph_ros.adapters.verdict_messages import JUDGE, read_decision
 from pose_graph_ros.core.backend import PoseGraphBackend
 from pose_graph_ros.core.measurements import Answer, AnswerStatus
+from pose_graph_ros.ros.log import ANSWER
 from pose_graph_ros.ros.worker import Worker
 
 logger = logging.getLogger(__name__)
@@ -34,7 +35,8 @@ def _hand_over(message: Message, worker: Worker, backend: PoseGraphBackend) -> N
     answer = read if isinstance(read, Answer) else backend.decide(*read)
     if answer.status is AnswerStatus.REJECTED:
         backend.counts[JUDGE, answer.reason] += 1
-        logger.warning('nothing is decided: %s: %s', answer.reason, answer.detail)
+        logger.warning(
+            'nothing is decided: %s: %s', answer.reason, answer.detail, extra=ANSWER)
     else:
         backend.counts[JUDGE, 'accepted'] += 1
         logger.info('%s', answer.detail or f'{message.key}: {message.value}')

@@ -16,6 +16,8 @@ from typing import Any
 PERIOD = 10.0  # for which a warning or an error is logged once [s]
 FLUSH_PERIOD = 2.0  # of the calls of `NodeLog.flush` [s]
 NUMBER = re.compile(r'(?<!\w)[-+]?\d[\w.+-]*')  # numbers do not make it another message
+ANSWER = {'is_answer': True}
+"""Argument `extra` of logging functions for what a person has asked for."""
 PACKAGE = __name__.partition('.')[0]
 
 
@@ -46,9 +48,14 @@ class NodeLog(logging.Handler):
         logging.getLogger(PACKAGE).setLevel(logging.DEBUG)
 
     def emit(self, record: logging.LogRecord) -> None:
-        """Log a record; a warning or an error like another one only after a `PERIOD`."""
+        """
+        Log a record; a warning or an error like another one only after a `PERIOD`.
+
+        Those that answer a person are always logged: `extra=ANSWER`.
+        """
         try:
-            if record.levelno < logging.WARNING or self._is_new(record):
+            if (record.levelno < logging.WARNING or hasattr(record, 'is_answer')
+                    or self._is_new(record)):
                 self._log(record.levelno, self.format(record))
         except Exception:
             self.handleError(record)

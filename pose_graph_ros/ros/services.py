@@ -212,7 +212,7 @@ class Services:
         saved = await _Done(self._session.worker.call(capture, 'a copy of the graph'))
         files = await self._in_file_thread(write_graph, saved, path)
         left_out = '' if saved.n_left_out == 0 else (
-            f'; {saved.n_left_out} waiting measurements are left out')
+            f'; not in it: {saved.n_left_out} that wait for odometry or for the alignment')
         return (f'{len(saved.nodes.rows)} hidden nodes in {files[0]}, with '
                 f'{files[1].name} and {files[2].name}{left_out}')
 

@@ -271,15 +271,20 @@ class Worker:
             answer = (self._backend.add_odometry(measurement, source)
                       if isinstance(measurement, OdometrySample)
                       else self._backend.add_measurement(measurement, source))
-            key = (source, answer.reason)
-            if answer.status is AnswerStatus.REJECTED and key not in self._warned:
-                self._warned.add(key)
-                logger.warning('%s: %s: %s (logged once, counted in diagnostics)', source,
-                               answer.reason, answer.detail)
+            if answer.status is AnswerStatus.REJECTED:
+                self._warn_once(source, answer.reason, answer.detail)
         except Exception as error:
+            self._warned.add((source, 'internal_error'))
             self._backend.counts[source, 'internal_error'] += 1
             self._backend.refusals[source, 'internal_error'] = f'{type(error).__name__}: {error}'
             logger.exception('a measurement of %s could not be added', source)
+
+    def _warn_once(self, source: str, reason: str, detail: str) -> None:
+        """Log why a measurement is rejected, the first time for each source and reason."""
+        if (source, reason) not in self._warned:
+            self._warned.add((source, reason))
+            logger.warning(
+                '%s: %s: %s (logged once, counted in diagnostics)', source, reason, detail)
 
     def _update(self, update: Callable[[], UpdateReport]) -> UpdateReport:
         start = time.monotonic()
@@ -308,6 +313,8 @@ class Worker:
         It keeps the report of the last update if there is no new one.
         """
         status, backend = self.status, self._backend
+        for (source, reason), detail in backend.refusals.items():
+            self._warn_once(source, reason, detail)  # also those that had to wait for odometry
         changes, verdicts = backend.verdict_changes(), backend.verdict_totals()
         for level, text in self._announcer.lines(
                 changes, verdicts, time.monotonic(), flush=ends):

@@ -282,7 +282,8 @@ def test_wrong_closures_are_found_and_left_out(
     file = read_g2o(out)
     assert len(file.graph.edges) == len(drive.graph.edges) - 11
     assert drive.error(file.graph.poses) < 0.5
-    comments = re.findall(r'(?m)^# doubted EDGE_SE2 (\d+) (\d+) ', out.read_text(encoding='ascii'))
+    comments = re.findall(
+        r'(?m)^# not used EDGE_SE2 (\d+) (\d+) ', out.read_text(encoding='ascii'))
     assert {(int(i), int(j)) for i, j in comments} == ends
     # the optimum is that of the file's own numbers
     assert main(['solve', str(out)]) == 0
@@ -318,7 +319,7 @@ def test_nothing_is_doubted_where_nothing_contradicts(
         assert re.search(r'(\d+) loop closures: \1 believed, 0 doubted', printed)
         assert printed_chi2(printed.splitlines()) == pytest.approx(
             GOLDEN[name]['chi2'], rel=SAME_CHI2)
-        assert 'doubted' not in out.read_text(encoding='ascii')
+        assert '# not used' not in out.read_text(encoding='ascii')
 
 
 def test_the_least_sigma_of_a_closure_can_be_chosen(
@@ -332,6 +333,18 @@ def test_the_least_sigma_of_a_closure_can_be_chosen(
         printed = capsys.readouterr().out
         doubted.append(int(re.search(r'(\d+) doubted', printed)[1]))
     assert doubted == [5, 5, 0]
+
+
+@pytest.mark.parametrize('sigma', ['-1', 'nan', 'inf', 'wide'])
+def test_a_sigma_that_is_none_is_refused(
+    sigma: str, tmp_path: Path, capsys: pytest.CaptureFixture[str],
+) -> None:
+    with pytest.raises(SystemExit) as error:
+        main(['solve', str(tmp_path / 'graph.g2o'), '--robust', '--closure-sigma', sigma, '0.1'])
+    assert error.value.code == 2
+    said = capsys.readouterr().err.splitlines()[-1]
+    assert 'argument --closure-sigma: ' in said
+    assert sigma in said
 
 
 @pytest.mark.parametrize('name', LOOSE)

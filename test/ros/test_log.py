@@ -8,7 +8,7 @@ import logging
 import pytest
 
 from pose_graph_ros.ros import log
-from pose_graph_ros.ros.log import NodeLog, PERIOD
+from pose_graph_ros.ros.log import ANSWER, NodeLog, PERIOD
 
 core = logging.getLogger('pose_graph_ros.core.somewhere')
 
@@ -98,6 +98,12 @@ def test_what_differs_in_more_than_numbers_is_another_message(lines: Lines) -> N
     assert [text for _, text in lines] == [
         'gps1: not_finite: got 1.5e-07', 'gps2: not_finite: got 1.5e-07',
         'gps1: not_finite: got 7', 'the pose is set to 1', 'the pose is set to 2']
+
+
+def test_each_answer_to_a_person_is_logged(lines: Lines) -> None:
+    for number in (7, 8):
+        core.warning('there is no closure %d', number, extra=ANSWER)
+    assert lines == [('warning', 'there is no closure 7'), ('warning', 'there is no closure 8')]
 
 
 def test_the_same_line_may_fail_in_different_ways(lines: Lines) -> None:

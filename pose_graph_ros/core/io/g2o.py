@@ -16,7 +16,10 @@ The last tag is specific to this project, because g2o has no tag for an observed
 offset; other programs skip it with a warning.
 
 Biases and the constraints on them have no tag. They are left out, and a comment gives their
-number.
+number; a measurement with a correlated error is written as if its error were white. Constraints
+with weight 0, such as doubted loop closures, are written as comments, `# not used EDGE_SE2 ...`,
+so that other programs read the graph without them. Other weights are not written: the information
+is that of the measurement.
 
 A file keeps neither the order of observed nodes with different tags nor the kind of an edge. An
 edge between consecutive ids is read as odometry, any other as a loop closure. Of each information
@@ -27,12 +30,14 @@ information as 11 12 22 33 13 23, iSAM stores its square root as R11 R12 R13 R22
 caller has to say which of them a file has. `VERTEX` and `EDGE` are TORO's old tags, `ODOMETRY` is
 another one of iSAM's for `EDGE2`.
 
+A loop closure with a switch, `EDGE_SE2_SWITCHABLE i j switch x y theta I11 ...`, is read as an
+edge; its switch, `VERTEX_SWITCH` and `EDGE_SWITCH_PRIOR`, is not needed.
+
 Lines with any other tag are skipped and counted: landmarks and their measurements, parameters of
 sensors, constraints in space. So are the lines `EQUIV i j` of TORO: they allow it to merge two
 nodes that an edge of the file connects, and add nothing to that edge.
 """
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import NoReturn
@@ -51,6 +56,9 @@ from pose_graph_ros.core.graph.constraints import (
 )
 from pose_graph_ros.core.graph.graph import Graph, GraphRows, GraphUpdate
 
+NOT_USED = '# not used '
+"""Begin of the line of a constraint with weight 0."""
+SWITCHES = ('VERTEX_SWITCH', 'EDGE_SWITCH_PRIOR')
 # Formats of EDGE2.
 EDGE2_ORDERS = ('toro', 'isam')
 # Row and column of each of six numbers: of an upper triangle, and of the information in TORO.
@@ -127,7 +135,9 @@ def read_g2o(path: Path, edge2_order: str | None = None) -> GraphFile:
         raise FileFormatError(f'{path}: cannot be read as text ({error})') from error
     for line, content in enumerate(text.splitlines(), 1):
         words = content.split()
-        if len(words) == 0 or words[0].startswith('#'):
+        if words[:1] == ['EDGE_SE2_SWITCHABLE']:
+            words = ['EDGE_SE2', *words[1:3], *words[4:]]
+        if len(words) == 0 or words[0].startswith('#') or words[0] in SWITCHES:
             continue
         where = f'{path}:{line}'
         if words[0] == 'FIX':
@@ -321,9 +331,7 @@ def _refused_line(
     return str(path)
 
 
-def write_g2o(
-    graph: Graph, path: Path, ids: IntArray | None = None, doubted: Sequence[int] | IntArray = (),
-) -> None:
+def write_g2o(graph: Graph, path: Path, ids: IntArray | None = None) -> None:
     """
     Write a graph so that its numbers read back bit for bit.
 
@@ -332,16 +340,9 @@ def write_g2o(
     graph : Graph
     path : Path
     ids : ndarray, shape (N,), optional, id of each hidden node; by default its row in the graph
-    doubted : sequence of int, rows of edges that become comments, `# doubted EDGE_SE2 ...`
 
     """
-    rows = graph.rows()
-    ids = np.arange(len(rows.poses)) if ids is None else ids
-    kept = np.ones(len(rows.edges), dtype=bool)
-    kept[np.asarray(doubted, dtype=np.int64)] = False
-    comments = [f'# doubted {line}\n' for line in _edge_lines(rows.edges.rows(~kept), ids)]
-    path.write_text(g2o_text(rows._replace(edges=rows.edges.rows(kept)), ids) + ''.join(comments),
-                    encoding='ascii')
+    path.write_text(g2o_text(graph.rows(), ids), encoding='ascii')
 
 
 def g2o_text(rows: GraphRows, ids: IntArray | None = None) -> str:
@@ -356,8 +357,10 @@ def g2o_text(rows: GraphRows, ids: IntArray | None = None) -> str:
     """
     ids = np.arange(len(rows.poses)) if ids is None else ids
     edges, observed, is_pose = rows.edges, rows.observed, ~rows.is_bias
+    used = _is_used(observed, edges)
     lines = []
     if not np.all(is_pose):
+        used = used[is_pose[observed.node]]
         edges = edges.rows(edges.kind != EdgeKind.BIAS)
         observed = observed.rows(is_pose[observed.node])
         lines.append(f'# left out: {np.sum(~is_pose)} biases, {len(rows.edges) - len(edges)} '
@@ -365,16 +368,33 @@ def g2o_text(rows: GraphRows, ids: IntArray | None = None) -> str:
     lines += [f'VERTEX_SE2 {name} {numbers}' for name, numbers in zip(
         ids[is_pose].tolist(), _texts(rows.poses[is_pose]), strict=True)]
     lines += [f'FIX {name}' for name in ids[rows.fixed & is_pose].tolist()]
-    return '\n'.join([*lines, *_edge_lines(edges, ids), *_observed_lines(observed, ids)]) + '\n'
+    lines += [*_edge_lines(edges, ids), *_observed_lines(observed, ids, used)]
+    return '\n'.join(lines) + '\n'
+
+
+def _is_used(observed: ObservedNodes, edges: Edges) -> BoolArray:
+    """
+    Return which measurements are used, shape (K,).
+
+    One with a correlated error has weight 0; an edge from its node to a bias holds it instead.
+    """
+    to_bias = edges.rows((edges.kind == EdgeKind.BIAS) & (edges.weight > 0.0))
+    held = set(zip(to_bias.i.tolist(), *to_bias.mean[:, :2].T.tolist(), strict=True))
+    used = observed.weight > 0.0
+    for k in np.flatnonzero(~used).tolist() if len(held) > 0 else ():
+        used[k] = (int(observed.node[k]), *observed.mean[k, :2].tolist()) in held
+    return np.asarray(used)
 
 
 def _edge_lines(edges: Edges, ids: IntArray) -> list[str]:
-    return [f'EDGE_SE2 {i} {j} {numbers}' for i, j, numbers in zip(
-        ids[edges.i].tolist(), ids[edges.j].tolist(),
+    return [f'{begin}EDGE_SE2 {i} {j} {numbers}' for begin, i, j, numbers in zip(
+        _begins(edges.weight > 0.0), ids[edges.i].tolist(), ids[edges.j].tolist(),
         _texts(np.hstack((edges.mean, upper(edges.information)))), strict=True)]
 
 
-def _observed_lines(observed: ObservedNodes, ids: IntArray) -> list[str]:
+def _observed_lines(
+    observed: ObservedNodes, ids: IntArray, used: BoolArray,
+) -> list[str]:
     triangles = upper(observed.information)
     moved = np.any(observed.offset != 0.0, axis=1)
     placed = np.all(observed.information[:, 2] == 0.0, axis=1) & (observed.mean[:, 2] == 0.0)
@@ -388,9 +408,15 @@ def _observed_lines(observed: ObservedNodes, ids: IntArray) -> list[str]:
     lines = np.empty(len(observed), dtype=object)
     for tag, columns in numbers.items():
         rows = np.flatnonzero(tags == tag)
-        lines[rows] = [f'{tag} {name} {text}' for name, text in zip(
-            ids[observed.node[rows]].tolist(), _texts(np.hstack(columns)[rows]), strict=True)]
+        lines[rows] = [f'{begin}{tag} {name} {text}' for begin, name, text in zip(
+            _begins(used[rows]), ids[observed.node[rows]].tolist(),
+            _texts(np.hstack(columns)[rows]), strict=True)]
     return list(lines)
+
+
+def _begins(used: BoolArray) -> list[str]:
+    """Return what the lines of constraints begin with, given which are used, shape (M,)."""
+    return ['' if each else NOT_USED for each in used.tolist()]
 
 
 def _texts(rows: FloatArray) -> list[str]:

@@ -35,7 +35,7 @@ from pose_graph_ros.core.graph.constraints import (
 )
 from pose_graph_ros.core.graph.graph import GraphRows
 from pose_graph_ros.core.io.atomic_files import write_files
-from pose_graph_ros.core.io.g2o import g2o_text, LAYOUT
+from pose_graph_ros.core.io.g2o import g2o_text, LAYOUT, NOT_USED
 from pose_graph_ros.core.io.json_values import annotations, decoded, encoded
 from pose_graph_ros.core.io.old_versions import with_judgement, with_names
 from pose_graph_ros.core.io.saved_graph import SavedGraph
@@ -228,7 +228,7 @@ def _saved_rows(rows: GraphRows) -> SavedRows:
 
 def _graph_rows(rows: SavedRows, text: str) -> GraphRows:
     """Return the rows of a graph from both files; raise ValueError if they do not fit together."""
-    lines = text.split('\n')
+    lines = [line.removeprefix(NOT_USED) for line in text.split('\n')]
     vertices = _numbers(lines, 'VERTEX_SE2')
     n = len(vertices) + len(rows.biases)
     is_bias, fixed = np.zeros(n, dtype=bool), np.zeros(n, dtype=bool)

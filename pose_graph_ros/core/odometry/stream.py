@@ -198,7 +198,8 @@ class OdometryStream:
         if at > 0 and sample.stamp_ns <= self._waiting[-1].stamp_ns:
             at = bisect.bisect_left(self._waiting, sample.stamp_ns, key=_stamp)
             if self._waiting[at].stamp_ns == sample.stamp_ns:
-                return rejected('duplicate_stamp', f'odometry at {sample.stamp_ns} came before')
+                return rejected('duplicate_stamp',
+                                f'odometry at {1e-9 * sample.stamp_ns:.3f} s came before')
             del self._ahead[at:]
             self.n_sorted += 1
         variance = sample.twist_variance
@@ -225,7 +226,7 @@ class OdometryStream:
         at = int(np.searchsorted(stamps, stamp_ns))
         came = at < len(stamps) and (stamps[at] == stamp_ns or self.timeline.dense(at))
         return ('duplicate_stamp' if came else 'out_of_order',
-                f'odometry at {stamp_ns} after {self.settled_ns}')
+                f'odometry at {1e-9 * stamp_ns:.3f} s after {1e-9 * self.settled_ns:.3f} s')
 
     def settle(self, until_ns: int | None = None) -> Iterator[tuple[int, Pose]]:
         """

@@ -291,7 +291,7 @@ class FactorBuilder:
         self._error_models.pop(source, None)
         if model is not None:
             self._error_models[source] = model
-        self._constraints[source].report = None
+        self._constraints[source].n_reported = 0
 
     def inflate(self, source: str, errors: CorrelatedErrors | None) -> None:
         """
@@ -436,10 +436,12 @@ class FactorBuilder:
         reports = {}
         for source, constraints in self._constraints.items():
             n = len(constraints)
-            if n > 0 and (constraints.report is None
-                          or n > MORE_RESIDUALS * constraints.report.n):
+            if n > MORE_RESIDUALS * constraints.n_reported:
+                biased = self._has_given_bias(source)
+                used = constraints.used(graph, added_as_edges=biased)
+                constraints.n_reported = n if np.any(used) else 0
                 constraints.report = source_report.report(
-                    graph, constraints.rows.values, biased=self._has_given_bias(source),
+                    graph, constraints.rows.values[used], biased=biased,
                     in_use=self.errors_in_use(source),
                     found=self._settings(source).finds_correlation)
             # a source of headings alone has no residuals of positions

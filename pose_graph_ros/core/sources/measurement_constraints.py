@@ -37,10 +37,12 @@ def attach(nodes: HiddenNodes, stamp_ns: int) -> Attachment | Answer:
     """
     first_ns = int(nodes.stamps_ns[0])
     if stamp_ns < first_ns:
-        return rejected('before_odometry', f'stamp {stamp_ns}, odometry begins at {first_ns}')
+        return rejected('before_odometry', f'stamp {1e-9 * stamp_ns:.3f} s, odometry begins at '
+                                           f'{1e-9 * first_ns:.3f} s')
     attachment = nodes.attach(stamp_ns)
     if attachment is None:
-        return rejected('no_odometry', f'no odometry covers the motion up to {stamp_ns}')
+        return rejected(
+            'no_odometry', f'no odometry covers the motion up to {1e-9 * stamp_ns:.3f} s')
     return attachment
 
 

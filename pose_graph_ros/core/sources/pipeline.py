@@ -89,8 +89,8 @@ class MeasurementPipeline:
             return validated
         checked = validated.measurement
         if self.seen.has(source, checked):
-            return rejected(
-                'duplicate_stamp', f'{source} at {checked.stamp_ns} was received before')
+            return rejected('duplicate_stamp', f'{source} at {1e-9 * checked.stamp_ns:.3f} s was '
+                                               'received before')
         if settings.minimum_period > 0.0 and self.seen.near(
                 source, checked.stamp_ns, round(settings.minimum_period * 1e9)):
             return rejected('thinned', f'less than {settings.minimum_period} s from another')

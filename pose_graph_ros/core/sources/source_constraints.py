@@ -9,6 +9,7 @@ import numpy as np
 
 from pose_graph_ros.core.compiled.growing_array import GrowingArray
 from pose_graph_ros.core.geometry.se2 import BoolArray, FloatArray, IntArray
+from pose_graph_ros.core.graph.graph import Graph
 from pose_graph_ros.core.saved_columns import Integers, Pairs, Rows2
 from pose_graph_ros.core.sources.error_estimate import LEAST_POSITIONS
 from pose_graph_ros.core.sources.gauss_markov import CorrelatedErrors, SavedBins
@@ -70,6 +71,8 @@ class SourceConstraints:
         """Row of the edge that holds it instead, or -1."""
         self.report: SourceReport | None = None
         """The newest report."""
+        self.n_reported = 0
+        """Number of measurements when it was made; 0 if none of them was used."""
         self.n_otherwise = 0
         """Constraints of a loaded graph that were added under other settings."""
         self.next_estimate = LEAST_POSITIONS
@@ -100,6 +103,23 @@ class SourceConstraints:
         """Return the rows that hold some measurements, given by their numbers."""
         edges = self.edges.values[which]
         return Held(np.where(edges >= 0, edges, self.rows.values[which, 1]), edges >= 0)
+
+    def used(self, graph: Graph, *, added_as_edges: bool) -> BoolArray:
+        """
+        Return which measurements have a weight above 0, shape (K,).
+
+        Parameters
+        ----------
+        graph : Graph
+        added_as_edges : bool, whether the measurements were first added as edges
+
+        """
+        held = self.held(np.arange(len(self)))
+        is_edge = held.is_edge | added_as_edges
+        used = np.empty(len(self), dtype=bool)
+        used[is_edge] = graph.edges_at(held.rows[is_edge]).weight > 0.0
+        used[~is_edge] = graph.observed_at(held.rows[~is_edge]).weight > 0.0
+        return used
 
     def stamp_ns(self, row: int, *, edge: bool, added_as_edges: bool) -> int | None:
         """

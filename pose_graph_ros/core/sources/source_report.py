@@ -24,9 +24,9 @@ class SourceReport(NamedTuple):
     """How well the measurements of a source fit."""
 
     n: int
-    """Number of its measurements in the graph."""
+    """Number of its measurements that are used."""
     energy: float
-    """Mean squared residual of a coordinate, in units of its sigma."""
+    """Mean squared residual of a coordinate, in units of its sigma; 0 if there is none."""
     errors: autocorrelation.Autocorrelation
     """Autocorrelation of the newest residuals [m]."""
     in_use: CorrelatedErrors | None
@@ -56,7 +56,7 @@ def report(
     ----------
     graph : Graph
     rows : ndarray of int64, shape (K, 2)
-        Stamp [ns] and row of each constraint of the source, in the order of their addition.
+        Stamp [ns] and row of each measurement that is used, in the order of their addition.
     biased : bool, whether the constraints are edges to a bias; else they are observed nodes
     in_use : CorrelatedErrors, optional, statistics in use; None for white errors
     found : bool, whether these are estimated from the errors
@@ -64,14 +64,14 @@ def report(
     """
     newest = rows[-MOST_RESIDUALS:]
     newest = newest[np.argsort(newest[:, 0], kind='stable')]
-    newest = newest[np.append(True, np.diff(newest[:, 0]) > 0)]
+    newest = newest[np.diff(newest[:, 0], prepend=-1) > 0]
     stamps, numbers = newest[:, 0], newest[:, 1]
     if biased:
         residuals, information = _biased_residuals(graph, graph.edges_at(numbers))
     else:
         residuals, information = _residuals(graph, graph.observed_at(numbers))
     energy = np.einsum('ki,kij,kj->k', residuals, information, residuals)
-    return SourceReport(len(rows), float(np.mean(energy)) / 2.0,
+    return SourceReport(len(rows), float(np.sum(energy)) / (2.0 * max(len(energy), 1)),
                         autocorrelation.estimate(stamps, residuals), in_use, found)
 
 

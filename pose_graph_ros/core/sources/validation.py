@@ -80,7 +80,9 @@ def validate(measurement: Measurement, policy: CovariancePolicy) -> Validated | 
     defect = covariance.defect(cov)
     if defect is not None:
         if not policy.repair:
-            return rejected(f'covariance_{defect}', f'{kind}: {cov.tolist()}')
+            return rejected(
+                f'covariance_{defect}', f'{kind}: expected a positive definite matrix, got '
+                f'{cov.tolist()}; covariance_policy: repair would mend it')
         cov = repaired(cov, policy)
         repairs.append(f'repaired_covariance_{defect}')
     floors = np.array([policy.position_floor, policy.position_floor, policy.heading_floor])

@@ -106,7 +106,39 @@ def test_other_kinds_of_constraints_have_their_own_tags(folder: Path) -> None:
         'OBSERVED_SE2_OFFSET': 2}
 
 
+def test_what_is_not_used_is_a_comment(folder: Path) -> None:
+    path, graph = folder / 'doubted.g2o', graph_of_all_kinds(1)
+    graph.apply(GraphUpdate(remove_edges=[2, 5], weigh_observed={0: 0.0}))
+    write_g2o(graph, path)
+    read_back = read_g2o(path)
+    assert read_back.skipped == {}
+    np.testing.assert_array_equal(
+        read_back.graph.edges.mean, np.delete(graph.edges.mean, [2, 5], axis=0))
+    assert len(read_back.graph.observed) == len(graph.observed) - 1
+    comments = [line for line in path.read_text().splitlines() if line.startswith('# not used ')]
+    ends = [tuple(map(int, line.split()[4:6])) for line in comments if 'EDGE_SE2 ' in line]
+    assert ends == [(int(graph.edges.i[k]), int(graph.edges.j[k])) for k in (2, 5)]
+    assert len(comments) == 3
+
+
 # --- files of other programs -----------------------------------------------------------------
+
+def test_a_closure_with_a_switch_is_an_edge(folder: Path) -> None:
+    file = read(folder, f"""
+        VERTEX_SE2 0 0 0 0
+        VERTEX_SE2 1 1 0 0
+        VERTEX_SWITCH 2 1
+        EDGE_SWITCH_PRIOR 2 1 1
+        EDGE_SE2 0 1 1 0 0 {IDENTITY}
+        EDGE_SE2_SWITCHABLE 1 0 2 -1 0.5 0.25 {IDENTITY}
+    """)
+    assert file.skipped == {}
+    np.testing.assert_array_equal(file.ids, [0, 1])
+    np.testing.assert_array_equal(file.graph.edges.mean[1], [-1.0, 0.5, 0.25])
+    np.testing.assert_array_equal(file.graph.edges.i, [0, 1])
+    with pytest.raises(FileFormatError, match=r':1: EDGE_SE2 is followed by 11 numbers, got 2'):
+        read(folder, 'EDGE_SE2_SWITCHABLE 1 0')
+
 
 def test_ids_may_have_gaps_start_anywhere_and_come_in_any_order(folder: Path) -> None:
     file = read(folder, f"""

@@ -480,3 +480,26 @@ def test_a_file_has_no_biases_and_says_so(tmp_path: Path) -> None:
     np.testing.assert_array_equal(read.poses, same.poses)
     np.testing.assert_array_equal(read.edges.mean, same.edges.mean)
     assert (read.n_edges, read.n_observed) == (same.n_edges, same.n_observed)
+
+
+def test_a_file_has_measurements_with_correlated_errors_as_if_these_were_white(
+    tmp_path: Path,
+) -> None:
+    graph = random_graph(seed=3, fix=(0,), n_biases=1)
+    bias = int(np.flatnonzero(graph.rows().is_bias)[0])
+    white = ObservedNodes(
+        [2, 2], None, [[1.0, 2.0, 0.0], [30.0, 2.0, 0.0]],
+        np.tile(np.diag((4.0, 4.0, 0.0)), (2, 1, 1)), [ObservedKind.POSITION] * 2)
+    first = graph.n_observed
+    graph.apply(GraphUpdate(observed=white))
+    # an edge to the bias holds the first of them; the second is doubted
+    graph.apply(GraphUpdate(
+        weigh_observed={first: 0.0, first + 1: 0.0}, edges=Edges(
+            [2], [bias], white.mean[:1], np.diag((9.0, 9.0, 0.0))[None], [EdgeKind.BIAS],
+            bias=[(0.0, 0.0, 0.5, 0.0)])))
+    write_g2o(graph, tmp_path / 'graph.g2o')
+    lines = (tmp_path / 'graph.g2o').read_text(encoding='ascii').splitlines()
+    names = np.cumsum(~graph.rows().is_bias) - 1
+    assert names[2] == 2
+    assert 'EDGE_PRIOR_SE2_XY 2 1.0 2.0 4.0 0.0 4.0' in lines
+    assert '# not used EDGE_PRIOR_SE2_XY 2 30.0 2.0 4.0 0.0 4.0' in lines

@@ -73,6 +73,12 @@ def test_errors_that_are_treated_as_white_but_are_not_are_noticed(
     assert found.wrongly_white is wrong
 
 
+def test_there_is_nothing_to_report_of_what_is_not_used() -> None:
+    found = report(observed(np.ones((5, 2)), 0.5), in_time(5)[:0], biased=False, in_use=None)
+    assert (found.n, found.energy) == (0, 0.0)
+    assert not found.wrongly_white
+
+
 def test_neither_the_order_of_arrival_nor_repeated_stamps_change_the_residuals() -> None:
     graph, rows = observed(gauss_markov(300, 20.0), 1.0), in_time(300)
     expected = report(graph, rows, biased=False, in_use=None)
