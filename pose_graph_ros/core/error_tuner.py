@@ -26,7 +26,6 @@ from pose_graph_ros.core.graph.reweighting import Reweighting
 from pose_graph_ros.core.judgement.judge import Judge
 from pose_graph_ros.core.smoother.incremental import IncrementalSmoother
 from pose_graph_ros.core.sources import error_estimate
-from pose_graph_ros.core.sources.error_likelihood import MeasuredPath
 from pose_graph_ros.core.sources.factor_builder import FactorBuilder
 from pose_graph_ros.core.sources.gauss_markov import (
     Additions,
@@ -162,8 +161,7 @@ class ErrorTuner:
         weights = self._judge.final_weights()
         for source in sources:
             constraints = self._factors.constraints(source)
-            found = error_estimate.finished(
-                error_estimate.search(self._path(constraints, weights)))
+            found = error_estimate.finished(self._steps(constraints, weights))
             constraints.next_estimate = max(
                 constraints.next_estimate, math.ceil(MORE * len(constraints)))
             constraints.odometry_scale = found.odometry_scale
@@ -223,22 +221,23 @@ class ErrorTuner:
     def _next_search(self) -> _Search | None:
         for source in self._factors.due_for_estimate():
             constraints = self._factors.constraints(source)
-            steps = error_estimate.search(
-                self._path(constraints, self._smoother.graph.weights))
+            steps = self._steps(constraints, self._smoother.graph.weights)
             return _Search(source, steps, len(constraints))
         return None
 
-    def _path(
+    def _steps(
         self, constraints: SourceConstraints, by_row: tuple[FloatArray, FloatArray],
-    ) -> MeasuredPath:
-        """Return the measurements of a source whose edges or observed nodes have a weight."""
+    ) -> error_estimate.Search:
+        """Search with the measurements of a source whose edges or observed nodes have a weight."""
         held = constraints.held(np.arange(len(constraints)))
         edges, observed = by_row
         weights = np.zeros(len(constraints))
         weights[held.is_edge] = edges[held.rows[held.is_edge]]
         weights[~held.is_edge] = observed[held.rows[~held.is_edge]]
         used = constraints.rows.values[weights > 0.0]
-        return error_estimate.measured_path(self._smoother.graph, used[:, 0], used[:, 1])
+        path = yield from error_estimate.measured_path(
+            self._smoother.graph, used[:, 0], used[:, 1])
+        return (yield from error_estimate.search(path))
 
     def _begin(self, source: str, errors: CorrelatedErrors | None) -> None:
         """Begin to change the error model of a source."""

@@ -16,11 +16,11 @@ and so not on the order of arrival. Searches are generators: each step takes a b
 
 from collections.abc import Generator
 import math
-from typing import NamedTuple
+from typing import NamedTuple, TypeVar
 
 import numpy as np
 
-from pose_graph_ros.core.geometry.se2 import BoolArray, FloatArray, IntArray
+from pose_graph_ros.core.geometry.se2 import BoolArray, IntArray
 from pose_graph_ros.core.graph import tables as tb
 from pose_graph_ros.core.graph.constraints import EdgeKind, ObservedKind
 from pose_graph_ros.core.graph.graph import Graph
@@ -28,7 +28,6 @@ from pose_graph_ros.core.sources.error_likelihood import (
     chain_motions,
     filtered,
     MeasuredPath,
-    UNKNOWN,
 )
 from pose_graph_ros.core.sources.gauss_markov import CorrelatedErrors
 
@@ -38,6 +37,8 @@ NEWEST = OLDER = 2000
 LEAST_POSITIONS = 10
 # Number of filtered measurements in one step of a search, of 0.4 us each.
 PER_STEP = 5000
+# Number of nodes that are joined in one step, of 0.1 us each.
+NODES_PER_STEP = 10_000
 # How much more likely correlated errors must be: twice the difference of the logarithms. White
 # ones exceed it in one search of a hundred, which costs a few per cent of accuracy until the next;
 # correlated ones that are missed make the claimed covariances up to ten times too small.
@@ -61,10 +62,9 @@ WHITE_BEGINNINGS = tuple((0.0, at) for at in (-6.0, -4.0, -2.0, 0.0, 2.0, 4.0, 6
 ODOMETRY = -2
 # Headings at which the filter starts, of which the best one is used.
 HEADINGS = 16
-# Motion without an odometry edge: its covariance [m^2, m^2, rad^2].
-NO_ODOMETRY = np.diag((1e4, 1e4, 2.0 * UNKNOWN))
 
 Point = tuple[float, ...]
+Result = TypeVar('Result')
 
 
 class Estimate(NamedTuple):
@@ -79,6 +79,8 @@ class Estimate(NamedTuple):
 NOTHING = Estimate(None, 1.0)
 Search = Generator[None, None, Estimate]
 """Yields after each step."""
+PathSteps = Generator[None, None, MeasuredPath]
+"""The same of a path."""
 
 
 class _Minimum(NamedTuple):
@@ -88,13 +90,13 @@ class _Minimum(NamedTuple):
     point: Point
 
 
-def measured_path(graph: Graph, stamps_ns: IntArray, rows: IntArray) -> MeasuredPath:
+def measured_path(graph: Graph, stamps_ns: IntArray, rows: IntArray) -> PathSteps:
     """
-    Return the positions of a source along the path by odometry, sorted by stamp.
+    Return the positions of a source along the path by odometry, sorted by stamp, after some steps.
 
     Parameters
     ----------
-    graph : Graph
+    graph : Graph, the rows of its odometry stay as they are from step to step
     stamps_ns : ndarray of int64, shape (K,)
     rows : ndarray of int64, shape (K,), of the observed nodes; headings among them are left out
 
@@ -105,10 +107,18 @@ def measured_path(graph: Graph, stamps_ns: IntArray, rows: IntArray) -> Measured
     order = np.lexsort((where[:, 1], where[:, 0], stamps_ns))
     order = order[_chosen(len(order))]
     stamps_ns, observed = stamps_ns[order], graph.observed_at(rows[order])
-    nodes, motion, noise = _odometry(graph, observed.node)
-    until = np.maximum.accumulate(np.searchsorted(nodes, observed.node))
-    joined, spread = np.zeros((len(until), 3)), np.zeros((len(until), 3, 3))
-    chain_motions(motion, noise, until, joined, spread)
+    until, edge_after = _odometry(graph, observed.node)
+    yield
+    n = len(until)
+    joined, spread = np.zeros((n, 3)), np.zeros((n, 3, 3))
+    begin = 0
+    while begin < n:
+        most = until[max(begin - 1, 0)] + NODES_PER_STEP
+        end = max(int(np.searchsorted(until, most)), begin + 1)
+        chain_motions(
+            graph.memory['edge_f'], edge_after, until, begin, end, joined, spread)
+        begin = end
+        yield
     covariance = np.linalg.inv(observed.information[:, :2, :2])
     seconds = np.asarray((stamps_ns - stamps_ns[:1]) * 1e-9, dtype=np.float64)
     return MeasuredPath(
@@ -124,25 +134,20 @@ def _chosen(n: int) -> IntArray | slice:
     return np.concatenate((older, np.arange(n - NEWEST, n)))
 
 
-def _odometry(graph: Graph, nodes: IntArray) -> tuple[IntArray, FloatArray, FloatArray]:
-    """Return the poses from the first to the last of some nodes, and the motions between them."""
-    poses = np.flatnonzero(~graph.is_bias)
-    begin, end = np.searchsorted(poses, (np.min(nodes, initial=0), np.max(nodes, initial=0)))
-    poses = poses[begin:end + 1]
-    motion = np.zeros((len(poses), 3))
-    noise = np.tile(NO_ODOMETRY, (len(poses), 1, 1))
+def _odometry(graph: Graph, nodes: IntArray) -> tuple[IntArray, IntArray]:
+    """Return where nodes are among the poses of a path, and the row of the edge after each."""
+    at = np.cumsum(~graph.is_bias) - 1
+    first = int(at[np.min(nodes)]) if len(nodes) > 0 else 0
+    until = np.maximum.accumulate(at[nodes] - first)
+    edge_after = np.full(int(until[-1]) if len(until) > 0 else 0, -1)
     table = graph.memory['edge_i'][:graph.n_edges]
     edges = np.flatnonzero(table[:, tb.EDGE_KIND] == EdgeKind.ODOMETRY)
-    start, end_at = (np.searchsorted(poses, table[edges, column])
-                     for column in (tb.END_I, tb.END_J))
-    inside: BoolArray = (end_at == start + 1) & (end_at < len(poses))
-    inside[inside] = (poses[start[inside]] == table[edges[inside], tb.END_I]) & (
-        poses[end_at[inside]] == table[edges[inside], tb.END_J])
+    start = at[table[edges, tb.END_I]] - first
+    inside: BoolArray = ((start >= 0) & (start < len(edge_after))
+                         & (at[table[edges, tb.END_J]] - first == start + 1))
     # of several edges the first is that of the primary odometry
-    start, first = np.unique(start[inside], return_index=True)
-    used = graph.edges_at(edges[inside][first])
-    motion[start], noise[start] = used.mean, np.linalg.inv(used.information)
-    return poses, motion, noise
+    edge_after[start[inside][::-1]] = edges[inside][::-1]
+    return until, edge_after
 
 
 def search(positions: MeasuredPath) -> Search:
@@ -269,11 +274,11 @@ def _descend(
     return best
 
 
-def finished(steps: Search) -> Estimate:
-    """Return the result of a search that is done without a pause."""
+def finished(steps: Generator[None, None, Result]) -> Result:
+    """Return the result of what is done without a pause."""
     while True:
         try:
             next(steps)
         except StopIteration as end:
-            found: Estimate = end.value
+            found: Result = end.value
             return found

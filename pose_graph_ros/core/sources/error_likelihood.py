@@ -23,6 +23,7 @@ from typing import NamedTuple
 import numpy as np
 
 from pose_graph_ros.core.compiled.jit import (
+    INTEGER,
     INTEGERS,
     kernel,
     MATRICES,
@@ -31,6 +32,7 @@ from pose_graph_ros.core.compiled.jit import (
     ROWS,
 )
 from pose_graph_ros.core.geometry.se2 import FloatArray
+from pose_graph_ros.core.graph.tables import INFO, MEAN
 
 # Squared Mahalanobis distance beyond which a position is taken for wrong, and left out.
 GATE = 16.0
@@ -38,6 +40,8 @@ GATE = 16.0
 LOST = 5
 # Variance of the heading of a motion above which the filter starts again after it [rad^2].
 UNKNOWN = 0.3
+# Variances of a motion without an odometry edge [m^2, m^2, rad^2].
+NO_ODOMETRY = 1e4, 1e4, 2.0 * UNKNOWN
 # Variance of the heading at the first start, and at a later one [rad^2].
 START_VARIANCE, RESTART_VARIANCE = 0.1, 1.0
 # Variance of a position at a start, in units of the claimed variance.
@@ -61,24 +65,34 @@ class MeasuredPath(NamedTuple):
     """Covariance of that motion in the frame at its end, shape (K, 3, 3)."""
 
 
-@kernel(signature=(ROWS, MATRICES, INTEGERS, ROWS, MATRICES))
-def chain_motions(motion, noise, until, out_motion, out_noise):  # type: ignore[no-untyped-def]
+@kernel(signature=(ROWS, INTEGERS, INTEGERS, INTEGER, INTEGER, ROWS, MATRICES))
+def chain_motions(  # type: ignore[no-untyped-def]
+    edges, edge_after, until, begin, end, out_motion, out_noise,
+):
     """
-    Join motions along a path: row k of the result is those of the rows until[k - 1] to until[k].
+    Join the motions of a path: row k of the result is that from pose until[k - 1] to until[k].
 
     Parameters
     ----------
-    motion, noise : ndarray, shapes (N, 3) and (N, 3, 3), each in the frame at its start or its end
-    until : ndarray of int, shape (K,), not decreasing, at most N
-    out_motion, out_noise : ndarray, shapes (K, 3) and (K, 3, 3), are written
+    edges : ndarray, the table of edges of a graph (`graph.tables`)
+    edge_after : ndarray of int, shape (N - 1,), row of the edge after each pose; -1 if none is
+    until : ndarray of int, shape (K,), not decreasing, less than N
+    begin, end : int, of the rows of the result that are written
+    out_motion, out_noise : ndarray, shapes (K, 3) and (K, 3, 3), noise in the frame at the end
 
     """
-    for k in range(len(until)):
+    for k in range(begin, end):
         x = y = theta = 0.0
         cov = out_noise[k]
         cov[:] = 0.0
         for n in range(until[k - 1] if k > 0 else until[k], until[k]):
-            dx, dy, turn = motion[n, 0], motion[n, 1], motion[n, 2]
+            row = edge_after[n]
+            if row < 0:
+                cov[0, 0] += NO_ODOMETRY[0]
+                cov[1, 1] += NO_ODOMETRY[1]
+                cov[2, 2] += NO_ODOMETRY[2]
+                continue
+            dx, dy, turn = edges[row, MEAN], edges[row, MEAN + 1], edges[row, MEAN + 2]
             c, s = math.cos(turn), math.sin(turn)
             # adjoint of the inverse of the motion maps the covariance to the frame at its end
             a, b = -c * dy + s * dx, s * dy + c * dx
@@ -90,9 +104,19 @@ def chain_motions(motion, noise, until, out_motion, out_noise):  # type: ignore[
                 p, q, r = cov[0, i], cov[1, i], cov[2, i]
                 cov[0, i] = c * p + s * q + a * r
                 cov[1, i] = -s * p + c * q + b * r
-            for i in range(3):
-                for j in range(3):
-                    cov[i, j] += noise[n, i, j]
+            xx, xy, xt = edges[row, INFO], edges[row, INFO + 1], edges[row, INFO + 2]
+            yy, yt, tt = edges[row, INFO + 3], edges[row, INFO + 4], edges[row, INFO + 5]
+            first, second, third = yy * tt - yt * yt, xt * yt - xy * tt, xy * yt - xt * yy
+            det = xx * first + xy * second + xt * third
+            cov[0, 0] += first / det
+            cov[1, 1] += (xx * tt - xt * xt) / det
+            cov[2, 2] += (xx * yy - xy * xy) / det
+            cov[0, 1] += second / det
+            cov[1, 0] += second / det
+            cov[0, 2] += third / det
+            cov[2, 0] += third / det
+            cov[1, 2] += (xt * xy - xx * yt) / det
+            cov[2, 1] += (xt * xy - xx * yt) / det
             c, s = math.cos(theta), math.sin(theta)
             x, y, theta = x + c * dx - s * dy, y + s * dx + c * dy, theta + turn
         out_motion[k, 0], out_motion[k, 1], out_motion[k, 2] = x, y, theta

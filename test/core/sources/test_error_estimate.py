@@ -10,7 +10,12 @@ from pose_graph_ros.core.graph.constraints import EdgeKind, Edges, ObservedKind,
 from pose_graph_ros.core.graph.graph import Graph, GraphUpdate
 from pose_graph_ros.core.sources import error_estimate
 from pose_graph_ros.core.sources.error_estimate import finished, measured_path, search
-from pose_graph_ros.core.sources.error_likelihood import chain_motions, filtered, MeasuredPath
+from pose_graph_ros.core.sources.error_likelihood import (
+    chain_motions,
+    filtered,
+    MeasuredPath,
+    NO_ODOMETRY,
+)
 
 SECOND = 1_000_000_000
 
@@ -170,7 +175,7 @@ def test_a_path_has_the_motions_of_the_primary_odometry_in_the_order_of_stamps()
     graph, rng = line(30), np.random.default_rng(0)
     rows = np.sort(rng.choice(30, 12, replace=False))
     some = rng.permutation(rows)
-    found = measured_path(graph, SECOND * (some + 5), some)
+    found = finished(measured_path(graph, SECOND * (some + 5), some))
     np.testing.assert_allclose(found.seconds, rows - rows[0])
     np.testing.assert_allclose(found.position, np.column_stack((rows + 0.2, np.full(12, 0.1))))
     np.testing.assert_allclose(found.variance, 0.25)
@@ -182,10 +187,16 @@ def test_a_path_has_the_motions_of_the_primary_odometry_in_the_order_of_stamps()
 def test_chained_motions_are_those_of_an_oracle() -> None:
     rng, n = np.random.default_rng(4), 20
     motion = rng.normal(0.0, 1.0, (n, 3))
-    root = rng.normal(0.0, 0.1, (n, 3, 3))
+    root = rng.normal(0.0, 0.1, (n, 3, 3)) + np.eye(3)
     noise, until = root @ np.swapaxes(root, 1, 2), np.array((2, 2, 7, 20))
+    graph, poses = Graph(), np.arange(n)
+    graph.apply(GraphUpdate(hidden=np.zeros((n + 1, 3)), fix=(0,), edges=Edges(
+        poses, poses + 1, motion, np.linalg.inv(noise), [EdgeKind.ODOMETRY] * n)))
+    edge_after = np.where(poses == 10, -1, poses)
     got, spread = np.zeros((4, 3)), np.zeros((4, 3, 3))
-    chain_motions(motion, noise, until, got, spread)
+    for part in ((0, 3), (3, 4)):
+        chain_motions(graph.memory['edge_f'], edge_after, until, *part, got, spread)
+    motion[10], noise[10] = 0.0, np.diag(NO_ODOMETRY)
     for k in range(1, 4):
         pose, cov = np.zeros(3), np.zeros((3, 3))
         for row in range(until[k - 1], until[k]):
@@ -193,7 +204,16 @@ def test_chained_motions_are_those_of_an_oracle() -> None:
             pose, cov = se2.compose(pose, motion[row]), back @ cov @ back.T + noise[row]
         np.testing.assert_allclose(got[k, :2], pose[:2], atol=1e-12)
         assert se2.wrap(got[k, 2] - pose[2]) == pytest.approx(0.0, abs=1e-12)
-        np.testing.assert_allclose(spread[k], cov, atol=1e-12)
+        np.testing.assert_allclose(spread[k], cov, rtol=1e-10, atol=1e-10)
+
+
+def test_a_long_path_is_joined_in_steps(monkeypatch: pytest.MonkeyPatch) -> None:
+    arguments = line(40), SECOND * np.arange(40), np.arange(40)
+    at_once = finished(measured_path(*arguments))
+    monkeypatch.setattr(error_estimate, 'NODES_PER_STEP', 7)
+    assert len(list(measured_path(*arguments))) >= 40 // 7
+    for one, other in zip(finished(measured_path(*arguments)), at_once, strict=True):
+        np.testing.assert_array_equal(one, other)
 
 
 def test_of_many_positions_the_newest_and_a_sample_of_the_others_are_used(
@@ -201,6 +221,6 @@ def test_of_many_positions_the_newest_and_a_sample_of_the_others_are_used(
 ) -> None:
     monkeypatch.setattr(error_estimate, 'NEWEST', 10)
     monkeypatch.setattr(error_estimate, 'OLDER', 5)
-    found = measured_path(line(40), SECOND * np.arange(40), np.arange(40))
+    found = finished(measured_path(line(40), SECOND * np.arange(40), np.arange(40)))
     assert len(found.seconds) == 15
     np.testing.assert_allclose(found.seconds[-10:], np.arange(30, 40))
