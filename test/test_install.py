@@ -31,7 +31,7 @@ SHARED_FILES = ('package.xml', *(
     for path in sorted((TREE / folder).iterdir()) if path.is_file()))
 LEFT_OUT = shutil.ignore_patterns(
     '.*', '*.egg-info', '__pycache__', 'build', 'install', 'log', 'demo', 'docs', 'test')
-DEADLINE = 110.0    # [s] of any one command, below the time limit of a test
+DEADLINE = 240.0    # [s] of any one command, below the time limit of a test
 
 LOCATE = f"""
 from ament_index_python import get_package_prefix, get_package_share_directory

@@ -52,7 +52,7 @@ def loaded(*words: str | Path) -> set[str]:
             'except SystemExit: pass\n'
             'print(*sys.modules)')
     done = subprocess.run([sys.executable, '-c', code, *map(str, words)], check=True,
-                          capture_output=True, text=True, timeout=100)
+                          capture_output=True, text=True, timeout=240)
     return set(done.stdout.splitlines()[-1].split())
 
 

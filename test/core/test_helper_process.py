@@ -48,14 +48,14 @@ def stay():
     name = Path(__file__).with_name('pid')
     name.with_suffix('.new').write_text(str(os.getpid()))
     name.with_suffix('.new').rename(name)
-    time.sleep(60.0)
+    time.sleep(600.0)
 """,
 }
 PARENT = f"""
 import time
 from pose_graph_ros.core.helper_process import HelperProcess
 with HelperProcess('{PACKAGE}.help', 'stay'):
-    time.sleep(60.0)
+    time.sleep(600.0)
 """
 
 
@@ -110,7 +110,7 @@ def warm(
 
 def pid(folder: Path) -> int:
     """Wait until the helper has said who it is."""
-    deadline = time.monotonic() + 60.0
+    deadline = time.monotonic() + 240.0
     while not (folder / 'pid').exists():
         assert time.monotonic() < deadline
         time.sleep(0.01)
@@ -155,7 +155,7 @@ def test_a_helper_that_is_stuck_is_not_waited_for(
     start = time.monotonic()
     module = warm('stay')
     assert module.twice.signatures
-    assert time.monotonic() - start < 30.0
+    assert time.monotonic() - start < 240.0     # it would stay for ten minutes
     if (folder / 'pid').exists():   # it may have had no time to say who it is
         assert not Path(f'/proc/{pid(folder)}').exists()
 
@@ -186,7 +186,7 @@ def test_a_helper_ends_with_a_process_that_is_killed(folder: Path) -> None:
     assert is_alive(helper)
     parent.send_signal(signal.SIGKILL)
     parent.wait()
-    deadline = time.monotonic() + 60.0
+    deadline = time.monotonic() + 240.0
     while is_alive(helper):
         assert time.monotonic() < deadline
         time.sleep(0.01)

@@ -383,7 +383,7 @@ def launch(folder: Path, *prefix: str, **environment: str) -> 'subprocess.Popen[
 
 
 def output(process: 'subprocess.Popen[str]') -> tuple[list[str], str]:
-    out, errors = process.communicate(timeout=60)
+    out, errors = process.communicate(timeout=240)
     assert process.returncode == 0, errors
     return out.splitlines(), errors
 

@@ -39,7 +39,7 @@ def test_programs_say_so_in_one_line(module: str, program: str) -> None:
     code = (f'import sys, numba; numba.__version__ = "{UPPER}.1"\n'
             f'from pose_graph_ros.{module} import main; sys.exit(main(["solve", "a.g2o"]))')
     done = subprocess.run([sys.executable, '-c', code], capture_output=True, text=True,
-                          check=False, timeout=100)
+                          check=False, timeout=240)
     assert done.returncode == 2
     assert done.stderr == (
         f"{program}: Numba {UPPER}.1 is not supported: pip install 'numba>={LOWER},<{UPPER}'\n")
