@@ -290,6 +290,8 @@ class ClosureJudge:
 
     def _test_again(self, most: int) -> bool:
         """Test some closures that wait; tell whether some are left."""
+        if self._beliefs.trial.keeps_others_out:
+            return False
         waiting = np.flatnonzero(
             ~self._states.in_graph & self._states.judged
             & self._retests.due(self._beliefs.round, self._smoother.graph.n_nodes,
@@ -311,9 +313,11 @@ class ClosureJudge:
         chosen = self._choose(passed, chance)
         if self._change(chosen):
             return True
-        # what the update diverges with does not keep out the others
-        others = np.setdiff1d(passed, [*chosen]) if len(chosen) > 0 else passed[:0]
-        self._retests.again(others.tolist())
+        # what the update diverges with does not keep out the others, if that is an exception
+        others = passed[:0]
+        if len(chosen) > 0 and not self._beliefs.trial.is_pausing:
+            others = np.setdiff1d(passed, [*chosen])
+            self._retests.again(others.tolist())
         return len(rest) > most or len(others) > 0
 
     def _change(self, states: dict[int, State]) -> bool:

@@ -23,9 +23,10 @@ from pose_graph_ros.core.judgement.verdicts import State
 from pose_graph_ros.core.smoother.incremental import IncrementalSmoother
 from pose_graph_ros.core.smoother.trial import Trial
 
-# Number of trials without a pause. After each further one the graph has to grow by this share of
-# its size until the next one, doubled so many times.
-WITHOUT_PAUSE, PAUSE, MOST_DOUBLINGS = 3, 0.01, 5
+# Number of updates that diverge without a pause. After each further one the graph has to grow by
+# this share of its size until the next trial, doubled so many times; so many updates that do not
+# diverge make up for one.
+WITHOUT_PAUSE, PAUSE, MOST_DOUBLINGS, MAKE_UP = 3, 0.01, 4, 3
 
 
 class ClosureTrial:
@@ -49,8 +50,8 @@ class ClosureTrial:
         """Whether it is a whole set, whose residuals were compared already."""
         self.later: set[int] = set()
         """Numbers of closures that another update has diverged with meanwhile."""
-        self._n_needed = 0
-        """How many more updates have diverged than succeeded, of those that change beliefs."""
+        self._n_diverged = 0
+        """Updates that have diverged, times `MAKE_UP`, less those that have not."""
         self._next_at = 0
         """Size of the graph from which on there may be another trial."""
 
@@ -59,9 +60,9 @@ class ClosureTrial:
         poses: FloatArray | None = None,
     ) -> None:
         """
-        Begin a trial; while another one goes on, only note the closures for later.
+        Begin a trial, but during a pause; that of a whole set does not wait for its end.
 
-        Nothing happens during a pause, which does not hold for a whole set.
+        While another trial goes on, the closures are only noted for later.
 
         Parameters
         ----------
@@ -73,26 +74,32 @@ class ClosureTrial:
         if self._trial is not None:
             self.later.update(changes)
             return
-        n_nodes = self._smoother.graph.n_nodes
         if poses is None:
+            self._n_diverged = min(
+                self._n_diverged + MAKE_UP, MAKE_UP * (WITHOUT_PAUSE + MOST_DOUBLINGS))
             if self.is_pausing:
                 return
-            self._n_needed += 1
-            doublings = min(self._n_needed - WITHOUT_PAUSE, MOST_DOUBLINGS)
-            if doublings >= 0:
-                self._next_at = n_nodes + math.ceil(PAUSE * n_nodes * 2**doublings)
+            n_nodes = self._smoother.graph.n_nodes
+            doublings = max(self._n_diverged // MAKE_UP - WITHOUT_PAUSE, 0)
+            self._next_at = n_nodes + math.ceil(PAUSE * n_nodes * 2**doublings)
         self.changes, self.weights = dict(changes), dict(weights)
         self._is_set = poses is not None
         self._trial = self._smoother.trial(GraphUpdate(weigh_edges=self.weights), poses)
 
     @property
     def is_pausing(self) -> bool:
-        """Whether the graph has to grow until the next trial."""
-        return self._smoother.graph.n_nodes < self._next_at
+        """Whether the graph has to grow until the next trial, as too many updates diverge."""
+        return (self._n_diverged >= MAKE_UP * WITHOUT_PAUSE
+                and self._smoother.graph.n_nodes < self._next_at)
 
     def was_not_needed(self) -> None:
         """Shorten the next pause, as an update has changed beliefs without a trial."""
-        self._n_needed = max(self._n_needed - 1, 0)
+        self._n_diverged = max(self._n_diverged - 1, 0)
+
+    @property
+    def keeps_others_out(self) -> bool:
+        """Whether updates diverge as long as a trial goes on."""
+        return len(self.later) > 0
 
     def work(self) -> bool:
         """Do a part; tell whether there was any."""

@@ -76,7 +76,9 @@ class Trial:
                              if start is None else optimizer.in_parts(copy, _CONFIG))
         yield
         copy.set_poses(copy.poses)
-        if result.status is Status.CONVERGED and self._eliminate():
+        # from poses of a solution it needs few iterations, if any number of them is enough
+        all_used = start is not None and result.iterations == _CONFIG.max_iterations
+        if result.status is Status.CONVERGED and not all_used and self._eliminate():
             return result
         return replace(result, status=Status.FAILED)
 
