@@ -116,7 +116,7 @@ def restore(parts: Parts, saved: SavedGraph) -> None:
     parts.factors.n_bias_edges = int(np.sum(saved.rows.edges.kind == EdgeKind.BIAS))
     parts.reweighting.restore(saved.edge_losses, saved.observed_losses)
     parts.alignment.load(saved.alignment)
-    parts.judge.restore(saved.judgement)
+    parts.judge.restore(saved.judgement, int(parts.nodes.stamps_ns[-1]))
     for queue, edges in (
             (parts.pipeline.queue, saved.waiting), (parts.quarantine, saved.set_aside)):
         table = Edges(edges.i, edges.j, edges.mean, full(edges.information), edges.kind)

@@ -403,8 +403,17 @@ class ClosureJudge:
         """Return the state; what is left to be tested is not part of it."""
         return self._states.saved(self._beliefs.scales)
 
-    def restore(self, saved: SavedClosures) -> None:
-        """Restore what `saved` has returned, for a graph with the same rows."""
+    def restore(self, saved: SavedClosures, now_ns: int) -> None:
+        """
+        Restore what `saved` has returned, for a graph with the same rows.
+
+        Parameters
+        ----------
+        saved : SavedClosures
+        now_ns : int, stamp of the newest hidden node
+
+        """
+        self._beliefs.now_ns = now_ns
         self._chain.extend(self._smoother.graph)
         self._table.append(claims(self._smoother.graph.edges_at(saved.rows)))
         self._states.restore(saved)

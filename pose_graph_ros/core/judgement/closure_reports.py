@@ -19,7 +19,7 @@ from pose_graph_ros.core.judgement.closure_states import (
     STATES,
     WAITING,
 )
-from pose_graph_ros.core.judgement.closures import ClosureTable
+from pose_graph_ros.core.judgement.closures import ClosureTable, GATE
 from pose_graph_ros.core.judgement.listing import listed
 from pose_graph_ros.core.judgement.verdicts import (
     Judged,
@@ -85,7 +85,9 @@ class ClosureReports:
         states = self._states
         agree, against = self._neighbours(number)
         contradicted = [states.name(other) for other in against if states.in_graph_at(other)]
-        if states.state[number] == DOUBTED:
+        # a person may force out what fits, and force in what does not
+        if (states.state[number] == DOUBTED if states.decision[number] == AUTO
+                else states.distance[number] > GATE):
             contradicted.insert(0, 'odometry')
         stamp, reference = states.stamps_ns[number].tolist()
         return Verdict(

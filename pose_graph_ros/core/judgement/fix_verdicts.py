@@ -23,6 +23,7 @@ from pose_graph_ros.core.judgement.fix_states import (
     STAMP,
 )
 from pose_graph_ros.core.judgement.listing import listed
+from pose_graph_ros.core.judgement.runs import EVENT
 from pose_graph_ros.core.judgement.verdicts import Judged, MOST_NAMED, State, Verdict
 
 
@@ -81,6 +82,9 @@ def _verdict(states: FixStates, number: int, residual: FloatArray) -> Verdict:
     first, records = max(number - 50, 0), states.records
     alike = first + np.flatnonzero(records[first:number + 50, RUN] == record[RUN])
     alike = alike[alike != number] if record[RUN] != LONE else alike[:0]
+    # a person may force out what fits, and force in what does not
+    contradicted = (not believed if record[DECISION] == AUTO
+                    else bool(states.distances[number]**2 > EVENT))
     near = alike[np.argsort(np.abs(alike - number), kind='stable')][:MOST_NAMED]
     return Verdict(
         id=states.name(number), kind=Judged.FIX, source=states.sources[record[SOURCE]],
@@ -90,7 +94,7 @@ def _verdict(states: FixStates, number: int, residual: FloatArray) -> Verdict:
         residual=residual,
         distance=float(states.distances[number]),
         supported_by=tuple(states.name(other) for other in near.tolist()),
-        contradicted_by=() if believed else ('odometry',), edge=edge, row=int(record[ROW]))
+        contradicted_by=('odometry',) if contradicted else (), edge=edge, row=int(record[ROW]))
 
 
 def _residuals(graph: Graph, rows: IntArray, is_edge: IntArray) -> FloatArray:

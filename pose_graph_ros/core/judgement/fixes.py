@@ -290,8 +290,17 @@ class FixJudge:
         """Return the state; the runs are not part of it."""
         return self._states.saved(self._loosened)
 
-    def restore(self, saved: fs.SavedFixes) -> None:
-        """Restore what `saved` has returned, for a graph with the same rows."""
+    def restore(self, saved: fs.SavedFixes, now_ns: int) -> None:
+        """
+        Restore what `saved` has returned, for a graph with the same rows.
+
+        Parameters
+        ----------
+        saved : SavedFixes
+        now_ns : int, stamp of the newest hidden node
+
+        """
+        self._now_ns = now_ns
         self._states.restore(saved)
         self._loosened = dict(zip(saved.loosened.tolist(), saved.weights.tolist(), strict=True))
 

@@ -181,10 +181,18 @@ class Judge:
         """Return the state; what is left to be done is not part of it."""
         return SavedJudgement(self._closures.saved(), self._fixes.saved())
 
-    def restore(self, saved: SavedJudgement) -> None:
-        """Restore what `saved` has returned, for a graph with the same rows."""
-        self._closures.restore(saved.closures)
-        self._fixes.restore(saved.fixes)
+    def restore(self, saved: SavedJudgement, now_ns: int) -> None:
+        """
+        Restore what `saved` has returned, for a graph with the same rows.
+
+        Parameters
+        ----------
+        saved : SavedJudgement
+        now_ns : int, stamp of the newest hidden node
+
+        """
+        self._closures.restore(saved.closures, now_ns)
+        self._fixes.restore(saved.fixes, now_ns)
 
     def weigh_odometry(self, weight: float) -> None:
         """Tell the weight that the odometry has in the graph where it is not loosened."""

@@ -64,14 +64,13 @@ def joined(names: Sequence[str]) -> str:
 def sentence(verdict: Verdict) -> str:
     """Return state and reason of a verdict as a sentence."""
     since, far = seconds(verdict.since_ns), _far(verdict.distance)
-    if verdict.decision is Decision.IN:
-        return f'Used since {since}, as a person has decided; {far}.'
-    if verdict.decision is Decision.OUT:
-        return f'Not used since {since}, as a person has decided; {far}.'
     supported = '' if len(verdict.supported_by) == 0 else (
         f'; {joined(verdict.supported_by)} {_agree(verdict.supported_by)} with it')
     contradicted = '' if len(verdict.contradicted_by) == 0 else (
         f'; it contradicts {joined(verdict.contradicted_by)}')
+    if verdict.decision is not Decision.AUTO:
+        used = 'Used' if verdict.decision is Decision.IN else 'Not used'
+        return f'{used} since {since}, as a person has decided: {far}{contradicted}{supported}.'
     match verdict.state:
         case State.BELIEVED:
             return f'Believed and used since {since}: {far}{supported}{contradicted}.'

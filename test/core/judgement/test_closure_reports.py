@@ -114,6 +114,7 @@ def test_a_person_overrules_and_takes_it_back() -> None:
     assert answer.detail.startswith('loop/3: Used')
     settle(backend)
     assert states(backend)[3]
+    assert 'odometry' in backend.verdicts()[3].contradicted_by
     assert backend.decide('loop/1', Decision.OUT).status is AnswerStatus.ACCEPTED
     settle(backend)
     assert not states(backend)[1]
@@ -125,6 +126,13 @@ def test_a_person_overrules_and_takes_it_back() -> None:
     changed = {change.id for change in backend.verdict_changes()}
     assert {'loop/1', 'loop/3'} <= changed
     assert backend.verdict_changes() == []
+
+
+def test_a_decision_on_a_loaded_graph_is_since_its_newest_node() -> None:
+    saved = driven(0.0, 8.0).saved()
+    backend = PoseGraphBackend.restored(None, saved)
+    backend.decide('loop/0', Decision.OUT)
+    assert backend.verdicts()[0].since_ns == saved.nodes.stamps_ns[-1]
 
 
 def test_a_false_one_that_was_forced_in_where_nothing_contradicts_it_goes_again() -> None:
@@ -153,6 +161,7 @@ def test_changes_name_the_state_before() -> None:
     assert isinstance(change, Change)
     assert change.before is not None
     assert (change.before.in_graph, change.after) == (True, State.DOUBTED)
+    assert backend.verdicts()[2].contradicted_by == ()
 
 
 @pytest.mark.parametrize('robust', [Robust.LOSS, Robust.NONE])

@@ -10,7 +10,7 @@ from pose_graph_ros.core.backend import PoseGraphBackend
 from pose_graph_ros.core.config import BackendConfig, Correlation, MeasurementSource, POSITIONS
 from pose_graph_ros.core.geometry import se2
 from pose_graph_ros.core.geometry.se2 import BoolArray, FloatArray
-from pose_graph_ros.core.judgement.verdicts import Decision, State
+from pose_graph_ros.core.judgement.verdicts import Decision, State, Verdict
 from pose_graph_ros.core.measurements import GlobalPose, Measurement, OdometrySample, Position
 
 SECOND = 1_000_000_000
@@ -225,13 +225,14 @@ def test_decisions_of_a_person_are_kept_and_taken_back() -> None:
     backend.decide('fix/30', Decision.OUT)
     backend.update()
 
-    def state() -> State:
-        return next(each for each in backend.verdicts() if each.id == 'fix/30').state
+    def verdict() -> Verdict:
+        return next(each for each in backend.verdicts() if each.id == 'fix/30')
 
-    assert state() is State.DOUBTED
+    assert verdict().state is State.DOUBTED
+    assert verdict().contradicted_by == ()
     assert [change.id for change in backend.verdict_changes()] == ['fix/30']
     backend.decide('fix/30', Decision.AUTO)
-    assert state() is State.BELIEVED
+    assert verdict().state is State.BELIEVED
     assert backend.decide('fix/999', Decision.IN).reason == 'unknown_id'
 
 
