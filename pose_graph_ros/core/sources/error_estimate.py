@@ -47,6 +47,9 @@ SIGNIFICANT = 5.0
 PER_LOST = 100.0
 # The same of a scale of the noise of odometry other than 1.
 SIGNIFICANT_SCALE = 4.0
+# Longest time constant, in units of the time from the first measurement to the last. Shorter ones
+# would make the variance of an error that hardly changes in this time too small.
+LONGEST = 16.0
 # Smallest correlation of consecutive measurements that matters.
 LEAST_CORRELATION = 0.2
 # Sigma of the logarithm of the total variance in units of the claimed one, before it is seen.
@@ -160,7 +163,7 @@ def search(positions: MeasuredPath) -> Search:
     period = float(np.median(np.diff(positions.seconds)))
     shortest, longest = (
         math.ceil(math.log2(max(time, 1e-3)) / FINEST) * FINEST
-        for time in (period, 4.0 * float(positions.seconds[-1])))
+        for time in (period, LONGEST * float(positions.seconds[-1])))
     evaluate.bounds = shortest, longest
     found = yield from _descend(evaluate, [
         (time, *parts) for time in np.arange(shortest, longest + 0.1, 1.0).tolist()
