@@ -134,6 +134,12 @@ def test_measurements_come_in_and_poses_path_and_diagnostics_go_out(
     assert float(values['odom.rate_hz']) > 0.0
     assert 0.0 <= float(values['fix.squared_residual']) < 0.1
     assert {f'largest_energy.{rank}' for rank in (1, 2, 3)} < values.keys()
+    documented = (Path(__file__).parents[2] / 'docs' / 'topics.md').read_text()
+    for key in values.keys() - {f'largest_energy.{rank}' for rank in (2, 3)}:
+        source, _, last = key.partition('.')
+        names = (key, 'received.<source>' if source == 'received' else f'<source>.{last}',
+                 f'.{last}')
+        assert any(f'`{name}`' in documented for name in names), f'{key} is not documented'
     assert float(values['memory_mb']) > 10.0
     assert active.health() == (OK, 'Running.')
 
