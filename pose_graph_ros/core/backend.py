@@ -77,7 +77,7 @@ class PoseGraphBackend:
         self._newest_node_covariance = np.zeros((3, 3))
         """In map axes, shape (3, 3)."""
         self._reweighting = Reweighting()
-        self._judge = Judge(self._smoother, self._reweighting, self._config)
+        self._judge = Judge(self._smoother, self._reweighting, self._config, self._nodes)
         self._factors = FactorBuilder(self._config, self._reweighting)
         self._tuner = ErrorTuner(
             self._smoother, self._factors, self._reweighting, self._judge)

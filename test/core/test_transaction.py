@@ -20,6 +20,7 @@ from pose_graph_ros.core.graph.graph import GraphUpdate
 from pose_graph_ros.core.graph.reweighting import Reweighting
 from pose_graph_ros.core.judgement.judge import Judge
 from pose_graph_ros.core.measurements import LoopClosure, OdometrySample, Position
+from pose_graph_ros.core.odometry.hidden_nodes import HiddenNodes
 from pose_graph_ros.core.smoother.incremental import IncrementalSmoother, UpdateResult
 from pose_graph_ros.core.sources.factor_builder import FactorBuilder, Queue, QueuedEdge
 from pose_graph_ros.core.transaction import Transaction
@@ -167,7 +168,7 @@ def test_a_transaction_moves_the_graph_or_says_why_not(
     reweighting = Reweighting()
     transaction = Transaction(
         graph, AlignmentMonitor(CONFIG), FactorBuilder(CONFIG, reweighting),
-        Judge(IncrementalSmoother(), reweighting, CONFIG))
+        Judge(IncrementalSmoother(), reweighting, CONFIG, HiddenNodes(CONFIG, lambda *_: 0)))
     passed = contextlib.suppress(KeyboardInterrupt)     # the only one that goes through
     with passed, transaction:
         transaction.add(queue)

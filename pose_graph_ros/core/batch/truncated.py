@@ -50,6 +50,12 @@ class Choice:
     """The truncated cost [sigma^2]."""
     poses: FloatArray
     """Those that minimise chi2 of what is believed, shape (N, 3) [m, m, rad]."""
+    known: float
+    """chi2 of all that is known to be right [sigma^2]."""
+
+    def cost_by(self, limits: FloatArray) -> float:
+        """Return the truncated cost with other limits, shape (M,)."""
+        return self.known + float(np.sum(np.minimum(self.energies, limits)))
 
 
 class TruncatedProblem:
@@ -70,7 +76,7 @@ class TruncatedProblem:
     def __init__(
         self, graph: Graph, rows: IntArray, start: FloatArray | None = None,
     ) -> None:
-        self.graph, self._rows = graph, rows
+        self.graph, self.rows = graph, rows
         self.edges = graph.edges_at(rows)
         """What may be wrong; their weights have no meaning."""
         self.limits = LIMITS[_ranks(self.edges.information)]
@@ -80,9 +86,9 @@ class TruncatedProblem:
         self._weights = self.edges.weight
         self._choices: dict[tuple[bytes, bytes, SolverConfig], Choice] = {}
         """The last sets that were solved for, the newest last."""
-        self._start = graph.poses.copy() if start is None else start
+        self.start = graph.poses.copy() if start is None else start
         if start is None and self.solve(np.zeros(len(self)), CONFIG):
-            self._start = graph.poses.copy()
+            self.start = graph.poses.copy()
 
     def __len__(self) -> int:
         return len(self.limits)
@@ -102,7 +108,7 @@ class TruncatedProblem:
         """
         self._weigh(weights)
         if not go_on:
-            self.graph.set_poses(self._start)
+            self.graph.set_poses(self.start)
         return optimize(self.graph, config).status is not Status.FAILED
 
     def factorisation(self, weights: FloatArray) -> int:
@@ -147,7 +153,7 @@ class TruncatedProblem:
         squares = self.energies()
         known = chi2_of(self.graph) - float(np.sum(squares[believed]))
         cost = known + float(np.sum(np.minimum(squares, self.limits)))
-        return Choice(believed.copy(), squares, cost, self.graph.poses.copy())
+        return Choice(believed.copy(), squares, cost, self.graph.poses.copy(), known)
 
     def improved(
         self, choice: Choice, retests: int = RETESTS, config: SolverConfig = CONFIG,
@@ -178,7 +184,7 @@ class TruncatedProblem:
     def _weigh(self, weights: FloatArray) -> None:
         changed = np.flatnonzero(weights != self._weights)
         self.graph.apply(GraphUpdate(weigh_edges=dict(zip(
-            self._rows[changed].tolist(), weights[changed].tolist(), strict=True))))
+            self.rows[changed].tolist(), weights[changed].tolist(), strict=True))))
         self._weights = weights.copy()
 
 

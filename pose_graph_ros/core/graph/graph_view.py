@@ -108,7 +108,7 @@ def view(graph: Graph, drawn: DrawnRows = ALL_BELIEVED) -> GraphView | None:
                      sigmas[rows])
 
     in_graph, kinds = edges.weights > 0.0, edges.integers[:, tb.EDGE_KIND]
-    in_graph[list(drawn.weak)] = False
+    in_graph[[*drawn.weak, *drawn.doubted]] = False
     # a measurement with a time-correlated error is an edge to a bias
     biased = np.flatnonzero(
         (kinds == EdgeKind.BIAS) & edges.tells_position & ~is_bias[edges.integers[:, tb.END_I]])

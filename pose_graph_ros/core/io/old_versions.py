@@ -24,7 +24,8 @@ EMPTY_JUDGEMENT: dict[str, Any] = {'closures': {
     'distance': []}, 'fixes': {
     'sources': [], 'rows': [], 'edges': [], 'source': [], 'stamps_ns': [], 'believed': [],
     'since_ns': [], 'decision': {'names': [], 'of': []}, 'observed': [], 'distance': [],
-    'loosened': [], 'weights': []}}
+    'loosened': [], 'weights': []}, 'odometry': {
+    'rows': [], 'ends': [], 'weights': [], 'since_ns': []}}
 
 
 def with_judgement(members: dict[str, Any]) -> dict[str, Any]:

@@ -24,6 +24,7 @@ from pose_graph_ros.core.graph.reweighting import SavedLosses
 from pose_graph_ros.core.judgement.closure_states import SavedClosures
 from pose_graph_ros.core.judgement.fix_states import SavedFixes
 from pose_graph_ros.core.judgement.judge import SavedJudgement
+from pose_graph_ros.core.judgement.odometry_states import SavedOdometry
 from pose_graph_ros.core.judgement.verdicts import Decision, State
 from pose_graph_ros.core.odometry.hidden_nodes import SavedNodes
 from pose_graph_ros.core.saved_columns import Matrix
@@ -106,6 +107,7 @@ class SavedGraph:
         _require(alignment.next_verdict > 0, 'alignment.next_verdict: expected a positive number')
         self._check_judgement(self.judgement.closures, sizes['edges'])
         self._check_fixes(self.judgement.fixes, sizes)
+        self._check_doubts(self.judgement.odometry, sizes)
         for name, edges in (('waiting', self.waiting), ('set_aside', self.set_aside)):
             _same_length(name, edges, 'sources', 'i', 'j', 'mean', 'information', 'kind',
                          'stamps_ns')
@@ -166,6 +168,15 @@ class SavedGraph:
         _inside(where, fixes.decision, len(Decision))
         _inside(where, fixes.loosened, sizes['edges'])
         _require(fixes.weights > 0.0, f'{where}: expected positive weights')
+
+    def _check_doubts(self, odometry: SavedOdometry, sizes: Mapping[str, int]) -> None:
+        where = 'judgement.odometry'
+        _same_length(where, odometry, 'rows', 'ends', 'weights', 'since_ns')
+        _inside(where, odometry.rows, sizes['edges'])
+        _require(self.rows.edges.kind[odometry.rows] == EdgeKind.ODOMETRY,
+                 f'{where}: expected rows of odometry')
+        _require(np.isin(odometry.ends, self.nodes.rows), f'{where}: expected hidden nodes')
+        _require(odometry.weights > 0.0, f'{where}: expected positive weights')
 
     def _check_source(self, where: str, source: SavedSource, sizes: Mapping[str, int]) -> None:
         _same_length(where, source, 'seen_ns', 'seen_references')

@@ -12,14 +12,17 @@ from collections.abc import Mapping
 import numpy as np
 
 from pose_graph_ros.core.batch.optimizer import Status
-from pose_graph_ros.core.geometry.se2 import FloatArray, IntArray
+from pose_graph_ros.core.geometry.se2 import BoolArray, FloatArray, IntArray
 from pose_graph_ros.core.graph.graph import GraphUpdate
 from pose_graph_ros.core.graph.reweighting import Reweighting
 from pose_graph_ros.core.judgement.closure_states import ClosureStates, DOUBTED, STATES
 from pose_graph_ros.core.judgement.closure_trial import ClosureTrial
 from pose_graph_ros.core.judgement.closures import ClosureTable
+from pose_graph_ros.core.judgement.odometry_states import Doubt, OdometryStates
+from pose_graph_ros.core.judgement.swaps import Found
 from pose_graph_ros.core.judgement.verdicts import State
 from pose_graph_ros.core.smoother.incremental import DIVERGED, IncrementalSmoother
+from pose_graph_ros.core.smoother.trial import continued
 
 
 class Beliefs:
@@ -32,14 +35,15 @@ class Beliefs:
     reweighting : Reweighting, of its constraints with a robust loss
     states : ClosureStates
     table : ClosureTable
+    odometry : OdometryStates
 
     """
 
     def __init__(
         self, smoother: IncrementalSmoother, reweighting: Reweighting, states: ClosureStates,
-        table: ClosureTable,
+        table: ClosureTable, odometry: OdometryStates,
     ) -> None:
-        self._smoother, self._reweighting = smoother, reweighting
+        self._smoother, self._reweighting, self._odometry = smoother, reweighting, odometry
         self._states, self._table = states, table
         self.scales: list[float] = []
         """Of each source, the factor on its sigmas in the graph."""
@@ -47,6 +51,9 @@ class Beliefs:
         """Increases when more or less is believed, so that those that wait are tested again."""
         self.now_ns = 0
         self.trial = ClosureTrial(smoother)
+        self._doubts: dict[int, Doubt] | None = None
+        """Odometry that is doubted with the set that is tried, if that changes."""
+        self._odometry_round = -1
 
     def weights(self, numbers: IntArray) -> FloatArray:
         """Return the weights of closures by their states."""
@@ -58,7 +65,10 @@ class Beliefs:
         for number, weight in zip(numbers.tolist(), self.weights(numbers).tolist(), strict=True):
             self._reweighting.set_base_weight(int(self._states.row[number]), weight, edge=True)
 
-    def apply(self, changes: Mapping[int, State], *, at_once: bool = False) -> bool:
+    def apply(
+        self, changes: Mapping[int, State], *, at_once: bool = False,
+        doubts: Mapping[int, Doubt] | None = None,
+    ) -> bool:
         """
         Return whether states and weights could be changed; else nothing has.
 
@@ -68,34 +78,91 @@ class Beliefs:
         ----------
         changes : mapping, new states by the numbers of closures
         at_once : bool
+        doubts : mapping, optional, the doubted odometry edges by row, if they change as well
 
         """
-        weights = self.weights_with(changes)
+        weights = self.weights_with(changes, doubts)
         result = self._smoother.update(GraphUpdate(weigh_edges=weights), fall_back=at_once)
         if result.status is Status.FAILED:
             if result.reason == DIVERGED:
                 self.trial.begin(changes, weights)
             return False
         self.trial.was_not_needed()
-        self._keep(changes)
+        self._keep(changes, doubts)
         return True
 
-    def weights_with(self, changes: Mapping[int, State]) -> dict[int, float]:
-        """Return the weights of edges, by row, after a change of states."""
+    def change_to(
+        self, inside: BoolArray, poses: FloatArray, doubts: Mapping[int, Doubt],
+    ) -> bool:
+        """
+        Return whether another set could be believed, at the poses of its solution.
+
+        Parameters
+        ----------
+        inside : ndarray of bool, shape (M,), which closures are believed
+        poses : ndarray, shape (N, 3)
+        doubts : mapping, doubted odometry edges by row
+
+        """
+        graph = self._smoother.graph
+        before = graph.poses.copy()
+        graph.set_poses(continued(graph, poses))
+        done = self.apply(self._states.changes_to(inside), at_once=True, doubts=doubts)
+        if not done:
+            graph.set_poses(before)
+            self._smoother.update(GraphUpdate())
+        return done
+
+    def try_set(self, found: Found) -> None:
+        """Try another set of closures, and odometry that is doubted with it, on a copy."""
+        changes, graph = self._states.changes_to(found.inside), self._smoother.graph
+        self._doubts = None if found.jump is None else {
+            **self._odometry.doubts, **self._odometry.doubted(
+                graph, (found.jump,), self.now_ns, np.arange(len(self._states)))}
+        self.trial.begin(changes, self.weights_with(changes, self._doubts),
+                         continued(graph, found.poses))
+
+    def believe_odometry_again(self) -> bool:
+        """Believe odometry that no believed closure leads over; tell whether there was any."""
+        if self.round == self._odometry_round or len(self._odometry.doubts) == 0:
+            return False
+        self._odometry_round = self.round
+        edges = self._smoother.graph.edges_at(self._states.row[self._states.in_graph])
+        left = self._odometry.still_doubted(edges)
+        return len(left) < len(self._odometry.doubts) and self.apply({}, doubts=left)
+
+    def weights_with(
+        self, changes: Mapping[int, State], doubts: Mapping[int, Doubt] | None = None,
+    ) -> dict[int, float]:
+        """
+        Return the weights of edges, by row, after a change of states.
+
+        Parameters
+        ----------
+        changes, doubts : as in `apply`
+
+        """
         numbers = np.array(sorted(changes), dtype=np.int64)
         before = self._states.state[numbers].copy()
         self._states.state[numbers] = [STATES.index(changes[k]) for k in numbers.tolist()]
         weights = self.weights(numbers).tolist()
         self._states.state[numbers] = before
-        return dict(zip(self._states.row[numbers].tolist(), weights, strict=True))
+        odometry = {} if doubts is None else self._odometry.weights_with(doubts)
+        return {**dict(zip(self._states.row[numbers].tolist(), weights, strict=True)), **odometry}
 
-    def _keep(self, changes: Mapping[int, State]) -> None:
+    def _keep(
+        self, changes: Mapping[int, State], doubts: Mapping[int, Doubt] | None,
+    ) -> None:
         """Change states, of which the graph has the weights already."""
         for number, state in sorted(changes.items()):
             before = int(self._states.state[number])
             self._states.state[number] = STATES.index(state)
             self._states.announce(number, before, self.now_ns)
         self.set_base_weights(np.array(sorted(changes), dtype=np.int64))
+        if doubts is not None:
+            for row, weight in self._odometry.weights_with(doubts).items():
+                self._reweighting.set_base_weight(row, weight, edge=True)
+            self._odometry.keep(doubts, self._smoother.graph)
         self.round += 1
 
     def try_part(self) -> list[int] | None:
@@ -110,17 +177,22 @@ class Beliefs:
         if not trial.is_finished:
             return []
         changes, later = trial.changes, trial.later
-        if trial.is_outdated or trial.weights != self.weights_with(changes) or not np.all(
-                states.judged[[*changes]]):
+        if (trial.is_outdated or trial.weights != self.weights_with(changes, self._doubts)
+                or not np.all(states.judged[[*changes]])):
             later |= set(changes)
         else:
             bad = trial.misfits(self._table)
             if len(bad) == 0 and trial.adopt():
-                self._keep(changes)
+                self._keep(changes, self._doubts)
                 later |= set(changes)
             for number in bad:
                 before, states.state[number] = int(states.state[number]), DOUBTED
                 states.announce(number, before, self.now_ns)
             later |= set(changes) - set(bad) if len(bad) > 0 else set()
-        trial.end()
+        self.end_trial()
         return sorted(later)
+
+    def end_trial(self) -> None:
+        """Forget what is tried."""
+        self.trial.end()
+        self._doubts = None

@@ -21,7 +21,6 @@ from pose_graph_ros.core.config import BackendConfig
 from pose_graph_ros.core.geometry.se2 import BoolArray, FloatArray, IntArray
 from pose_graph_ros.core.graph import tables as tb
 from pose_graph_ros.core.graph.constraints import EdgeKind, Edges
-from pose_graph_ros.core.graph.graph import GraphUpdate
 from pose_graph_ros.core.graph.reweighting import Reweighting
 from pose_graph_ros.core.judgement import final, relative
 from pose_graph_ros.core.judgement.beliefs import Beliefs
@@ -38,6 +37,7 @@ from pose_graph_ros.core.judgement.closure_states import (
 )
 from pose_graph_ros.core.judgement.closures import chances, claims, ClosureTable, GATE
 from pose_graph_ros.core.judgement.consistency import OdometryChain
+from pose_graph_ros.core.judgement.odometry_states import OdometryStates
 from pose_graph_ros.core.judgement.retests import Retests
 from pose_graph_ros.core.judgement.scale_learner import ScaleLearner
 from pose_graph_ros.core.judgement.set_search import SetSearch
@@ -49,7 +49,6 @@ from pose_graph_ros.core.judgement.verdicts import (
 )
 from pose_graph_ros.core.measurements import Answer, AnswerStatus, rejected
 from pose_graph_ros.core.smoother.incremental import IncrementalSmoother
-from pose_graph_ros.core.smoother.trial import continued
 from pose_graph_ros.core.sources.factor_builder import NewConstraint
 
 # A clique supports a closure if it has so many members, over so long a way [m].
@@ -76,13 +75,16 @@ class ClosureJudge:
     Parameters
     ----------
     smoother, reweighting, config : as in `Judge`
+    odometry : OdometryStates, which odometry is doubted
 
     """
 
     def __init__(
         self, smoother: IncrementalSmoother, reweighting: Reweighting, config: BackendConfig,
+        odometry: OdometryStates,
     ) -> None:
         self._smoother, self._reweighting = smoother, reweighting
+        self._odometry = odometry
         self._chain = OdometryChain()
         self._table = ClosureTable(self._chain)
         self.states = self._states = ClosureStates()
@@ -94,7 +96,7 @@ class ClosureJudge:
         self._corroborated = GrowingArray((), np.bool_)
         """Whether a clique of closures outside of the graph supports one that is doubted."""
         self._search = SetSearch(self._states, self._table)
-        self._beliefs = Beliefs(smoother, reweighting, self._states, self._table)
+        self._beliefs = Beliefs(smoother, reweighting, self._states, self._table, odometry)
         self._scales = ScaleLearner(smoother, self._states, self._table, self._beliefs, config)
 
     def configure(self, config: BackendConfig) -> None:
@@ -342,13 +344,18 @@ class ClosureJudge:
             return
         forced = states.row[states.in_graph & ~states.judged]
         inside = states.in_graph
-        choice = final.decide(
-            graph, self._reweighting, states.row[judged], forced, inside[judged])
+        choice, jumps = final.decide(
+            graph, self._reweighting, states.row[judged], forced, inside[judged],
+            odometry=self._odometry.weights_with({}))
         if choice is None:
             return
         inside[judged] = choice.believed
         self._scales.begin()
-        if not self._change_to(inside, choice.poses):
+        doubts = self._odometry.doubts if jumps is None else self._odometry.doubted(
+            graph, jumps, self._beliefs.now_ns, judged)
+        done = self._beliefs.change_to(inside, choice.poses, doubts)
+        self._table.forget_spread()
+        if not done:
             return
         if self._scales.learn_all():
             self._table.forget_spread()
@@ -359,12 +366,14 @@ class ClosureJudge:
     def state(self) -> Callable[[], None]:
         """Return what brings the present state back, as long as no closure is added."""
         states, scales = self._states.state_of_all(), self._scales.state()
+        odometry = self._odometry.state()
 
         def bring_back() -> None:
+            odometry()
             self._states.set_state_of_all(*states)
             self._scales.set_state(*scales)
             self._search = SetSearch(self._states, self._table)
-            self._beliefs.trial.end()
+            self._beliefs.end_trial()
             self._retests.again(slice(None))
             self._table.forget_spread()
         return bring_back
@@ -381,23 +390,8 @@ class ClosureJudge:
         more = self._search.work(
             self._smoother.graph, self._corroborated.values, self._beliefs.round)
         if self._search.found is not None:
-            changes = self._states.changes_to(self._search.found.inside)
-            self._beliefs.trial.begin(
-                changes, self._beliefs.weights_with(changes),
-                continued(self._smoother.graph, self._search.found.poses))
-        return more
-
-    def _change_to(self, inside: BoolArray, poses: FloatArray) -> bool:
-        """Believe another set at once, at the poses of its solution; tell whether that worked."""
-        graph = self._smoother.graph
-        before = graph.poses.copy()
-        graph.set_poses(continued(graph, poses))
-        done = self._beliefs.apply(self._states.changes_to(inside), at_once=True)
-        if not done:
-            graph.set_poses(before)
-            self._smoother.update(GraphUpdate())
-        self._table.forget_spread()
-        return done
+            self._beliefs.try_set(self._search.found)
+        return more or self._beliefs.believe_odometry_again()
 
     def saved(self) -> SavedClosures:
         """Return the state; what is left to be tested is not part of it."""

@@ -11,6 +11,8 @@ That would take long for a very large graph. There the set that is believed alre
 for retests of all closures at its poses.
 """
 
+from collections.abc import Mapping
+
 import numpy as np
 
 from pose_graph_ros.core.batch import final_optimization, optimizer
@@ -21,7 +23,8 @@ from pose_graph_ros.core.geometry.se2 import BoolArray, IntArray
 from pose_graph_ros.core.graph.constraints import Edges
 from pose_graph_ros.core.graph.graph import Graph, GraphUpdate
 from pose_graph_ros.core.graph.reweighting import Reweighting
-from pose_graph_ros.core.judgement import selection
+from pose_graph_ros.core.judgement import jumps, selection
+from pose_graph_ros.core.judgement.jumps import Jump
 
 CONFIG = SolverConfig(max_iterations=100)
 # Nodes and closures, together, above which the set is only improved, and the number of retests.
@@ -30,11 +33,13 @@ MOST, RETESTS = 30_000, 3
 
 def decide(
     graph: Graph, reweighting: Reweighting, rows: IntArray, forced: IntArray, inside: BoolArray,
-) -> Choice | None:
+    *, odometry: Mapping[int, float],
+) -> tuple[Choice | None, tuple[Jump, ...] | None]:
     """
-    Return which loop closures to believe; None if the graph cannot be solved.
+    Return which loop closures to believe, and which odometry not to.
 
-    With more than `MOST` nodes and closures that is `inside`, improved.
+    There is no choice if the graph cannot be solved. With more than `MOST` nodes and closures it
+    is `inside`, improved, and the same odometry is doubted as before: None.
 
     Parameters
     ----------
@@ -43,14 +48,16 @@ def decide(
     rows : ndarray of int, shape (M,), edges that may be doubted; their weights do not matter
     forced : ndarray of int, edges that a person has decided to believe
     inside : ndarray of bool, shape (M,), which of `rows` are believed now
+    odometry : mapping, weights of the odometry edges that are doubted now, as if they were not
 
     """
     copy = _copy(graph, np.union1d(rows, forced))
     if graph.n_nodes + len(rows) > MOST:
         problem = TruncatedProblem(copy, rows, start=copy.poses.copy())
         present = problem.choice(inside)
-        return None if present is None else problem.improved(present, RETESTS)
-    weights = dict.fromkeys(rows.tolist(), 0.0) | dict.fromkeys(forced.tolist(), 1.0)
+        return None if present is None else problem.improved(present, RETESTS), None
+    weights = dict.fromkeys(rows.tolist(), 0.0) | dict.fromkeys(
+        forced.tolist(), 1.0) | dict(odometry)
     copy.apply(GraphUpdate(weigh_edges=weights))
     others = Reweighting()
     others.restore(*reweighting.saved())
@@ -61,9 +68,9 @@ def decide(
     if result.status is not Status.FAILED and len(others) > 0:
         result = final_optimization.optimize(copy, others, CONFIG, optimizer.optimize)
     if result.status is Status.FAILED:
-        return None
+        return None, None
     problem = TruncatedProblem(copy, rows, start=copy.poses.copy())
-    return selection.best(problem, insured=True)
+    return jumps.best(problem, insured=True)
 
 
 def _copy(graph: Graph, closures: IntArray) -> Graph:

@@ -59,6 +59,21 @@ def drawn_rows(states: FixStates, others: DrawnRows) -> DrawnRows:
                            unused_observed=unused[~edge, ROW].tolist())
 
 
+def believed_after(states: FixStates, stamp_ns: int) -> tuple[str, ...]:
+    """
+    Return the ids of the first believed measurements from a stamp on.
+
+    Parameters
+    ----------
+    states : FixStates
+    stamp_ns : int
+
+    """
+    after = np.flatnonzero(states.believed & (states.records[:, STAMP] >= stamp_ns))
+    first = after[np.argsort(states.records[after, STAMP], kind='stable')][:MOST_NAMED]
+    return tuple(map(states.name, first.tolist()))
+
+
 def verdicts_on(states: FixStates, graph: Graph, numbers: IntArray) -> list[Verdict]:
     """
     Return the verdicts on some measurements.

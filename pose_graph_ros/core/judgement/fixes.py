@@ -124,9 +124,13 @@ class FixJudge:
         edges, observed = self._states.weights(first, self._reweighting)
         for row in () if loosened is self._loosened else {*loosened, *self._loosened}:
             if loosened.get(row) != self._loosened.get(row):
-                edges[row] = self.odometry_weight * self._loosened.get(row, 1.0)
+                edges[row] = self.weight_of_odometry(row)
         return change._replace(weigh_edges={**change.weigh_edges, **edges},
                                weigh_observed={**change.weigh_observed, **observed})
+
+    def weight_of_odometry(self, row: int) -> float:
+        """Return the weight that an odometry edge has, as far as fixes know."""
+        return self.odometry_weight * self._loosened.get(row, 1.0)
 
     def _copy(self) -> _Before:
         return _Before(len(self._states), self._runs.copy(), self._loosened)

@@ -37,12 +37,12 @@ def improved(problem: TruncatedProblem, choice: Choice) -> Choice:
     choice : Choice
 
     """
-    groups, given = _groups(problem), choice
+    all_groups, given = groups(problem), choice
     left = WORK // max(problem.graph.n_nodes, 1)
     tried: set[int] = set()     # first members of groups, in or out of the present choice
     for _ in range(ROUNDS):
         before = choice
-        for group in _to_try(problem, choice, groups):
+        for group in _to_try(problem, choice, all_groups):
             if left == 0 or int(group[0]) in tried:
                 continue
             left -= 1
@@ -62,7 +62,7 @@ def improved(problem: TruncatedProblem, choice: Choice) -> Choice:
     return problem.improved(problem.choice(choice.believed) or choice)
 
 
-def _groups(problem: TruncatedProblem) -> list[IntArray]:
+def groups(problem: TruncatedProblem) -> list[IntArray]:
     """Return the groups of at least two closures that agree, by their numbers."""
     a, b = agreeing_pairs(problem)
     n = len(problem)

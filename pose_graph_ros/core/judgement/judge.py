@@ -11,6 +11,7 @@ changed. It does a bounded part of that; `work` does the rest, part by part, bet
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from functools import partial
 
 import numpy as np
 
@@ -26,8 +27,10 @@ from pose_graph_ros.core.judgement.closure_judge import ClosureJudge
 from pose_graph_ros.core.judgement.closure_states import SavedClosures
 from pose_graph_ros.core.judgement.fix_states import SavedFixes
 from pose_graph_ros.core.judgement.fixes import FixJudge
+from pose_graph_ros.core.judgement.odometry_states import OdometryStates, SavedOdometry
 from pose_graph_ros.core.judgement.verdicts import Change, Decision, SourceVerdicts, Verdict
 from pose_graph_ros.core.measurements import Answer, LoopClosure
+from pose_graph_ros.core.odometry.hidden_nodes import HiddenNodes
 from pose_graph_ros.core.smoother.incremental import (
     DIVERGED,
     IncrementalSmoother,
@@ -43,6 +46,7 @@ class SavedJudgement:
 
     closures: SavedClosures
     fixes: SavedFixes
+    odometry: SavedOdometry
 
 
 class Judge:
@@ -54,15 +58,19 @@ class Judge:
     smoother : IncrementalSmoother
     reweighting : Reweighting, of its constraints with a robust loss
     config : BackendConfig
+    nodes : HiddenNodes, with the stamps and the sources of the odometry
 
     """
 
     def __init__(
         self, smoother: IncrementalSmoother, reweighting: Reweighting, config: BackendConfig,
+        nodes: HiddenNodes,
     ) -> None:
         self._smoother, self._reweighting, self._config = smoother, reweighting, config
-        self._closures = ClosureJudge(smoother, reweighting, config)
+        self._nodes = nodes
         self._fixes = FixJudge(smoother, reweighting, config)
+        self._odometry = OdometryStates(nodes, self._fixes.weight_of_odometry)
+        self._closures = ClosureJudge(smoother, reweighting, config, self._odometry)
         self._staged = np.empty(0, dtype=np.int64)
         """The judged closures of the last `before`, by their numbers among its edges."""
 
@@ -86,6 +94,7 @@ class Judge:
 
         """
         change = self._fixes.before(new, change, now_ns)
+        change = change._replace(weigh_edges=self._odometry.kept(change.weigh_edges))
         first = self._smoother.graph.n_edges
         closures = [
             one for one in new if one.is_edge and self._is_judged_closure(one, change, first)]
@@ -127,6 +136,11 @@ class Judge:
         """Keep what the last `before` has decided, after its update has succeeded."""
         self._closures.commit()
         self._fixes.commit()
+        self._keep_gaps()
+
+    def _keep_gaps(self) -> None:
+        self._odometry.keep_gaps(
+            self._fixes.loosened, self._smoother.graph, self._nodes.newest_ns)
 
     def rollback(self) -> None:
         """Forget the constraints of the last `before`, as their update has failed."""
@@ -149,20 +163,25 @@ class Judge:
         """Return the verdicts that are listed; see `listing.listed`."""
         graph = self._smoother.graph
         return [*self._closures.reports.verdicts(graph, most_believed),
+                *self._odometry.verdicts(
+                    graph, self._closures.states.name,
+                    partial(fix_verdicts.believed_after, self._fixes.states)),
                 *fix_verdicts.verdicts(self._fixes.states, graph, most_believed)]
 
     def drawn_rows(self) -> DrawnRows:
         """Return the rows of constraints that are drawn in another way than believed ones."""
         return fix_verdicts.drawn_rows(
-            self._fixes.states, self._closures.reports.drawn_rows())
+            self._fixes.states, self._odometry.drawn_rows(self._closures.reports.drawn_rows()))
 
     def changes(self) -> list[Change]:
         """Return the changes of verdicts since the last call."""
-        return [*self._closures.states.take_changes(), *self._fixes.states.take_changes()]
+        return [*self._closures.states.take_changes(), *self._odometry.take_changes(),
+                *self._fixes.states.take_changes()]
 
     def totals(self) -> Mapping[str, SourceVerdicts]:
         """Return what is believed of each source, as a whole."""
-        return {**self._closures.totals(), **self._fixes.states.totals()}
+        return {**self._odometry.totals(), **self._closures.totals(),
+                **self._fixes.states.totals()}
 
     def decide(self, name: str, decision: Decision) -> Answer:
         """
@@ -179,7 +198,8 @@ class Judge:
 
     def saved(self) -> SavedJudgement:
         """Return the state; what is left to be done is not part of it."""
-        return SavedJudgement(self._closures.saved(), self._fixes.saved())
+        return SavedJudgement(
+            self._closures.saved(), self._fixes.saved(), self._odometry.saved())
 
     def restore(self, saved: SavedJudgement, now_ns: int) -> None:
         """
@@ -193,6 +213,9 @@ class Judge:
         """
         self._closures.restore(saved.closures, now_ns)
         self._fixes.restore(saved.fixes, now_ns)
+        self._odometry.restore(saved.odometry)
+        self._odometry.keep_gaps(self._fixes.loosened, self._smoother.graph, now_ns)
+        self._odometry.take_changes()   # which were told before
 
     def weigh_odometry(self, weight: float) -> None:
         """Tell the weight that the odometry has in the graph where it is not loosened."""
@@ -238,6 +261,7 @@ class Judge:
         while self.work():
             pass
         self._fixes.finish()
+        self._keep_gaps()
         self._closures.decide_finally()
         return undo
 

@@ -9,6 +9,7 @@ import numpy as np
 
 from pose_graph_ros.core.geometry.se2 import BoolArray, IntArray
 from pose_graph_ros.core.graph.graph import Graph
+from pose_graph_ros.core.judgement import jump_search
 from pose_graph_ros.core.judgement.closure_states import ClosureStates
 from pose_graph_ros.core.judgement.closures import ClosureTable
 from pose_graph_ros.core.judgement.swaps import Found, Swap
@@ -80,8 +81,10 @@ class SetSearch:
                     states.judged[known])
         while swap.step(np.searchsorted(known, clique)):
             yield
-        if swap.found is None:
+        found = swap.found or (yield from jump_search.search(swap, graph))
+        if found is None:
             return None
         inside = np.zeros(n, dtype=bool)
-        inside[known] = swap.found.inside
-        return Found(inside, swap.found.poses)
+        inside[known] = found.inside
+        jump = found.jump and found.jump._replace(seen_by=known[found.jump.seen_by])
+        return Found(inside, found.poses, jump)

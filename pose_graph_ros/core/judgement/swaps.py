@@ -25,6 +25,7 @@ from pose_graph_ros.core.graph.error_functions import edge_errors, energies
 from pose_graph_ros.core.graph.graph import Graph, GraphRows, GraphUpdate
 from pose_graph_ros.core.judgement.closures import GATE
 from pose_graph_ros.core.judgement.consistency import Closures
+from pose_graph_ros.core.judgement.jumps import Jump
 
 _CONFIG = SolverConfig(max_iterations=20, step_tolerance=1e-3)
 # Factors on the limit of r^2 in successive rounds; in the first ones the clique stays in.
@@ -41,6 +42,8 @@ class Found:
     """Which closures are in it, shape (M,)."""
     poses: FloatArray
     """Of all hidden nodes, shape (N, 3)."""
+    jump: Jump | None = None
+    """Odometry that is doubted with it."""
 
 
 class Swap:
@@ -60,18 +63,18 @@ class Swap:
         self, graph: Graph, closures: Closures, rows: IntArray, inside: BoolArray,
         free: BoolArray,
     ) -> None:
-        self._rows, self._before, self._free = rows, inside, free
+        self.rows, self.before, self.free = rows, inside, free
         copied = graph.rows()
         information = np.linalg.inv(closures.noise)
         kinds, weights = copied.edges.kind[rows], inside.astype(np.float64)
-        self._edges = Edges(
+        self.edges = Edges(
             closures.i, closures.j, closures.mean, information, kinds, np.ones(len(rows)))
         columns = (closures.i, closures.j, closures.mean, information, kinds, weights)
         for column, values in zip(copied.edges.columns, columns, strict=False):
             column[rows] = values
         self._graph = Graph()
         self._parts = self._first(copied)
-        self._n_steps, self._cost = 0, np.inf
+        self._n_steps, self.cost = 0, np.inf
         self._inside = inside.copy()
         self.found: Found | None = None
 
@@ -92,20 +95,19 @@ class Swap:
 
     def _goes_on(self, clique: IntArray) -> bool:
         """Compare the set that was optimised, and choose the next one; tell if there is any."""
-        residual = energies(
-            edge_errors(self._graph.poses, self._edges), self._edges.information)
+        residual = self.residuals(self._graph)
         if self._n_steps == 0:
-            self._cost = self._truncated(residual)
-            self._choose(self._before, clique)
+            self.cost = self.truncated(self._graph, residual)
+            self._choose(self.before, clique)
             self._n_steps = 1
             return True
         if self._n_steps > len(NARROWING):
             return False
         limit = GATE * NARROWING[self._n_steps - 1]
         settled = limit <= GATE
-        if settled and self._truncated(residual) < self._cost - GAIN:
+        if settled and self.truncated(self._graph, residual) < self.cost - GAIN:
             self.found = Found(self._inside.copy(), self._graph.poses.copy())
-            self._cost = self._truncated(residual)
+            self.cost = self.truncated(self._graph, residual)
         self._n_steps += 1
         before = self._inside
         self._choose(residual < limit,
@@ -114,17 +116,30 @@ class Swap:
 
     def _choose(self, wanted: BoolArray, forced: IntArray) -> None:
         before = self._inside
-        self._inside = np.where(self._free, wanted, self._before)
+        self._inside = np.where(self.free, wanted, self.before)
         self._inside[forced] = True
         changed = np.flatnonzero(self._inside != before)
         self._graph.apply(GraphUpdate(weigh_edges=dict(zip(
-            self._rows[changed].tolist(), self._inside[changed].astype(float).tolist(),
+            self.rows[changed].tolist(), self._inside[changed].astype(float).tolist(),
             strict=True))))
 
-    def _truncated(self, residual: FloatArray) -> float:
-        others = np.ones(self._graph.n_edges, dtype=bool)
-        others[self._rows] = False
-        all_energies = self._graph.energies()
+    def residuals(self, graph: Graph) -> FloatArray:
+        """Return r^2 of all closures in a copy, shape (M,)."""
+        return energies(edge_errors(graph.poses, self.edges), self.edges.information)
+
+    def truncated(self, graph: Graph, residual: FloatArray) -> float:
+        """
+        Return the truncated cost of a copy.
+
+        Parameters
+        ----------
+        graph : Graph
+        residual : ndarray, shape (M,), of `residuals`
+
+        """
+        others = np.ones(graph.n_edges, dtype=bool)
+        others[self.rows] = False
+        all_energies = graph.energies()
         chi2 = float(np.sum(all_energies.edges[others]) + np.sum(all_energies.observed))
-        return chi2 + float(np.sum(np.minimum(residual[self._free], GATE))) + float(
-            np.sum(residual[~self._free & self._before]))
+        return chi2 + float(np.sum(np.minimum(residual[self.free], GATE))) + float(
+            np.sum(residual[~self.free & self.before]))

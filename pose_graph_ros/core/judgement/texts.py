@@ -81,7 +81,17 @@ def sentence(verdict: Verdict) -> str:
             return (f'Waits since {since} and is not used: too little is known yet to believe or '
                     f'to doubt it; {far}{supported}{contradicted}.')
         case State.DOUBTED:
-            return f'Doubted and not used since {since}: {far}{contradicted}{supported}.'
+            return (f'Doubted and not used since {since}: {_jump(verdict) or far}{contradicted}'
+                    f'{supported}.')
+
+
+def _jump(verdict: Verdict) -> str:
+    """Return by how much odometry is wrong, and where; nothing of other constraints."""
+    if verdict.kind is not Judged.ODOMETRY or verdict.reference_ns is None:
+        return ''
+    x, y, theta = verdict.residual.tolist()
+    return (f'it is wrong by {math.hypot(x, y):.2f} m and {abs(theta):.2f} rad, somewhere '
+            f'between {seconds(verdict.reference_ns)} and {seconds(verdict.stamp_ns)}')
 
 
 def _agree(names: Sequence[str]) -> str:

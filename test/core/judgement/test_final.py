@@ -163,7 +163,8 @@ def test_nothing_is_decided_again_until_something_has_changed(
 ) -> None:
     calls: list[int] = []
     decide = final.decide
-    monkeypatch.setattr(final, 'decide', lambda *args: (calls.append(1), decide(*args))[1])
+    monkeypatch.setattr(final, 'decide', lambda *args, **rest: (
+        calls.append(1), decide(*args, **rest))[1])
     drive = DRIVES[1, False]
     backend = run(sorted([*drive.odometry, *drive.measurements], key=lambda one: one.stamp_ns))
     assert len(calls) == 1
@@ -186,7 +187,7 @@ def test_a_graph_without_a_solution_keeps_what_is_believed(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     drive = DRIVES[0, False]
-    monkeypatch.setattr(final, 'decide', lambda *_: None)
+    monkeypatch.setattr(final, 'decide', lambda *_, **__: (None, None))
     backend = run(sorted([*drive.odometry, *drive.measurements], key=lambda one: one.stamp_ns))
     assert len(believed(backend)) > 10
 

@@ -1,0 +1,78 @@
+# Copyright 2026 The pose_graph_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""A jump of odometry while driving, tried on a copy of the graph, part by part: see `jumps`."""
+
+from collections.abc import Generator
+
+import numpy as np
+
+from pose_graph_ros.core.batch import optimizer
+from pose_graph_ros.core.batch.optimizer import Status
+from pose_graph_ros.core.config import SolverConfig
+from pose_graph_ros.core.geometry import se2
+from pose_graph_ros.core.geometry.se2 import BoolArray
+from pose_graph_ros.core.graph.constraints import Edges
+from pose_graph_ros.core.graph.graph import Graph
+from pose_graph_ros.core.judgement import jumps
+from pose_graph_ros.core.judgement.closures import GATE
+from pose_graph_ros.core.judgement.jumps import Jump
+from pose_graph_ros.core.judgement.odometry_motions import Odometry
+from pose_graph_ros.core.judgement.swaps import Found, Swap
+
+CONFIG = SolverConfig(max_iterations=20, step_tolerance=1e-3)
+# Number of doubted closures that all others are compared with.
+MOST_SEEDS = 10
+
+
+def search(present: Swap, graph: Graph) -> Generator[None, None, Found | None]:
+    """
+    Return a set with a jump, None if none pays; part by part.
+
+    Parameters
+    ----------
+    present : Swap, that has found nothing better than the set that is believed
+    graph : Graph, it is not changed
+
+    """
+    edges, odometry, poses = present.edges, Odometry(graph), graph.poses.copy()
+    yield
+    free_or_in = present.free | present.before
+    found = jumps.places(
+        edges.rows(free_or_in), present.before[free_or_in], poses, odometry, (),
+        most_seeds=MOST_SEEDS)
+    yield
+    for place in found[:1]:
+        numbers = np.flatnonzero(free_or_in)
+        members, against = numbers[place.members], numbers[place.against]
+        inside = present.before.copy()
+        inside[against[present.free[against]]], inside[members] = False, True
+        motion, = odometry.motion_at(
+            np.array([place.at]), place.first, place.last, place.total)
+        copy, rows = Graph(), graph.rows()
+        _write(rows.edges, present, inside)
+        copy.fill(jumps.rows_with_motion(rows, odometry, place.at, motion, jumps.LOOSE))
+        yield
+        result = yield from optimizer.in_parts(copy, CONFIG)
+        if result.status is Status.FAILED:
+            continue
+        residual = present.residuals(copy)
+        fit = members[residual[members] <= GATE]
+        if (present.truncated(copy, residual) + jumps.PRICE >= present.cost
+                or len(fit) < jumps.MOST_FIT * len(members)
+                or jumps.n_places(copy.poses, edges.rows(fit)) < jumps.PLACES):
+            continue
+        total = se2.between(*copy.poses[odometry.nodes[[place.first, place.last]]])
+        at, motion = odometry.smallest_jump(
+            place.first, place.last, place.first, place.last, total)
+        first, last = odometry.nodes[[place.first, place.last]].tolist()
+        inside = np.where(present.free, residual <= GATE, inside)
+        return Found(inside, copy.poses.copy(), Jump(
+            int(odometry.rows[at]), (first, last), motion, fit))
+    return None
+
+
+def _write(edges: Edges, present: Swap, inside: BoolArray) -> None:
+    own = present.edges
+    columns = (own.i, own.j, own.mean, own.information, own.kind, inside.astype(np.float64))
+    for column, values in zip(edges.columns, columns, strict=False):
+        column[present.rows] = values

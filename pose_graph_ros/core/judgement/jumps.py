@@ -1,0 +1,405 @@
+# Copyright 2026 The pose_graph_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""
+Jumps of odometry: motions that it has not measured, such as slip of the wheels, or being carried.
+
+All closures over a jump contradict odometry, by the same motion, and agree with one another. The
+hypothesis is that one odometry edge is wrong: a closure from node i to node j shows how it was,
+
+    x = (T_i O_ik)^-1 T_i z O_lj^-1
+
+with O the motions before and after the edge, from k to l. In a trial the edge has this motion. It
+is kept if the truncated cost falls by more than its price.
+
+Wrong closures agree as well where places look alike, but on few places, and right ones contradict
+them. So a jump has to be seen from several places, and those over it that are believed, and do not
+agree with it, are lost by it.
+"""
+
+from collections.abc import Sequence
+from itertools import pairwise
+from typing import NamedTuple
+
+import numpy as np
+
+from pose_graph_ros.core.batch.truncated import Choice, ROUGH, TruncatedProblem
+from pose_graph_ros.core.geometry import se2
+from pose_graph_ros.core.geometry.se2 import BoolArray, FloatArray, IntArray
+from pose_graph_ros.core.graph.constraints import EdgeKind, Edges
+from pose_graph_ros.core.graph.graph import Graph, GraphRows
+from pose_graph_ros.core.judgement import group_search, selection
+from pose_graph_ros.core.judgement.closures import GATE
+from pose_graph_ros.core.judgement.consistency import Closures
+from pose_graph_ros.core.judgement.odometry_motions import Odometry, SIGMAS
+from pose_graph_ros.core.smoother import innovations
+
+# Least reduction of the truncated cost by a jump [sigma^2]: which edge it is, of many thousands,
+# and its size, of all that would fit into the map, have to be told.
+PRICE = 35.0
+# From how many places a jump is to be seen, and their distance: at most so many metres, and so
+# much of the extent of the map.
+PLACES, PLACE, PLACE_SHARE = 3, 20.0, 0.2
+# Sigmas of the motion in a trial where it is only known roughly [m, m, rad].
+LOOSE = np.array((30.0, 30.0, 3.0))
+# Share of the closures that show a jump which must fit with it.
+MOST_FIT = 0.75
+# Limits of the search: jumps, closures that others are compared with, and trials for one jump.
+MOST, MOST_SEEDS, MOST_TRIALS = 10, 60, 4
+# Maximum number of retests of a trial.
+RETESTS = 6
+# Of the search of the edge: how many ends of closures beyond the place, and how many at most.
+FURTHER, MOST_CUTS = 2, 16
+# Median of chi2 with three degrees of freedom, and least part of the variance of an edge that the
+# rest of the graph must leave, so that it says anything on the edge.
+USUAL, _FREE = 3.5, 1e-7
+
+
+class Jump(NamedTuple):
+    """An odometry edge that is doubted."""
+
+    row: int
+    """The edge."""
+    ends: tuple[int, int]
+    """Nodes between which it is; the closures do not tell which edge it is."""
+    motion: FloatArray
+    """What has moved the robot along the edge, by the closures, shape (3,) [m, m, rad]."""
+    seen_by: IntArray
+    """Numbers of the closures that the jump was found by."""
+
+
+class Place(NamedTuple):
+    """Where a jump may be."""
+
+    gain: float
+    first: int
+    last: int
+    """Places in the chain between which it is."""
+    at: int
+    """Where it is tried."""
+    total: FloatArray
+    """Pose of the last place in the first one, if it is there, shape (3,)."""
+    members: IntArray
+    """Closures over the jump that show it."""
+    against: IntArray
+    """Believed closures over the jump that do not agree with it."""
+
+
+def best(
+    problem: TruncatedProblem, *, insured: bool = False,
+) -> tuple[Choice | None, tuple[Jump, ...]]:
+    """
+    Return the set of `selection.best`, and jumps of odometry that lower its cost.
+
+    Parameters
+    ----------
+    problem, insured : as there
+
+    """
+    choice, jumps = selection.best(problem, insured=insured), list[Jump]()
+    while choice is not None and len(jumps) < MOST:
+        found = _one_more(problem, choice, insured=insured)
+        if found is None:
+            break
+        problem, choice, jump = found
+        jumps.append(jump)
+    return choice, tuple(jumps)
+
+
+def _one_more(
+    problem: TruncatedProblem, choice: Choice, *, insured: bool,
+) -> tuple[TruncatedProblem, Choice, Jump] | None:
+    odometry = Odometry(problem.graph)
+    strained, scale = _strained(problem, choice, odometry)
+    price = PRICE * scale
+    groups = group_search.groups(problem)
+    for place in strained + places(
+            problem.edges, choice.believed, choice.poses, odometry, groups):
+        trial = _with_jump(problem, choice, odometry, place, price)
+        if trial is None:
+            continue
+        first, last, at, motion = _located(problem, trial, odometry, place)
+        other = with_motion(problem, odometry, at, motion)
+        found = _decided(other, trial.believed, insured=insured)
+        if found is not None and _is_better(problem, choice, other, found, price):
+            begin, end = odometry.nodes[[first, last]].tolist()
+            return other, found, Jump(
+                int(odometry.rows[at]), (begin, end), motion, place.members)
+    return None
+
+
+def _located(
+    problem: TruncatedProblem, trial: Choice, odometry: Odometry, place: Place,
+) -> tuple[int, int, int, FloatArray]:
+    """
+    Return between which places a jump is, where the edge begins that is doubted, and its motion.
+
+    Closures that end around the place tell more than those that it was found by.
+    """
+    ends = odometry.places(np.concatenate((problem.edges.i, problem.edges.j)))
+    ends = np.unique(np.append(ends[ends >= 0], (place.first, place.last)))
+    first, last = np.searchsorted(ends, (place.first, place.last)).tolist()
+    cuts = ends[max(first - FURTHER, 0):last + FURTHER + 1]
+    cuts = cuts[np.unique(np.linspace(0, len(cuts) - 1, MOST_CUTS).astype(np.int64))]
+    outer = int(cuts[0]), int(cuts[-1])
+    total = se2.between(*trial.poses[odometry.nodes[list(outer)]])
+    lowest, found = np.inf, (*outer, *odometry.smallest_jump(*outer, *outer, total))
+    for begin, end in pairwise(cuts.tolist()):
+        at, motion = odometry.smallest_jump(begin, end, *outer, total)
+        other = with_motion(problem, odometry, at, motion)
+        choice = other.choice(trial.believed, ROUGH)
+        if choice is None:
+            continue
+        cost = other.improved(choice, RETESTS, ROUGH).cost_by(problem.limits)
+        if cost < lowest:
+            lowest, found = cost, (begin, end, at, motion)
+    return found
+
+
+def _decided(
+    problem: TruncatedProblem, believed: BoolArray, *, insured: bool,
+) -> Choice | None:
+    """Return the set of `selection.best`, or the given one, improved, if it costs less."""
+    given = problem.choice(believed)
+    if given is not None:
+        given = problem.improved(given)
+    found = selection.best(problem, insured=insured)
+    if given is None or found is None:
+        return found or given
+    # with equal limits, as the first ones are never lower
+    return found if found.cost <= given.cost_by(problem.limits) else given
+
+
+def _strained(
+    problem: TruncatedProblem, choice: Choice, odometry: Odometry,
+) -> tuple[list[Place], float]:
+    """
+    Return where odometry is bent most by what is believed, and how large its energies are.
+
+    Without an edge, with the error e, information W and covariance C of the estimate along it,
+    chi2 would be lower by `e^T (W^-1 - C)^-1 e`, and its error be `(1 - C W)^-1 e`.
+    """
+    graph, n = problem.graph, len(odometry.rows)
+    graph.set_poses(choice.poses)
+    if n == 0 or not problem.solve(choice.believed.astype(np.float64), go_on=True):
+        return [], 1.0
+    edges = graph.edges_at(odometry.rows)
+    errors, covariances = np.empty((n, 3)), np.zeros((n, 3, 3))
+    innovations.of_edges(graph.memory.head, *map(np.ascontiguousarray, (
+        edges.i, edges.j, edges.mean, edges.kind, edges.bias)), errors, covariances)
+    # in sigmas: with W = L L^T, L^T C L is between 0 and 1
+    root = np.linalg.cholesky(edges.weighted_information)
+    white = np.swapaxes(root, 1, 2)
+    values, vectors = np.linalg.eigh(white @ covariances @ root)
+    free = 1.0 - values
+    along = np.einsum('mij,mi->mj', vectors, np.einsum('mij,mj->mi', white, errors))
+    with np.errstate(divide='ignore', invalid='ignore'):
+        without = np.where(free > _FREE, along / free, 0.0)
+    gains = np.sum(along * without, axis=1)
+    known = gains[np.any(free > _FREE, axis=1)]
+    scale = max(float(np.median(known)) / USUAL, 1.0) if len(known) > 0 else 1.0
+    k = int(np.argmax(gains))
+    if gains[k] <= PRICE * scale:
+        return [], scale
+    near = gains > gains[k] - GATE * scale
+    first, last = (k - int(np.argmin(np.append(near[k::-1], False))) + 1,
+                   k + int(np.argmin(np.append(near[k:], False))))
+    jump = np.linalg.solve(white[k], vectors[k] @ without[k])
+    motion = se2.compose(edges.mean[k], jump)
+    ends = problem.edges
+    over = choice.believed & (odometry.places(ends.i) <= k) & (odometry.places(ends.j) > k)
+    if n_places(choice.poses, ends.rows(over)) < PLACES:
+        return [], scale
+    total = se2.between(odometry.poses[first], odometry.poses[k])
+    total = se2.compose(se2.compose(total, motion),
+                        se2.between(odometry.poses[k + 1], odometry.poses[last]))
+    return [Place(float(gains[k]), first, last, k, total, np.flatnonzero(over),
+                  np.empty(0, dtype=np.int64))], scale
+
+
+def _with_jump(
+    problem: TruncatedProblem, choice: Choice, odometry: Odometry, place: Place, price: float,
+) -> Choice | None:
+    """Return a set with a jump; None if it does not pay."""
+    motion, = odometry.motion_at(
+        np.array([place.at]), place.first, place.last, place.total)
+    other = with_motion(problem, odometry, place.at, motion, LOOSE)
+    believed = choice.believed.copy()
+    believed[place.against], believed[place.members] = False, True
+    trial = other.choice(believed, ROUGH)
+    if trial is None:
+        return None
+    trial = other.improved(trial, RETESTS, ROUGH)
+    fit = place.members[trial.believed[place.members]]
+    if len(fit) < MOST_FIT * len(place.members) or n_places(
+            trial.poses, problem.edges.rows(fit)) < PLACES:
+        return None
+    return trial if _is_better(problem, choice, other, trial, price) else None
+
+
+def _is_better(
+    problem: TruncatedProblem, choice: Choice, other: TruncatedProblem, trial: Choice,
+    price: float,
+) -> bool:
+    """Tell whether a jump lowers the cost by more than its price, with equal limits."""
+    limits = np.minimum(problem.limits, other.limits)
+    return trial.cost_by(limits) + price < choice.cost_by(limits)
+
+
+def with_motion(
+    problem: TruncatedProblem, odometry: Odometry, at: int, motion: FloatArray,
+    sigmas: FloatArray = SIGMAS,
+) -> TruncatedProblem:
+    """
+    Return a problem with another motion along one edge of odometry.
+
+    Parameters
+    ----------
+    problem : TruncatedProblem
+    odometry : Odometry, of its graph
+    at : int, place in the chain that the edge begins at
+    motion, sigmas : ndarray, shape (3,), and its sigmas, at least
+
+    """
+    rows = problem.graph.rows()._replace(poses=problem.start.copy())
+    graph = Graph()
+    graph.fill(rows_with_motion(rows, odometry, at, motion, sigmas))
+    return TruncatedProblem(graph, problem.rows)
+
+
+def rows_with_motion(
+    rows: GraphRows, odometry: Odometry, at: int, motion: FloatArray, sigmas: FloatArray,
+) -> GraphRows:
+    """
+    Return rows of a graph, which are changed, with another motion along one edge of odometry.
+
+    Parameters
+    ----------
+    rows : GraphRows
+    odometry, at, motion, sigmas : as in `with_motion`
+
+    """
+    row, edges, poses, moved = int(odometry.rows[at]), rows.edges, rows.poses, ~rows.is_bias
+    edges.mean[row] = motion
+    edges.information[row] = selection.floored(edges.rows(np.array([row])), sigmas).information[0]
+    k, l = odometry.nodes[[at, at + 1]]     # noqa: E741  as above
+    moved[:l] = False
+    change = se2.compose(se2.compose(poses[k], motion), se2.inverse(poses[l]))
+    poses[moved] = se2.compose(change[None], poses[moved])
+    return rows
+
+
+def places(
+    edges: Edges, believed: BoolArray, poses: FloatArray, odometry: Odometry,
+    groups: Sequence[IntArray], *, most_seeds: int = MOST_SEEDS,
+) -> list[Place]:
+    """
+    Return where jumps may be, those that explain the most closures first.
+
+    Parameters
+    ----------
+    edges : Edges, M closures, from earlier to later nodes
+    believed : ndarray of bool, shape (M,)
+    poses : ndarray, shape (N, 3), with what is believed
+    odometry : Odometry
+    groups : sequence of ndarray of int, closures that agree along the path
+    most_seeds : int, number of closures that all others are compared with
+
+    """
+    usable = ((edges.kind == EdgeKind.LOOP_CLOSURE)
+              & np.all(np.einsum('mii->mi', edges.information) > 0.0, axis=1))
+    first, last = odometry.places(edges.i), odometry.places(edges.j)
+    usable &= (first >= 0) & (last > first)
+    doubted = np.flatnonzero(usable & ~believed)
+    if len(doubted) * GATE <= PRICE:
+        return []
+    numbers = np.flatnonzero(usable)
+    table = Closures(edges.i, edges.j, edges.mean, np.linalg.inv(np.where(
+        usable[:, None, None], edges.information, np.eye(3))))
+    found: dict[tuple[int, int], Place] = {}
+    for seed in _seeds(doubted, groups, most_seeds):
+        squared = odometry.chain.squared_distances(
+            table, np.full(len(numbers), seed), numbers)
+        agrees = np.zeros(len(edges), dtype=bool)
+        agrees[numbers] = squared <= GATE
+        agrees[seed] = True
+        place = _place(seed, first, last, agrees & usable & ~believed,
+                       usable & believed & ~agrees)
+        if place is not None:
+            place = place._replace(
+                total=_shown_by(edges.rows(np.array([seed])), poses, odometry, place))
+        if place is None or place.gain <= found.get(
+                (place.first, place.last), place._replace(gain=0.0)).gain:
+            continue
+        if n_places(poses, edges.rows(place.members)) >= PLACES:
+            found[place.first, place.last] = place
+    return sorted(found.values(), key=lambda place: (-place.gain, place.first))[:MOST_TRIALS]
+
+
+def _seeds(doubted: IntArray, groups: Sequence[IntArray], most: int) -> list[int]:
+    """Return doubted closures that others are compared with: of the largest groups, and others."""
+    within = [group[np.isin(group, doubted)] for group in groups]
+    within = sorted((group for group in within if len(group) > 0),
+                    key=lambda group: (-len(group), int(group[0])))
+    seeds = [int(group[len(group) // 2]) for group in within[:most // 2]]
+    rest = np.setdiff1d(doubted, np.concatenate([np.empty(0, np.int64), *within]))
+    n = min(len(rest), most - len(seeds))
+    return seeds + rest[np.linspace(0, len(rest) - 1, n).astype(np.int64)].tolist()
+
+
+def _place(
+    seed: int, first: IntArray, last: IntArray, agrees: BoolArray, against: BoolArray,
+) -> Place | None:
+    """
+    Return where a jump would explain the most closures, less those that it contradicts.
+
+    Parameters
+    ----------
+    seed : int, it leads over the jump
+    first, last : ndarray of int, shape (M,), places of the ends of closures
+    agrees, against : ndarray of bool, doubted ones that agree with the seed, and believed others
+
+    """
+    begin, end = int(first[seed]), int(last[seed])
+    change = np.zeros(end - begin + 1)
+    for chosen, sign in ((agrees, 1.0), (against, -1.0)):
+        np.add.at(change, np.clip(first[chosen], begin, end) - begin, sign)
+        np.add.at(change, np.clip(last[chosen], begin, end) - begin, -sign)
+    score = np.cumsum(change)[:-1]
+    gain = GATE * float(np.max(score)) - PRICE
+    if gain <= 0.0:
+        return None
+    k = int(np.argmax(score))
+    n = int(np.argmin(np.append(score[k:] == score[k], False)))
+    at = begin + k
+    over = (first <= at) & (last >= at + n)
+    return Place(gain, at, at + n, at + n // 2, np.zeros(3), np.flatnonzero(agrees & over),
+                 np.flatnonzero(against & (first < at + n) & (last > at)))
+
+
+def n_places(poses: FloatArray, edges: Edges) -> int:
+    """
+    Return the number of places that closures are apart from one another at both ends.
+
+    Parameters
+    ----------
+    poses : ndarray, shape (N, 3)
+    edges : Edges
+
+    """
+    size = min(PLACE, PLACE_SHARE * float(np.max(np.ptp(poses[:, :2], axis=0))))
+    ends = poses[np.column_stack((edges.i, edges.j)), :2]
+    kept = np.empty((0, 2, 2))
+    for each in ends:
+        if np.all(np.linalg.norm(kept - each, axis=2) >= size):
+            kept = np.concatenate((kept, each[None]))
+    return len(kept)
+
+
+def _shown_by(
+    closure: Edges, poses: FloatArray, odometry: Odometry, place: Place,
+) -> FloatArray:
+    """Return the pose of the last place in the first one, as a closure shows it, shape (3,)."""
+    first, last = poses[odometry.nodes[[place.first, place.last]]]
+    end = se2.compose(se2.compose(poses[closure.i[0]], closure.mean[0]),
+                      se2.between(poses[closure.j[0]], last))
+    return np.asarray(se2.between(first, end))
