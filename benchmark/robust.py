@@ -27,6 +27,7 @@ from benchmark import (
     kept_sections,
     report,
     robust_fixes,
+    robust_jumps,
     robust_peers,
     robust_picture,
     robust_timing,
@@ -317,7 +318,7 @@ SECTIONS: dict[str, Callable[[Options], Section]] = {
     'timing': lambda options: robust_timing.timing(quick=options.quick),
     'fixes': lambda options: robust_fixes.section(
         options.data, quick=options.quick, robust=options.fix_robust, cases=options.cases),
-    'peers': peers}
+    'jumps': lambda options: robust_jumps.section(quick=options.quick), 'peers': peers}
 
 
 LIMITS = Section(

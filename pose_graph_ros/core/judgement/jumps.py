@@ -96,7 +96,8 @@ def best(
 
     """
     choice, jumps = selection.best(problem, insured=insured), list[Jump]()
-    while choice is not None and len(jumps) < MOST:
+    # where chance explains all that fit odometry, it also gives jumps that others fit
+    while choice is not None and np.any(problem.allowed) and len(jumps) < MOST:
         found = _one_more(problem, choice, insured=insured)
         if found is None:
             break
