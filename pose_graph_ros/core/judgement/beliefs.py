@@ -111,6 +111,7 @@ class Beliefs:
         if not done:
             graph.set_poses(before)
             self._smoother.update(GraphUpdate())
+        self._table.forget_spread()
         return done
 
     def try_set(self, found: Found) -> None:

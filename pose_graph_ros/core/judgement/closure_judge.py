@@ -353,9 +353,7 @@ class ClosureJudge:
         self._scales.begin()
         doubts = self._odometry.doubts if jumps is None else self._odometry.doubted(
             graph, jumps, self._beliefs.now_ns, judged)
-        done = self._beliefs.change_to(inside, choice.poses, doubts)
-        self._table.forget_spread()
-        if not done:
+        if not self._beliefs.change_to(inside, choice.poses, doubts):
             return
         if self._scales.learn_all():
             self._table.forget_spread()
