@@ -58,8 +58,17 @@ def _import(name: str) -> None:
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """Begin with the files that wait for other processes, so that none of them is the last."""
-    items.sort(key=lambda item: item.path.parent.name not in ('ros', 'test'))
+    """
+    Let two files follow each one that waits for other processes.
+
+    So the processors have something to do meanwhile, and none of those that wait is the last.
+    """
+    waiting, others = ({path: None for path in (item.path for item in items)
+                        if (path.parent.name in ('ros', 'test')) is waits}
+                       for waits in (True, False))
+    turns = {path: 2 * turn for turn, path in enumerate(waiting)}
+    turns |= {path: turn | 1 for turn, path in enumerate(others)}
+    items.sort(key=lambda item: turns[item.path])
 
 
 @pytest.fixture(autouse=True)

@@ -53,7 +53,7 @@ def client(request: pytest.FixtureRequest) -> Iterator[Any]:
         process.process.send_signal(signal.SIGSTOP)
 
 
-@pytest.fixture(scope='package')
+@pytest.fixture(scope='session')
 def _shared_node(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Any]:
     """Start a node with the default parameters, for all tests that leave them as they are."""
     from harness import NodeProcess  # noqa: PLC0415
