@@ -21,6 +21,7 @@ import numpy as np
 
 from pose_graph_ros.core.compiled.growing_array import GrowingArray
 from pose_graph_ros.core.compiled.jit import (
+    FLAG,
     INTEGER,
     INTEGERS,
     kernel,
@@ -34,6 +35,8 @@ from pose_graph_ros.core.graph import factors, tables as tb
 from pose_graph_ros.core.graph.constraints import EdgeKind, full
 from pose_graph_ros.core.graph.graph import Graph
 
+# Weight that one of 0 counts as.
+_LEAST_WEIGHT = 1e-9
 # Relative difference of lengths that is rounding.
 _TIE = 1e-9
 
@@ -55,10 +58,16 @@ class OdometryChain:
     """
     The hidden nodes of a graph, chained by the odometry edge that each was made with.
 
-    Weights are not looked at: an edge counts with the information that odometry claims.
+    Parameters
+    ----------
+    weighted : bool
+        Whether an edge counts with its present weight; by default it counts with the information
+        that odometry claims.
+
     """
 
-    def __init__(self) -> None:
+    def __init__(self, *, weighted: bool = False) -> None:
+        self._weighted = weighted
         self._rows = GrowingArray((), np.int64)
         self._poses = GrowingArray((3,), np.float64)
         self._sums = GrowingArray((6,), np.float64)
@@ -108,7 +117,7 @@ class OdometryChain:
         poses, sums = np.empty((len(new), 3)), np.empty((len(new), 6))
         n = _extend(
             head, new, int(self._rows.values[last]), self._poses.values[last],
-            self._sums.values[last], rows, poses, sums, travel)
+            self._sums.values[last], self._weighted, rows, poses, sums, travel)
         self._rows.append(rows[:n])
         self._poses.append(poses[:n])
         self._sums.append(sums[:n])
@@ -176,9 +185,9 @@ class OdometryChain:
 
 
 @kernel(signature=(
-    tb.HEAD, INTEGERS, INTEGER, NUMBERS, NUMBERS, INTEGERS, ROWS, ROWS, NUMBERS))
+    tb.HEAD, INTEGERS, INTEGER, NUMBERS, NUMBERS, FLAG, INTEGERS, ROWS, ROWS, NUMBERS))
 def _extend(  # type: ignore[no-untyped-def]
-    head, edges, last, pose, before, rows, poses, sums, travel,
+    head, edges, last, pose, before, weighted, rows, poses, sums, travel,
 ):
     """
     Return the number of nodes that were appended to a chain.
@@ -187,6 +196,7 @@ def _extend(  # type: ignore[no-untyped-def]
     ----------
     edges : ndarray of int, odometry edges by the rows of their ends
     last, pose, before : int, ndarray, ndarray, row, pose and prefix sum of the last node
+    weighted : bool, whether to divide covariances by the weights of the edges
     rows, poses, sums, travel : ndarray, output; the travel from the last node
 
     """
@@ -203,6 +213,10 @@ def _extend(  # type: ignore[no-untyped-def]
         rows[n], travel[n] = last, length
         poses[n, 0], poses[n, 1], poses[n, 2] = x, y, th
         xx, xy, xt, yy, yt, tt = _inverse(f[tb.INFO:tb.INFO + 6])
+        if weighted:
+            loose = 1.0 / max(f[tb.WEIGHT], _LEAST_WEIGHT)
+            xx, xy, xt, yy, yt, tt = (
+                loose * xx, loose * xy, loose * xt, loose * yy, loose * yt, loose * tt)
         # Ad Q Ad^T: rotated, then with the arm (y, -x) of the heading
         c, s = math.cos(th), math.sin(th)
         xt, yt = c * xt - s * yt, s * xt + c * yt

@@ -163,13 +163,10 @@ class _Gates:
         The tree of a graph without closures is as deep as the path is long, so those that are not
         among the surest are computed by it only later, when it is flat.
         """
-        problem, chain = self._problem, OdometryChain()
+        problem, chain = self._problem, OdometryChain(weighted=True)
         chain.extend(problem.graph)
-        edges = problem.graph.edges
         chained = np.zeros(problem.graph.n_nodes, dtype=bool)
         chained[chain.nodes] = True
-        if np.any(edges.weight[edges.kind == EdgeKind.ODOMETRY] < 1.0):
-            return    # the graph knows less than odometry claims
         numbers = np.flatnonzero(chained[problem.edges.i] & chained[problem.edges.j])
         some = problem.edges.rows(numbers)
         pose, covariance = chain.between(some.i, some.j)

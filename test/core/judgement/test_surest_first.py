@@ -8,7 +8,7 @@ import pytest
 
 from pose_graph_ros.core.batch.truncated import TruncatedProblem
 from pose_graph_ros.core.geometry import se2
-from pose_graph_ros.core.graph.constraints import Edges
+from pose_graph_ros.core.graph.constraints import EdgeKind, Edges
 from pose_graph_ros.core.graph.error_functions import edge_errors, energies
 from pose_graph_ros.core.graph.graph import Graph, GraphUpdate
 from pose_graph_ros.core.judgement import selection, surest_first
@@ -68,8 +68,12 @@ def test_a_gate_is_that_of_the_smoother() -> None:
         assert min(abs(ratio / factor - 1.0) for factor in surest_first.ALONE) < 1e-5
 
 
-def test_gates_begin_with_those_of_odometry_alone() -> None:
+@pytest.mark.parametrize('weight', [1.0, 0.3])
+def test_gates_begin_with_those_of_odometry_alone(weight: float) -> None:
     drive = laps(2, n_wrong=5)
+    odometry = np.flatnonzero(drive.graph.edges.kind == EdgeKind.ODOMETRY)
+    drive.graph.apply(GraphUpdate(weigh_edges=dict.fromkeys(odometry.tolist(), weight) | {
+        int(odometry[20]): 0.1 * weight}))
     problem = TruncatedProblem(drive.graph, drive.closures)
     problem.solve(np.zeros(len(problem)))
     gates = surest_first._Gates(problem)
