@@ -5,11 +5,8 @@ Which loop closures to believe, decided as they come and again when the evidence
 
 A closure passes the *gate* if its error at the estimate is plausible: `e^T (J P J^T + R)^-1 e` is
 below the 99 % quantile, with P the joint covariance of both nodes in the graph of what is believed
-and R the claimed covariance, floored. It is *believed* if it passes and a clique of closures that
-agree along the path supports it, or if a random one of its source would hardly pass: q p is small
-against 1 - q, with p the chance to pass and q the share of its source that is doubted. One
-that is believed and does not fit any more is thrown out: back to weight 0, from where it may come
-again. If p is large, only the record q of the source speaks for it: it is believed weakly.
+and R the claimed covariance, floored. Then `belief_rule` says whether it is *believed*. One that
+does not fit any more is thrown out: back to weight 0, from where it may come again.
 """
 
 from collections.abc import Callable, Sequence
@@ -23,6 +20,7 @@ from pose_graph_ros.core.graph import tables as tb
 from pose_graph_ros.core.graph.constraints import EdgeKind, Edges
 from pose_graph_ros.core.graph.reweighting import Reweighting
 from pose_graph_ros.core.judgement import final, relative
+from pose_graph_ros.core.judgement.belief_rule import BeliefRule
 from pose_graph_ros.core.judgement.beliefs import Beliefs
 from pose_graph_ros.core.judgement.closure_reports import ClosureReports
 from pose_graph_ros.core.judgement.closure_states import (
@@ -30,7 +28,6 @@ from pose_graph_ros.core.judgement.closure_states import (
     ClosureStates,
     DECISIONS,
     DOUBTED,
-    OUT,
     SavedClosures,
     STATES,
     WAITING,
@@ -51,18 +48,10 @@ from pose_graph_ros.core.measurements import Answer, AnswerStatus, rejected
 from pose_graph_ros.core.smoother.incremental import IncrementalSmoother
 from pose_graph_ros.core.sources.factor_builder import NewConstraint
 
-# A clique supports a closure if it has so many members, over so long a way [m].
-CLIQUE, CLIQUE_TRAVEL = 3, 1.0
-# Largest odds that a closure is wrong which is believed alone.
-WRONG_ODDS = 0.02
-# Chance of a random closure to pass, above which a lone one is only believed weakly.
-WEAK = 0.02
-# The same, below which several are believed at once, as none changes the gates of others much.
-NARROW = 1e-3
 # Numbers of new closures that are tested before an update, and of those that are tested later: in
 # an update, and in a part of the work. Without closures the tree is as deep as the path is long,
 # and so is what a test has to solve for; the last is the limit of nodes times tests in a part.
-MOST_NEW, IN_UPDATE, IN_PART, NODES_IN_PART = 32, 16, 64, 160_000
+MOST_NEW, IN_UPDATE, IN_PART, NODES_IN_PART = 32, 16, 32, 160_000
 # Number of nodes above which an update adds closures with weight 0 and leaves all tests to the
 # work after it, so that it has nothing to solve for but what is new.
 LARGE = 500
@@ -90,6 +79,7 @@ class ClosureJudge:
         self.states = self._states = ClosureStates()
         self.reports = ClosureReports(self._states, self._table)
         self._retests = Retests()
+        self._rule = BeliefRule(self._states, self._table, self._retests)
         self._final = (0, 0, 0, -1)
         """Sizes of the graph and round at the last final decision."""
         self._n_staged = 0
@@ -124,7 +114,7 @@ class ClosureJudge:
         self._append_unknown(n)
         numbers = np.arange(begin, begin + n)
         if not self._smoother.graph.has_touched and not self._is_large:
-            for number, state in self._choose(*self._test(numbers[:MOST_NEW])).items():
+            for number, state in self._rule.choose(*self._test(numbers[:MOST_NEW])).items():
                 self._states.state[number] = STATES.index(state)
         return self._beliefs.weights(numbers)
 
@@ -196,48 +186,11 @@ class ClosureJudge:
             before = int(self._states.state[number])
             self._states.state[number] = state
             if state == DOUBTED and not self._corroborated.values[number]:
-                self._corroborated.values[number] = self._is_corroborated(
+                self._corroborated.values[number] = self._rule.is_corroborated(
                     number, ~self._states.in_graph)
             if number < len(self._states) - self._n_staged:
                 self._states.announce(number, before, self._beliefs.now_ns)
         return numbers[passes], chances(total[passes], self._smoother.poses)
-
-    def _choose(self, passed: IntArray, chance: FloatArray) -> dict[int, State]:
-        """
-        Return which closures that have passed are believed now.
-
-        Of wide gates only one is, and of those that have failed before.
-
-        Parameters
-        ----------
-        passed : ndarray of int, shape (M,)
-        chance : ndarray, shape (M,)
-
-        """
-        chosen: dict[int, State] = {}
-        failures = self._retests.failures(passed)
-        for k in np.lexsort((chance, failures)).tolist():
-            if (chance[k] > NARROW or failures[k] > 0) and len(chosen) > 0:
-                break
-            state = self._belief(int(passed[k]), float(chance[k]))
-            if state.in_graph:
-                chosen[int(passed[k])] = state
-        return chosen
-
-    def _belief(self, number: int, chance: float) -> State:
-        """Return the state of a closure that has passed the gate."""
-        of_source = self._states.source == self._states.source[number]
-        bad = int(np.sum((self._states.state == DOUBTED) & of_source))
-        good = int(np.sum(self._states.in_graph & of_source))
-        alone = (bad + 1.0) * chance < WRONG_ODDS * (good + 1.0)
-        if (alone and chance <= WEAK) or self._is_corroborated(
-                number, self._states.decision != OUT):
-            return State.BELIEVED
-        return State.WEAKLY_BELIEVED if alone else State.WAITING
-
-    def _is_corroborated(self, number: int, usable: BoolArray) -> bool:
-        support = self._table.support(number, usable)
-        return len(support.clique) >= CLIQUE and support.travel >= CLIQUE_TRAVEL
 
     def after(self) -> None:
         """Judge again, within bounds, after an update of a graph that is not large."""
@@ -247,12 +200,17 @@ class ClosureJudge:
     def work(self) -> bool:
         """Do a bounded part of what is left; tell whether there is more."""
         return not self._smoother.graph.has_touched and (
-            self.test() or self._try() or self._learn_scales() or self._look_for_another_set())
+            self._part(self._most) or self._try() or self._learn_scales()
+            or self._look_for_another_set())
 
     def test(self) -> bool:
         """Do a bounded part of the tests that are left; tell whether there was any."""
-        n_nodes = max(self._smoother.graph.n_nodes, 1)
-        return self._part(max(min(IN_PART, NODES_IN_PART // n_nodes), 1))
+        return len(self._states) > 0 and self._test_again(self._most)
+
+    @property
+    def _most(self) -> int:
+        """Number of tests in a part of the work."""
+        return max(min(IN_PART, NODES_IN_PART // max(self._smoother.graph.n_nodes, 1)), 1)
 
     def _try(self) -> bool:
         """Do a part of a trial; tell whether there is any."""
@@ -312,7 +270,7 @@ class ClosureJudge:
         rest = waiting[~hopeless]
         rest = rest[np.argsort(np.where(known, least, 0.0)[~hopeless], kind='stable')]
         passed, chance = self._test(rest[:most])
-        chosen = self._choose(passed, chance)
+        chosen = self._rule.choose(passed, chance)
         if self._change(chosen):
             return True
         # what the update diverges with does not keep out the others, if that is an exception
