@@ -20,8 +20,8 @@ from pose_graph_ros.core.judgement.odometry_motions import Odometry
 from pose_graph_ros.core.judgement.swaps import Found, Swap
 
 CONFIG = SolverConfig(max_iterations=20, step_tolerance=1e-3)
-# Number of doubted closures that all others are compared with.
-MOST_SEEDS = 10
+# Number of doubted closures that all others are compared with, and of comparisons in a part.
+MOST_SEEDS, MOST_COMPARED = 10, 20_000
 
 
 def search(present: Swap, graph: Graph) -> Generator[None, None, Found | None]:
@@ -37,9 +37,10 @@ def search(present: Swap, graph: Graph) -> Generator[None, None, Found | None]:
     edges, odometry, poses = present.edges, Odometry(graph), graph.poses.copy()
     yield
     free_or_in = present.free | present.before
+    most_seeds = MOST_COMPARED // max(int(np.sum(free_or_in)), 1)
     found = jumps.places(
         edges.rows(free_or_in), present.before[free_or_in], poses, odometry, (),
-        most_seeds=MOST_SEEDS)
+        most_seeds=min(max(most_seeds, 1), MOST_SEEDS))
     yield
     for place in found[:1]:
         numbers = np.flatnonzero(free_or_in)

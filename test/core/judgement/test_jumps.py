@@ -118,6 +118,25 @@ def test_a_jump_is_found_and_all_closures_are_kept(jump: tuple[float, float, flo
     assert error(backend, truth) < clean() + 0.5
 
 
+def test_a_jump_is_found_while_driving() -> None:
+    truth, events = drive(0, {140: (0.0, 0.0, 0.6)})
+    backend = PoseGraphBackend(CONFIG)
+    for k, event in enumerate(events):
+        if isinstance(event, OdometrySample):
+            backend.add_odometry(event)
+        else:
+            backend.add_measurement(event, 'scan')
+        if k % 10 == 0:
+            backend.update()
+            while not backend.refine().finished:
+                pass
+    backend.update()
+    assert len(jumps_in(backend)) == 1
+    assert error(backend, truth) < clean() + 0.5
+    changes = [each for each in backend.verdict_changes() if each.kind is Judged.ODOMETRY]
+    assert [each.after for each in changes] == [State.DOUBTED]
+
+
 def test_two_jumps_are_found() -> None:
     truth, events = drive(1, {100: (0.0, 5.0, 0.0), 170: (0.0, 0.0, -0.7)})
     backend = run(events)
