@@ -125,7 +125,7 @@ class RunSet:
             prior = of_graph._replace(cov=np.diag((NOWHERE, NOWHERE, 0.3**2)))
             return Given(self._begin_run(stamp_ns, seen, prior, believed=True).number, True, 0.0)
         mine = predicted.innovation(seen)
-        fits = mine.d2 <= EVENT + MORE_OF_POSE * (seen.size - 2)
+        fits = mine.d2 <= gate(seen.size)
         late = stamp_ns < main.end_ns
         cov, noise = predicted.cov, seen.noise
         wide = cov[0, 0] + cov[1, 1] >= WIDE * (noise[0, 0] + noise[1, 1])
@@ -185,7 +185,7 @@ class RunSet:
             begin, track, turned = run.predicted(seen, self.chain)
             innovation = track.innovation(seen)
             cost = innovation.d2 + innovation.spread + turned
-            if innovation.d2 <= EVENT + MORE_OF_POSE * (seen.size - 2) and cost < best:
+            if innovation.d2 <= gate(seen.size) and cost < best:
                 best, chosen = cost, (run, begin, track.updated(innovation))
         if chosen is None:
             return None
@@ -248,3 +248,8 @@ class RunSet:
         for each in self._runs:
             each.prices.pop(run.number, None)
         return run.number, rest.number, stamp_ns
+
+
+def gate(size: int) -> float:
+    """Return the squared distance beyond which a measurement of 2 or 3 numbers is in doubt."""
+    return EVENT + MORE_OF_POSE * (size - 2)

@@ -11,7 +11,8 @@ price in units of chi2:
 - two runs that are believed one after the other cost the squared Mahalanobis distance between
   them, or, if odometry was worse than claimed in between, `EVENT` and a price that grows with the
   square of the jump over the way travelled in between, later with its logarithm: where there is
-  little way, a jump is unlikely, however large.
+  little way, a jump is unlikely, however large. It is less where the measurements go on as a robot
+  moves: a receiver that goes wrong would hardly do so next to where it was right.
 
 The set of runs with the lowest price is a shortest path through the runs in the order of time.
 """
@@ -43,7 +44,9 @@ WORSE_BY_WAY = 0.1
 WORSE = 0.5
 WORSE_HEADING = 0.1
 # Squared sigmas of a jump at which its price becomes logarithmic.
-KNEE = 6.0
+KNEE = 5.0
+# How far wrong measurements are off, about [m].
+FAR = 60.0
 # Time between the states that a run notes [ns]; one is dropped when its neighbours' ages differ by
 # less than this factor; the newest so many are kept, which reach back about 7 minutes.
 NOTED_EVERY_NS, NOTED_RATIO, NOTED = 3_000_000_000, 1.4, 20
@@ -271,8 +274,20 @@ class Run:
         size2 = float(jump[0]**2 + jump[1]**2)
         variance = float(jump[:2] @ cov[:2, :2] @ jump[:2]) / max(size2, 1e-12)
         s2 = size2 / max(variance, worse) + jump[2]**2 / max(cov[2, 2], WORSE_HEADING**2)
-        return Transition(min(EVENT + KNEE * math.log1p(s2 / KNEE), d2),
-                          self._scale(track, jump, chain))
+        price = max(KNEE * math.log1p(s2 / KNEE) - self._goes_on(track, way), 0.0)
+        return Transition(min(EVENT + price, d2), self._scale(track, jump, chain))
+
+    def _goes_on(self, track: Track, way: float) -> float:
+        """
+        Return the evidence for a jump of odometry in that the positions go on from a track.
+
+        It is twice the logarithm of how much likelier it is that the robot moved so far, about as
+        far as the way by odometry, than that a measurement which is off by about `FAR` is so near.
+        """
+        moved = self.first.pose[:2] - track.pose[:2]
+        cov = track.cov + self.first.cov
+        variance = 0.5 * float(cov[0, 0] + cov[1, 1]) + way**2
+        return max(2.0 * math.log(FAR**2 / variance) - float(moved @ moved) / variance, 0.0)
 
     def cut_after(self, state: int, number: int) -> 'Run':
         """

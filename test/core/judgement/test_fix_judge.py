@@ -169,8 +169,8 @@ def test_slip_without_an_outage_is_found() -> None:
     drive = Drive(200)
     drive.slip(60.0, 12.0)
     driven = Driven(drive)
-    assert max(driven.newest[at] for at in range(180, 200)) < 2.0
-    assert driven.rms < 2.0
+    assert max(driven.newest[at] for at in range(105, 200)) < 2.0
+    assert driven.rms < 1.0
 
 
 def test_receivers_that_contradict_each_other_the_first_one_is_believed() -> None:
