@@ -29,7 +29,7 @@ from pose_graph_ros.core.geometry.se2 import BoolArray, FloatArray, IntArray
 from pose_graph_ros.core.geometry.trajectory import Trajectory
 from pose_graph_ros.core.graph.constraints import EdgeKind, Edges
 from pose_graph_ros.core.io.g2o import read_g2o
-from pose_graph_ros.core.judgement import selection
+from pose_graph_ros.core.judgement.floors import forward
 from pose_graph_ros.core.measurements import LoopClosure, OdometrySample
 
 SECOND = 1_000_000_000
@@ -258,7 +258,7 @@ def hidden_graph(run: Run) -> tuple[IntArray, Edges, Edges, BoolArray]:
     edges = run.backend.graph.edges
     chain = edges.rows(edges.kind == EdgeKind.ODOMETRY)
     loops = edges.rows((edges.kind == EdgeKind.LOOP_CLOSURE) & (np.abs(edges.j - edges.i) > 1))
-    loops = selection.forward(loops)
+    loops = forward(loops)
     return run.backend.node_stamps_ns, chain, loops, loops.weight > 0.0
 
 

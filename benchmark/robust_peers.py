@@ -26,7 +26,7 @@ from pose_graph_ros.core.geometry.trajectory import Trajectory
 from pose_graph_ros.core.graph.constraints import Edges
 from pose_graph_ros.core.graph.graph import Graph, GraphUpdate
 from pose_graph_ros.core.io.g2o import read_g2o, write_g2o
-from pose_graph_ros.core.judgement import selection
+from pose_graph_ros.core.judgement.floors import FLOORS
 
 PEER = 'benchmark.robust_peer'
 METHODS = 'GNC-TLS', 'GNC-GM', 'LM, Cauchy', 'LM, DCS'
@@ -116,7 +116,7 @@ def _compare(
     with TemporaryDirectory() as name:
         plain, floored = Path(name) / 'plain.g2o', Path(name) / 'floored.g2o'
         _write(plain, stamps, chain, loops)
-        _write(floored, stamps, chain, selection.floored(loops))
+        _write(floored, stamps, chain, floored(loops))
         add('ours, online', Solved(run.backend.graph.poses.copy(), believed, run.seconds))
         add('ours, batch', _ours(plain))
         for method in methods:
@@ -157,7 +157,7 @@ def _ours(file: Path) -> Solved:
         graph = read_g2o(file).graph
         graph.apply(GraphUpdate(fix=[0]))
         begin = time.perf_counter()
-        beliefs = believe(graph, selection.FLOORS)
+        beliefs = believe(graph, FLOORS)
         assert beliefs is not None
         graph.set_poses(beliefs.poses)
         graph.apply(GraphUpdate(

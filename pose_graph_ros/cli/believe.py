@@ -13,6 +13,7 @@ from pose_graph_ros.core.geometry.se2 import BoolArray, FloatArray, IntArray
 from pose_graph_ros.core.graph.constraints import EdgeKind, Edges
 from pose_graph_ros.core.graph.graph import Graph, GraphUpdate
 from pose_graph_ros.core.judgement import selection
+from pose_graph_ros.core.judgement.floors import floored, forward
 from pose_graph_ros.core.judgement.residual_scale import give_scale
 
 # Number of sets of closures that are tried to join parts that no odometry joins.
@@ -48,10 +49,10 @@ def believe(graph: Graph, sigmas: FloatArray) -> BelievedEdges | None:
     sigmas : ndarray, shape (3,), least sigmas of closures for the decision [m, m, rad]
 
     """
-    edges = selection.forward(graph.edges)
+    edges = forward(graph.edges)
     is_closure = np.abs(edges.j - edges.i) != 1
     kind = np.where(is_closure, EdgeKind.LOOP_CLOSURE, EdgeKind.ODOMETRY).astype(np.uint8)
-    given, softened = edges.information, selection.floored(edges, sigmas).information
+    given, softened = edges.information, floored(edges, sigmas).information
     information = np.where(is_closure[:, None, None], softened, given)
     edges = Edges(edges.i, edges.j, edges.mean, information, kind, edges.weight, edges.bias)
     closures = np.flatnonzero(is_closure & (edges.weight > 0.0) & (edges.i != edges.j))

@@ -10,11 +10,10 @@ import numpy as np
 
 from pose_graph_ros.core.batch.truncated import LIMITS
 from pose_graph_ros.core.compiled.growing_array import GrowingArray
-from pose_graph_ros.core.config import CLOSURE_FLOORS
-from pose_graph_ros.core.geometry import se2
 from pose_graph_ros.core.geometry.se2 import BoolArray, FloatArray, IntArray
 from pose_graph_ros.core.graph.constraints import Edges
 from pose_graph_ros.core.judgement.consistency import Closures, OdometryChain
+from pose_graph_ros.core.judgement.floors import floored, FLOORS, forward
 
 # Squared Mahalanobis distance that 99 % of errors with three components are within.
 GATE = float(LIMITS[3])
@@ -37,30 +36,20 @@ class Support(NamedTuple):
     """Those that contradict it, by number."""
 
 
-def claims(edges: Edges, floors: Sequence[float] = CLOSURE_FLOORS) -> Closures:
+def claims(edges: Edges, floors: FloatArray = FLOORS) -> Closures:
     """
     Return closures from the earlier to the later node, with covariances to decide by.
 
     Parameters
     ----------
     edges : Edges
-    floors : sequence of three floats, least sigmas [m, m, rad]
+    floors : ndarray, shape (3,), least sigmas [m, m, rad]
 
     """
+    own = floored(forward(edges), floors)
     covariance = np.asarray(
-        np.linalg.inv(edges.information + _LEAST_INFORMATION * np.eye(3)), dtype=np.float64)
-    diagonal = np.einsum('mii->mi', covariance)
-    np.maximum(diagonal, np.square(floors), out=diagonal)
-    first, second, mean = edges.i.copy(), edges.j.copy(), edges.mean.copy()
-    back = np.flatnonzero(first > second)
-    if len(back) == 0:
-        return Closures(first, second, mean, covariance)
-    first[back], second[back] = edges.j[back], edges.i[back]
-    # the error at the end of z moves to its start
-    turn = se2.adjoint(mean[back])
-    covariance[back] = turn @ covariance[back] @ turn.transpose(0, 2, 1)
-    mean[back] = se2.inverse(mean[back])
-    return Closures(first, second, mean, covariance)
+        np.linalg.inv(own.information + _LEAST_INFORMATION * np.eye(3)), dtype=np.float64)
+    return Closures(own.i.copy(), own.j.copy(), own.mean.copy(), covariance)
 
 
 def chances(covariance: FloatArray, poses: FloatArray) -> FloatArray:

@@ -23,7 +23,8 @@ from pose_graph_ros.core.geometry.se2 import BoolArray, IntArray
 from pose_graph_ros.core.graph.constraints import Edges
 from pose_graph_ros.core.graph.graph import Graph, GraphUpdate
 from pose_graph_ros.core.graph.reweighting import Reweighting
-from pose_graph_ros.core.judgement import jumps, selection
+from pose_graph_ros.core.judgement import jumps
+from pose_graph_ros.core.judgement.floors import floored, forward
 from pose_graph_ros.core.judgement.jumps import Jump
 
 CONFIG = SolverConfig(max_iterations=100)
@@ -78,7 +79,7 @@ def _copy(graph: Graph, closures: IntArray) -> Graph:
     rows, copy = graph.rows(), Graph()
     edges = rows.edges
     columns = edges.i.copy(), edges.j.copy(), edges.mean.copy(), edges.information.copy()
-    own = selection.floored(selection.forward(edges.rows(closures)))
+    own = floored(forward(edges.rows(closures)))
     for column, values in zip(
             columns, (own.i, own.j, own.mean, own.information), strict=True):
         column[closures] = values

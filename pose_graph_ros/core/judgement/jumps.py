@@ -30,6 +30,7 @@ from pose_graph_ros.core.graph.graph import Graph, GraphRows
 from pose_graph_ros.core.judgement import group_search, selection
 from pose_graph_ros.core.judgement.closures import GATE
 from pose_graph_ros.core.judgement.consistency import Closures
+from pose_graph_ros.core.judgement.floors import floored
 from pose_graph_ros.core.judgement.odometry_motions import Odometry, SIGMAS
 from pose_graph_ros.core.smoother import innovations
 
@@ -281,7 +282,7 @@ def rows_with_motion(
     """
     row, edges, poses, moved = int(odometry.rows[at]), rows.edges, rows.poses, ~rows.is_bias
     edges.mean[row] = motion
-    edges.information[row] = selection.floored(edges.rows(np.array([row])), sigmas).information[0]
+    edges.information[row] = floored(edges.rows(np.array([row])), sigmas).information[0]
     k, l = odometry.nodes[[at, at + 1]]     # noqa: E741  as above
     moved[:l] = False
     change = se2.compose(se2.compose(poses[k], motion), se2.inverse(poses[l]))

@@ -188,7 +188,7 @@ def agreement_scale(
         second += others
     if len(set(first)) < LEAST:
         return 1.0
-    claimed, pairs = claims(edges, (0.0, 0.0, 0.0)), (np.array(first), np.array(second))
+    claimed, pairs = claims(edges, np.zeros(3)), (np.array(first), np.array(second))
     scale = 1.0
     while scale < LARGEST and np.median(table.squared_distances(
             claimed._replace(noise=scale**2 * claimed.noise), *pairs)) > MEDIAN:

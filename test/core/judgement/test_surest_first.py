@@ -12,6 +12,7 @@ from pose_graph_ros.core.graph.constraints import EdgeKind, Edges
 from pose_graph_ros.core.graph.error_functions import edge_errors, energies
 from pose_graph_ros.core.graph.graph import Graph, GraphUpdate
 from pose_graph_ros.core.judgement import selection, surest_first
+from pose_graph_ros.core.judgement.floors import floored, FLOORS, forward
 from pose_graph_ros.core.smoother.incremental import IncrementalSmoother
 
 
@@ -119,12 +120,12 @@ def test_floors_raise_variances_and_leave_what_is_not_measured() -> None:
                   np.linalg.inv(covariance), [1] * 20)
     expected = covariance.copy()
     diagonal = np.einsum('mii->mi', expected)
-    np.maximum(diagonal, selection.FLOORS**2, out=diagonal)
-    softened = selection.floored(edges)
+    np.maximum(diagonal, FLOORS**2, out=diagonal)
+    softened = floored(edges)
     np.testing.assert_allclose(np.linalg.inv(softened.information), expected, rtol=1e-6, atol=1e-9)
     heading = Edges([0], [1], np.zeros((1, 3)), [np.diag([0.0, 0.0, 1e6])], [1])
     np.testing.assert_allclose(
-        selection.floored(heading).information[0], np.diag([0.0, 0.0, 400.0]), rtol=1e-3)
+        floored(heading).information[0], np.diag([0.0, 0.0, 400.0]), rtol=1e-3)
 
 
 def test_an_edge_that_is_turned_round_has_the_same_energy() -> None:
@@ -133,10 +134,9 @@ def test_an_edge_that_is_turned_round_has_the_same_energy() -> None:
     mean = se2.between(poses[1], poses[0]) + rng.normal(0.0, 1e-5, 3)
     root = rng.normal(0.0, 1.0, (3, 3))
     edge = Edges([1], [0], mean[None], (root @ root.T)[None], [1])
-    turned = selection.forward(edge)
+    turned = forward(edge)
     assert (turned.i[0], turned.j[0]) == (0, 1)
     before, after = (energies(edge_errors(poses, each), each.information)
                      for each in (edge, turned))
     assert after[0] == pytest.approx(before[0], rel=1e-3)
-    forward = selection.forward(turned)
-    assert forward is turned
+    assert forward(turned) is turned
