@@ -26,7 +26,7 @@ from pose_graph_ros.core.geometry.trajectory import Trajectory
 from pose_graph_ros.core.graph.constraints import Edges
 from pose_graph_ros.core.graph.graph import Graph, GraphUpdate
 from pose_graph_ros.core.io.g2o import read_g2o, write_g2o
-from pose_graph_ros.core.judgement.floors import FLOORS
+from pose_graph_ros.core.judgement.floors import floored, FLOORS
 
 PEER = 'benchmark.robust_peer'
 METHODS = 'GNC-TLS', 'GNC-GM', 'LM, Cauchy', 'LM, DCS'
@@ -114,15 +114,15 @@ def _compare(
         say('  ' + ' | '.join(table.rows[-1]))
 
     with TemporaryDirectory() as name:
-        plain, floored = Path(name) / 'plain.g2o', Path(name) / 'floored.g2o'
+        plain, raised = Path(name) / 'plain.g2o', Path(name) / 'raised.g2o'
         _write(plain, stamps, chain, loops)
-        _write(floored, stamps, chain, floored(loops))
+        _write(raised, stamps, chain, floored(loops))
         add('ours, online', Solved(run.backend.graph.poses.copy(), believed, run.seconds))
         add('ours, batch', _ours(plain))
         for method in methods:
             add(f'GTSAM {method}', _peer(method, plain, limit))
             if method in FLOORED:
-                add(f'GTSAM {method}, floors', _peer(method, floored, limit))
+                add(f'GTSAM {method}, floors', _peer(method, raised, limit))
     gnc = [tool for tool in results if 'GNC' in tool]
     ended = [tool for tool in gnc if results[tool].poses is not None] or [
         tool for tool in results if tool.startswith('GTSAM')]

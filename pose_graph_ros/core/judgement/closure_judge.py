@@ -200,7 +200,7 @@ class ClosureJudge:
     def work(self) -> bool:
         """Do a bounded part of what is left; tell whether there is more."""
         return not self._smoother.graph.has_touched and (
-            self._part(self._most) or self._try() or self._learn_scales()
+            self._part(self._most) or self._try() or self._scales.learn()
             or self._look_for_another_set())
 
     def test(self) -> bool:
@@ -313,8 +313,7 @@ class ClosureJudge:
             graph, jumps, self._beliefs.now_ns, judged)
         if not self._beliefs.change_to(inside, choice.poses, doubts):
             return
-        if self._scales.learn_all():
-            self._table.forget_spread()
+        self._scales.learn_all()
         # nothing is to be tested again until something changes
         self._retests.tested(slice(None), self._beliefs.round)
         self._final = *present[:-1], self._beliefs.round
@@ -333,13 +332,6 @@ class ClosureJudge:
             self._retests.again(slice(None))
             self._table.forget_spread()
         return bring_back
-
-    def _learn_scales(self) -> bool:
-        """Learn the scale of a source; tell whether one has changed."""
-        if not self._scales.learn():
-            return False
-        self._table.forget_spread()
-        return True
 
     def _look_for_another_set(self) -> bool:
         """Do a part of the search of another set; tell whether there was anything to do."""

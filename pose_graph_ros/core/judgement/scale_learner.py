@@ -95,22 +95,19 @@ class ScaleLearner:
                     return True
         return False
 
-    def learn_all(self) -> bool:
+    def learn_all(self) -> None:
         """
-        Learn all factors from 1, which they are to be; tell whether one has changed.
+        Learn all factors from 1, which they are to be.
 
         Residuals are those with the present factor, so a source is looked at until it shows none
         that is larger.
         """
-        changed = False
         for source in range(len(self._states.sources)):
             self._learnt_from[source] = int(np.sum(self._of(source)))
             if self._learnt_from[source] >= AND_MORE:
                 for _ in range(ROUNDS):
                     if not self._learn(source, larger=True):
                         break
-                    changed = True
-        return changed
 
     def _of(self, source: int) -> BoolArray:
         """Tell which closures of a source are believed, shape (M,)."""
@@ -127,6 +124,7 @@ class ScaleLearner:
             return False
         self._beliefs.scales[source] = scale
         if self._beliefs.apply({k: STATES[self._states.state[k]] for k in numbers.tolist()}):
+            self._table.forget_spread()
             return True
         self._beliefs.scales[source] = before
         return not larger
