@@ -8,6 +8,7 @@ that it measures and the true one, seen from its true start. Errors of paths are
 best rigid motion, as nothing ties them to the truth. The truth decides nothing but figures.
 """
 
+from collections import defaultdict, deque
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 import time
@@ -30,6 +31,7 @@ from pose_graph_ros.core.geometry.trajectory import Trajectory
 from pose_graph_ros.core.graph.constraints import EdgeKind, Edges
 from pose_graph_ros.core.io.g2o import read_g2o
 from pose_graph_ros.core.judgement.floors import forward
+from pose_graph_ros.core.judgement.verdicts import Verdict
 from pose_graph_ros.core.measurements import LoopClosure, OdometrySample
 
 SECOND = 1_000_000_000
@@ -172,14 +174,19 @@ def kept_closures(
     backend: PoseGraphBackend, recording: Recording,
 ) -> tuple[BoolArray, dict[str, int]]:
     """Return which closures take part, shape (M,), and the number of them by state."""
-    verdicts = {(verdict.reference_ns, verdict.stamp_ns): verdict
-                for verdict in backend.verdicts()
-                if verdict.source == CLOSURES} if hasattr(backend, 'verdicts') else {}
+    if not hasattr(backend, 'verdicts'):
+        return np.ones(len(recording.ends), dtype=bool), {}
+    # several closures may be between the same two poses, right ones and wrong ones
+    verdicts: defaultdict[tuple[int, int | None], deque[Verdict]] = defaultdict(deque)
+    for verdict in backend.verdicts():
+        if verdict.source == CLOSURES:
+            verdicts[verdict.stamp_ns, verdict.reference_ns].append(verdict)
     if len(verdicts) == 0:
         return np.ones(len(recording.ends), dtype=bool), {}
     kept, states = [], dict[str, int]()
-    for ends in recording.ends.tolist():
-        verdict = verdicts.get(tuple(ends))
+    for reference, stamp in recording.ends.tolist():
+        same = verdicts[stamp, reference]
+        verdict = same.popleft() if len(same) > 0 else None
         kept.append(verdict is not None and verdict.state.in_graph)
         state = 'forgotten' if verdict is None else verdict.state.value
         states[state] = states.get(state, 0) + 1
