@@ -14,7 +14,7 @@ from typing import NamedTuple
 import numpy as np
 
 from pose_graph_ros.core.config import BackendConfig, Robust
-from pose_graph_ros.core.geometry.se2 import BoolArray, FloatArray
+from pose_graph_ros.core.geometry.se2 import BoolArray, FloatArray, IntArray
 from pose_graph_ros.core.graph.constraints import Edges, ObservedNodes
 from pose_graph_ros.core.graph.graph import GraphUpdate
 from pose_graph_ros.core.graph.reweighting import Reweighting
@@ -51,6 +51,16 @@ class _Before(NamedTuple):
     loosened: dict[int, float]
 
 
+class _Decided(NamedTuple):
+    """What was decided on all measurements by `final_weights`, for `finish`."""
+
+    run: IntArray
+    believed: IntArray
+    """Of each record, both of shape (M,)."""
+    runs: RunSet
+    loosened: dict[int, float]
+
+
 class FixJudge:
     """
     Judges positions and poses in the map; see the module.
@@ -71,6 +81,7 @@ class FixJudge:
         """Weights of odometry edges by row; replaced, never changed, so that it is not copied."""
         self.odometry_weight = 1.0  # in the graph, where it is not loosened
         self._restore: _Before | None = None
+        self._decided: _Decided | None = None
         self._now_ns, self._again = -1, -1
         """Newest stamp of odometry, and the record that is judged again, -1 for a new one."""
 
@@ -101,7 +112,8 @@ class FixJudge:
                   is Robust.JUDGED]
         if len(judged) == 0:
             return change
-        self._restore, self._now_ns = self._copy(), now_ns
+        self._begin()
+        self._now_ns = now_ns
         graph = self._smoother.graph
         solved = not graph.has_touched
         self._runs.chain.extend(graph)
@@ -131,6 +143,9 @@ class FixJudge:
     def weight_of_odometry(self, row: int) -> float:
         """Return the weight that an odometry edge has, as far as fixes know."""
         return self.odometry_weight * self._loosened.get(row, 1.0)
+
+    def _begin(self) -> None:
+        self._restore, self._decided = self._copy(), None
 
     def _copy(self) -> _Before:
         return _Before(len(self._states), self._runs.copy(), self._loosened)
@@ -211,11 +226,25 @@ class FixJudge:
             for row in odometry_between(self._smoother.graph, begin, end).tolist()}
 
     def finish(self) -> None:
-        """Judge all measurements again in the order of their stamps, by odometry alone."""
-        loosened, states = self._loosened, self._states
-        if not self._judge_all():
+        """
+        Judge all measurements again in the order of their stamps, by odometry alone.
+
+        What `final_weights` has decided since the last measurement came is not decided twice.
+        """
+        loosened, states, decided = self._loosened, self._states, self._decided
+        if not self._can_judge_all():
             return
-        states.changed = {number: before for number, before in states.changed.items()
+        self._begin()
+        states.keep(np.arange(len(states)))
+        if decided is None:
+            self._judge_all()
+        else:
+            self._runs, self._loosened = decided.runs, decided.loosened
+            states.records[:, fs.RUN] = decided.run
+            for believed in (False, True):
+                states.believe(np.flatnonzero(decided.believed == believed), believed=believed,
+                               now_ns=self._now_ns)
+        states.changed = {number: before for number, before in sorted(states.changed.items())
                           if before != bool(states.records[number, fs.BELIEVED])}
         change = self._with_weights(GraphUpdate(), len(states), loosened)
         if (len(change.weigh_edges) + len(change.weigh_observed) > 0
@@ -226,25 +255,31 @@ class FixJudge:
 
     def final_weights(self) -> tuple[FloatArray, FloatArray]:
         """Return the weights that `finish` would give."""
-        weights = self._smoother.graph.weights
-        if self._judge_all():
-            for kind, table in ((1, weights[0]), (0, weights[1])):
-                some = self._states.records[self._states.records[:, fs.EDGE] == kind]
-                table[some[:, fs.ROW]] = some[:, fs.BELIEVED]
-            self.rollback()
+        weights, records = self._smoother.graph.weights, self._states.records
+        if not self._can_judge_all():
+            return weights
+        self._begin()
+        self._states.keep(np.arange(len(self._states)))
+        self._judge_all()
+        for kind, table in ((1, weights[0]), (0, weights[1])):
+            some = records[records[:, fs.EDGE] == kind]
+            table[some[:, fs.ROW]] = some[:, fs.BELIEVED]
+        decided = _Decided(records[:, fs.RUN].copy(), records[:, fs.BELIEVED].copy(),
+                           self._runs, self._loosened)
+        self.rollback()
+        self._decided = decided
         return weights
 
-    def _judge_all(self) -> bool:
+    def _can_judge_all(self) -> bool:
+        return 0 < len(self._states) <= MOST_AGAIN and not self._smoother.graph.has_touched
+
+    def _judge_all(self) -> None:
         """
-        Judge all measurements again, if that can be done; `commit` or `rollback` follows.
+        Judge all measurements again.
 
         Their errors are taken to be as stated, whatever was found since they came.
         """
         graph, states = self._smoother.graph, self._states
-        if not 0 < len(states) <= MOST_AGAIN or graph.has_touched:
-            return False
-        self._restore = self._copy()
-        states.keep(np.arange(len(states)))
         self._runs, self._loosened = self._runs.empty(), {}
         self._runs.chain.extend(graph)
         states.records[:, fs.RUN] = fs.LONE
@@ -256,7 +291,6 @@ class FixJudge:
                 order.tolist(), stamps_ns.tolist(), seen, strict=True):
             self._judge(stamp_ns, one, None)
         self._again = -1
-        return True
 
     def decide(self, name: str, decision: Decision) -> Answer:
         """
@@ -274,7 +308,7 @@ class FixJudge:
         record = self._states.records[number]
         believed = decision is Decision.IN or (
             decision is Decision.AUTO and self._runs.believes(int(record[fs.RUN])))
-        self._restore = self._copy()
+        self._begin()
         self._states.keep(np.array((number,)))
         record[fs.DECISION] = fs.AUTO
         self._states.believe(np.array((number,)), believed=believed, now_ns=self._now_ns)
