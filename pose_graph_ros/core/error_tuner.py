@@ -16,7 +16,7 @@ import math
 
 import numpy as np
 
-from pose_graph_ros.core.batch.optimizer import Status
+from pose_graph_ros.core.batch.optimizer import Status, to_the_end
 from pose_graph_ros.core.config import Correlation
 from pose_graph_ros.core.geometry.se2 import FloatArray, IntArray
 from pose_graph_ros.core.graph import tables as tb
@@ -161,7 +161,7 @@ class ErrorTuner:
         weights = self._judge.final_weights()
         for source in sources:
             constraints = self._factors.constraints(source)
-            found = error_estimate.finished(self._steps(constraints, weights))
+            found = to_the_end(self._steps(constraints, weights))
             constraints.next_estimate = max(
                 constraints.next_estimate, math.ceil(MORE * len(constraints)))
             constraints.odometry_scale = found.odometry_scale

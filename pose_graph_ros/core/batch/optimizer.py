@@ -11,6 +11,7 @@ poses, with which the incremental smoother can continue.
 from collections.abc import Callable, Collection, Generator
 from dataclasses import dataclass, replace
 from enum import Enum
+from typing import TypeVar
 
 import numpy as np
 
@@ -60,6 +61,7 @@ class BatchResult:
     start: Start = Start.PRESENT
 
 
+Result = TypeVar('Result')
 Parts = Generator[None, None, BatchResult]
 """An optimisation that pauses after parts of at most an iteration; it returns the result."""
 Solve = Callable[[Graph, SolverConfig], BatchResult]
@@ -109,13 +111,13 @@ def in_parts(graph: Graph, config: SolverConfig) -> Parts:
         yield from _minimize(graph, config, _analysed(graph), chi2)))
 
 
-def to_the_end(parts: Parts) -> BatchResult:
-    """Return the result of an optimisation after doing all of its parts."""
+def to_the_end(parts: Generator[None, None, Result]) -> Result:
+    """Return the result of what is done in parts after doing all of them."""
     while True:
         try:
             next(parts)
         except StopIteration as end:
-            result: BatchResult = end.value
+            result: Result = end.value
             return result
 
 

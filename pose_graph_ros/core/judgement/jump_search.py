@@ -38,7 +38,7 @@ def search(present: Swap, graph: Graph) -> Generator[None, None, Found | None]:
     yield
     free_or_in = present.free | present.before
     most_seeds = MOST_COMPARED // max(int(np.sum(free_or_in)), 1)
-    found = jumps.places(
+    found = yield from jumps.places(
         edges.rows(free_or_in), present.before[free_or_in], poses, odometry, (),
         most_seeds=min(max(most_seeds, 1), MOST_SEEDS))
     yield
@@ -54,6 +54,7 @@ def search(present: Swap, graph: Graph) -> Generator[None, None, Found | None]:
         copy.fill(jumps.rows_with_motion(rows, odometry, place.at, motion, jumps.LOOSE))
         yield
         result = yield from optimizer.in_parts(copy, CONFIG)
+        yield
         if result.status is Status.FAILED:
             continue
         residual = present.residuals(copy)

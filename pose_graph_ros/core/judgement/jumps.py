@@ -16,12 +16,13 @@ them. So a jump has to be seen from several places, and those over it that are b
 agree with it, are lost by it.
 """
 
-from collections.abc import Sequence
+from collections.abc import Generator, Sequence
 from itertools import pairwise
 from typing import NamedTuple
 
 import numpy as np
 
+from pose_graph_ros.core.batch.optimizer import to_the_end
 from pose_graph_ros.core.batch.truncated import Choice, ROUGH, TruncatedProblem
 from pose_graph_ros.core.geometry import se2
 from pose_graph_ros.core.geometry.se2 import BoolArray, FloatArray, IntArray
@@ -114,8 +115,8 @@ def _one_more(
     strained, scale = _strained(problem, choice, odometry)
     price = PRICE * scale
     groups = group_search.groups(problem)
-    for place in strained + places(
-            problem.edges, choice.believed, choice.poses, odometry, groups):
+    for place in strained + to_the_end(places(
+            problem.edges, choice.believed, choice.poses, odometry, groups)):
         trial = _with_jump(problem, choice, odometry, place, price)
         if trial is None:
             continue
@@ -293,9 +294,9 @@ def rows_with_motion(
 def places(
     edges: Edges, believed: BoolArray, poses: FloatArray, odometry: Odometry,
     groups: Sequence[IntArray], *, most_seeds: int = MOST_SEEDS,
-) -> list[Place]:
+) -> Generator[None, None, list[Place]]:
     """
-    Return where jumps may be, those that explain the most closures first.
+    Return where jumps may be, those that explain the most closures first; part by part.
 
     Parameters
     ----------
@@ -319,6 +320,7 @@ def places(
         usable[:, None, None], edges.information, np.eye(3))))
     found: dict[tuple[int, int], Place] = {}
     for seed in _seeds(doubted, groups, most_seeds):
+        yield
         squared = odometry.chain.squared_distances(
             table, np.full(len(numbers), seed), numbers)
         agrees = np.zeros(len(edges), dtype=bool)

@@ -16,7 +16,7 @@ and so not on the order of arrival. Searches are generators: each step takes a b
 
 from collections.abc import Generator
 import math
-from typing import NamedTuple, TypeVar
+from typing import NamedTuple
 
 import numpy as np
 
@@ -67,7 +67,6 @@ ODOMETRY = -2
 HEADINGS = 16
 
 Point = tuple[float, ...]
-Result = TypeVar('Result')
 
 
 class Estimate(NamedTuple):
@@ -275,13 +274,3 @@ def _descend(
         if best.value == before.value:
             step /= 2.0
     return best
-
-
-def finished(steps: Generator[None, None, Result]) -> Result:
-    """Return the result of what is done without a pause."""
-    while True:
-        try:
-            next(steps)
-        except StopIteration as end:
-            found: Result = end.value
-            return found

@@ -5,11 +5,12 @@
 import numpy as np
 import pytest
 
+from pose_graph_ros.core.batch.optimizer import to_the_end
 from pose_graph_ros.core.geometry import se2
 from pose_graph_ros.core.graph.constraints import EdgeKind, Edges, ObservedKind, ObservedNodes
 from pose_graph_ros.core.graph.graph import Graph, GraphUpdate
 from pose_graph_ros.core.sources import error_estimate
-from pose_graph_ros.core.sources.error_estimate import finished, measured_path, search
+from pose_graph_ros.core.sources.error_estimate import measured_path, search
 from pose_graph_ros.core.sources.error_likelihood import (
     chain_motions,
     filtered,
@@ -83,7 +84,7 @@ def test_the_likelihood_is_that_of_the_full_covariance() -> None:
 @pytest.mark.parametrize(('tau', 'period', 'n'), [
     (5.0, 0.5, 200), (10.0, 5.0, 120), (60.0, 1.0, 400), (60.0, 5.0, 120), (300.0, 1.0, 900)])
 def test_the_time_constant_is_found_within_a_factor(tau: float, period: float, n: int) -> None:
-    found = [finished(search(a_drive(seed, n=n, period=period, tau=tau))).errors
+    found = [to_the_end(search(a_drive(seed, n=n, period=period, tau=tau))).errors
              for seed in range(3)]
     known = [each for each in found if each is not None]
     assert len(known) == 3
@@ -97,7 +98,7 @@ def test_the_time_constant_is_found_within_a_factor(tau: float, period: float, n
     {'drift': 0.3}, {'drift': 3.0}, {'wrong': 0.2}], ids=str)
 def test_white_errors_are_not_taken_for_correlated_ones(settings: dict[str, float]) -> None:
     """Nor the drift of odometry that is better or worse than it says, nor wrong positions."""
-    taken = [finished(search(a_drive(seed, **settings))).errors for seed in range(12)]
+    taken = [to_the_end(search(a_drive(seed, **settings))).errors for seed in range(12)]
     assert sum(errors is not None for errors in taken) <= 1     # by chance in one of a hundred
 
 
@@ -105,21 +106,21 @@ def test_white_errors_are_not_taken_for_correlated_ones(settings: dict[str, floa
     (12, 1.0, 60.0), (30, 1.0, 10.0), (30, 1.0, 60.0), (30, 1.0, 300.0), (30, 5.0, 30.0)])
 def test_correlated_errors_show_in_few_positions(n: int, period: float, tau: float) -> None:
     """Even where all of them are within one time constant: they scatter less than is claimed."""
-    found = [finished(search(a_drive(seed, n=n, period=period, tau=tau))).errors
+    found = [to_the_end(search(a_drive(seed, n=n, period=period, tau=tau))).errors
              for seed in range(12)]
     assert sum(errors is not None for errors in found) >= 10
 
 
 def test_correlated_errors_are_found_among_wrong_positions() -> None:
     for seed in range(3):
-        found = finished(search(a_drive(seed, n=400, tau=20.0, wrong=0.2))).errors
+        found = to_the_end(search(a_drive(seed, n=400, tau=20.0, wrong=0.2))).errors
         assert found is not None
         assert 8.0 < found.tau < 50.0
 
 
 def test_too_few_positions_show_nothing() -> None:
     drive = a_drive(0, n=error_estimate.LEAST_POSITIONS - 1, tau=30.0)
-    assert finished(search(drive)) == error_estimate.NOTHING
+    assert to_the_end(search(drive)) == error_estimate.NOTHING
 
 
 def test_a_step_of_a_search_is_bounded(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -138,7 +139,7 @@ def test_a_step_of_a_search_is_bounded(monkeypatch: pytest.MonkeyPatch) -> None:
         except StopIteration as end:
             found = end.value
         assert sum(done[before:]) <= error_estimate.PER_STEP + 300
-    assert found == finished(search(a_drive(1, n=300, tau=20.0)))
+    assert found == to_the_end(search(a_drive(1, n=300, tau=20.0)))
 
 
 @pytest.mark.parametrize(('drift', 'tau', 'n'), [
@@ -148,7 +149,7 @@ def test_the_noise_of_odometry_is_found_where_it_is_more_than_claimed(
     drift: float, tau: float, n: int,
 ) -> None:
     """Odometry that is as it says, or better, keeps its noise."""
-    scales = [finished(search(a_drive(seed, n=n, tau=tau, drift=drift))).odometry_scale
+    scales = [to_the_end(search(a_drive(seed, n=n, tau=tau, drift=drift))).odometry_scale
               for seed in range(5)]
     assert max(drift, 1.0) / 1.35 < np.median(scales) < 1.35 * max(drift, 1.0)
     assert drift > 1.0 or sum(scale > 1.0 for scale in scales) <= 1
@@ -175,7 +176,7 @@ def test_a_path_has_the_motions_of_the_primary_odometry_in_the_order_of_stamps()
     graph, rng = line(30), np.random.default_rng(0)
     rows = np.sort(rng.choice(30, 12, replace=False))
     some = rng.permutation(rows)
-    found = finished(measured_path(graph, SECOND * (some + 5), some))
+    found = to_the_end(measured_path(graph, SECOND * (some + 5), some))
     np.testing.assert_allclose(found.seconds, rows - rows[0])
     np.testing.assert_allclose(found.position, np.column_stack((rows + 0.2, np.full(12, 0.1))))
     np.testing.assert_allclose(found.variance, 0.25)
@@ -209,10 +210,10 @@ def test_chained_motions_are_those_of_an_oracle() -> None:
 
 def test_a_long_path_is_joined_in_steps(monkeypatch: pytest.MonkeyPatch) -> None:
     arguments = line(40), SECOND * np.arange(40), np.arange(40)
-    at_once = finished(measured_path(*arguments))
+    at_once = to_the_end(measured_path(*arguments))
     monkeypatch.setattr(error_estimate, 'NODES_PER_STEP', 7)
     assert len(list(measured_path(*arguments))) >= 40 // 7
-    for one, other in zip(finished(measured_path(*arguments)), at_once, strict=True):
+    for one, other in zip(to_the_end(measured_path(*arguments)), at_once, strict=True):
         np.testing.assert_array_equal(one, other)
 
 
@@ -221,6 +222,6 @@ def test_of_many_positions_the_newest_and_a_sample_of_the_others_are_used(
 ) -> None:
     monkeypatch.setattr(error_estimate, 'NEWEST', 10)
     monkeypatch.setattr(error_estimate, 'OLDER', 5)
-    found = finished(measured_path(line(40), SECOND * np.arange(40), np.arange(40)))
+    found = to_the_end(measured_path(line(40), SECOND * np.arange(40), np.arange(40)))
     assert len(found.seconds) == 15
     np.testing.assert_allclose(found.seconds[-10:], np.arange(30, 40))
