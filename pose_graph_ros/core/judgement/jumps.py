@@ -189,8 +189,9 @@ def _strained(
     errors, covariances = np.empty((n, 3)), np.zeros((n, 3, 3))
     innovations.of_edges(graph.memory.head, *map(np.ascontiguousarray, (
         edges.i, edges.j, edges.mean, edges.kind, edges.bias)), errors, covariances)
-    # in sigmas: with W = L L^T, L^T C L is between 0 and 1
-    root = np.linalg.cholesky(edges.weighted_information)
+    # in sigmas: with W = L L^T, L^T C L is between 0 and 1; W may be singular
+    information, axes = np.linalg.eigh(edges.weighted_information)
+    root = axes * np.sqrt(np.maximum(information, 0.0))[:, None]
     white = np.swapaxes(root, 1, 2)
     values, vectors = np.linalg.eigh(white @ covariances @ root)
     free = 1.0 - values
@@ -206,7 +207,7 @@ def _strained(
     near = gains > gains[k] - GATE * scale
     first, last = (k - int(np.argmin(np.append(near[k::-1], False))) + 1,
                    k + int(np.argmin(np.append(near[k:], False))))
-    jump = np.linalg.solve(white[k], vectors[k] @ without[k])
+    jump = np.linalg.lstsq(white[k], vectors[k] @ without[k])[0]
     motion = se2.compose(edges.mean[k], jump)
     ends = problem.edges
     over = choice.believed & (odometry.places(ends.i) <= k) & (odometry.places(ends.j) > k)

@@ -36,6 +36,8 @@ class Odometry:
         is_chained = (at > 0) & (self.nodes[np.maximum(at, 1) - 1] == ends[rows, tb.END_I])
         self.rows = np.full(n, -1)
         self.rows[at[is_chained][::-1] - 1] = rows[is_chained][::-1]
+        if np.any(self.rows < 0):   # an edge was removed: a chain with a gap is none
+            self.nodes, self.rows = self.nodes[:1], self.rows[:0]
         self.motions = graph.edges_at(self.rows).mean
         self.poses = integrated(self.motions)
 
