@@ -79,7 +79,8 @@ class TruncatedProblem:
         self.graph, self.rows = graph, rows
         self.edges = graph.edges_at(rows)
         """What may be wrong; their weights have no meaning."""
-        self.limits = LIMITS[_ranks(self.edges.information)]
+        self._full_limits = LIMITS[_ranks(self.edges.information)]
+        self.limits = self._full_limits.copy()
         """c^2 of each, shape (M,)."""
         self.allowed = np.ones(len(self.limits), dtype=bool)
         """Which of them a set may believe, shape (M,)."""
@@ -92,6 +93,10 @@ class TruncatedProblem:
 
     def __len__(self) -> int:
         return len(self.limits)
+
+    def lowered(self) -> float:
+        """Return the factor by which the limits have been lowered."""
+        return float(np.min(self.limits / np.maximum(self._full_limits, 1e-9), initial=1.0))
 
     def solve(
         self, weights: FloatArray, config: SolverConfig = ROUGH, *, go_on: bool = False,

@@ -13,7 +13,7 @@ from pose_graph_ros.core.geometry import se2
 from pose_graph_ros.core.geometry.se2 import BoolArray
 from pose_graph_ros.core.graph.constraints import Edges
 from pose_graph_ros.core.graph.graph import Graph
-from pose_graph_ros.core.judgement import jumps
+from pose_graph_ros.core.judgement import jumps, strain
 from pose_graph_ros.core.judgement.closures import GATE
 from pose_graph_ros.core.judgement.jumps import Jump
 from pose_graph_ros.core.judgement.odometry_motions import Odometry
@@ -59,9 +59,9 @@ def search(present: Swap, graph: Graph) -> Generator[None, None, Found | None]:
             continue
         residual = present.residuals(copy)
         fit = members[residual[members] <= GATE]
-        if (present.truncated(copy, residual) + jumps.PRICE >= present.cost
+        if (present.truncated(copy, residual) + strain.PRICE >= present.cost
                 or len(fit) < jumps.MOST_FIT * len(members)
-                or jumps.n_places(copy.poses, edges.rows(fit)) < jumps.PLACES):
+                or strain.n_places(copy.poses, edges.rows(fit)) < strain.PLACES):
             continue
         total = se2.between(*copy.poses[odometry.nodes[[place.first, place.last]]])
         at, motion = odometry.smallest_jump(

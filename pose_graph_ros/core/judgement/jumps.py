@@ -17,7 +17,7 @@ agree with it, are lost by it.
 """
 
 from collections.abc import Generator, Sequence
-from itertools import pairwise
+from itertools import pairwise, product
 from typing import NamedTuple
 
 import numpy as np
@@ -33,27 +33,28 @@ from pose_graph_ros.core.judgement.closures import GATE
 from pose_graph_ros.core.judgement.consistency import Closures
 from pose_graph_ros.core.judgement.floors import floored
 from pose_graph_ros.core.judgement.odometry_motions import Odometry, SIGMAS
-from pose_graph_ros.core.smoother import innovations
+from pose_graph_ros.core.judgement.strain import (
+    gains_of,
+    n_places,
+    Place,
+    PLACES,
+    PRICE,
+    scale_of,
+    strained,
+)
 
-# Least reduction of the truncated cost by a jump [sigma^2]: which edge it is, of many thousands,
-# and its size, of all that would fit into the map, have to be told.
-PRICE = 35.0
-# From how many places a jump is to be seen, and their distance: at most so many metres, and so
-# much of the extent of the map.
-PLACES, PLACE, PLACE_SHARE = 3, 20.0, 0.2
 # Sigmas of the motion in a trial where it is only known roughly [m, m, rad].
 LOOSE = np.array((30.0, 30.0, 3.0))
 # Share of the closures that show a jump which must fit with it.
 MOST_FIT = 0.75
+# Share of all closures that a jump must explain where the others fit odometry by chance.
+HALF = 0.5
 # Limits of the search: jumps, closures that others are compared with, and trials for one jump.
 MOST, MOST_SEEDS, MOST_TRIALS = 10, 60, 4
 # Maximum number of retests of a trial.
 RETESTS = 6
 # Of the search of the edge: how many ends of closures beyond the place, and how many at most.
 FURTHER, MOST_CUTS = 2, 16
-# Median of chi2 with three degrees of freedom, and least part of the variance of an edge that the
-# rest of the graph must leave, so that it says anything on the edge.
-USUAL, _FREE = 3.5, 1e-7
 
 
 class Jump(NamedTuple):
@@ -69,23 +70,6 @@ class Jump(NamedTuple):
     """Numbers of the closures that the jump was found by."""
 
 
-class Place(NamedTuple):
-    """Where a jump may be."""
-
-    gain: float
-    first: int
-    last: int
-    """Places in the chain between which it is."""
-    at: int
-    """Where it is tried."""
-    total: FloatArray
-    """Pose of the last place in the first one, if it is there, shape (3,)."""
-    members: IntArray
-    """Closures over the jump that show it."""
-    against: IntArray
-    """Believed closures over the jump that do not agree with it."""
-
-
 def best(
     problem: TruncatedProblem, *, insured: bool = False,
 ) -> tuple[Choice | None, tuple[Jump, ...]]:
@@ -98,8 +82,7 @@ def best(
 
     """
     choice, jumps = selection.best(problem, insured=insured), list[Jump]()
-    # where chance explains all that fit odometry, it also gives jumps that others fit
-    while choice is not None and np.any(problem.allowed) and len(jumps) < MOST:
+    while choice is not None and len(jumps) < MOST:
         found = _one_more(problem, choice, insured=insured)
         if found is None:
             break
@@ -112,18 +95,23 @@ def _one_more(
     problem: TruncatedProblem, choice: Choice, *, insured: bool,
 ) -> tuple[TruncatedProblem, Choice, Jump] | None:
     odometry = Odometry(problem.graph)
-    strained, scale = _strained(problem, choice, odometry)
-    price = PRICE * scale
     groups = group_search.groups(problem)
-    for place in strained + to_the_end(places(
+    scale, candidates = strained(problem, choice, odometry, groups)
+    for place in candidates + to_the_end(places(
             problem.edges, choice.believed, choice.poses, odometry, groups)):
+        price = place.price * scale
         trial = _with_jump(problem, choice, odometry, place, price)
         if trial is None:
             continue
-        first, last, at, motion = _located(problem, trial, odometry, place)
+        first, last, at, motion = _located(problem, trial, odometry, place, groups)
         other = with_motion(problem, odometry, at, motion)
         found = _decided(other, trial.believed, insured=insured)
-        if found is not None and _is_better(problem, choice, other, found, price):
+        # where chance explains all that fit odometry, it would also give jumps that others fit
+        by_chance = found is None or not np.any(other.allowed) or (
+            not np.any(problem.allowed) and np.mean(found.believed) < HALF)
+        if (found is not None and not by_chance
+                and _is_better(problem, choice, other, found, price)
+                and _is_needed(problem, other, found, place.price)):
             begin, end = odometry.nodes[[first, last]].tolist()
             return other, found, Jump(
                 int(odometry.rows[at]), (begin, end), motion, place.members)
@@ -132,6 +120,7 @@ def _one_more(
 
 def _located(
     problem: TruncatedProblem, trial: Choice, odometry: Odometry, place: Place,
+    groups: Sequence[IntArray],
 ) -> tuple[int, int, int, FloatArray]:
     """
     Return between which places a jump is, where the edge begins that is doubted, and its motion.
@@ -146,15 +135,26 @@ def _located(
     outer = int(cuts[0]), int(cuts[-1])
     total = se2.between(*trial.poses[odometry.nodes[list(outer)]])
     lowest, found = np.inf, (*outer, *odometry.smallest_jump(*outer, *outer, total))
-    for begin, end in pairwise(cuts.tolist()):
-        at, motion = odometry.smallest_jump(begin, end, *outer, total)
-        other = with_motion(problem, odometry, at, motion)
-        choice = other.choice(trial.believed, ROUGH)
+    tried = [(place.first, place.last, place.at, np.asarray(se2.between(
+        *trial.poses[odometry.nodes[[place.at, place.at + 1]]])))]
+    tried += [(begin, end, *odometry.smallest_jump(begin, end, *outer, total))
+              for begin, end in pairwise(cuts.tolist())]
+    around = trial.believed.copy()
+    for group in groups:
+        at_ends = odometry.places(np.concatenate((problem.edges.i[group], problem.edges.j[group])))
+        around[group] |= bool(np.any((at_ends >= outer[0]) & (at_ends <= outer[1])))
+    sets = [trial.believed] if np.array_equal(around, trial.believed) else [
+        trial.believed, around]
+    for (begin, end, at, motion), believed in product(tried, sets):
+        other = with_motion(problem, odometry, at, motion, LOOSE)
+        choice = other.choice(believed, ROUGH)
         if choice is None:
             continue
-        cost = other.improved(choice, RETESTS, ROUGH).cost_by(problem.limits)
-        if cost < lowest:
-            lowest, found = cost, (begin, end, at, motion)
+        choice = other.improved(choice, RETESTS, ROUGH)
+        if choice.cost_by(problem.limits) < lowest:
+            lowest = choice.cost_by(problem.limits)
+            found = begin, end, at, np.asarray(se2.between(
+                *choice.poses[odometry.nodes[[at, at + 1]]]))
     return found
 
 
@@ -170,54 +170,6 @@ def _decided(
         return found or given
     # with equal limits, as the first ones are never lower
     return found if found.cost <= given.cost_by(problem.limits) else given
-
-
-def _strained(
-    problem: TruncatedProblem, choice: Choice, odometry: Odometry,
-) -> tuple[list[Place], float]:
-    """
-    Return where odometry is bent most by what is believed, and how large its energies are.
-
-    Without an edge, with the error e, information W and covariance C of the estimate along it,
-    chi2 would be lower by `e^T (W^-1 - C)^-1 e`, and its error be `(1 - C W)^-1 e`.
-    """
-    graph, n = problem.graph, len(odometry.rows)
-    graph.set_poses(choice.poses)
-    if n == 0 or not problem.solve(choice.believed.astype(np.float64), go_on=True):
-        return [], 1.0
-    edges = graph.edges_at(odometry.rows)
-    errors, covariances = np.empty((n, 3)), np.zeros((n, 3, 3))
-    innovations.of_edges(graph.memory.head, *map(np.ascontiguousarray, (
-        edges.i, edges.j, edges.mean, edges.kind, edges.bias)), errors, covariances)
-    # in sigmas: with W = L L^T, L^T C L is between 0 and 1; W may be singular
-    information, axes = np.linalg.eigh(edges.weighted_information)
-    root = axes * np.sqrt(np.maximum(information, 0.0))[:, None]
-    white = np.swapaxes(root, 1, 2)
-    values, vectors = np.linalg.eigh(white @ covariances @ root)
-    free = 1.0 - values
-    along = np.einsum('mij,mi->mj', vectors, np.einsum('mij,mj->mi', white, errors))
-    with np.errstate(divide='ignore', invalid='ignore'):
-        without = np.where(free > _FREE, along / free, 0.0)
-    gains = np.sum(along * without, axis=1)
-    known = gains[np.any(free > _FREE, axis=1)]
-    scale = max(float(np.median(known)) / USUAL, 1.0) if len(known) > 0 else 1.0
-    k = int(np.argmax(gains))
-    if gains[k] <= PRICE * scale:
-        return [], scale
-    near = gains > gains[k] - GATE * scale
-    first, last = (k - int(np.argmin(np.append(near[k::-1], False))) + 1,
-                   k + int(np.argmin(np.append(near[k:], False))))
-    jump = np.linalg.lstsq(white[k], vectors[k] @ without[k])[0]
-    motion = se2.compose(edges.mean[k], jump)
-    ends = problem.edges
-    over = choice.believed & (odometry.places(ends.i) <= k) & (odometry.places(ends.j) > k)
-    if n_places(choice.poses, ends.rows(over)) < PLACES:
-        return [], scale
-    total = se2.between(odometry.poses[first], odometry.poses[k])
-    total = se2.compose(se2.compose(total, motion),
-                        se2.between(odometry.poses[k + 1], odometry.poses[last]))
-    return [Place(float(gains[k]), first, last, k, total, np.flatnonzero(over),
-                  np.empty(0, dtype=np.int64))], scale
 
 
 def _with_jump(
@@ -247,6 +199,19 @@ def _is_better(
     """Tell whether a jump lowers the cost by more than its price, with equal limits."""
     limits = np.minimum(problem.limits, other.limits)
     return trial.cost_by(limits) + price < choice.cost_by(limits)
+
+
+def _is_needed(
+    problem: TruncatedProblem, other: TruncatedProblem, found: Choice, price: float,
+) -> bool:
+    """Tell whether a set costs more without its jump, by how all odometry is bent."""
+    gains, _ = gains_of(other, found, Odometry(other.graph))
+    allowed, problem.allowed = problem.allowed, np.ones_like(problem.allowed)
+    without = problem.choice(found.believed)
+    without = without and problem.improved(without)
+    problem.allowed = allowed
+    return without is None or _is_better(
+        problem, without, other, found, price * scale_of(gains, problem.lowered()))
 
 
 def with_motion(
@@ -379,25 +344,6 @@ def _place(
     over = (first <= at) & (last >= at + n)
     return Place(gain, at, at + n, at + n // 2, np.zeros(3), np.flatnonzero(agrees & over),
                  np.flatnonzero(against & (first < at + n) & (last > at)))
-
-
-def n_places(poses: FloatArray, edges: Edges) -> int:
-    """
-    Return the number of places that closures are apart from one another at both ends.
-
-    Parameters
-    ----------
-    poses : ndarray, shape (N, 3)
-    edges : Edges
-
-    """
-    size = min(PLACE, PLACE_SHARE * float(np.max(np.ptp(poses[:, :2], axis=0))))
-    ends = poses[np.column_stack((edges.i, edges.j)), :2]
-    kept = np.empty((0, 2, 2))
-    for each in ends:
-        if np.all(np.linalg.norm(kept - each, axis=2) >= size):
-            kept = np.concatenate((kept, each[None]))
-    return len(kept)
 
 
 def _shown_by(
