@@ -96,10 +96,10 @@ def _one_more(
 ) -> tuple[TruncatedProblem, Choice, Jump] | None:
     odometry = Odometry(problem.graph)
     groups = group_search.groups(problem)
-    scale, candidates = strained(problem, choice, odometry, groups)
+    scale, candidates = strained(problem, choice, odometry)
+    price = PRICE * scale
     for place in candidates + to_the_end(places(
             problem.edges, choice.believed, choice.poses, odometry, groups)):
-        price = place.price * scale
         trial = _with_jump(problem, choice, odometry, place, price)
         if trial is None:
             continue
@@ -111,7 +111,7 @@ def _one_more(
             not np.any(problem.allowed) and np.mean(found.believed) < HALF)
         if (found is not None and not by_chance
                 and _is_better(problem, choice, other, found, price)
-                and _is_needed(problem, other, found, place.price)):
+                and _is_needed(problem, other, found)):
             begin, end = odometry.nodes[[first, last]].tolist()
             return other, found, Jump(
                 int(odometry.rows[at]), (begin, end), motion, place.members)
@@ -201,9 +201,7 @@ def _is_better(
     return trial.cost_by(limits) + price < choice.cost_by(limits)
 
 
-def _is_needed(
-    problem: TruncatedProblem, other: TruncatedProblem, found: Choice, price: float,
-) -> bool:
+def _is_needed(problem: TruncatedProblem, other: TruncatedProblem, found: Choice) -> bool:
     """Tell whether a set costs more without its jump, by how all odometry is bent."""
     gains, _ = gains_of(other, found, Odometry(other.graph))
     allowed, problem.allowed = problem.allowed, np.ones_like(problem.allowed)
@@ -211,7 +209,7 @@ def _is_needed(
     without = without and problem.improved(without)
     problem.allowed = allowed
     return without is None or _is_better(
-        problem, without, other, found, price * scale_of(gains, problem.lowered()))
+        problem, without, other, found, PRICE * scale_of(gains, problem.lowered()))
 
 
 def with_motion(

@@ -1,36 +1,25 @@
 # Copyright 2026 The pose_graph_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""
-Where odometry is bent most by closures: of `jumps`, the hint that one edge may be wrong.
+"""Where odometry is bent most by closures that are believed: a hint at one of `jumps`."""
 
-What is believed bends it, or would if a group of closures that are doubted were believed besides.
-"""
-
-from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
 
-from pose_graph_ros.core.batch.truncated import Choice, ROUGH, TruncatedProblem
+from pose_graph_ros.core.batch.truncated import Choice, TruncatedProblem
 from pose_graph_ros.core.geometry import se2
 from pose_graph_ros.core.geometry.se2 import FloatArray, IntArray
 from pose_graph_ros.core.graph.constraints import Edges
 from pose_graph_ros.core.judgement.closures import GATE
-from pose_graph_ros.core.judgement.odometry_motions import Odometry, SIGMAS
-from pose_graph_ros.core.judgement.surest_first import WRONG_ODDS
+from pose_graph_ros.core.judgement.odometry_motions import Odometry
 from pose_graph_ros.core.smoother import innovations
 
 # Least reduction of the truncated cost by a jump [sigma^2]: which edge it is, of many thousands,
 # and its size, of all that would fit into the map, have to be told.
 PRICE = 35.0
-# The same where a few closures show it and wrong ones would hardly ask for so small a jump: most
-# of what two of them cost if they are doubted.
-SMALL_PRICE = 20.0
 # From how many places a jump is to be seen, and their distance: at most so many metres, and so
 # much of the extent of the map.
 PLACES, PLACE, PLACE_SHARE = 3, 20.0, 0.2
-# Maximum number of groups that are tried.
-MOST_GROUPS = 4
 # Median of chi2 with three degrees of freedom, and least part of the variance of an edge that the
 # rest of the graph must leave, so that it says anything on the edge.
 USUAL, _FREE = 3.5, 1e-7
@@ -51,22 +40,19 @@ class Place(NamedTuple):
     """Closures over the jump that show it."""
     against: IntArray
     """Believed closures over the jump that do not agree with it."""
-    price: float = PRICE
-    """Least reduction of the cost, in the units of odometry."""
 
 
 def strained(
-    problem: TruncatedProblem, choice: Choice, odometry: Odometry, groups: Sequence[IntArray],
+    problem: TruncatedProblem, choice: Choice, odometry: Odometry,
 ) -> tuple[float, list[Place]]:
     """
-    Return how large the energies of odometry are, and where it is bent most, the best first.
+    Return how large the energies of odometry are, and where it is bent most, if it is.
 
     Parameters
     ----------
     problem : TruncatedProblem
     choice : Choice, what is believed
     odometry : Odometry
-    groups : sequence of ndarray of int, closures that agree along the path
 
     """
     gains, without = gains_of(problem, choice, odometry)
@@ -74,39 +60,7 @@ def strained(
         return 1.0, []
     scale = scale_of(gains, problem.lowered())
     place = _where(problem, choice, odometry, (gains, without), scale)
-    found = [] if place is None else [(choice.cost - place.gain, place)]
-    outside = [group[~choice.believed[group]] for group in groups]
-    outside.sort(key=lambda group: (-len(group), int(np.min(group, initial=0))))
-    for group in outside[:MOST_GROUPS]:
-        shown = _of_group(problem, choice, odometry, group, scale)
-        if shown is not None:
-            found.append(shown)
-    return scale, [place for _, place in sorted(found, key=lambda each: each[0])]
-
-
-def _of_group(
-    problem: TruncatedProblem, choice: Choice, odometry: Odometry, group: IntArray, scale: float,
-) -> tuple[float, Place] | None:
-    """
-    Return where a doubted group bends odometry most, after the cost that a jump there would give.
-
-    One group is little: it counts if wrong ones would hardly ask for so small a jump.
-    """
-    believed = choice.believed.copy()
-    believed[group] = True
-    bent = problem.choice(believed, ROUGH) if len(group) > 0 else None
-    if bent is None:
-        return None
-    gains, without = gains_of(problem, bent, odometry)
-    place = _where(problem, bent, odometry, (gains, without), scale)
-    if place is None or not _is_telling(problem, choice, odometry, place, group):
-        return None
-    cost = bent.known - place.gain + float(np.sum(np.where(
-        believed, bent.energies, np.minimum(bent.energies, problem.limits))))
-    if cost + SMALL_PRICE * scale > choice.cost:
-        return None
-    members = np.concatenate((group, np.setdiff1d(place.members, group)))
-    return cost, place._replace(price=SMALL_PRICE, members=members)
+    return scale, [] if place is None else [place]
 
 
 def scale_of(gains: FloatArray, least: float) -> float:
@@ -121,19 +75,6 @@ def scale_of(gains: FloatArray, least: float) -> float:
     """
     known = gains[gains > 0.0]
     return max(float(np.median(known)) / USUAL, least) if len(known) > 0 else 1.0
-
-
-def _is_telling(
-    problem: TruncatedProblem, choice: Choice, odometry: Odometry, place: Place, group: IntArray,
-) -> bool:
-    """Tell whether a group of wrong closures would hardly ask for a jump as small as this one."""
-    motion, = odometry.motion_at(np.array([place.at]), place.first, place.last, place.total)
-    jump = se2.between(odometry.motions[place.at], motion)
-    radius, angle = float(np.hypot(*jump[:2])) + SIGMAS[0], abs(float(jump[2])) + SIGMAS[2]
-    area = float(np.prod(np.maximum(np.ptp(choice.poses[:, :2], axis=0), 1.0)))
-    chance = min(np.pi * radius**2 / area, 1.0) * min(angle / np.pi, 1.0)
-    n_wrong = int(np.sum(~choice.believed)) - len(group)
-    return bool((n_wrong + 1.0) * chance < WRONG_ODDS * (np.sum(choice.believed) + 1.0))
 
 
 def gains_of(
