@@ -71,7 +71,7 @@ def decide(
     if result.status is Status.FAILED:
         return None, None
     problem = TruncatedProblem(copy, rows, start=copy.poses.copy())
-    return jumps.best(problem, insured=True)
+    return jumps.best(problem)
 
 
 def _copy(graph: Graph, closures: IntArray) -> Graph:

@@ -70,20 +70,11 @@ class Jump(NamedTuple):
     """Numbers of the closures that the jump was found by."""
 
 
-def best(
-    problem: TruncatedProblem, *, insured: bool = False,
-) -> tuple[Choice | None, tuple[Jump, ...]]:
-    """
-    Return the set of `selection.best`, and jumps of odometry that lower its cost.
-
-    Parameters
-    ----------
-    problem, insured : as there
-
-    """
-    choice, jumps = selection.best(problem, insured=insured), list[Jump]()
+def best(problem: TruncatedProblem) -> tuple[Choice | None, tuple[Jump, ...]]:
+    """Return the set of `selection.best`, insured, and jumps of odometry that lower its cost."""
+    choice, jumps = selection.best(problem, insured=True), list[Jump]()
     while choice is not None and len(jumps) < MOST:
-        found = _one_more(problem, choice, insured=insured)
+        found = _one_more(problem, choice)
         if found is None:
             break
         problem, choice, jump = found
@@ -92,7 +83,7 @@ def best(
 
 
 def _one_more(
-    problem: TruncatedProblem, choice: Choice, *, insured: bool,
+    problem: TruncatedProblem, choice: Choice,
 ) -> tuple[TruncatedProblem, Choice, Jump] | None:
     odometry = Odometry(problem.graph)
     groups = group_search.groups(problem)
@@ -105,7 +96,7 @@ def _one_more(
             continue
         first, last, at, motion = _located(problem, trial, odometry, place, groups)
         other = with_motion(problem, odometry, at, motion)
-        found = _decided(other, trial.believed, insured=insured)
+        found = _decided(other, trial.believed)
         # where chance explains all that fit odometry, it would also give jumps that others fit
         by_chance = found is None or not np.any(other.allowed) or (
             not np.any(problem.allowed) and np.mean(found.believed) < HALF)
@@ -158,14 +149,12 @@ def _located(
     return found
 
 
-def _decided(
-    problem: TruncatedProblem, believed: BoolArray, *, insured: bool,
-) -> Choice | None:
+def _decided(problem: TruncatedProblem, believed: BoolArray) -> Choice | None:
     """Return the set of `selection.best`, or the given one, improved, if it costs less."""
     given = problem.choice(believed)
     if given is not None:
         given = problem.improved(given)
-    found = selection.best(problem, insured=insured)
+    found = selection.best(problem, insured=True)
     if given is None or found is None:
         return found or given
     # with equal limits, as the first ones are never lower

@@ -87,9 +87,7 @@ def give_scale(graph: Graph, closures: IntArray) -> float:
     for _ in range(ROUNDS):
         if optimize(graph, CONFIG).status is Status.FAILED:
             break
-        errors, covariances = np.empty((len(closures), 3)), np.zeros((len(closures), 3, 3))
-        innovations.of_edges(graph.memory.head, *map(np.ascontiguousarray, (
-            edges.i, edges.j, edges.mean, edges.kind, edges.bias)), errors, covariances)
+        errors, covariances = innovations.at_estimate(graph.memory.head, edges)
         shown = max(agreement, residual_scale(
             errors, covariances, edges.information, group, scale))
         if shown <= scale:

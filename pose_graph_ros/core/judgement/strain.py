@@ -97,9 +97,7 @@ def gains_of(
     if n == 0 or not problem.solve(choice.believed.astype(np.float64), go_on=True):
         return np.empty(0), np.empty((0, 3))
     edges = graph.edges_at(odometry.rows)
-    errors, covariances = np.empty((n, 3)), np.zeros((n, 3, 3))
-    innovations.of_edges(graph.memory.head, *map(np.ascontiguousarray, (
-        edges.i, edges.j, edges.mean, edges.kind, edges.bias)), errors, covariances)
+    errors, covariances = innovations.at_estimate(graph.memory.head, edges)
     # in sigmas: with W = L L^T, L^T C L is between 0 and 1; W may be singular
     information, axes = np.linalg.eigh(edges.weighted_information)
     root = axes * np.sqrt(np.maximum(information, 0.0))[:, None]
@@ -119,8 +117,6 @@ def _where(
 ) -> Place | None:
     """Return where odometry is bent most, by what several places show; None if hardly."""
     gains, without = strain
-    if len(gains) == 0:
-        return None
     k = int(np.argmax(gains))
     if gains[k] <= PRICE * scale:
         return None

@@ -25,6 +25,7 @@ from pose_graph_ros.core.batch.truncated import TruncatedProblem
 from pose_graph_ros.core.geometry import se2
 from pose_graph_ros.core.geometry.se2 import BoolArray, FloatArray, IntArray
 from pose_graph_ros.core.graph.constraints import EdgeKind
+from pose_graph_ros.core.judgement.belief_rule import WRONG_ODDS
 from pose_graph_ros.core.judgement.closures import GATE, NEAR
 from pose_graph_ros.core.judgement.consistency import Closures, OdometryChain
 from pose_graph_ros.core.smoother import innovations
@@ -49,8 +50,6 @@ REACH = 20.0
 # Number of those with the smallest volumes, at least, that are looked at before all others, and
 # their share; both double after each round in which most of these were believed.
 SOME, SOME_SHARE = 200, 1.0 / 16.0
-# Largest odds that a constraint is wrong which no neighbours support, where these are counted.
-WRONG_ODDS = 0.02
 # Least size of a group of closures that agree. If wrong groups give as many that fit odometry with
 # more than this chance, and so do wrong ones outside of groups, nothing is believed.
 GROUP, BY_CHANCE = 3, 0.1
@@ -274,9 +273,7 @@ class _Gates:
     def _compute(self, numbers: IntArray) -> None:
         """Compute gates by the present cliques."""
         problem, edges = self._problem, self._problem.edges.rows(numbers)
-        errors, covariances = np.empty((len(numbers), 3)), np.zeros((len(numbers), 3, 3))
-        innovations.of_edges(problem.graph.memory.head, *map(np.ascontiguousarray, (
-            edges.i, edges.j, edges.mean, edges.kind, edges.bias)), errors, covariances)
+        errors, covariances = innovations.at_estimate(problem.graph.memory.head, edges)
         self._present[numbers] = True
         self._set(numbers, covariances)
         self.share[numbers] = self._squared(numbers, errors) / problem.limits[numbers]

@@ -291,11 +291,7 @@ class IncrementalSmoother:
         Raises as `covariance` does.
         """
         self._require_eliminated(*edges.i, *edges.j)
-        result = Innovations(np.empty((len(edges), 3)), np.zeros((len(edges), 3, 3)))
-        columns = edges.i, edges.j, edges.mean, edges.kind, edges.bias
-        innovations.of_edges(
-            self._memory.head, *map(np.ascontiguousarray, columns), *result)
-        return result
+        return innovations.at_estimate(self._memory.head, edges)
 
     def _require_eliminated(self, *nodes: Any) -> None:
         waiting, n_nodes = int(self._memory.head[tb.N_TOUCHED]), self.graph.n_nodes

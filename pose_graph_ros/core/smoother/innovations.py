@@ -26,8 +26,9 @@ from pose_graph_ros.core.compiled.jit import (
     ROWS,
 )
 from pose_graph_ros.core.elimination import clique_frames
-from pose_graph_ros.core.geometry.se2 import FloatArray
+from pose_graph_ros.core.geometry.se2 import FloatArray, IntArray
 from pose_graph_ros.core.graph import factors, tables as tb
+from pose_graph_ros.core.graph.constraints import Edges
 from pose_graph_ros.core.graph.pools import row_start
 from pose_graph_ros.core.smoother.covariances import cleared, pass_up
 
@@ -51,6 +52,22 @@ class Innovations(NamedTuple):
         joint = np.eye(3) + self.covariances @ information
         scaled = np.linalg.solve(joint, self.errors[:, :, None])[:, :, 0]
         return np.einsum('mi,mij,mj->m', self.errors, information, scaled)
+
+
+def at_estimate(head: IntArray, edges: Edges) -> Innovations:
+    """
+    Return by how much edges, not in the graph or with weight 0, disagree with the estimate.
+
+    Parameters
+    ----------
+    head : ndarray of int, of the memory of a graph all of whose edits have been solved for
+    edges : Edges
+
+    """
+    result = Innovations(np.empty((len(edges), 3)), np.zeros((len(edges), 3, 3)))
+    columns = edges.i, edges.j, edges.mean, edges.kind, edges.bias
+    of_edges(head, *map(np.ascontiguousarray, columns), *result)
+    return result
 
 
 @kernel(signature=(tb.HEAD, INTEGERS, INTEGERS, ROWS, BYTES, ROWS, ROWS, MATRICES), allocates=True)
