@@ -2,9 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """The pose graph: hidden nodes, edges and observed nodes, as struct of arrays."""
 
-from collections.abc import Collection, Mapping, Sequence
-from types import MappingProxyType
-from typing import Any, Final, NamedTuple
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -12,77 +10,52 @@ import numpy.typing as npt
 from pose_graph_ros.core.exceptions import GraphUpdateError
 from pose_graph_ros.core.geometry import se2
 from pose_graph_ros.core.geometry.se2 import BoolArray, FloatArray, IntArray
-from pose_graph_ros.core.graph import editing, tables as tb, transaction_log
+from pose_graph_ros.core.graph import editing, identities, tables as tb, transaction_log
 from pose_graph_ros.core.graph.constraints import check, EdgeKind, Edges, full, ObservedNodes
+from pose_graph_ros.core.graph.edit_checks import (
+    check_ids,
+    check_weights,
+    checked_poses,
+    integers,
+    values,
+)
 from pose_graph_ros.core.graph.error_functions import edge_errors, energies, observed_errors
+from pose_graph_ros.core.graph.graph_update import (
+    Energies,
+    GraphRows,
+    GraphUpdate,
+    NextIds,
+    NO_EDGES,
+    NO_POSES,
+    NO_WEIGHTS,
+    NOTHING_OBSERVED,
+)
 from pose_graph_ros.core.graph.tables import Memory
 
-# Empty parts of updates.
-NO_POSES: Final[FloatArray] = np.empty((0, 3))
-NO_EDGES: Final = Edges()
-NOTHING_OBSERVED: Final = ObservedNodes()
-NO_WEIGHTS: Final[Mapping[int, float]] = MappingProxyType({})
+__all__ = [
+    'NOTHING_OBSERVED',
+    'NO_EDGES',
+    'NO_POSES',
+    'NO_WEIGHTS',
+    'Energies',
+    'Graph',
+    'GraphRows',
+    'GraphUpdate',
+    'NextIds',
+]
 
 # Columns of edge_f with the column `Edges.bias`.
 _BIAS_COLUMNS = [tb.BIAS_OFFSET, tb.BIAS_OFFSET + 1, tb.FACTOR_T, tb.FACTOR_TH]
 
 
-class GraphUpdate(NamedTuple):
-    """An edit of a graph; new hidden nodes, edges and observed nodes get the next numbers."""
-
-    hidden: FloatArray = NO_POSES
-    """Initial poses of new hidden nodes in the map, shape (N, 3) [m, m, rad]."""
-    edges: Edges = NO_EDGES
-    """New edges, possibly to the new hidden nodes."""
-    observed: ObservedNodes = NOTHING_OBSERVED
-    """New observed nodes, possibly on the new hidden nodes."""
-    fix: Sequence[int] = ()
-    """Hidden nodes that keep their pose from now on (the gauge)."""
-    free: Sequence[int] = ()
-    """Hidden nodes that are no longer fixed."""
-    remove_edges: Sequence[int] = ()
-    """Edges whose weight becomes 0; they keep their numbers."""
-    remove_observed: Sequence[int] = ()
-    """Observed nodes whose weight becomes 0."""
-    weigh_edges: Mapping[int, float] = NO_WEIGHTS
-    """New weights (factors on the information) of edges, by number; removed edges may get one."""
-    weigh_observed: Mapping[int, float] = NO_WEIGHTS
-    """New weights of observed nodes, by number."""
-    biases: FloatArray = NO_POSES
-    """
-    Initial values of new biases, shape (S, 3) [sigma, sigma, rad]: hidden nodes that are numbered
-    after those of `hidden`.
-    """
-
-
-class Energies(NamedTuple):
-    """Energies of all constraints: weighted squared errors [sigma^2]."""
-
-    edges: FloatArray
-    """Shape (M,)."""
-    observed: FloatArray
-    """Shape (K,)."""
-
-    @property
-    def chi2(self) -> float:
-        """Sum of the energies, without a factor 1/2."""
-        return float(np.sum(self.edges) + np.sum(self.observed))
-
-
-class GraphRows(NamedTuple):
-    """Copies of all rows of a graph."""
-
-    poses: FloatArray
-    """Estimates of all hidden nodes, biases included, shape (N, 3) [m, m, rad]."""
-    is_bias: BoolArray
-    fixed: BoolArray
-    edges: Edges
-    observed: ObservedNodes
-
-
 class Graph:
     """
     A pose graph, edited by `GraphUpdate`s only, each applied whole or not at all.
+
+    Hidden nodes (biases included), edges and observed nodes have *ids*: one counter for each of
+    the three, ascending, and an id is never used again. The store has them in *rows*, in the
+    order of their ids; rows move when others leave. Whoever keeps a number keeps an id; arrays of
+    all nodes or constraints (`poses`, `weights`, `is_bias`, ...) are by row.
 
     Solvers work on its tables and write the poses of the hidden nodes.
     """
@@ -99,8 +72,40 @@ class Graph:
 
     @property
     def newest_pose(self) -> int:
-        """Newest hidden node that is not a bias, or -1."""
+        """Id of the newest hidden node that is not a bias, or -1."""
         return int(self.memory.head[tb.NEWEST])
+
+    @property
+    def node_ids(self) -> IntArray:
+        """Ids of all hidden nodes, ascending, shape (N,), read-only."""
+        return identities.read_only(np.arange(self.n_nodes))
+
+    @property
+    def edge_ids(self) -> IntArray:
+        """Ids of all edges, ascending, shape (M,), read-only."""
+        return identities.read_only(np.arange(self.n_edges))
+
+    @property
+    def observed_ids(self) -> IntArray:
+        """Ids of all observed nodes, ascending, shape (K,), read-only."""
+        return identities.read_only(np.arange(self.n_observed))
+
+    @property
+    def next_ids(self) -> NextIds:
+        """Ids of the next new rows of an update."""
+        return NextIds(self.n_nodes, self.n_edges, self.n_observed)
+
+    def node_rows(self, ids: npt.ArrayLike) -> IntArray:
+        """Return the rows of hidden nodes, shape of `ids`; -1 where they have left the graph."""
+        return identities.rows_of(self.node_ids, ids)
+
+    def edge_rows(self, ids: npt.ArrayLike) -> IntArray:
+        """Return the rows of edges, shape of `ids`; -1 where they have left the graph."""
+        return identities.rows_of(self.edge_ids, ids)
+
+    def observed_rows(self, ids: npt.ArrayLike) -> IntArray:
+        """Return the rows of observed nodes, shape of `ids`; -1 where they have left the graph."""
+        return identities.rows_of(self.observed_ids, ids)
 
     @property
     def n_edges(self) -> int:
@@ -124,6 +129,15 @@ class Graph:
         view.flags.writeable = False
         return view
 
+    def poses_of(self, ids: npt.ArrayLike) -> FloatArray:
+        """
+        Return a copy of the estimates of hidden nodes, shape (K, 3) for K ids, (3,) for one.
+
+        Raises ValueError if one has left the graph.
+        """
+        rows = identities.known(self.node_rows(ids), ids, 'hidden node')
+        return self.memory['node_f'][rows, tb.POSE:tb.POSE + 3]
+
     @property
     def fixed(self) -> BoolArray:
         """Whether hidden nodes keep their pose, shape (N,)."""
@@ -136,11 +150,15 @@ class Graph:
 
     @property
     def edges(self) -> Edges:
-        """All edges, with their weights."""
-        return self.edges_at(slice(self.n_edges))
+        """All edges, by row, with their weights; their ends are ids."""
+        return self._edges_in(slice(self.n_edges))
 
-    def edges_at(self, rows: IntArray | slice) -> Edges:
-        """Return the edges with the given numbers."""
+    def edges_at(self, ids: npt.ArrayLike) -> Edges:
+        """Return edges by id; their ends are ids. Raises ValueError if one has left the graph."""
+        return self._edges_in(identities.known(self.edge_rows(ids), ids, 'edge'))
+
+    def _edges_in(self, rows: IntArray | slice) -> Edges:
+        """Return the edges in some rows."""
         numbers, integers = self.memory['edge_f'][rows], self.memory['edge_i'][rows]
         kind, bias = integers[:, tb.EDGE_KIND], np.zeros((len(integers), 4))
         to_bias = np.flatnonzero(kind == EdgeKind.BIAS)
@@ -151,11 +169,15 @@ class Graph:
 
     @property
     def observed(self) -> ObservedNodes:
-        """All observed nodes, with their weights."""
-        return self.observed_at(slice(self.n_observed))
+        """All observed nodes, by row, with their weights; their nodes are ids."""
+        return self._observed_in(slice(self.n_observed))
 
-    def observed_at(self, rows: IntArray | slice) -> ObservedNodes:
-        """Return the observed nodes with the given numbers."""
+    def observed_at(self, ids: npt.ArrayLike) -> ObservedNodes:
+        """Return observed nodes by id, as `edges_at` does."""
+        return self._observed_in(identities.known(self.observed_rows(ids), ids, 'observed node'))
+
+    def _observed_in(self, rows: IntArray | slice) -> ObservedNodes:
+        """Return the observed nodes in some rows."""
         numbers, integers = self.memory['observed_f'][rows], self.memory['observed_i'][rows]
         return ObservedNodes(
             integers[:, tb.OBS_NODE], numbers[:, tb.OBS_OFFSET:tb.OBS_OFFSET + 3].copy(),
@@ -203,12 +225,12 @@ class Graph:
     def _check_edits(self, update: GraphUpdate) -> None:
         """Raise GraphUpdateError for invalid numbers or weights; those of new rows are valid."""
         n_nodes, n_edges, n_observed = self._sizes_after(update)
-        _check_numbers('fix', update.fix, 'hidden nodes', n_nodes)
-        _check_numbers('free', update.free, 'hidden nodes', n_nodes)
-        _check_numbers('remove_edges', update.remove_edges, 'edges', n_edges)
-        _check_numbers('remove_observed', update.remove_observed, 'observed nodes', n_observed)
-        _check_weights('weigh_edges', update.weigh_edges, 'edges', n_edges)
-        _check_weights('weigh_observed', update.weigh_observed, 'observed nodes', n_observed)
+        check_ids('fix', update.fix, 'hidden nodes', n_nodes)
+        check_ids('free', update.free, 'hidden nodes', n_nodes)
+        check_ids('remove_edges', update.remove_edges, 'edges', n_edges)
+        check_ids('remove_observed', update.remove_observed, 'observed nodes', n_observed)
+        check_weights('weigh_edges', update.weigh_edges, 'edges', n_edges)
+        check_weights('weigh_observed', update.weigh_observed, 'observed nodes', n_observed)
 
     def _edit(self, update: GraphUpdate) -> None:
         """Apply the edits of existing rows, which have been checked."""
@@ -217,17 +239,17 @@ class Graph:
                 (editing.weigh_edges, update.remove_edges, update.weigh_edges),
                 (editing.weigh_observed, update.remove_observed, update.weigh_observed)):
             if len(removed) > 0:
-                weigh(head, _integers(removed), np.zeros(len(removed)))
+                weigh(head, integers(removed), np.zeros(len(removed)))
             if len(weights) > 0:
-                weigh(head, _integers(weights), _values(weights))
+                weigh(head, integers(weights), values(weights))
         for nodes, fixed in ((update.fix, True), (update.free, False)):
             if len(nodes) > 0:
-                editing.set_fixed(head, _integers(nodes), fixed)
+                editing.set_fixed(head, integers(nodes), fixed)
 
     def _checked_columns(self, update: GraphUpdate) -> tuple[npt.NDArray[Any], ...]:
         """Return new rows as arrays for the kernel; raise GraphUpdateError if one is invalid."""
         hidden, biases = (
-            _checked_poses(name, getattr(update, name)) for name in ('hidden', 'biases'))
+            checked_poses(name, getattr(update, name)) for name in ('hidden', 'biases'))
         edges, observed = update.edges, update.observed
         is_bias = np.concatenate((
             self.is_bias, np.zeros(len(hidden), dtype=bool), np.ones(len(biases), dtype=bool)))
@@ -324,8 +346,33 @@ class Graph:
         poses = self.poses if poses is None else poses
         edges, observed = self.edges, self.observed
         return Energies(
-            energies(edge_errors(poses, edges), edges.weighted_information),
-            energies(observed_errors(poses, observed), observed.weighted_information))
+            energies(self.edge_errors(edges, poses), edges.weighted_information),
+            energies(self.observed_errors(observed, poses), observed.weighted_information))
+
+    def edge_errors(self, edges: Edges, poses: FloatArray | None = None) -> FloatArray:
+        """
+        Return the errors of edges at the estimate, shape (M, 3); see `error_functions`.
+
+        Parameters
+        ----------
+        edges : Edges, with ids for ends, in the graph or not
+        poses : ndarray, shape (N, 3), optional, of all hidden nodes, by row, in place of theirs
+
+        """
+        return edge_errors(self.poses if poses is None else poses, edges)
+
+    def observed_errors(
+        self, observed: ObservedNodes, poses: FloatArray | None = None,
+    ) -> FloatArray:
+        """
+        Return the errors of observed nodes at the estimate, shape (K, 3).
+
+        Parameters
+        ----------
+        observed, poses : ObservedNodes, ndarray, as for `edge_errors`
+
+        """
+        return observed_errors(self.poses if poses is None else poses, observed)
 
     def begin(self) -> None:
         """Begin an update; `rollback` reverts all edits and steps after it."""
@@ -336,42 +383,3 @@ class Graph:
     def rollback(self) -> None:
         """Revert all edits and steps since `begin`, bit for bit."""
         transaction_log.rollback(self.memory.head)
-
-
-def _checked_poses(name: str, poses: FloatArray) -> FloatArray:
-    array = np.asarray(poses, dtype=np.float64)
-    has_shape = array.ndim == 2 and array.shape[1:] == (3,)
-    if not has_shape or not np.all(np.isfinite(array)):
-        raise GraphUpdateError(
-            f'{name}: expected finite poses, shape (N, 3), got shape {array.shape}'
-            + ' with numbers that are not finite' * has_shape)
-    return array
-
-
-def _integers(numbers: Collection[int]) -> IntArray:
-    return np.fromiter(numbers, np.int64, len(numbers))
-
-
-def _values(weights: Mapping[int, float]) -> FloatArray:
-    return np.fromiter(weights.values(), np.float64, len(weights))
-
-
-def _check_numbers(name: str, numbers: Collection[int], what: str, size: int) -> None:
-    if len(numbers) == 0:
-        return
-    array = np.array(list(numbers))
-    if array.dtype.kind not in 'iu' or not 0 <= array.min() <= array.max() < size:
-        # looks for the first one, and lets integers of other types pass
-        for number in numbers:
-            if not (isinstance(number, int | np.integer) and 0 <= number < size):
-                raise GraphUpdateError(f'{name}: expected {what} in 0..{size - 1}, got {number}')
-
-
-def _check_weights(name: str, weights: Mapping[int, float], what: str, size: int) -> None:
-    _check_numbers(name, weights, what, size)
-    values = _values(weights)
-    if not np.all(np.isfinite(values) & (values >= 0.0)):
-        number, weight = next(item for item in weights.items() if not 0.0 <= item[1] < np.inf)
-        raise GraphUpdateError(
-            f'{name}: expected a finite weight that is not negative, got {weight} '
-            f'for number {number}')

@@ -102,8 +102,8 @@ class Trial:
         was_fixed = np.zeros(now.n_nodes, dtype=bool)
         was_fixed[:n] = before.fixed
         copy.apply(GraphUpdate(
-            edges=now.edges_at(slice(len(before.edges), now.n_edges)),
-            observed=now.observed_at(slice(len(before.observed), now.n_observed)),
+            edges=now.edges_at(np.arange(len(before.edges), now.n_edges)),
+            observed=now.observed_at(np.arange(len(before.observed), now.n_observed)),
             weigh_edges=weights[0], weigh_observed=weights[1],
             fix=np.flatnonzero(fixed & ~was_fixed).tolist(),
             free=np.flatnonzero(was_fixed & ~fixed).tolist()))

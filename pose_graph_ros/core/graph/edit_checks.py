@@ -1,0 +1,80 @@
+# Copyright 2026 The pose_graph_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""Checks of the parts of a `GraphUpdate` that are not tables of constraints."""
+
+from collections.abc import Collection, Mapping
+
+import numpy as np
+
+from pose_graph_ros.core.exceptions import GraphUpdateError
+from pose_graph_ros.core.geometry.se2 import FloatArray, IntArray
+
+
+def checked_poses(name: str, poses: FloatArray) -> FloatArray:
+    """
+    Return poses as an array of floats; raise GraphUpdateError if they are invalid.
+
+    Parameters
+    ----------
+    name : str, name of the part of the update
+    poses : ndarray, shape (N, 3)
+
+    """
+    array = np.asarray(poses, dtype=np.float64)
+    has_shape = array.ndim == 2 and array.shape[1:] == (3,)
+    if not has_shape or not np.all(np.isfinite(array)):
+        raise GraphUpdateError(
+            f'{name}: expected finite poses, shape (N, 3), got shape {array.shape}'
+            + ' with numbers that are not finite' * has_shape)
+    return array
+
+
+def integers(numbers: Collection[int]) -> IntArray:
+    """Return integers as an array."""
+    return np.fromiter(numbers, np.int64, len(numbers))
+
+
+def values(weights: Mapping[int, float]) -> FloatArray:
+    """Return weights as an array."""
+    return np.fromiter(weights.values(), np.float64, len(weights))
+
+
+def check_ids(name: str, ids: Collection[int], what: str, end: int) -> None:
+    """
+    Raise GraphUpdateError unless all ids are integers in 0..end - 1.
+
+    Parameters
+    ----------
+    name, what : str, name of the part of the update, and what has the ids
+    ids : collection of int
+    end : int, next id
+
+    """
+    if len(ids) == 0:
+        return
+    array = np.array(list(ids))
+    if array.dtype.kind not in 'iu' or not 0 <= array.min() <= array.max() < end:
+        # looks for the first one, and lets integers of other types pass
+        for number in ids:
+            if not (isinstance(number, int | np.integer) and 0 <= number < end):
+                raise GraphUpdateError(f'{name}: expected {what} in 0..{end - 1}, got {number}')
+
+
+def check_weights(name: str, weights: Mapping[int, float], what: str, end: int) -> None:
+    """
+    Raise GraphUpdateError unless ids and weights are valid.
+
+    Parameters
+    ----------
+    name, what : str, as for `check_ids`
+    weights : mapping of int to float, by id
+    end : int, next id
+
+    """
+    check_ids(name, weights, what, end)
+    numbers = values(weights)
+    if not np.all(np.isfinite(numbers) & (numbers >= 0.0)):
+        number, weight = next(item for item in weights.items() if not 0.0 <= item[1] < np.inf)
+        raise GraphUpdateError(
+            f'{name}: expected a finite weight that is not negative, got {weight} '
+            f'for number {number}')

@@ -1,0 +1,53 @@
+# Copyright 2026 The pose_graph_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""Ids of nodes and constraints never change; rows do, when others leave."""
+
+import numpy as np
+import pytest
+from random_graphs import random_graph
+
+from pose_graph_ros.core.graph.error_functions import edge_errors, observed_errors
+
+
+def test_in_a_graph_that_nothing_has_left_ids_are_rows() -> None:
+    graph = random_graph(seed=1, n_biases=2)
+    assert graph.node_ids.tolist() == list(range(graph.n_nodes))
+    assert graph.edge_ids.tolist() == list(range(graph.n_edges))
+    assert graph.observed_ids.tolist() == list(range(graph.n_observed))
+    assert graph.next_ids == (graph.n_nodes, graph.n_edges, graph.n_observed)
+    assert graph.newest_pose == 6
+    for rows, size in ((graph.node_rows, graph.n_nodes), (graph.edge_rows, graph.n_edges),
+                       (graph.observed_rows, graph.n_observed)):
+        assert rows([2, 0, size - 1]).tolist() == [2, 0, size - 1]
+        assert rows([-1, size]).tolist() == [-1, -1]
+        assert rows(1).tolist() == 1
+
+
+def test_ids_are_read_only() -> None:
+    graph = random_graph(seed=2)
+    for ids in (graph.node_ids, graph.edge_ids, graph.observed_ids):
+        with pytest.raises(ValueError, match='read-only'):
+            ids[0] = 1
+
+
+def test_poses_and_errors_are_found_by_id() -> None:
+    graph = random_graph(seed=3, n_biases=2)
+    assert np.array_equal(graph.poses_of([3, 1]), graph.poses[[3, 1]])
+    assert np.array_equal(graph.poses_of(4), graph.poses[4])
+    assert np.array_equal(graph.edge_errors(graph.edges_at([5, 2])),
+                          edge_errors(graph.poses, graph.edges)[[5, 2]])
+    assert np.array_equal(graph.observed_errors(graph.observed_at([1])),
+                          observed_errors(graph.poses, graph.observed)[[1]])
+    elsewhere = graph.poses + 0.5
+    assert np.array_equal(graph.edge_errors(graph.edges, elsewhere),
+                          edge_errors(elsewhere, graph.edges))
+
+
+def test_what_is_not_in_the_graph_is_refused_by_its_id() -> None:
+    graph = random_graph(seed=4)
+    with pytest.raises(ValueError, match='hidden node 7 is not in the graph'):
+        graph.poses_of([2, 7])
+    with pytest.raises(ValueError, match='edge -1 is not in the graph'):
+        graph.edges_at([-1])
+    with pytest.raises(ValueError, match='observed node 99 is not in the graph'):
+        graph.observed_at(99)
