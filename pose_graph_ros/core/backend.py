@@ -265,7 +265,7 @@ class PoseGraphBackend:
             return self._pipeline.count(source, moved)
         self._collect()
         self._alignment.stop_rechecking()
-        self._pipeline.attach_to_node(moved, source, int(self._nodes.rows[-1]))
+        self._pipeline.attach_to_node(moved, source, int(self._nodes.ids[-1]))
         return self._pipeline.count(source, ACCEPTED)
 
     def update(self) -> UpdateReport:

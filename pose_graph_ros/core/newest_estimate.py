@@ -35,7 +35,7 @@ def estimate(
 
     """
     graph, nodes, factors = parts.graph, parts.nodes, parts.factors
-    node = graph.poses[nodes.rows[-1]]
+    node = graph.poses[nodes.ids[-1]]
     motion, motion_noise, odometry = nodes.newest()
     newest = se2.compose(node, motion)
     cov = covariance.propagated(node, newest_covariance, motion, scale**2 * motion_noise)
@@ -58,4 +58,4 @@ def estimate(
         primary=nodes.primary, noise=noise if scale == 1.0 else noise.scaled(scale),
         odometry_scale=scale,
         trajectory=None if not with_path else Trajectory(
-            nodes.stamps_ns, graph.poses[nodes.rows] + shift).continued(stamp_ns, newest))
+            nodes.stamps_ns, graph.poses[nodes.ids] + shift).continued(stamp_ns, newest))

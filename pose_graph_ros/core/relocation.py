@@ -44,7 +44,7 @@ def relocate(
                         se2.compose(poses[end.node], end.motion))
     now = se2.compose(measurement.pose, moved)
     row = nodes.relocate(
-        se2.between(poses[nodes.rows[-1]], now), np.diag(RELOCATION_SIGMA) ** 2)
+        se2.between(poses[nodes.ids[-1]], now), np.diag(RELOCATION_SIGMA) ** 2)
     if row < 0:
         return rejected('failed', 'the solver failed')
     return replace(measurement, stamp_ns=last_ns + 1, pose=now)

@@ -157,9 +157,9 @@ class AlignmentMonitor:
             return None
         self._next_recheck = 2 * len(self._evidence)
         table = _table(self._evidence)
-        table = ObservedNodes(np.searchsorted(nodes.rows, table.node), *table.columns[1:])
+        table = ObservedNodes(np.searchsorted(nodes.ids, table.node), *table.columns[1:])
         found = estimator.recheck(
-            solved[nodes.rows], nodes.odometry, table, self._config.alignment,
+            solved[nodes.ids], nodes.odometry, table, self._config.alignment,
             self._noise(nodes.primary), correlation=self._correlation(self._evidence),
             sigma=self.sigma)
         if self._next_recheck > LAST_RECHECK:
@@ -168,7 +168,7 @@ class AlignmentMonitor:
             return None
         self.sigma = found.sigma
         poses = np.zeros_like(solved)
-        poses[nodes.rows] = se2.compose(found.T_map_graph, nodes.odometry)
+        poses[nodes.ids] = se2.compose(found.T_map_graph, nodes.odometry)
         return poses
 
     def _noise(self, primary: str) -> OdometryNoise:

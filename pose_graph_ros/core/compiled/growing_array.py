@@ -62,6 +62,15 @@ class GrowingArray:
         """Remove all rows from an index on."""
         self._size = min(self._size, size)
 
+    def drop_first(self, n: int) -> None:
+        """Remove the first n rows, in place, or into a quarter of the memory if that is enough."""
+        left = self._size - n
+        if 4 * max(left, 16) < len(self._data):
+            self._data = np.concatenate((self._data[n:self._size], self._data[:left]))
+        else:
+            self._data[:left] = self._data[n:self._size]
+        self._size = left
+
     def select(self, rows: npt.NDArray[np.int64]) -> None:
         """Keep some rows, by number, in this order, and give the memory of the others back."""
         self._data, self._size = self.values[rows], len(rows)

@@ -203,10 +203,10 @@ class OdometryStates:
 
         """
         end = int(graph.memory['edge_i'][row, tb.END_J])
-        return f'{self._source(end)}/{np.searchsorted(self._nodes.rows, end) - 1}'
+        return f'{self._source(end)}/{np.searchsorted(self._nodes.ids, end) - 1}'
 
     def _stamp_ns(self, node: int) -> int:
-        return int(self._nodes.stamps_ns[np.searchsorted(self._nodes.rows, node)])
+        return int(self._nodes.stamps_ns[np.searchsorted(self._nodes.ids, node)])
 
     def _source(self, node: int) -> str:
         """Return the source of the odometry that has led to a node."""

@@ -3,12 +3,11 @@
 """Hidden nodes, which are made from odometry alone."""
 
 from collections.abc import Callable, Iterable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 import math
 
 import numpy as np
 
-from pose_graph_ros.core.compiled.growing_array import GrowingArray
 from pose_graph_ros.core.config import BackendConfig
 from pose_graph_ros.core.geometry import covariance, se2
 from pose_graph_ros.core.geometry.scalar_se2 import Pose, wrap_one
@@ -17,6 +16,7 @@ from pose_graph_ros.core.graph.constraints import Edges
 from pose_graph_ros.core.measurements import Answer, OdometrySample
 from pose_graph_ros.core.odometry.gaps import gap_motion
 from pose_graph_ros.core.odometry.motion import Attachment
+from pose_graph_ros.core.odometry.node_table import NodeTable
 from pose_graph_ros.core.odometry.primary_source import (
     choose_first,
     find_silence,
@@ -45,9 +45,9 @@ class SavedNodes:
     stamps_ns: Integers
     """Shape (H,) [ns]."""
     rows: Integers
-    """Rows of the nodes in the graph, shape (H,)."""
+    """Ids of the nodes in the graph, shape (H,)."""
     odometry: Rows3
-    """Poses of the nodes by odometry alone, shape (H, 3) [m, m, rad]."""
+    """Poses by odometry alone of those that are in the graph, shape (H - F, 3) [m, m, rad]."""
     leads: tuple[str, ...]
     """Primary sources one after the other, P of them."""
     leads_after_ns: Integers
@@ -62,6 +62,10 @@ class SavedNodes:
     """Motion from the newest node to `base_ns`; None if that is the stamp of the node."""
     streams: Mapping[str, SavedStream]
     """By the name of the source."""
+    frozen: Rows3 = field(default_factory=lambda: np.empty((0, 3)))
+    """Poses of the first nodes, which have left the graph, shape (F, 3) [m, m, rad]."""
+    travelled: float = 0.0
+    """Path length up to the first node in the graph [m]."""
 
 
 class HiddenNodes:
@@ -77,7 +81,7 @@ class HiddenNodes:
     config : BackendConfig
     make_node : callable
         Takes the mean of the edge to a new node, shape (3,), its information, shape (3, 3), and
-        the name of the source; for the first node its pose and None. Returns the row of the node
+        the name of the source; for the first node its pose and None. Returns the id of the node
         in the graph, or -1 if there is none: it is then tried again at the next sample.
 
     """
@@ -88,13 +92,13 @@ class HiddenNodes:
     ) -> None:
         self._config = config
         self._make_node = make_node
-        self._stamps = GrowingArray((), np.int64)
-        self._rows = GrowingArray((), np.int64)
-        self._odometry = GrowingArray((3,), np.float64)
+        self.table = NodeTable()
+        """All nodes; only this object edits it."""
         self.streams: dict[str, OdometryStream] = {}
         """By the name of the source."""
         self._primaries: list[tuple[int, str]] = []
         """Stamp after which a source is the primary one [ns], and its name, by stamp."""
+        self._n_forgotten_primaries = 0
         self.covered_ns = -1
         """
         Stamp of the newest sample of the primary source that was checked for a node [ns]: up to
@@ -110,22 +114,32 @@ class HiddenNodes:
         self._secondary = SecondaryEdges()
 
     def __len__(self) -> int:
-        return len(self._stamps)
+        return len(self.table)
 
     @property
     def stamps_ns(self) -> IntArray:
-        """Stamps of the hidden nodes [ns], shape (N,), a read-only view."""
-        return self._stamps.read_only
+        """Stamps of all hidden nodes [ns], shape (N,), a read-only view."""
+        return self.table.stamps_ns
 
     @property
-    def rows(self) -> IntArray:
-        """Rows of the hidden nodes in the graph, shape (N,), a read-only view."""
-        return self._rows.read_only
+    def ids(self) -> IntArray:
+        """Ids of all hidden nodes in the graph, shape (N,), a read-only view."""
+        return self.table.ids
+
+    @property
+    def n_frozen(self) -> int:
+        """Number of nodes that have left the graph: the first ones."""
+        return self.table.n_frozen
 
     @property
     def odometry(self) -> FloatArray:
-        """Poses of the nodes by odometry alone, shape (N, 3), a read-only view."""
-        return self._odometry.read_only
+        """Poses of the nodes in the graph by odometry alone, shape (N - F, 3), read-only."""
+        return self.table.odometry
+
+    @property
+    def last_frozen_ns(self) -> int:
+        """Stamp of the newest node that has left the graph [ns]; -1 if none has."""
+        return int(self.stamps_ns[self.n_frozen - 1]) if self.n_frozen > 0 else -1
 
     @property
     def primary(self) -> str:
@@ -135,7 +149,7 @@ class HiddenNodes:
     @property
     def n_primaries(self) -> int:
         """Number of times that a source became the primary one."""
-        return len(self._primaries)
+        return self._n_forgotten_primaries + len(self._primaries)
 
     @property
     def newest_ns(self) -> int:
@@ -261,7 +275,7 @@ class HiddenNodes:
         Make a node 1 ns after the newest odometry, for a robot that was moved by hand.
 
         All odometry must be settled. The motion by odometry since the newest node is not used.
-        Returns the row of the new node in the graph, or -1 if it could not be made.
+        Returns the id of the new node in the graph, or -1 if it could not be made.
 
         Parameters
         ----------
@@ -271,18 +285,18 @@ class HiddenNodes:
         """
         timeline = self.streams[self.primary].timeline
         moved = self._motion_since_node(self.streams[self.primary], self.covered_ns)[0]
-        row = self._make_node(mean, covariance.information(noise), self.primary)
-        if row < 0:
-            return row
+        node = self._make_node(mean, covariance.information(noise), self.primary)
+        if node < 0:
+            return node
         stamp_ns = max(self.covered_ns, int(self.stamps_ns[-1])) + 1
         self._append(
-            stamp_ns, row, as_pose(timeline.poses[-1]), se2.compose(self.odometry[-1], moved))
+            stamp_ns, node, as_pose(timeline.poses[-1]), se2.compose(self.odometry[-1], moved))
         self._base_ns = self.covered_ns
         # no secondary edge spans the step to the new pose
         for source in self.streams:
             if source != self.primary:
                 self._secondary.skip_to(source, len(self) - 1, reached=False)
-        return row
+        return node
 
     def _catch_up(self) -> None:
         """Make the nodes that are due at the settled samples of a new primary source."""
@@ -298,10 +312,8 @@ class HiddenNodes:
                 return  # the nodes of the source that replaced it are made
             self._extend(stamp_ns, (x, y, theta))
 
-    def _append(self, stamp_ns: int, row: int, base: Pose, odometry: FloatArray) -> None:
-        self._odometry.append_one(odometry)
-        self._stamps.append_one(stamp_ns)
-        self._rows.append_one(row)
+    def _append(self, stamp_ns: int, node: int, base: Pose, odometry: FloatArray) -> None:
+        self.table.append(stamp_ns, node, odometry)
         self._base_ns, self._base, self._span = stamp_ns, base, None
         self._secondary.skip_to(self.primary, len(self) - 1, reached=True)
 
@@ -313,9 +325,9 @@ class HiddenNodes:
                 abs(wrap_one(pose[2] - base[2])), (stamp_ns - self._base_ns) * 1e-9):
             return
         mean, noise = self._motion_since_node(self.streams[self.primary], stamp_ns)
-        row = self._make_node(mean, covariance.information(noise), self.primary)
-        if row >= 0:
-            self._append(stamp_ns, row, pose, se2.compose(self.odometry[-1], mean))
+        node = self._make_node(mean, covariance.information(noise), self.primary)
+        if node >= 0:
+            self._append(stamp_ns, node, pose, se2.compose(self.odometry[-1], mean))
 
     def _motion_since_node(
         self, stream: OdometryStream, stamp_ns: int,
@@ -335,30 +347,54 @@ class HiddenNodes:
     def _add_secondary_edges(self) -> None:
         if len(self.streams) == 1 or not self._primaries:
             return
-        stamps_ns, rows, primary = self.stamps_ns, self.rows, self.primary
+        stamps_ns, ids, primary = self.stamps_ns, self.ids, self.primary
         for source, stream in self.streams.items():
             if source != primary:
-                self._secondary.extend(source, stream, stamps_ns, rows)
+                self._secondary.extend(source, stream, stamps_ns, ids)
 
     def primary_at(self, stamp_ns: int) -> str:
         """Return the source that was the primary one at a stamp [ns]."""
-        return next(name for after_ns, name in reversed(self._primaries) if after_ns < stamp_ns)
+        return next((name for after_ns, name in reversed(self._primaries) if after_ns < stamp_ns),
+                    self._primaries[0][1])
 
     def attach(self, stamp_ns: int) -> Attachment | None:
         """
         Return the last hidden node before a stamp and the motion from there to the stamp.
 
-        The motion is that of the source that was the primary one at the stamp, so the result does
-        not depend on later samples; None if that source does not cover the node and the stamp. The
-        stamp is not before the first node, and not after `covered_ns` [ns].
+        If that node has left the graph, it is the next one, and the motion leads back. The motion
+        is that of the source that was the primary one then, so the result does not depend on later
+        samples; None if that source does not cover the node and the stamp. The stamp is not before
+        the first node or `last_frozen_ns`, and not after `covered_ns` [ns].
         """
         node = int(np.searchsorted(self.stamps_ns, stamp_ns, side='right')) - 1
-        node_ns, row = int(self.stamps_ns[node]), int(self.rows[node])
-        stream = self.streams[self.primary_at(stamp_ns)]
+        node = max(node, self.n_frozen)
+        node_ns, node_id = int(self.stamps_ns[node]), int(self.ids[node])
+        stream = self.streams[self.primary_at(max(stamp_ns, node_ns))]
         if not (stream.timeline.covers(node_ns) and stream.timeline.covers(stamp_ns)):
             return None
-        motion = stream.timeline.motion(node_ns, stamp_ns)
-        return Attachment(row, motion.increment, stream.covariance(motion, floor=False))
+        motion = stream.timeline.motion(min(node_ns, stamp_ns), max(node_ns, stamp_ns))
+        mean, noise = motion.increment, stream.covariance(motion, floor=False)
+        if stamp_ns < node_ns:
+            adjoint = se2.adjoint(mean)
+            mean, noise = se2.inverse(mean), adjoint @ noise @ adjoint.T
+        return Attachment(node_id, mean, noise)
+
+    def forget(self, poses: FloatArray) -> None:
+        """
+        Freeze the oldest nodes in the graph at the given poses, shape (M, 3), as they have left.
+
+        The samples and the primary sources before them are dropped.
+        """
+        self.table.freeze(poses)
+        first, last_ns = self.n_frozen, self.last_frozen_ns
+        for source, stream in self.streams.items():
+            stream.forget(last_ns)
+            begin, node = self._secondary.progress[source]
+            if begin < first:   # no edge begins at a node that has left
+                self._secondary.skip_to(source, max(node, first), reached=False)
+        n_old = sum(after_ns < last_ns for after_ns, _ in self._primaries) - 1
+        del self._primaries[:max(n_old, 0)]
+        self._n_forgotten_primaries += max(n_old, 0)
 
     def newest(self) -> tuple[FloatArray, FloatArray, FloatArray]:
         """
@@ -376,17 +412,18 @@ class HiddenNodes:
         span = None if self._span is None else SavedSpan(
             as_pose(self._span[0]), as_matrix(self._span[1]))
         after_ns, primaries = zip(*self._primaries, strict=True)
+        needed_ns = self.stamps_ns[max(self.n_frozen - 1, 0):]
         return SavedNodes(
-            self.stamps_ns.copy(), self.rows.copy(), self.odometry.copy(),
+            self.stamps_ns.copy(), self.ids.copy(), self.odometry.copy(),
             primaries, np.array(after_ns), self.covered_ns, self._base_ns, self._base, span,
-            {name: stream.saved(self.stamps_ns, self._secondary.progress[name])
-             for name, stream in self.streams.items()})
+            {name: stream.saved(needed_ns, self._secondary.progress[name])
+             for name, stream in self.streams.items()},
+            self.table.frozen.copy(), float(self.table.travelled[0]))
 
     def restore(self, saved: SavedNodes) -> None:
         """Set the state of this empty object to a saved one."""
-        self._stamps.append(saved.stamps_ns)
-        self._rows.append(saved.rows)
-        self._odometry.append(saved.odometry)
+        self.table.restore(
+            saved.stamps_ns, saved.rows, saved.odometry, saved.frozen, saved.travelled)
         self._primaries = list(zip(saved.leads_after_ns.tolist(), saved.leads, strict=True))
         self.covered_ns, self._base_ns, self._base = saved.lead_ns, saved.base_ns, saved.base
         if saved.bridge is not None:

@@ -39,7 +39,7 @@ class Attachment:
     """An instant, given by the last hidden node before it and the motion since."""
 
     node: int
-    """Row of the node in the graph."""
+    """Id of the node in the graph."""
     motion: FloatArray
     """`T_at`, pose at the instant in the frame of the node, shape (3,) [m, m, rad]."""
     noise: FloatArray

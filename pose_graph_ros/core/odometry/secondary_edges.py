@@ -38,7 +38,7 @@ class SecondaryEdges:
         self.progress[source] = (node, node + 1) if reached else (-1, node)
 
     def extend(
-        self, source: str, stream: OdometryStream, stamps_ns: IntArray, rows: IntArray,
+        self, source: str, stream: OdometryStream, stamps_ns: IntArray, ids: IntArray,
     ) -> None:
         """
         Add the edges of a source up to its newest settled sample to `new`.
@@ -47,8 +47,8 @@ class SecondaryEdges:
         ----------
         source : str
         stream : OdometryStream, samples of the source
-        stamps_ns, rows : ndarray of int64, shape (N,)
-            Stamps [ns] of all hidden nodes, and their rows in the graph.
+        stamps_ns, ids : ndarray of int64, shape (N,)
+            Stamps [ns] of all hidden nodes, and their ids in the graph.
 
         """
         last, node = self.progress[source]
@@ -58,7 +58,7 @@ class SecondaryEdges:
                 if last >= 0 and not stamps_ns[last] < stream.restarted_ns <= stamps_ns[node]:
                     motion = stream.timeline.motion(int(stamps_ns[last]), int(stamps_ns[node]))
                     self.new.append((source, Edges(
-                        [rows[last]], [rows[node]], [motion.increment],
+                        [ids[last]], [ids[node]], [motion.increment],
                         [covariance.information(stream.covariance(motion))],
                         [EdgeKind.ODOMETRY])))
                 last = node

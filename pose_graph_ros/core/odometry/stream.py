@@ -22,7 +22,12 @@ from pose_graph_ros.core.measurements import (
     rejected,
     value_defect,
 )
-from pose_graph_ros.core.odometry.gaps import JUMP_SIGMA, RESTART_VARIANCE, RESUMED_WITHIN
+from pose_graph_ros.core.odometry.gaps import (
+    JUMP_SIGMA,
+    RESTART_VARIANCE,
+    RESUMED_WITHIN,
+    SPEED_TIME_NS,
+)
 from pose_graph_ros.core.odometry.jumps import is_jump, MEMORY_TIME, Speeds, SpeedWindow, UNKNOWN
 from pose_graph_ros.core.odometry.motion import Motion, odometry_covariance
 from pose_graph_ros.core.odometry.timeline import (
@@ -252,6 +257,10 @@ class OdometryStream:
         """Settle all samples up to a stamp [ns]."""
         for _ in self.settle(until_ns):
             pass
+
+    def forget(self, before_ns: int) -> None:
+        """Drop settled samples that motions from an instant [ns] on do not depend on."""
+        self.timeline.drop_before(min(before_ns, self.settled_ns - SPEED_TIME_NS))
 
     def first_after(self, stamp_ns: int) -> int | None:
         """

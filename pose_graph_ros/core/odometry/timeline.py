@@ -170,6 +170,14 @@ class OdometryTimeline:
         """Tell whether equal samples between the one before and this one were left out."""
         return bool(self._dense.values[sample])
 
+    def drop_before(self, stamp_ns: int) -> None:
+        """Drop the samples older than the last one up to an instant [ns]; one is always kept."""
+        n_old = int(np.searchsorted(self._stamps.values, stamp_ns, side='right')) - 1
+        if n_old > 0:
+            for column in (self._stamps, self._samples, self._variances, self._dense):
+                if len(column) > 0:
+                    column.drop_first(n_old)
+
     def thinned(
         self, instants_ns: IntArray, since_ns: int,
     ) -> tuple[IntArray, FloatArray, BoolArray]:

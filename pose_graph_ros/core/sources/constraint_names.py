@@ -74,11 +74,11 @@ def queued(queue: Queue, nodes: HiddenNodes) -> list[str]:
     nodes : HiddenNodes
 
     """
-    ends = [(source, np.searchsorted(nodes.rows, (edge.i[0], edge.j[0])).tolist())
+    ends = [(source, np.searchsorted(nodes.ids, (edge.i[0], edge.j[0])).tolist())
             for source, edge, *_ in queue.edges]
     return [f'{source} x{i} - x{j}' for source, (i, j) in ends] + [
         f'{each.source} at {each.measurement.stamp_ns * 1e-9:.3f} s near '
-        f'x{int(np.searchsorted(nodes.rows, each.attachment.node))}' for each in queue.observed]
+        f'x{int(np.searchsorted(nodes.ids, each.attachment.node))}' for each in queue.observed]
 
 
 def _names(
@@ -90,7 +90,7 @@ def _names(
         node = int(integers[tb.END_I if edge else tb.OBS_NODE])
         return _measurement_name(origin, node, table.numbers[row], nodes, factors)
     kind = EdgeKind(int(integers[tb.EDGE_KIND]))
-    i, j = np.searchsorted(nodes.rows, integers[[tb.END_I, tb.END_J]]).tolist()
+    i, j = np.searchsorted(nodes.ids, integers[[tb.END_I, tb.END_J]]).tolist()
     source = '' if origin is None else origin.source
     if origin is None and kind == EdgeKind.ODOMETRY:
         source = nodes.primary_at(int(nodes.stamps_ns[j]))
@@ -108,8 +108,8 @@ def _measurement_name(
     `node` is the row of its hidden node in the graph, `numbers` its row of the constraint table. A
     constraint on a bias alone comes from no measurement and is named after the bias.
     """
-    number = int(np.searchsorted(nodes.rows, node))
-    if number == len(nodes) or nodes.rows[number] != node:
+    number = int(np.searchsorted(nodes.ids, node))
+    if number == len(nodes) or nodes.ids[number] != node:
         origin, kind, where = factors.bias_origin(node), 'bias', ''
     else:
         position, _, heading = numbers[DIAGONAL] > 0.0

@@ -61,7 +61,7 @@ def attach_reference(nodes: HiddenNodes, closure: LoopClosure) -> Attachment | A
     node = closure.reference_node
     if node is None or not 0 <= node < len(nodes):
         return rejected('unknown_node', f'there is no hidden node {node}')
-    return Attachment(int(nodes.rows[node]), np.zeros(3), np.zeros((3, 3)))
+    return Attachment(int(nodes.ids[node]), np.zeros(3), np.zeros((3, 3)))
 
 
 def absolute_constraint(measurement: Absolute, attachment: Attachment) -> ObservedNodes:

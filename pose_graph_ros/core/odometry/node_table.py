@@ -1,0 +1,119 @@
+# Copyright 2026 The pose_graph_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""The hidden nodes by stamp: those in the graph, and those that have left it for good."""
+
+import math
+
+import numpy as np
+
+from pose_graph_ros.core.compiled.growing_array import GrowingArray
+from pose_graph_ros.core.geometry import se2
+from pose_graph_ros.core.geometry.se2 import FloatArray, IntArray
+
+
+class NodeTable:
+    """
+    Stamps and ids of all hidden nodes, in the order of time.
+
+    The first `n_frozen` of them have left the graph: their poses do not change any more, but for
+    motions of the whole map, and a node takes 40 bytes. The number of a node, such as 42 of x42,
+    is its index among all of them, and never changes.
+    """
+
+    def __init__(self) -> None:
+        self._stamps = GrowingArray((), np.int64)
+        self._ids = GrowingArray((), np.int64)
+        self._frozen = GrowingArray((3,), np.float64)
+        self._odometry = GrowingArray((3,), np.float64)
+        self._travelled = GrowingArray((), np.float64)
+
+    def __len__(self) -> int:
+        return len(self._stamps)
+
+    @property
+    def stamps_ns(self) -> IntArray:
+        """Stamps of all nodes [ns], shape (N,), a read-only view."""
+        return self._stamps.read_only
+
+    @property
+    def ids(self) -> IntArray:
+        """Ids of all nodes in the graph, shape (N,), a read-only view."""
+        return self._ids.read_only
+
+    @property
+    def n_frozen(self) -> int:
+        """Number of nodes that have left the graph."""
+        return len(self._frozen)
+
+    @property
+    def frozen(self) -> FloatArray:
+        """Poses of the nodes that have left, in the map, shape (F, 3), a read-only view."""
+        return self._frozen.read_only
+
+    @property
+    def odometry(self) -> FloatArray:
+        """Poses of the nodes in the graph by odometry alone, shape (N - F, 3), read-only."""
+        return self._odometry.read_only
+
+    @property
+    def travelled(self) -> FloatArray:
+        """Path lengths up to the nodes in the graph, shape (N - F,) [m], read-only."""
+        return self._travelled.read_only
+
+    def append(self, stamp_ns: int, node: int, odometry: FloatArray) -> None:
+        """
+        Append a node.
+
+        Parameters
+        ----------
+        stamp_ns : int
+        node : int, its id in the graph
+        odometry : ndarray, shape (3,), its pose by odometry alone [m, m, rad]
+
+        """
+        travelled = 0.0
+        if len(self._odometry) > 0:
+            step = odometry - self._odometry.values[-1]
+            travelled = float(self._travelled.values[-1]) + math.hypot(step[0], step[1])
+        self._stamps.append_one(stamp_ns)
+        self._ids.append_one(node)
+        self._odometry.append_one(odometry)
+        self._travelled.append_one(travelled)
+
+    def freeze(self, poses: FloatArray) -> None:
+        """Freeze the oldest nodes in the graph at the given poses, shape (M, 3)."""
+        self._frozen.append(poses)
+        self._odometry.drop_first(len(poses))
+        self._travelled.drop_first(len(poses))
+
+    def move_frozen(self, T: FloatArray) -> None:
+        """Move the frozen poses by a rigid motion of the map, shape (3,) [m, m, rad]."""
+        if self.n_frozen > 0:
+            self._frozen.values[:] = se2.compose(T, self._frozen.values)
+
+    def set_frozen(self, poses: FloatArray) -> None:
+        """Set the frozen poses, shape (F, 3), to what they were before a motion."""
+        self._frozen.values[:] = poses
+
+    def restore(
+        self, stamps_ns: IntArray, ids: IntArray, odometry: FloatArray, frozen: FloatArray,
+        travelled: float,
+    ) -> None:
+        """
+        Fill this empty table.
+
+        Parameters
+        ----------
+        stamps_ns, ids : ndarray of int64, shape (N,)
+        odometry : ndarray, shape (N - F, 3), of the nodes in the graph
+        frozen : ndarray, shape (F, 3), poses of the others
+        travelled : float, path length up to the first node in the graph [m]
+
+        """
+        self._stamps.append(stamps_ns)
+        self._ids.append(ids)
+        self._odometry.append(odometry)
+        self._frozen.append(frozen)
+        steps = np.diff(odometry[:, :2], axis=0)
+        lengths = [math.hypot(x, y) for x, y in steps.tolist()]
+        self._travelled.append(np.cumsum([travelled, *lengths]))
