@@ -25,6 +25,8 @@ CORE = {
     'core.graph': {'core.compiled', 'core.geometry'},
     'core.elimination': {'core.compiled', 'core.graph'},
     'core.batch': {'core.compiled', 'core.geometry', 'core.graph', 'core.elimination'},
+    'core.marginalization': {
+        'core.compiled', 'core.geometry', 'core.graph', 'core.elimination'},
     'core.smoother': {
         'core.compiled', 'core.geometry', 'core.graph', 'core.elimination', 'core.batch'},
     'core.odometry': {'core.compiled', 'core.geometry', 'core.graph'},

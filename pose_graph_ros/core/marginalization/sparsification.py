@@ -1,0 +1,262 @@
+# Copyright 2026 The pose_graph_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""
+A dense Gaussian prior over poses as edges and observed nodes, conservatively.
+
+A prior over k poses connects every pair of them. Here it becomes a tree: edges between the poses
+and, if the prior tells of the map, observed nodes, which are edges to one more node, the map. Of
+all trees the one with the smallest sum of `log det` of the covariances of its relative poses is
+the nearest in the sense of Kullback and Leibler, as the coordinates of a tree have the determinant
+1: the tree of C. Chow and C. Liu ("Approximating discrete probability distributions with
+dependence trees", IEEE Trans. Inf. Theory 14, 1968). The information of its edges is then chosen
+by `conservative.nearest_below`, so that nothing is told that the prior does not tell.
+
+All is linear in map axes at the reference poses. With d = t_j - t_i, an edge measures
+
+    h_j - T h_i,        T = ((1, 0, -d_y), (0, 1, d_x), (0, 0, 1))
+
+for displacements h of the poses, and an observed node measures h_i. Directions that the prior
+tells nothing of (rounding apart) get no information: a prior without absolute information becomes
+edges alone. docs/solver.md has the derivation.
+"""
+
+from dataclasses import replace
+from typing import NamedTuple
+
+import numpy as np
+
+from pose_graph_ros.core.geometry import se2
+from pose_graph_ros.core.geometry.se2 import FloatArray, IntArray
+from pose_graph_ros.core.graph.constraints import EdgeKind, Edges, ObservedKind, ObservedNodes
+from pose_graph_ros.core.marginalization import conservative
+
+# Eigenvalues of the scaled information below this part of the largest one are rounding.
+_RANK = 1e-12
+# A measurement sees an undetermined direction if it is above this part of its size.
+_SEEN = 1e-6
+# What an undetermined direction counts in the weight of a tree: more than any covariance.
+_UNDETERMINED = 1e3
+
+
+class SparsePrior(NamedTuple):
+    """A prior as constraints."""
+
+    edges: Edges
+    observed: ObservedNodes
+    divergence: float
+    """Kullback-Leibler divergence of the constraints from the prior [nats]."""
+
+
+class _Candidates(NamedTuple):
+    """Measurements between pairs of poses, and of poses in the map (node k)."""
+
+    i: IntArray
+    """Shape (C,); k stands for the map."""
+    j: IntArray
+    rows: FloatArray
+    """In coordinates where the prior is I, and with covariance I, shape (C, 3, r)."""
+    roots: FloatArray
+    """Turn information for `rows` into information in map axes, shape (C, 3, 3)."""
+    weights: FloatArray
+    """`log det` of the covariance, shape (C,)."""
+
+
+def sparsify(
+    nodes: IntArray, poses: FloatArray, information: FloatArray, vector: FloatArray, *,
+    anchored: bool, n_extra: int = 0, kind: EdgeKind = EdgeKind.ODOMETRY,
+) -> SparsePrior:
+    """
+    Return edges and observed nodes that approximate a prior and tell no more than it.
+
+    They have their minimum where the prior has it, in the linear model at the reference poses.
+
+    Parameters
+    ----------
+    nodes : ndarray of int, shape (k,), the hidden nodes
+    poses : ndarray, shape (k, 3), reference poses in the map [m, m, rad]
+    information : ndarray, shape (3 k, 3 k), positive semidefinite, in map axes
+    vector : ndarray, shape (3 k,), b: the prior's minimum is at `information @ delta = b`
+    anchored : bool, whether the prior tells of the map; if not, its null space is that of motions
+        of all poses as one body
+    n_extra : int, number of edges beyond the tree
+    kind : EdgeKind, of the new edges
+
+    """
+    basis, free = _basis(poses, information, anchored)
+    delta = basis @ (basis.T @ vector)
+    found = _candidates(poses, basis, free, anchored)
+    chosen = _spanning_tree(found, len(nodes) + (1 if anchored else 0))
+    chosen = chosen[np.any(found.rows[chosen] != 0.0, axis=(1, 2))]
+    blocks = conservative.nearest_below(found.rows[chosen])
+    extra = _overestimated(found, chosen, blocks)[:n_extra] if n_extra > 0 else chosen[:0]
+    if len(extra) > 0:
+        chosen = np.append(chosen, extra)
+        blocks = conservative.nearest_below(found.rows[chosen])
+    distance = conservative.divergence(found.rows[chosen], blocks)
+    roots = found.roots[chosen]
+    in_map = np.matmul(np.matmul(roots, blocks), np.swapaxes(roots, 1, 2))
+    i, j = found.i[chosen], found.j[chosen]
+    is_edge = i < len(nodes)
+    displaced = poses, delta.reshape(-1, 3)
+    edges = _edges(*displaced, (i[is_edge], j[is_edge]), in_map[is_edge])
+    seen = _observed(*displaced, j[~is_edge], in_map[~is_edge])
+    kinds = np.full(len(edges), kind, dtype=np.uint8)
+    return SparsePrior(
+        replace(edges, i=nodes[edges.i], j=nodes[edges.j], kind=kinds),
+        replace(seen, node=nodes[seen.node]), distance)
+
+
+def _basis(
+    poses: FloatArray, information: FloatArray, anchored: bool,
+) -> tuple[FloatArray, FloatArray]:
+    """
+    Return T, (3 k, r), with `T^T information T = I`, and a basis of the null space, (3 k, n).
+
+    The null space of a prior that is not anchored is known, and is kept to rounding; of that basis
+    it is left out, as no relative pose sees it.
+    """
+    diagonal = np.diagonal(information)
+    scale = np.where(diagonal > 0.0, 1.0 / np.sqrt(np.where(diagonal > 0.0, diagonal, 1.0)), 1.0)
+    scaled = 0.5 * (information + information.T) * scale[:, None] * scale
+    n_gauge = 0
+    if not anchored:
+        gauge = np.linalg.qr(_rigid_motions(poses) / scale[:, None])[0]
+        n_gauge = 3
+        scaled = scaled - gauge @ (gauge.T @ scaled)
+        scaled = scaled - (scaled @ gauge) @ gauge.T
+        # above all others, so that they are the last ones
+        scaled = scaled + 2.0 * np.trace(scaled) * gauge @ gauge.T
+    values, vectors = np.linalg.eigh(scaled)
+    values, vectors = values[:len(values) - n_gauge], vectors[:, :len(values) - n_gauge]
+    kept = values > _RANK * values[-1] if len(values) > 0 else np.zeros(0, dtype=bool)
+    return (scale[:, None] * vectors[:, kept] / np.sqrt(values[kept]),
+            scale[:, None] * vectors[:, ~kept])
+
+
+def _rigid_motions(poses: FloatArray) -> FloatArray:
+    """Return the displacements of all poses as one body, shape (3 k, 3)."""
+    motions = np.tile(np.eye(3), (len(poses), 1))
+    motions[0::3, 2] = -(poses[:, 1] - poses[0, 1])
+    motions[1::3, 2] = poses[:, 0] - poses[0, 0]
+    return motions
+
+
+def _candidates(
+    poses: FloatArray, basis: FloatArray, free: FloatArray, anchored: bool,
+) -> _Candidates:
+    """Return all measurements that a tree may consist of."""
+    n = len(poses)
+    i, j = np.triu_indices(n, 1)
+    rows, seen = (_relative(poses, each.reshape(n, 3, -1), i, j) for each in (basis, free))
+    if anchored:
+        rows = np.concatenate((rows, basis.reshape(n, 3, -1)))
+        seen = np.concatenate((seen, free.reshape(n, 3, -1)))
+        i, j = np.append(i, np.full(n, n)), np.append(j, np.arange(n))
+    covariance = np.matmul(rows, np.swapaxes(rows, 1, 2))
+    roots, weights = np.empty_like(covariance), np.zeros(len(rows))
+    if free.shape[1] > 0:
+        return _partly_determined(i, j, rows, seen)
+    factors = np.linalg.cholesky(covariance)
+    inverse = np.linalg.inv(factors)
+    rows, roots = np.matmul(inverse, rows), np.swapaxes(inverse, 1, 2)
+    weights = 2.0 * np.sum(np.log(np.diagonal(factors, axis1=1, axis2=2)), axis=1)
+    return _Candidates(i, j, rows, roots, weights)
+
+
+def _relative(poses: FloatArray, at: FloatArray, i: IntArray, j: IntArray) -> FloatArray:
+    """Return `h_j - T h_i` of pairs, shape (C, 3, r), from the displacements h, (k, 3, r)."""
+    start, end = at[i], at[j]
+    arm = poses[j, :2] - poses[i, :2]
+    difference = end - start
+    difference[:, 0] += arm[:, 1, None] * start[:, 2]
+    difference[:, 1] -= arm[:, 0, None] * start[:, 2]
+    return difference
+
+
+def _partly_determined(
+    i: IntArray, j: IntArray, rows: FloatArray, seen: FloatArray,
+) -> _Candidates:
+    """Return measurements restricted to what the prior determines of them."""
+    roots, weights = np.zeros((len(rows), 3, 3)), np.zeros(len(rows))
+    whitened = np.zeros_like(rows)
+    for m, (row, undetermined) in enumerate(zip(rows, seen, strict=True)):
+        # both in units of the measurement's own coordinates
+        size = np.sqrt(np.sum(row**2, axis=1) + np.sum(undetermined**2, axis=1))
+        size[size == 0.0] = 1.0
+        left, values, _ = np.linalg.svd(undetermined / size[:, None])
+        n_seen = np.count_nonzero(values > _SEEN)
+        weights[m] = n_seen * _UNDETERMINED + 2.0 * np.sum(np.log(size))
+        if n_seen < 3:
+            known = left[:, n_seen:] / size[:, None]    # (3, d)
+            reduced = known.T @ row
+            factor = np.linalg.cholesky(reduced @ reduced.T)
+            inverse = np.linalg.inv(factor)
+            whitened[m, :3 - n_seen] = inverse @ reduced
+            roots[m, :, :3 - n_seen] = known @ inverse.T
+            weights[m] += 2.0 * np.sum(np.log(np.diagonal(factor)))
+    return _Candidates(i, j, whitened, roots, weights)
+
+
+def _spanning_tree(found: _Candidates, n: int) -> IntArray:
+    """Return the rows of the tree over n nodes with the smallest sum of weights (R. Prim)."""
+    weight, row = np.full((n, n), np.inf), np.zeros((n, n), dtype=np.int64)
+    weight[found.i, found.j] = weight[found.j, found.i] = found.weights
+    row[found.i, found.j] = row[found.j, found.i] = np.arange(len(found.i))
+    best, nearest = weight[0].copy(), np.zeros(n, dtype=np.int64)
+    best[0] = np.inf
+    outside = np.arange(n) > 0
+    tree = []
+    for _ in range(n - 1):
+        node = int(np.argmin(np.where(outside, best, np.inf)))
+        tree.append(row[nearest[node], node])
+        outside[node] = False
+        closer = weight[node] < best
+        best[closer], nearest[closer] = weight[node][closer], node
+    return np.sort(np.array(tree, dtype=np.int64))
+
+
+def _overestimated(
+    found: _Candidates, chosen: IntArray, blocks: FloatArray,
+) -> IntArray:
+    """Return the other candidates by how much the chosen ones overestimate their covariance."""
+    information = np.einsum('mir,mij,mjs->rs', found.rows[chosen], blocks, found.rows[chosen])
+    covariance = np.linalg.pinv(information, hermitian=True)
+    others = np.setdiff1d(np.flatnonzero(np.any(found.rows != 0.0, axis=(1, 2))), chosen)
+    rows = found.rows[others]
+    # the true covariance is I; padding counts as known
+    predicted = np.matmul(np.matmul(rows, covariance), np.swapaxes(rows, 1, 2))
+    padding = ~np.any(rows != 0.0, axis=2)
+    gain = np.linalg.slogdet(predicted + np.eye(3) * padding[:, :, None])[1]
+    return others[np.argsort(-gain, kind='stable')]
+
+
+def _edges(
+    poses: FloatArray, delta: FloatArray, ends: tuple[IntArray, IntArray], in_map: FloatArray,
+) -> Edges:
+    """Return edges with information in map axes whose minimum is at displacements delta."""
+    start, end = ends
+    moved = _relative(poses, delta[:, :, None], start, end)[:, :, 0]
+    mean, turn = se2.between(poses[start], poses[end]), poses[start, 2]
+    # (3.48) is linear in the measured pose, but for its axes
+    mean[:, :2] += np.einsum('mji,mj->mi', se2.rotation(turn), moved[:, :2])
+    mean[:, 2] = se2.wrap(mean[:, 2] + moved[:, 2])
+    return Edges(start, end, mean, _turned(in_map, turn + mean[:, 2]),
+                 np.zeros(len(start), dtype=np.uint8))
+
+
+def _observed(
+    poses: FloatArray, delta: FloatArray, node: IntArray, in_map: FloatArray,
+) -> ObservedNodes:
+    """Return observed nodes with information in map axes."""
+    mean = se2.wrapped(poses[node] + delta[node])
+    return ObservedNodes(
+        node, mean=mean, information=_turned(in_map, mean[:, 2]),
+        kind=np.full(len(node), ObservedKind.GLOBAL_POSE, dtype=np.uint8))
+
+
+def _turned(information: FloatArray, theta: FloatArray) -> FloatArray:
+    """Return symmetric information in axes turned by angles, shape (M, 3, 3)."""
+    axes = np.zeros((len(theta), 3, 3))
+    axes[:, :2, :2], axes[:, 2, 2] = se2.rotation(theta), 1.0
+    turned = np.matmul(np.matmul(np.swapaxes(axes, 1, 2), information), axes)
+    return np.asarray(0.5 * (turned + np.swapaxes(turned, 1, 2)))

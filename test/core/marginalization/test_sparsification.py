@@ -1,0 +1,242 @@
+# Copyright 2026 The pose_graph_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""A sparsified prior tells no more than the dense one, and is as near to it as a tree can be."""
+
+from collections.abc import Sequence
+import itertools
+
+from hypothesis import given, settings, strategies as st
+import numpy as np
+import pytest
+from random_graphs import dense_system, random_information, random_poses
+
+from pose_graph_ros.core.geometry import se2
+from pose_graph_ros.core.geometry.se2 import FloatArray
+from pose_graph_ros.core.graph.constraints import Edges, ObservedNodes
+from pose_graph_ros.core.graph.graph import Graph, GraphUpdate
+from pose_graph_ros.core.marginalization.sparsification import SparsePrior, sparsify
+
+ROUNDING = 1e-8
+# What was observed of poses that are no longer in the graph: diagonals of the information.
+ANCHORS: dict[str, list[list[float]]] = {
+    'relative': [], 'pose': [[1.0, 2.0, 9.0]], 'position': [[1.0, 1.0, 0.0]],
+    'positions': [[1.0, 1.0, 0.0], [3.0, 2.0, 0.0]], 'heading': [[0.0, 0.0, 5.0]]}
+seeds, sizes = st.integers(0, 2**32 - 1), st.integers(2, 9)
+anchors = st.sampled_from(sorted(ANCHORS))
+
+Tree = Sequence[tuple[int, int]]
+
+
+class Prior:
+    """Information and vector of the first k nodes of a graph, and their poses."""
+
+    def __init__(self, graph: Graph, k: int, *, anchored: bool) -> None:
+        H, b = dense_system(graph)
+        X = np.linalg.solve(H[3 * k:, 3 * k:], H[3 * k:, :3 * k]).T
+        self.information = H[:3 * k, :3 * k] - X @ H[3 * k:, :3 * k]
+        self.vector = -(b[:3 * k] - X @ b[3 * k:])
+        self.poses, self.k, self.anchored = graph.poses[:k].copy(), k, anchored
+        self.sigmas = 1.0 / np.sqrt(np.diagonal(self.information))
+
+    def scaled(self, matrix: FloatArray) -> FloatArray:
+        """Return a matrix of information without units."""
+        return matrix * self.sigmas * self.sigmas[:, None]
+
+    def sparsified(self, n_extra: int = 0) -> SparsePrior:
+        return sparsify(np.arange(self.k), self.poses, self.information, self.vector,
+                        anchored=self.anchored, n_extra=n_extra)
+
+    def system_of(self, sparse: SparsePrior) -> tuple[FloatArray, FloatArray]:
+        """Return information and vector of the constraints that stand for the prior."""
+        graph = Graph()
+        graph.apply(GraphUpdate(hidden=self.poses, edges=sparse.edges, observed=sparse.observed))
+        H, b = dense_system(graph)
+        return H, -b
+
+    @property
+    def regular(self) -> slice:
+        """Rows whose information is regular: without an anchor the first node may be fixed."""
+        return slice(0 if self.anchored else 3, 3 * self.k)
+
+    def divergence(self, approximation: FloatArray) -> float:
+        exact = self.information[self.regular, self.regular]
+        ratio = np.linalg.solve(exact, approximation[self.regular, self.regular])
+        return float(0.5 * (np.trace(ratio) - np.linalg.slogdet(ratio)[1] - len(exact)))
+
+    def tree(self, sparse: SparsePrior) -> Tree:
+        """Return the pairs of nodes of a tree; k stands for the map."""
+        edges = zip(sparse.edges.i.tolist(), sparse.edges.j.tolist(), strict=True)
+        return [*edges, *((node, self.k) for node in sparse.observed.node.tolist())]
+
+    def measured(self, tree: Tree) -> tuple[list[FloatArray], list[FloatArray]]:
+        """Return Jacobians of the pairs of a tree and their covariances by the prior."""
+        covariance = np.zeros_like(self.information)
+        part = self.regular
+        covariance[part, part] = np.linalg.inv(self.information[part, part])
+        jacobians = []
+        for i, j in tree:
+            J = np.zeros((3, 3 * self.k))
+            J[:, 3 * i:3 * i + 3] = np.eye(3)
+            if j < self.k:
+                d = self.poses[j, :2] - self.poses[i, :2]
+                J[:, 3 * i:3 * i + 3] = [
+                    [-1.0, 0.0, d[1]], [0.0, -1.0, -d[0]], [0.0, 0.0, -1.0]]
+                J[:, 3 * j:3 * j + 3] = np.eye(3)
+            jacobians.append(J)
+        return jacobians, [J @ covariance @ J.T for J in jacobians]
+
+    def scaled_as_a_whole(self, tree: Tree) -> float:
+        """Return the divergence of a tree from covariances, scaled until it is conservative."""
+        total = sum(J.T @ np.linalg.solve(C, J)
+                    for J, C in zip(*self.measured(tree), strict=True))
+        part = self.regular
+        ratio = np.linalg.solve(self.information[part, part], total[part, part])
+        return self.divergence(total / max(np.max(np.linalg.eigvals(ratio).real), 1.0))
+
+    def volume(self, tree: Tree) -> float:
+        """Return the sum of `log det` of the covariances of a tree."""
+        return float(sum(np.linalg.slogdet(C)[1] for C in self.measured(tree)[1]))
+
+
+def noisy_edges(rng: np.random.Generator, poses: FloatArray, ends: Tree) -> Edges:
+    i, j = np.array(ends).T
+    mean = se2.between(poses[i], poses[j]) + 0.02 * rng.standard_normal((len(i), 3))
+    return Edges(i, j, mean, random_information(rng, len(i)), np.ones(len(i), dtype=np.uint8))
+
+
+def prior_of(seed: int, k: int, anchor: str, n_gone: int = 4) -> Prior:
+    """Return the prior that the last nodes of a graph with loops leave behind."""
+    rng = np.random.default_rng(seed)
+    n = k + n_gone
+    poses = random_poses(rng, n)
+    ends = [(int(rng.integers(0, node)), node) for node in range(1, n)]
+    ends += [tuple(rng.choice(n, 2, replace=False).tolist()) for _ in range(n)]
+    diagonals = np.array(ANCHORS[anchor]).reshape(-1, 3)
+    node = np.arange(n - len(diagonals), n)
+    observed = ObservedNodes(
+        node, mean=poses[node] + 0.1, information=diagonals[:, None] * np.eye(3),
+        kind=np.zeros(len(node), dtype=np.uint8))
+    graph = Graph()
+    graph.apply(GraphUpdate(hidden=poses, edges=noisy_edges(rng, poses, ends), observed=observed))
+    return Prior(graph, k, anchored=len(node) > 0)
+
+
+def all_trees(n: int) -> list[Tree]:
+    found = []
+    for edges in itertools.combinations(itertools.combinations(range(n), 2), n - 1):
+        reached = {0}
+        for _ in edges:
+            reached |= {node for edge in edges if reached & set(edge) for node in edge}
+        if len(reached) == n:
+            found.append(edges)
+    return found
+
+
+def rank(matrix: FloatArray) -> int:
+    return int(np.linalg.matrix_rank(matrix, tol=1e-9, hermitian=True))
+
+
+@given(seeds, sizes, anchors, st.integers(0, 3))
+@settings(max_examples=20)
+def test_no_covariance_is_smaller_than_the_exact_one(
+    seed: int, k: int, anchor: str, n_extra: int,
+) -> None:
+    prior = prior_of(seed, k, anchor)
+    approximation, _ = prior.system_of(prior.sparsified(n_extra))
+    difference = prior.scaled(prior.information - approximation)
+    assert np.linalg.eigvalsh(difference)[0] > -ROUNDING
+
+
+@given(seeds, sizes, anchors, st.integers(0, 2))
+@settings(max_examples=20)
+def test_the_minimum_is_that_of_the_prior(
+    seed: int, k: int, anchor: str, n_extra: int,
+) -> None:
+    prior = prior_of(seed, k, anchor)
+    approximation, vector = prior.system_of(prior.sparsified(n_extra))
+    minimum = np.linalg.pinv(prior.information, rcond=1e-10, hermitian=True) @ prior.vector
+    np.testing.assert_allclose((vector - approximation @ minimum) * prior.sigmas, 0.0, atol=1e-6)
+
+
+@given(seeds, sizes, anchors)
+@settings(max_examples=20)
+def test_the_null_space_is_kept(seed: int, k: int, anchor: str) -> None:
+    prior = prior_of(seed, k, anchor)
+    sparse = prior.sparsified()
+    approximation, _ = prior.system_of(sparse)
+    assert rank(prior.scaled(approximation)) == rank(prior.scaled(prior.information))
+    assert len(prior.tree(sparse)) == k - 1 + (1 if prior.anchored else 0)
+    if not prior.anchored:
+        assert len(sparse.observed) == 0
+        motions = np.tile(np.eye(3), (k, 1))
+        motions[0::3, 2], motions[1::3, 2] = -prior.poses[:, 1], prior.poses[:, 0]
+        np.testing.assert_allclose(
+            (approximation @ motions) * prior.sigmas[:, None], 0.0, atol=1e-6)
+
+
+@given(seeds, st.integers(2, 4), st.sampled_from(('relative', 'pose', 'positions')))
+@settings(max_examples=20)
+def test_no_tree_scaled_as_a_whole_is_nearer(seed: int, k: int, anchor: str) -> None:
+    prior = prior_of(seed, k, anchor)
+    sparse = prior.sparsified()
+    tree = prior.tree(sparse)
+    approximation, _ = prior.system_of(sparse)
+    assert sparse.divergence == pytest.approx(prior.divergence(approximation), abs=1e-6)
+    assert sparse.divergence <= prior.scaled_as_a_whole(tree) + 1e-6
+    # without the scaling the divergence is the sum of these logarithms, but for a constant
+    others = all_trees(k + 1 if prior.anchored else k)
+    assert prior.volume(tree) <= min(map(prior.volume, others)) + 1e-9
+
+
+@given(seeds, st.integers(2, 6), st.booleans())
+@settings(max_examples=20)
+def test_a_prior_that_is_a_tree_is_exact(seed: int, k: int, anchored: bool) -> None:
+    # of a chain every second node is kept
+    rng = np.random.default_rng(seed)
+    poses = random_poses(rng, 2 * k - 1)
+    ends = [end for m in range(k - 1) for end in ((m, k + m), (k + m, m + 1))]
+    observed = ObservedNodes(
+        [0], mean=poses[:1] + 0.1, information=np.eye(3)[None], kind=[0]) if anchored else (
+            ObservedNodes())
+    graph = Graph()
+    graph.apply(GraphUpdate(hidden=poses, edges=noisy_edges(rng, poses, ends), observed=observed))
+    prior = Prior(graph, k, anchored=anchored)
+    sparse = prior.sparsified()
+    approximation, vector = prior.system_of(sparse)
+    np.testing.assert_allclose(
+        prior.scaled(approximation), prior.scaled(prior.information), atol=ROUNDING)
+    np.testing.assert_allclose(
+        (vector - prior.vector) * prior.sigmas, 0.0, atol=1e-6)
+    assert sparse.divergence == pytest.approx(0.0, abs=ROUNDING)
+    assert len(sparse.edges) == k - 1
+
+
+@given(seeds, st.integers(3, 6), anchors)
+@settings(max_examples=20)
+def test_more_edges_are_nearer(seed: int, k: int, anchor: str) -> None:
+    prior = prior_of(seed, k, anchor)
+    tree, more, most = (prior.sparsified(n) for n in (0, 1, k * k))
+    assert len(prior.tree(more)) == len(prior.tree(tree)) + 1
+    # the barrier ends a little inside
+    assert most.divergence <= more.divergence + 1e-2
+    assert more.divergence <= tree.divergence + 1e-2
+
+
+def test_a_single_pose_becomes_an_observed_node() -> None:
+    prior = prior_of(1, 1, 'pose')
+    sparse = prior.sparsified()
+    assert (len(sparse.edges), len(sparse.observed)) == (0, 1)
+    approximation, vector = prior.system_of(sparse)
+    np.testing.assert_allclose(approximation, prior.information, rtol=ROUNDING)
+    np.testing.assert_allclose(vector, prior.vector, rtol=1e-6)
+
+
+def test_poses_that_nothing_connects_stay_apart() -> None:
+    rng = np.random.default_rng(5)
+    poses = random_poses(rng, 4)
+    graph = Graph()
+    graph.apply(GraphUpdate(hidden=poses, edges=noisy_edges(rng, poses, [(0, 1), (2, 3)])))
+    prior = Prior(graph, 4, anchored=False)
+    sparse = prior.sparsified()
+    assert sorted(prior.tree(sparse)) == [(0, 1), (2, 3)]
+    np.testing.assert_allclose(prior.system_of(sparse)[0], prior.information, atol=1e-6)
