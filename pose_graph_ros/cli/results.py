@@ -18,16 +18,94 @@ from pose_graph_ros.adapters.message_reader import MessageReader
 from pose_graph_ros.adapters.sources import Kind
 from pose_graph_ros.cli.evaluation import Drive, evaluate, format_table, summary
 from pose_graph_ros.cli.picture import draw_drive
+from pose_graph_ros.core.compiled.growing_array import GrowingArray
 from pose_graph_ros.core.geometry import se2
 from pose_graph_ros.core.geometry.geodesy import MapOrigin
+from pose_graph_ros.core.geometry.se2 import BoolArray, FloatArray
 from pose_graph_ros.core.geometry.trajectory import Trajectory
 from pose_graph_ros.core.io.tum import write_tum
 from pose_graph_ros.core.judgement.texts import Key
 from pose_graph_ros.core.judgement.verdicts import State
 from pose_graph_ros.core.measurements import Fix, GlobalPose, LoopClosure, OdometrySample
 
+# Largest number of samples of a path that are kept for comparison and the picture.
+MOST_SAMPLES = 400_000
+
 TRUTH_TYPES = ('nav_msgs/msg/Odometry', 'geometry_msgs/msg/PoseStamped',
                'geometry_msgs/msg/PoseWithCovarianceStamped')
+
+
+class PathCollector:
+    """Samples of a path; of very many, only every second one is kept, or fewer."""
+
+    def __init__(self) -> None:
+        self._stamps = GrowingArray((), np.int64)
+        self._poses = GrowingArray((3,), np.float64)
+        self._count, self._stride = 0, 1
+
+    def add(self, stamp_ns: int, pose: FloatArray) -> None:
+        """
+        Add a sample.
+
+        Parameters
+        ----------
+        stamp_ns : int
+        pose : ndarray, shape (3,)
+
+        """
+        if self._count % self._stride == 0:
+            self._stamps.append_one(stamp_ns)
+            self._poses.append_one(pose)
+        self._count += 1
+        if len(self._stamps) == MOST_SAMPLES:
+            every_second = np.arange(0, MOST_SAMPLES, 2)
+            self._stamps.select(every_second)
+            self._poses.select(every_second)
+            self._stride *= 2
+
+    def path(self) -> Trajectory:
+        """Return the samples by stamp; of several with the same stamp the first one."""
+        stamps, first = np.unique(self._stamps.values, return_index=True)
+        return Trajectory(stamps, self._poses.values[first])
+
+
+class _Positions:
+    """Measured positions, as columns."""
+
+    def __init__(self) -> None:
+        self.stamps = GrowingArray((), np.int64)
+        self.positions = GrowingArray((2,), np.float64)
+        self.arms = GrowingArray((2,), np.float64)
+        self.held_out = GrowingArray((), np.bool_)
+        self._fixes: dict[int, Fix] = {}
+
+    def add(
+        self, stamp_ns: int, position: FloatArray | Fix, arm: FloatArray, *, held_out: bool,
+    ) -> None:
+        """
+        Add a position.
+
+        Parameters
+        ----------
+        stamp_ns : int
+        position : ndarray, shape (2,), or a fix that is not in the map yet
+        arm : ndarray, shape (2,), of the antenna
+        held_out : bool
+
+        """
+        if isinstance(position, Fix):
+            self._fixes[len(self.stamps)] = position
+            position = np.zeros(2)
+        self.stamps.append_one(stamp_ns)
+        self.positions.append_one(position)
+        self.arms.append_one(arm)
+        self.held_out.append_one(held_out)
+
+    def place(self, inside: BoolArray) -> None:
+        """Compute the positions of all fixes; the first one that can have been used goes first."""
+        for at in sorted(self._fixes, key=lambda at: bool(
+                self.held_out.values[at] or not inside[at])):
+            self.positions.values[at] = self._fixes[at].place()
 
 
 def collect_drive(
@@ -65,9 +143,8 @@ def collect_drive(
     if origin is not None:
         reader.datum.keep(origin)
     preferred = inputs.of(Kind.ODOMETRY)[0]
-    odometry: dict[int, np.ndarray] = {}
-    observed: list[tuple[int, np.ndarray | Fix, np.ndarray, bool]] = []
-    unused: list[bool] = []
+    odometry, fixes = PathCollector(), _Positions()
+    unused = GrowingArray((), np.bool_)
     loops: list[tuple[int, int]] = []
     loop_states: list[State] = []
     for source, message, held_out in read_inputs(bag, inputs):
@@ -77,35 +154,32 @@ def collect_drive(
             continue
         match measurement:
             case Fix(stamp, _, _, lever_arm):
-                observed.append((stamp, measurement, lever_arm, held_out))
+                # without the datum of the graph, it is decided below which fix makes it
+                fixes.add(stamp, measurement if origin is None else measurement.place(),
+                          lever_arm, held_out=held_out)
             case GlobalPose(stamp, pose, _):
-                observed.append((stamp, pose[:2], np.zeros(2), held_out))
+                fixes.add(stamp, pose[:2], np.zeros(2), held_out=held_out)
             case LoopClosure(stamp, _, _, int(reference)):
                 loops.append((reference, stamp))
                 loop_states.append(states.get((source, stamp, reference), State.BELIEVED))
             case OdometrySample(stamp, pose) if source == preferred:
-                odometry.setdefault(stamp, pose)
-        if len(observed) > len(unused):
-            stamp = observed[-1][0]
-            unused.append(not states.get((source, stamp, None), State.BELIEVED).in_graph)
-    stamps = np.array([row[0] for row in observed], dtype=np.int64)
+                odometry.add(stamp, pose)
+        if len(fixes.stamps) > len(unused):
+            stamp = int(fixes.stamps.values[-1])
+            unused.append_one(not states.get((source, stamp, None), State.BELIEVED).in_graph)
+    stamps, arms = fixes.stamps.values, fixes.arms.values
     inside = corrected.covers(stamps)
-    # without the datum of the graph: the first fix that can have been used in it is placed first
-    for at in sorted(range(len(observed)), key=lambda at: bool(observed[at][3] or not inside[at])):
-        stamp, position, arm, held_out = observed[at]
-        if isinstance(position, Fix):
-            observed[at] = stamp, position.place(), arm, held_out
-    positions = np.array([row[1] for row in observed]).reshape(-1, 2)
-    arms = np.array([row[2] for row in observed]).reshape(-1, 2)
+    fixes.place(inside)
+    positions = fixes.positions.values
     if np.any(arms):  # from the antenna to the robot, with the heading of the corrected path
         turn = corrected.at(stamps[inside]) * (0.0, 0.0, 1.0)
         positions[inside] -= se2.transform(turn, arms[inside])
     return Drive(
-        odometry=_trajectory(odometry), fix_stamps_ns=stamps, fix_positions=positions,
-        fix_held_out=np.array([row[3] for row in observed], dtype=bool), corrected=corrected,
+        odometry=odometry.path(), fix_stamps_ns=stamps, fix_positions=positions,
+        fix_held_out=fixes.held_out.values, corrected=corrected,
         truth=None if truth_topic is None else read_truth(bag, truth_topic),
         loop_stamps_ns=np.array(loops, dtype=np.int64).reshape(-1, 2), loop_states=loop_states,
-        fix_unused=np.array(unused, dtype=bool),
+        fix_unused=unused.values,
         map_axes=('east', 'north') if len(inputs.of(Kind.FIX)) > 0 and not any(values['datum'][2:])
         else ('x', 'y'))
 
@@ -130,19 +204,14 @@ def read_truth(bag: BagReader, topic: str) -> Trajectory:
         what = 'no topic' if info is None else f'type {info.type} of'
         raise BagError(f'{bag.path}: {what} {topic} (--truth); expected one of '
                        f'{", ".join(TRUTH_TYPES)}; the bag has {bag.describe()}')
-    poses: dict[int, np.ndarray] = {}
+    poses = PathCollector()
     for bag_message in bag.messages([topic]):
         with suppress(MessageError):
             message = bag_message.decode()
             pose = planar_pose(message.pose if info.type == TRUTH_TYPES[1] else message.pose.pose)
             if pose is not None:
-                poses.setdefault(stamp_ns(message), pose)
-    return _trajectory(poses)
-
-
-def _trajectory(poses: Mapping[int, np.ndarray]) -> Trajectory:
-    stamps = np.array(sorted(poses), dtype=np.int64)
-    return Trajectory(stamps, np.array([poses[stamp] for stamp in stamps.tolist()]).reshape(-1, 3))
+                poses.add(stamp_ns(message), pose)
+    return poses.path()
 
 
 def write_results(drive: Drive, folder: Path, title: str, facts: Mapping[str, Any]) -> str:

@@ -17,7 +17,7 @@ from pose_graph_ros.adapters.bag_writer import message_types
 from pose_graph_ros.adapters.bags import BagError, open_bag
 from pose_graph_ros.adapters.parameters import checked
 from pose_graph_ros.adapters.sources import source_list
-from pose_graph_ros.cli import replay
+from pose_graph_ros.cli import replay, results
 from pose_graph_ros.cli.bag_messages import (
     fix_messages,
     loop_closure_messages,
@@ -26,7 +26,7 @@ from pose_graph_ros.cli.bag_messages import (
     write_bag,
 )
 from pose_graph_ros.cli.main import guarded, main, replay as replay_alone
-from pose_graph_ros.cli.results import collect_drive, read_truth
+from pose_graph_ros.cli.results import collect_drive, PathCollector, read_truth
 from pose_graph_ros.core.batch.optimizer import Status
 from pose_graph_ros.core.exceptions import PoseGraphError
 from pose_graph_ros.core.geometry import se2
@@ -308,3 +308,18 @@ def test_a_pipe_whose_reader_has_ended_is_no_traceback(
         assert guarded(execute) == 1
         # what is still in the buffer goes nowhere
         assert os.path.samestat(os.fstat(stream.fileno()), os.stat(os.devnull))
+
+
+def test_of_very_many_samples_those_that_are_kept_are_bounded_and_evenly_spaced(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr(results, 'MOST_SAMPLES', 16)
+    few, many = PathCollector(), PathCollector()
+    for k in (3, 1, 2, 1):
+        few.add(k, np.array([float(k), 0.0, 0.0]))
+    assert few.path().stamps_ns.tolist() == [1, 2, 3]
+    for k in range(100):
+        many.add(k, np.array([float(k), 0.0, 0.0]))
+        assert len(many.path()) < 16
+    assert many.path().stamps_ns.tolist() == many.path().poses[:, 0].tolist()
+    assert set(np.diff(many.path().stamps_ns).tolist()) == {8}

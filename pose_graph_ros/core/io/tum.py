@@ -2,6 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Trajectories in the TUM format: `stamp x y z qx qy qz qw` a line, stamps in seconds."""
 
+from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
@@ -9,6 +10,7 @@ import numpy as np
 from pose_graph_ros.core.geometry.trajectory import Trajectory
 
 NANOSECONDS = 1_000_000_000
+PART = 10_000
 
 
 def write_tum(trajectory: Trajectory, path: Path) -> None:
@@ -21,18 +23,24 @@ def write_tum(trajectory: Trajectory, path: Path) -> None:
     path : Path
 
     """
-    path.write_text(tum_text(trajectory), encoding='ascii')
+    with path.open('w', encoding='ascii') as file:
+        file.writelines(f'{line}\n' for line in _lines(trajectory))
 
 
 def tum_text(trajectory: Trajectory) -> str:
     """Return the text of a TUM file with a trajectory."""
-    lines = ['# timestamp tx ty tz qx qy qz qw']
-    half = trajectory.poses[:, 2] / 2
-    for stamp, (x, y, _), qz, qw in zip(
-            trajectory.stamps_ns.tolist(), trajectory.poses.tolist(), np.sin(half).tolist(),
-            np.cos(half).tolist(), strict=True):
-        seconds, nanoseconds = divmod(abs(stamp), NANOSECONDS)
-        sign = '-' if stamp < 0 else ''
-        lines.append(
-            f'{sign}{seconds}.{nanoseconds:09d} {x!r} {y!r} 0 0 0 {qz!r} {qw!r}')
-    return '\n'.join(lines) + '\n'
+    return '\n'.join(_lines(trajectory)) + '\n'
+
+
+def _lines(trajectory: Trajectory) -> Iterator[str]:
+    yield '# timestamp tx ty tz qx qy qz qw'
+    # in parts: a list of all numbers of a long path takes ten times its memory
+    for begin in range(0, len(trajectory), PART):
+        poses = trajectory.poses[begin:begin + PART]
+        half = poses[:, 2] / 2
+        for stamp, (x, y, _), qz, qw in zip(
+                trajectory.stamps_ns[begin:begin + PART].tolist(), poses.tolist(),
+                np.sin(half).tolist(), np.cos(half).tolist(), strict=True):
+            seconds, nanoseconds = divmod(abs(stamp), NANOSECONDS)
+            sign = '-' if stamp < 0 else ''
+            yield f'{sign}{seconds}.{nanoseconds:09d} {x!r} {y!r} 0 0 0 {qz!r} {qw!r}'
