@@ -87,6 +87,8 @@ def sparsify(
     found = _candidates(poses, basis, free, anchored)
     chosen = _spanning_tree(found, len(nodes) + (1 if anchored else 0))
     chosen = chosen[np.any(found.rows[chosen] != 0.0, axis=(1, 2))]
+    if len(chosen) == 0:
+        return SparsePrior(Edges(), ObservedNodes(), 0.0)
     blocks = conservative.nearest_below(found.rows[chosen])
     extra = _overestimated(found, chosen, blocks)[:n_extra] if n_extra > 0 else chosen[:0]
     if len(extra) > 0:

@@ -240,3 +240,9 @@ def test_poses_that_nothing_connects_stay_apart() -> None:
     sparse = prior.sparsified()
     assert sorted(prior.tree(sparse)) == [(0, 1), (2, 3)]
     np.testing.assert_allclose(prior.system_of(sparse)[0], prior.information, atol=1e-6)
+
+
+def test_a_single_pose_without_an_anchor_tells_nothing() -> None:
+    prior = prior_of(1, 1, 'relative')
+    sparse = prior.sparsified()
+    assert len(sparse.edges) == len(sparse.observed) == 0
