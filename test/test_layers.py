@@ -35,6 +35,9 @@ CORE = {
     'core.judgement': {
         'core.compiled', 'core.geometry', 'core.graph', 'core.elimination', 'core.batch',
         'core.smoother', 'core.odometry', 'core.sources'},
+    'core.window': {
+        'core.compiled', 'core.geometry', 'core.graph', 'core.elimination',
+        'core.marginalization', 'core.batch', 'core.smoother', 'core.odometry'},
 }
 CORE['core.io'] = set(CORE)
 # The modules on top of the packages: the facade, what it hands out, and who drives it.

@@ -357,6 +357,24 @@ class SmootherConfig:
 
 
 @dataclass(frozen=True, slots=True)
+class ThinningConfig:
+    """Which hidden nodes leave where a place is driven often; see `window.thinning`."""
+
+    cell: float = 0.0
+    """Side of the cells [m]; 0 for no thinning."""
+    angle: float = math.pi / 2.0
+    """Sector of headings [rad]."""
+    poses: int = 1
+    """Number of poses that stay in a sector of a cell."""
+    newest: int = 50
+    """Number of newest hidden nodes that stay in any case."""
+
+    def __post_init__(self) -> None:
+        require(self, 'cell')
+        require(self, 'angle', 'poses', 'newest', positive=True)
+
+
+@dataclass(frozen=True, slots=True)
 class BackendConfig:
     """Settings of `PoseGraphBackend`."""
 

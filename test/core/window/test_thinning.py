@@ -1,0 +1,101 @@
+# Copyright 2026 The pose_graph_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""Which hidden nodes leave where a place is driven again and again."""
+
+import math
+
+from hypothesis import given, settings, strategies as st
+import numpy as np
+import pytest
+from random_graphs import random_poses
+
+from pose_graph_ros.core.config import ThinningConfig
+from pose_graph_ros.core.exceptions import ConfigError
+from pose_graph_ros.core.graph.constraints import EdgeKind, Edges, ObservedNodes
+from pose_graph_ros.core.graph.graph import Graph, GraphUpdate
+from pose_graph_ros.core.window import thinning
+
+
+def slowly_crowded(
+    poses: list[list[float]], preferred: list[int], config: ThinningConfig,
+) -> dict[int, list[int]]:
+    """Return what leaves, each with those that stay in its cell."""
+    sectors = max(round(2.0 * math.pi / config.angle), 1)
+    cells: dict[tuple[int, int, int], list[int]] = {}
+    for row in sorted(range(len(poses)), key=lambda row: (-preferred[row], row)):
+        x, y, theta = poses[row]
+        sector = math.floor((theta + math.pi) / (2.0 * math.pi) * sectors) % sectors
+        cells.setdefault(
+            (math.floor(x / config.cell), math.floor(y / config.cell), sector), []).append(row)
+    return {row: rows[:config.poses] for rows in cells.values() for row in rows[config.poses:]}
+
+
+@given(st.integers(0, 2**32 - 1), st.integers(0, 80), st.sampled_from((0.7, 2.0, 30.0)),
+       st.sampled_from((0.5, math.pi / 2.0, 7.0)), st.integers(1, 3))
+@settings(max_examples=60)
+def test_each_sector_of_a_cell_keeps_its_first_poses(
+    seed: int, n: int, cell: float, angle: float, kept: int,
+) -> None:
+    rng = np.random.default_rng(seed)
+    poses, preferred = random_poses(rng, n), rng.integers(0, 3, n)
+    config = ThinningConfig(cell=cell, angle=angle, poses=kept)
+    found = thinning.crowded(poses, preferred, config)
+    expected = slowly_crowded(poses.tolist(), preferred.tolist(), config)
+    assert found.leaving.tolist() == sorted(expected)
+    for row, anchor in zip(found.leaving.tolist(), found.anchors.tolist(), strict=True):
+        nearest = min(expected[row], key=lambda k: math.dist(poses[k, :2], poses[row, :2]))
+        assert anchor == nearest
+
+
+def laps(n: int, per_lap: int) -> Graph:
+    """Return a chain around a circle, with a closure to the lap before at each lap's begin."""
+    angle = 2.0 * np.pi / per_lap * (np.arange(n) + 0.25)
+    poses = np.column_stack((10.0 + 5.0 * np.cos(angle), 10.0 + 5.0 * np.sin(angle), angle))
+    i = np.arange(n - 1)
+    edges = Edges(i, i + 1, np.zeros((n - 1, 3)), np.tile(np.eye(3), (n - 1, 1, 1)),
+                  np.full(n - 1, EdgeKind.ODOMETRY))
+    j = np.arange(per_lap, n, per_lap)
+    closures = Edges(j - per_lap, j, np.zeros((len(j), 3)), np.tile(np.eye(3), (len(j), 1, 1)),
+                     np.full(len(j), EdgeKind.LOOP_CLOSURE))
+    graph = Graph()
+    graph.apply(GraphUpdate(
+        hidden=poses, edges=Edges.joined([edges, closures]), fix=(0,),
+        observed=ObservedNodes([per_lap + 3], mean=np.zeros((1, 3)),
+                               information=np.eye(3)[None], kind=[0])))
+    return graph
+
+
+def test_the_newest_nodes_and_those_that_something_tells_of_stay() -> None:
+    graph = laps(60, 20)
+    # sectors of 36 degrees, of which each has two nodes of a lap
+    config = ThinningConfig(cell=100.0, angle=np.pi / 5.0, poses=1, newest=15)
+    found = thinning.crowd(graph, config)
+    leaving = set(found.leaving.tolist())
+    assert found.anchors.tolist() == [
+        anchor for anchor in found.anchors.tolist() if anchor not in leaving]
+    assert not leaving & {0, 23, *range(45, 60)}
+    # 20 and 40 have closures, but in their sector the fixed node is before them
+    assert {1, 20, 40, 3, 43} <= leaving
+    told = thinning.informed(graph)
+    assert np.flatnonzero(told).tolist() == [0, 20, 23, 40]
+
+
+def test_nothing_leaves_a_graph_of_the_newest_nodes_alone() -> None:
+    config = ThinningConfig(cell=1000.0, angle=7.0, newest=60)
+    assert len(thinning.crowd(laps(60, 20), config).leaving) == 0
+    assert len(thinning.crowd(laps(60, 20), ThinningConfig(cell=1.0, newest=61)).leaving) == 0
+
+
+def test_a_group_is_connected_and_has_few_neighbours() -> None:
+    chain = np.column_stack((np.arange(29), np.arange(1, 30)))
+    assert thinning.group(np.array([3, 4, 5, 9]), chain).tolist() == [3, 4, 5]
+    assert len(thinning.group(np.arange(1, 29), chain)) == thinning.MOST_IN_GROUP
+    # a hub with many neighbours leaves alone
+    star = np.column_stack((np.zeros(20, dtype=int), np.arange(1, 21)))
+    assert thinning.group(np.array([0, 1, 2]), star).tolist() == [0]
+
+
+def test_wrong_settings_are_refused() -> None:
+    for settings_ in ({'cell': -1.0}, {'angle': 0.0}, {'poses': 0}, {'newest': 0}):
+        with pytest.raises(ConfigError):
+            ThinningConfig(**settings_)
