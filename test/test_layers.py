@@ -17,7 +17,8 @@ PACKAGE = Path(pose_graph_ros.__file__).parent
 MODULES = sorted(path.relative_to(PACKAGE) for path in PACKAGE.rglob('*.py'))
 
 # What everything in `core` may import: settings, values and errors.
-BASE = {'core.exceptions', 'core.config', 'core.measurements', 'core.saved_columns'}
+BASE = {'core.exceptions', 'core.config', 'core.measurements', 'core.saved_columns',
+        'core.setting_checks'}
 # The packages of `core`, and the other packages that each may import.
 CORE = {
     'core.compiled': set(),
@@ -42,8 +43,8 @@ CORE = {
 CORE['core.io'] = set(CORE)
 # The modules on top of the packages: the facade, what it hands out, and who drives it.
 TOP = {'core.estimate', 'core.newest_estimate', 'core.prediction', 'core.transaction',
-       'core.isolation', 'core.refiner', 'core.relocation', 'core.error_tuner', 'core.backend',
-       'core.warm_up', 'core.helper_process'}
+       'core.isolation', 'core.refiner', 'core.relocation',
+       'core.error_tuner', 'core.backend', 'core.warm_up', 'core.helper_process'}
 # Third-party libraries of `core`.
 LIBRARIES = {'numpy', 'scipy', 'numba', 'pyproj'}
 ROS = {'rclpy', 'rosidl_runtime_py', 'ament_index_python', 'launch', 'launch_ros'}

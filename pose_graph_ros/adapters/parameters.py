@@ -57,6 +57,7 @@ def _values(choices: type[Enum]) -> tuple[str, ...]:
 _BACKEND, _ODOMETRY = config.BackendConfig(), config.OdometrySource()
 _MEASUREMENT, _COVARIANCE = config.MeasurementSource(), config.CovariancePolicy()
 _NODES, _ALIGNMENT, _NOISE = _BACKEND.nodes, _BACKEND.alignment, _ODOMETRY.noise
+_WINDOW = _BACKEND.window
 
 PARAMETERS: tuple[Parameter, ...] = (
     Parameter('sources', list(DEFAULT_SOURCES), '', 'Names of the sources of measurements; the '
@@ -114,6 +115,17 @@ PARAMETERS: tuple[Parameter, ...] = (
     Parameter('odometry_patience', _BACKEND.odometry_patience, 's', 'Hidden nodes are added from '
               'another odometry source if the present one lags behind it by more than this time.',
               0.05, 3600.0),
+    Parameter('window.seconds', _WINDOW.seconds, 's', 'Time that the graph looks back. What is '
+              'older leaves it: its path stays as it is, and what its measurements told is kept '
+              'as a prior. If 0, there is no limit; the smallest of the three limits applies.',
+              0.0, 1e9),
+    Parameter('window.metres', _WINDOW.metres, 'm', 'Length of the path that the graph looks '
+              'back. If 0, there is no limit.', 0.0, 1e9),
+    Parameter('window.nodes', float(_WINDOW.nodes), '', 'Number of hidden nodes that the graph '
+              'keeps. If 0, there is no limit.', 0.0, 1e9),
+    Parameter('window.prior', _WINDOW.prior.value, '', 'What stays of those that leave: `dense`, '
+              'one constraint of all their neighbours, or `sparse`, a few constraints of pairs '
+              'of them, which are cheaper and less certain.', choices=_values(config.Prior)),
     Parameter('alignment.sigma_heading', _ALIGNMENT.sigma_heading, 'rad', 'The map is aligned '
               'with the odometry from positions alone once the standard deviation of the angle '
               'between them is at most this.', 1e-3, 1.0),
@@ -232,7 +244,7 @@ OF_SOURCES = frozenset(parameter.name for parameter in SOURCE_PARAMETERS)
 # Names of sources are prefixes of parameters and of counts in the diagnostics.
 _NAME = re.compile(r'[A-Za-z][A-Za-z0-9_]*')
 _TOPIC = re.compile(r'(~?/)?[A-Za-z_][A-Za-z0-9_]*(/[A-Za-z_][A-Za-z0-9_]*)*')
-_TAKEN = {'solver', 'worker', 'received', 'alignment', 'qos_overrides', 'use_sim_time',
+_TAKEN = {'solver', 'worker', 'received', 'alignment', 'window', 'qos_overrides', 'use_sim_time',
           'start_type_description_service'} | {parameter.name for parameter in PARAMETERS}
 
 

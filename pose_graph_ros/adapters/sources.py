@@ -5,6 +5,7 @@
 from collections.abc import Mapping
 from dataclasses import dataclass
 from enum import Enum
+import math
 from typing import Any
 
 from pose_graph_ros.core import config
@@ -112,7 +113,10 @@ def backend_config(values: Mapping[str, Any]) -> config.BackendConfig:
             minimum_baseline=values['alignment.minimum_baseline'],
             baseline_in_sigmas=values['alignment.baseline_in_sigmas']),
         odometry=odometry, measurements=measurements,
-        odometry_patience=values['odometry_patience'])
+        odometry_patience=values['odometry_patience'],
+        window=config.WindowConfig(
+            seconds=values['window.seconds'], metres=values['window.metres'],
+            nodes=math.ceil(values['window.nodes']), prior=config.Prior(values['window.prior'])))
 
 
 def _odometry_source(own: Mapping[str, Any]) -> config.OdometrySource:

@@ -16,6 +16,7 @@ from pose_graph_ros.core.batch.optimizer import Solve, Status
 from pose_graph_ros.core.config import BackendConfig
 from pose_graph_ros.core.error_tuner import ErrorTuner
 from pose_graph_ros.core.estimate import Estimate, UpdateReport
+from pose_graph_ros.core.geometry import se2
 from pose_graph_ros.core.geometry.geodesy import MapOrigin
 from pose_graph_ros.core.geometry.se2 import FloatArray, IntArray
 from pose_graph_ros.core.graph import graph_view
@@ -218,10 +219,9 @@ class PoseGraphBackend:
         self._settled = self._settled and result.status is Status.CONVERGED
         self._newest_node_covariance = self._smoother.newest_covariance()
         settings = self._config.odometry_source(source)
-        self._reweighting.add(
-            self.graph.n_edges - 1, settings.loss, settings.rejection_threshold, edge=True)
-        self._reweighting.set_base_weight(
-            self.graph.n_edges - 1, self._tuner.odometry_weight, edge=True)
+        edge = self.graph.next_ids.edge - 1
+        self._reweighting.add(edge, settings.loss, settings.rejection_threshold, edge=True)
+        self._reweighting.set_base_weight(edge, self._tuner.odometry_weight, edge=True)
         return self.graph.newest_pose
 
     def add_measurement(self, measurement: Measurement, source: str) -> Answer:
@@ -255,7 +255,8 @@ class PoseGraphBackend:
         self.finish()
         if self.graph.n_nodes == 0:
             return self._pipeline.count(source, rejected('before_odometry', 'no odometry yet'))
-        first_ns, last_ns = int(self.node_stamps_ns[0]), self._nodes.covered_ns
+        first_ns = max(int(self.node_stamps_ns[0]), self._nodes.last_frozen_ns)
+        last_ns = self._nodes.covered_ns
         pose = replace(pose, stamp_ns=min(max(pose.stamp_ns, first_ns), last_ns))
         if not self._alignment.is_aligned:
             return self.add_measurement(pose, source)
@@ -299,7 +300,7 @@ class PoseGraphBackend:
             return UpdateReport(Status.CONVERGED, '', 0, 0, 0.0), Queue()
         with self._transaction() as transaction:
             T_map_graph = self._alignment.find(
-                self.graph.poses, self._pipeline.queue.observed, self._nodes.primary)
+                self.graph, self._pipeline.queue.observed, self._nodes.primary)
             queue = transaction.add(self._pipeline.take_ready(aligned=self._alignment.is_aligned))
             if len(queue) == 0 and self._settled:
                 return UpdateReport(Status.CONVERGED, '', 0, 0, self._chi2), Queue()
@@ -339,7 +340,8 @@ class PoseGraphBackend:
         self._smoother.interrupt()
 
     def _transaction(self) -> Transaction:
-        return Transaction(self.graph, self._alignment, self._factors, self._judge)
+        return Transaction(
+            self.graph, self._nodes, self._alignment, self._factors, self._judge)
 
     def _evaluate(self) -> None:
         """Update chi2 and the covariance of the newest node."""
@@ -349,13 +351,17 @@ class PoseGraphBackend:
 
     def _recheck_alignment(self) -> None:
         """Rotate and optimise the graph anew if the angle between odometry and map is wrong."""
-        before = self.graph.poses.copy()
-        poses = self._alignment.recheck(before, self._nodes)
+        poses = self._alignment.recheck(self.graph, self._nodes)
         if poses is None:
             return
+        before, oldest = self.graph.poses.copy(), int(self._nodes.ids[self._nodes.n_frozen])
+        left = self.graph.poses_of(oldest)
         self.graph.set_poses(poses)
         if self._optimize_whole().status is not Status.FAILED:
             self.counts['alignment', 'done_over'] += 1
+            # the frozen part of the path stays in front of the rest
+            self._nodes.table.move_frozen(
+                se2.compose(self.graph.poses_of(oldest), se2.inverse(left)))
             return
         self.graph.set_poses(before)
         with self._transaction():

@@ -14,6 +14,7 @@ import math
 
 from pose_graph_ros.core.exceptions import ConfigError
 from pose_graph_ros.core.measurements import HeadingOnly, LoopClosure, Measurement
+from pose_graph_ros.core.setting_checks import require, require_member
 
 # Motion since the last hidden node below which the robot stands still [m], [rad].
 REST_DISTANCE = 0.05
@@ -26,42 +27,6 @@ FLAT_GUESS = math.pi / math.sqrt(3.0)
 
 # Correlation time of a source whose errors tell whether they are correlated, and for how long.
 FOUND = -1.0
-
-
-def require(settings: object, *names: str, positive: bool = False) -> None:
-    """
-    Raise ConfigError unless the named settings are finite and not negative.
-
-    Parameters
-    ----------
-    settings : object
-    *names : str, attributes of `settings`
-    positive : bool, whether 0 is invalid, too
-
-    """
-    for name in names:
-        value = getattr(settings, name)
-        if not math.isfinite(value) or value < 0.0 or (positive and value == 0.0):
-            expected = 'a positive number' if positive else 'a number that is not negative'
-            raise ConfigError(
-                f'{type(settings).__name__}.{name}: expected {expected}, got {value!r}')
-
-
-def require_member(settings: object, name: str, kind: type[Enum]) -> None:
-    """
-    Raise ConfigError unless the named setting is a member of an enumeration.
-
-    Parameters
-    ----------
-    settings : object
-    name : str, attribute of `settings`
-    kind : type, the enumeration
-
-    """
-    value = getattr(settings, name)
-    if not isinstance(value, kind):
-        raise ConfigError(f'{type(settings).__name__}.{name}: expected one of '
-                          f'{", ".join(map(str, kind))}, got {value!r}')
 
 
 class Loss(Enum):
@@ -356,6 +321,37 @@ class SmootherConfig:
                               f'got {self.max_iterations!r}')
 
 
+class Prior(Enum):
+    """What becomes of constraints whose hidden nodes leave the graph."""
+
+    DENSE = 'dense'
+    """One constraint of all their neighbours: exact but for the linearization."""
+    SPARSE = 'sparse'
+    """A few constraints of pairs of neighbours, with covariances that are no smaller."""
+
+
+@dataclass(frozen=True, slots=True)
+class WindowConfig:
+    """How much of the past the graph keeps: the smallest limit that is not 0; see `window`."""
+
+    seconds: float = 0.0
+    """Time before the newest hidden node [s]; 0 for no limit."""
+    metres: float = 0.0
+    """Path length before it [m]; 0 for no limit."""
+    nodes: int = 0
+    """Number of hidden nodes; 0 for no limit."""
+    prior: Prior = Prior.DENSE
+
+    def __post_init__(self) -> None:
+        require(self, 'seconds', 'metres', 'nodes')
+        require_member(self, 'prior', Prior)
+
+    @property
+    def is_limited(self) -> bool:
+        """Whether there is any limit."""
+        return self.nodes > 0 or self.seconds > 0.0 or self.metres > 0.0
+
+
 @dataclass(frozen=True, slots=True)
 class ThinningConfig:
     """Which hidden nodes leave where a place is driven often; see `window.thinning`."""
@@ -391,6 +387,8 @@ class BackendConfig:
     """Sources of measurements by name; others have the defaults of their kind."""
     odometry_patience: float = 2.0
     """Silence of the primary odometry source after which another one replaces it [s]."""
+    window: WindowConfig = field(default_factory=WindowConfig)
+    """What the graph keeps; the rest leaves it, and what it told stays as a prior."""
 
     def __post_init__(self) -> None:
         require(self, 'odometry_patience', positive=True)

@@ -60,6 +60,7 @@ class Estimate:
     """Of the angle between odometry and map [rad]; infinite if it is unknown."""
     chi2: float
     n_hidden: int
+    """Hidden nodes of the path."""
     n_edges: int
     """Edges between hidden nodes."""
     n_observed: int
@@ -72,6 +73,10 @@ class Estimate:
     """Noise of that source, by its settings and `odometry_scale`."""
     odometry_scale: float = 1.0
     """Factor on the sigmas of the primary odometry."""
+    n_frozen: int = 0
+    """How many of the hidden nodes have left the graph; their poses do not change any more."""
+    n_priors: int = 0
+    """Priors that stand for them in the graph."""
     trajectory: Trajectory | None = None
     """The value of `path`; None if the estimate was made without it."""
 

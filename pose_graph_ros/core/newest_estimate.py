@@ -7,13 +7,12 @@ import math
 import numpy as np
 
 from pose_graph_ros.core.alignment import estimator
-from pose_graph_ros.core.alignment.monitor import AlignmentState, placed
+from pose_graph_ros.core.alignment.monitor import AlignmentState, in_rows, placed
 from pose_graph_ros.core.config import OdometryNoise
 from pose_graph_ros.core.estimate import Estimate
 from pose_graph_ros.core.geometry import covariance, se2
 from pose_graph_ros.core.geometry.se2 import FloatArray
 from pose_graph_ros.core.geometry.trajectory import Trajectory
-from pose_graph_ros.core.graph.constraints import ObservedNodes
 from pose_graph_ros.core.io.capture import Parts
 
 
@@ -35,7 +34,7 @@ def estimate(
 
     """
     graph, nodes, factors = parts.graph, parts.nodes, parts.factors
-    node = graph.poses[nodes.ids[-1]]
+    node = graph.poses_of(nodes.ids[-1])
     motion, motion_noise, odometry = nodes.newest()
     newest = se2.compose(node, motion)
     cov = covariance.propagated(node, newest_covariance, motion, scale**2 * motion_noise)
@@ -43,9 +42,8 @@ def estimate(
     shift = np.zeros(3)
     if state is AlignmentState.UNALIGNED:
         # if the aligning update failed, its measurements are in the quarantine
-        shift, cov = estimator.guess(graph.poses, newest, ObservedNodes.joined(
-            [attached.observed for attached in placed(
-                parts.pipeline.queue.observed + parts.quarantine.observed)]))
+        shift, cov = estimator.guess(graph.poses, newest, in_rows(graph, placed(
+            parts.pipeline.queue.observed + parts.quarantine.observed)))
         newest = newest + shift
     stamp_ns = max(nodes.newest_ns, int(nodes.stamps_ns[-1]))
     return Estimate(
@@ -53,9 +51,9 @@ def estimate(
         T_map_odom=se2.compose(newest, se2.inverse(odometry)), covariance=cov,
         alignment=state, chi2=chi2, alignment_sigma=(
             math.sqrt(cov[2, 2]) if state is AlignmentState.ALIGNED else sigma),
-        n_hidden=len(nodes), n_edges=graph.n_edges - factors.n_bias_edges,
-        n_observed=factors.n_measurements, n_biases=graph.n_nodes - len(nodes),
+        n_hidden=len(nodes), n_frozen=nodes.n_frozen, n_edges=graph.n_edges - factors.n_bias_edges,
+        n_observed=factors.n_measurements, n_biases=int(np.count_nonzero(graph.is_bias)),
         primary=nodes.primary, noise=noise if scale == 1.0 else noise.scaled(scale),
         odometry_scale=scale,
         trajectory=None if not with_path else Trajectory(
-            nodes.stamps_ns, graph.poses[nodes.ids] + shift).continued(stamp_ns, newest))
+            nodes.stamps_ns, nodes.poses(graph) + shift).continued(stamp_ns, newest))

@@ -39,12 +39,10 @@ def relocate(
     if isinstance(begin, Answer) or isinstance(end, Answer) or not isinstance(
             measurement, GlobalPose):
         return rejected('no_odometry', 'none at that time')
-    poses = graph.poses
-    moved = se2.between(se2.compose(poses[begin.node], begin.motion),
-                        se2.compose(poses[end.node], end.motion))
+    first, last, newest = graph.poses_of([begin.node, end.node, int(nodes.ids[-1])])
+    moved = se2.between(se2.compose(first, begin.motion), se2.compose(last, end.motion))
     now = se2.compose(measurement.pose, moved)
-    row = nodes.relocate(
-        se2.between(poses[nodes.ids[-1]], now), np.diag(RELOCATION_SIGMA) ** 2)
-    if row < 0:
+    node = nodes.relocate(se2.between(newest, now), np.diag(RELOCATION_SIGMA) ** 2)
+    if node < 0:
         return rejected('failed', 'the solver failed')
     return replace(measurement, stamp_ns=last_ns + 1, pose=now)

@@ -12,6 +12,7 @@ from pose_graph_ros.core.geometry import se2
 from pose_graph_ros.core.geometry.se2 import FloatArray
 from pose_graph_ros.core.graph.graph import Graph
 from pose_graph_ros.core.judgement.judge import Judge
+from pose_graph_ros.core.odometry.hidden_nodes import HiddenNodes
 from pose_graph_ros.core.smoother.incremental import UpdateResult
 from pose_graph_ros.core.sources.factor_builder import FactorBuilder, Queue
 
@@ -28,6 +29,7 @@ class Transaction:
     Parameters
     ----------
     graph : Graph
+    nodes : HiddenNodes
     alignment : AlignmentMonitor
     factors : FactorBuilder
     judge : Judge
@@ -35,12 +37,13 @@ class Transaction:
     """
 
     def __init__(
-        self, graph: Graph, alignment: AlignmentMonitor, factors: FactorBuilder, judge: Judge,
+        self, graph: Graph, nodes: HiddenNodes, alignment: AlignmentMonitor,
+        factors: FactorBuilder, judge: Judge,
     ) -> None:
-        self._graph, self._alignment, self._factors = graph, alignment, factors
-        self._judge = judge
+        self._graph, self._nodes, self._alignment = graph, nodes, alignment
+        self._factors, self._judge = factors, judge
         self._before = alignment.copy()
-        self._poses: FloatArray | None = None
+        self._poses: tuple[FloatArray, FloatArray] | None = None
         self.queue = Queue()
         """The new constraints."""
         self.result = UpdateResult(Status.CONVERGED, '', 0, 0, 0, 0)
@@ -54,9 +57,11 @@ class Transaction:
         return queue
 
     def move_graph(self, T_map_graph: FloatArray) -> None:
-        """Move all nodes by a rigid motion, shape (3,) [m, m, rad]."""
-        self._poses = self._graph.poses.copy()
-        self._graph.set_poses(se2.compose(T_map_graph, self._poses))
+        """Move all nodes, frozen ones too, by a rigid motion, shape (3,) [m, m, rad]."""
+        poses = self._graph.poses.copy()
+        self._poses = poses, self._nodes.table.frozen.copy()
+        self._graph.set_poses(se2.compose(T_map_graph, poses))
+        self._nodes.table.move_frozen(T_map_graph)
 
     @property
     def moved_back(self) -> bool:
@@ -81,7 +86,9 @@ class Transaction:
         self._factors.rollback()
         self._judge.rollback()
         if self._poses is not None:
-            self._graph.set_poses(self._poses)
+            poses, frozen = self._poses
+            self._graph.set_poses(poses)
+            self._nodes.table.set_frozen(frozen)
         self._alignment.restore(self._before)
         self.failure = str(error)
         if not isinstance(error, LinearSolveError):

@@ -166,9 +166,11 @@ def test_a_transaction_moves_the_graph_or_says_why_not(
     queue = Queue([QueuedEdge('scan', graph.edges.rows(slice(0, 1)))], [])
     poses, T_map_graph = graph.poses.copy(), np.array([3.0, -2.0, 0.5])
     reweighting = Reweighting()
+    nodes = HiddenNodes(CONFIG, lambda *_: 0)
+    nodes.table.restore(np.arange(4), np.arange(4), np.zeros((2, 3)), poses[:2], 0.0)
     transaction = Transaction(
-        graph, AlignmentMonitor(CONFIG), FactorBuilder(CONFIG, reweighting),
-        Judge(IncrementalSmoother(), reweighting, CONFIG, HiddenNodes(CONFIG, lambda *_: 0)))
+        graph, nodes, AlignmentMonitor(CONFIG), FactorBuilder(CONFIG, reweighting),
+        Judge(IncrementalSmoother(), reweighting, CONFIG, nodes))
     passed = contextlib.suppress(KeyboardInterrupt)     # the only one that goes through
     with passed, transaction:
         transaction.add(queue)
@@ -178,8 +180,10 @@ def test_a_transaction_moves_the_graph_or_says_why_not(
         transaction.solved(UpdateResult(Status.CONVERGED, '', 1, 0, 0, 0))
     if error is None:
         np.testing.assert_allclose(graph.poses, se2.compose(T_map_graph, poses), atol=1e-12)
+        np.testing.assert_array_equal(nodes.table.frozen, graph.poses[:2])
         assert transaction.failure == ''
         return
+    np.testing.assert_array_equal(nodes.table.frozen, poses[:2])
     np.testing.assert_array_equal(graph.poses, poses)
     assert transaction.moved_back
     assert transaction.queue is queue

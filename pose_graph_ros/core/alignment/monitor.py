@@ -22,6 +22,7 @@ from pose_graph_ros.core.graph.constraints import (
     ObservedNodes,
     upper,
 )
+from pose_graph_ros.core.graph.graph import Graph
 from pose_graph_ros.core.odometry.hidden_nodes import HiddenNodes
 from pose_graph_ros.core.saved_columns import Integers, Rows3, Rows6
 from pose_graph_ros.core.sources.factor_builder import AttachedMeasurement
@@ -96,7 +97,7 @@ class AlignmentMonitor:
         self._config = config
 
     def find(
-        self, poses: FloatArray, waiting: list[AttachedMeasurement], primary: str,
+        self, graph: Graph, waiting: list[AttachedMeasurement], primary: str,
     ) -> FloatArray | None:
         """
         Return the motion of the graph into the map if it is found, and update the state.
@@ -106,8 +107,8 @@ class AlignmentMonitor:
 
         Parameters
         ----------
-        poses : ndarray, shape (N, 3), hidden nodes in the frame of the graph [m, m, rad]
-        waiting : list of AttachedMeasurement, on these nodes, not in the graph yet
+        graph : Graph
+        waiting : list of AttachedMeasurement, on its hidden nodes, but not in it yet
         primary : str, name of the primary odometry source
 
         """
@@ -117,11 +118,12 @@ class AlignmentMonitor:
         if len(positions) == 0:
             return None
         found = estimator.find_alignment(
-            poses, _table(positions), self._config.alignment, self._noise(primary),
+            graph.poses, in_rows(graph, positions), self._config.alignment, self._noise(primary),
             self._correlation([_evidence_of(each) for each in positions]))
         headings = [each for each in waiting if each.observed.kind[0] == ObservedKind.HEADING]
         if len(headings) > 0:
-            by_heading = _by_heading(poses, _table(headings), _table(positions))
+            by_heading = _by_heading(
+                graph.poses, in_rows(graph, headings), in_rows(graph, positions))
             if by_heading.sigma < min(found.sigma, ALIGNING_SIGMA):
                 found = by_heading
         self.state = (AlignmentState.UNALIGNED if found.T_map_graph is None
@@ -139,7 +141,11 @@ class AlignmentMonitor:
         self._evidence.clear()
         self._next_recheck = LAST_RECHECK + 1
 
-    def recheck(self, solved: FloatArray, nodes: HiddenNodes) -> FloatArray | None:
+    def forget(self, node: int) -> None:
+        """Drop the stored measurements on hidden nodes before one, by its id."""
+        self._evidence = [each for each in self._evidence if each.observed.node[0] >= node]
+
+    def recheck(self, graph: Graph, nodes: HiddenNodes) -> FloatArray | None:
         """
         Return new poses of all rows of the graph if the angle in use is wrong.
 
@@ -149,17 +155,18 @@ class AlignmentMonitor:
 
         Parameters
         ----------
-        solved : ndarray, shape (N, 3), all rows of the graph in the map, by the present solution
+        graph : Graph, in the map
         nodes : HiddenNodes
 
         """
         if self.state is not AlignmentState.ALIGNED or len(self._evidence) < self._next_recheck:
             return None
         self._next_recheck = 2 * len(self._evidence)
-        table = _table(self._evidence)
-        table = ObservedNodes(np.searchsorted(nodes.ids, table.node), *table.columns[1:])
+        table, ids = _table(self._evidence), nodes.ids[nodes.n_frozen:]
+        table = ObservedNodes(np.searchsorted(ids, table.node), *table.columns[1:])
+        rows = graph.node_rows(ids)
         found = estimator.recheck(
-            solved[nodes.ids], nodes.odometry, table, self._config.alignment,
+            graph.poses[rows], nodes.odometry, table, self._config.alignment,
             self._noise(nodes.primary), correlation=self._correlation(self._evidence),
             sigma=self.sigma)
         if self._next_recheck > LAST_RECHECK:
@@ -167,8 +174,11 @@ class AlignmentMonitor:
         if found is None or found.T_map_graph is None:
             return None
         self.sigma = found.sigma
-        poses = np.zeros_like(solved)
-        poses[nodes.ids] = se2.compose(found.T_map_graph, nodes.odometry)
+        moved = se2.compose(found.T_map_graph, nodes.odometry)
+        # what is no hidden node of the path any more keeps its place beside the oldest one
+        poses = se2.compose(moved[0], se2.between(graph.poses[rows[0]], graph.poses))
+        poses[graph.is_bias] = 0.0
+        poses[rows] = moved
         return poses
 
     def _noise(self, primary: str) -> OdometryNoise:
@@ -223,6 +233,20 @@ class AlignmentMonitor:
 def placed(attached: list[AttachedMeasurement]) -> list[AttachedMeasurement]:
     """Return the measurements that contain a position: all but headings."""
     return [each for each in attached if each.observed.kind[0] != ObservedKind.HEADING]
+
+
+def in_rows(graph: Graph, measurements: Sequence[AttachedMeasurement]) -> ObservedNodes:
+    """
+    Return the observed nodes of measurements, with the rows of their hidden nodes.
+
+    Parameters
+    ----------
+    graph : Graph, with the hidden nodes
+    measurements : sequence of AttachedMeasurement
+
+    """
+    table = _table(measurements)
+    return ObservedNodes(graph.node_rows(table.node), *table.columns[1:])
 
 
 def _evidence_of(attached: AttachedMeasurement) -> Evidence:

@@ -13,6 +13,7 @@ from pose_graph_ros.core.geometry import covariance, se2
 from pose_graph_ros.core.geometry.scalar_se2 import Pose, wrap_one
 from pose_graph_ros.core.geometry.se2 import FloatArray, IntArray
 from pose_graph_ros.core.graph.constraints import Edges
+from pose_graph_ros.core.graph.graph import Graph
 from pose_graph_ros.core.measurements import Answer, OdometrySample
 from pose_graph_ros.core.odometry.gaps import gap_motion
 from pose_graph_ros.core.odometry.motion import Attachment
@@ -135,6 +136,11 @@ class HiddenNodes:
     def odometry(self) -> FloatArray:
         """Poses of the nodes in the graph by odometry alone, shape (N - F, 3), read-only."""
         return self.table.odometry
+
+    def poses(self, graph: Graph) -> FloatArray:
+        """Return the poses of all hidden nodes, shape (N, 3): frozen ones, then the graph's."""
+        kept = graph.poses_of(self.ids[self.n_frozen:])
+        return kept if self.n_frozen == 0 else np.concatenate((self.table.frozen, kept))
 
     @property
     def last_frozen_ns(self) -> int:

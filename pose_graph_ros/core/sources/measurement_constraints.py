@@ -39,11 +39,18 @@ def attach(nodes: HiddenNodes, stamp_ns: int) -> Attachment | Answer:
     if stamp_ns < first_ns:
         return rejected('before_odometry', f'stamp {1e-9 * stamp_ns:.3f} s, odometry begins at '
                                            f'{1e-9 * first_ns:.3f} s')
+    if stamp_ns < nodes.last_frozen_ns:
+        return _before_window(stamp_ns, nodes)
     attachment = nodes.attach(stamp_ns)
     if attachment is None:
         return rejected(
             'no_odometry', f'no odometry covers the motion up to {1e-9 * stamp_ns:.3f} s')
     return attachment
+
+
+def _before_window(stamp_ns: int, nodes: HiddenNodes) -> Answer:
+    return rejected('before_window', f'stamp {1e-9 * stamp_ns:.3f} s, the graph begins at '
+                                     f'{1e-9 * nodes.last_frozen_ns:.3f} s')
 
 
 def attach_reference(nodes: HiddenNodes, closure: LoopClosure) -> Attachment | Answer:
@@ -61,6 +68,8 @@ def attach_reference(nodes: HiddenNodes, closure: LoopClosure) -> Attachment | A
     node = closure.reference_node
     if node is None or not 0 <= node < len(nodes):
         return rejected('unknown_node', f'there is no hidden node {node}')
+    if node < nodes.n_frozen:
+        return _before_window(int(nodes.stamps_ns[node]), nodes)
     return Attachment(int(nodes.ids[node]), np.zeros(3), np.zeros((3, 3)))
 
 

@@ -3,6 +3,7 @@
 """From a received measurement to a constraint in the queue, in any order of stamps."""
 
 from collections import Counter
+from collections.abc import Iterator
 
 import numpy as np
 
@@ -13,6 +14,7 @@ from pose_graph_ros.core.measurements import (
     Answer,
     AnswerStatus,
     Fix,
+    HeadingOnly,
     LoopClosure,
     Measurement,
     rejected,
@@ -180,6 +182,31 @@ class MeasurementPipeline:
             del self.queue.observed[:len(excess)]
             self.counts.update((dropped.source, 'dropped_unaligned') for dropped in excess)
         return ready
+
+    def needed_ns(self, *, aligned: bool) -> int | None:
+        """
+        Return the earliest stamp at which something is to be attached to the graph [ns], or None.
+
+        Before the graph is aligned with the map, that includes positions that may align it.
+        """
+        needed = [stamp_ns for _, measurement in self.waiting.measurements
+                  for stamp_ns in self._stamps_of(measurement)]
+        for edge in self.queue.edges:
+            needed += [stamp_ns for stamp_ns in edge[2:] if stamp_ns >= 0]
+        if not aligned:
+            needed += [each.measurement.stamp_ns for each in self.queue.observed
+                       if not isinstance(each.measurement, HeadingOnly)]
+        return min(needed, default=None)
+
+    def _stamps_of(self, measurement: Measurement) -> Iterator[int]:
+        """Yield the stamps that a measurement is attached at, as far as they are known [ns]."""
+        yield measurement.stamp_ns
+        if isinstance(measurement, LoopClosure):
+            node = measurement.reference_node
+            if measurement.reference_ns is not None:
+                yield measurement.reference_ns
+            elif node is not None and 0 <= node < len(self._nodes):
+                yield int(self._nodes.stamps_ns[node])
 
     def count(self, source: str, answer: Answer) -> Answer:
         """

@@ -11,6 +11,7 @@ from pose_graph_ros.core.alignment.monitor import AlignmentMonitor, AlignmentSta
 from pose_graph_ros.core.config import BackendConfig
 from pose_graph_ros.core.geometry import se2
 from pose_graph_ros.core.geometry.se2 import FloatArray
+from pose_graph_ros.core.graph.graph import Graph
 from pose_graph_ros.core.measurements import (
     Absolute,
     GlobalPose,
@@ -42,6 +43,15 @@ def driven(n: int) -> HiddenNodes:
 NODES = driven(70)
 
 
+def graph_at(poses: FloatArray) -> Graph:
+    graph = Graph()
+    graph.append_nodes(poses, np.zeros(len(poses), dtype=bool))
+    return graph
+
+
+GRAPH = graph_at(NODES.odometry)
+
+
 def attached(
     measurement: Absolute, node: int, source: str = 'fix',
 ) -> AttachedMeasurement:
@@ -60,7 +70,7 @@ def fixes(
 
 def aligned_with(first: list[AttachedMeasurement]) -> AlignmentMonitor:
     monitor_ = AlignmentMonitor(CONFIG)
-    assert monitor_.find(NODES.odometry, first, 'odom') is not None
+    assert monitor_.find(GRAPH, first, 'odom') is not None
     monitor_.add(first)
     return monitor_
 
@@ -68,24 +78,24 @@ def aligned_with(first: list[AttachedMeasurement]) -> AlignmentMonitor:
 def test_positions_lead_from_local_over_unaligned_to_aligned() -> None:
     some = AlignmentMonitor(CONFIG)
     assert (some.state, some.sigma) == (AlignmentState.LOCAL, np.inf)
-    assert some.find(NODES.odometry, [], 'odom') is None
+    assert some.find(GRAPH, [], 'odom') is None
     assert some.state is AlignmentState.LOCAL
-    assert some.find(NODES.odometry, fixes(range(1)), 'odom') is None
+    assert some.find(GRAPH, fixes(range(1)), 'odom') is None
     assert some.state is AlignmentState.UNALIGNED
     assert not some.is_aligned
-    T_map_graph = some.find(NODES.odometry, fixes(range(12)), 'odom')
+    T_map_graph = some.find(GRAPH, fixes(range(12)), 'odom')
     assert T_map_graph is not None
     assert some.is_aligned
     assert 0.0 < some.sigma < CONFIG.alignment.sigma_heading
     np.testing.assert_allclose(T_map_graph, T_MAP_ODOM, atol=1e-9)
     # found once
-    assert some.find(NODES.odometry, fixes(range(12)), 'odom') is None
+    assert some.find(GRAPH, fixes(range(12)), 'odom') is None
 
 
 def test_headings_alone_leave_the_map_local() -> None:
     some = AlignmentMonitor(CONFIG)
     compass = [attached(HeadingOnly(SECOND, T_MAP_ODOM[2], 1e-4), 0)]
-    assert some.find(NODES.odometry, compass, 'odom') is None
+    assert some.find(GRAPH, compass, 'odom') is None
     assert some.state is AlignmentState.LOCAL
 
 
@@ -95,7 +105,7 @@ def test_a_certain_heading_and_one_position_are_enough(node: int) -> None:
     heading = float(se2.wrap(T_MAP_ODOM[2] + NODES.odometry[node, 2]))
     compass = [attached(HeadingOnly(SECOND, heading, variance), node, 'compass')
                for variance in (1e-4, 4e-4)]
-    T_map_graph = some.find(NODES.odometry, [*compass, *fixes(range(1))], 'odom')
+    T_map_graph = some.find(GRAPH, [*compass, *fixes(range(1))], 'odom')
     assert T_map_graph is not None
     np.testing.assert_allclose(T_map_graph, T_MAP_ODOM, atol=1e-9)
     assert some.sigma == pytest.approx(0.01)    # of the better one
@@ -104,14 +114,14 @@ def test_a_certain_heading_and_one_position_are_enough(node: int) -> None:
 def test_an_uncertain_heading_does_not_align() -> None:
     some = AlignmentMonitor(CONFIG)
     compass = attached(HeadingOnly(SECOND, T_MAP_ODOM[2], 4.0), 0, 'compass')
-    assert some.find(NODES.odometry, [compass, *fixes(range(1))], 'odom') is None
+    assert some.find(GRAPH, [compass, *fixes(range(1))], 'odom') is None
     assert some.state is AlignmentState.UNALIGNED
 
 
 def test_a_global_pose_aligns_alone() -> None:
     some = AlignmentMonitor(CONFIG)
     pose = GlobalPose(SECOND, T_MAP_ODOM, np.diag([0.01, 0.01, 1e-4]))
-    T_map_graph = some.find(NODES.odometry, [attached(pose, 0)], 'odom')
+    T_map_graph = some.find(GRAPH, [attached(pose, 0)], 'odom')
     assert T_map_graph is not None
     np.testing.assert_allclose(T_map_graph, T_MAP_ODOM, atol=1e-9)
 
@@ -123,20 +133,20 @@ def test_the_angle_is_checked_at_eight_measurements_and_whenever_they_have_doubl
     for k in range(5, 70):
         before = some.saved().next_verdict
         # the solution is right: whatever is found, it is no reason to turn
-        assert some.recheck(se2.compose(T_MAP_ODOM, NODES.odometry), NODES) is None
+        assert some.recheck(graph_at(se2.compose(T_MAP_ODOM, NODES.odometry)), NODES) is None
         if some.saved().next_verdict != before:
             checked.append(k)
         some.add(fixes(range(k, k + 1)))
     assert checked == [8, 16, 32, 64]
     # after a check a wrong angle stays unnoticed until the evidence has doubled again
-    assert some.recheck(turned, NODES) is None
+    assert some.recheck(graph_at(turned), NODES) is None
 
 
 def test_a_wrong_first_angle_is_corrected_and_its_sigma_too() -> None:
     wrong = se2.compose(T_MAP_ODOM, np.array([0.0, 0.0, 1.5]))
     some = aligned_with(fixes(range(5), wrong))
     some.add(fixes(range(5, 35)))
-    found = some.recheck(se2.compose(wrong, NODES.odometry), NODES)
+    found = some.recheck(graph_at(se2.compose(wrong, NODES.odometry)), NODES)
     assert found is not None
     turn = se2.wrap(found[:, 2] - se2.compose(T_MAP_ODOM, NODES.odometry)[:, 2])
     assert np.max(np.abs(turn)) < 0.2
@@ -156,7 +166,7 @@ def test_checks_end_when_the_path_is_not_that_of_odometry_any_more() -> None:
     some.stop_rechecking()
     some.add(fixes(range(5, 65)))
     assert len(some.saved().node) == 0
-    assert some.recheck(se2.compose(wrong, NODES.odometry), NODES) is None
+    assert some.recheck(graph_at(se2.compose(wrong, NODES.odometry)), NODES) is None
 
 
 def test_after_the_last_check_no_evidence_is_kept(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -165,29 +175,29 @@ def test_after_the_last_check_no_evidence_is_kept(monkeypatch: pytest.MonkeyPatc
     solved = se2.compose(T_MAP_ODOM, NODES.odometry)
     for k in range(5, 60):
         some.add(fixes(range(k, k + 1)))
-        some.recheck(solved, NODES)
+        some.recheck(graph_at(solved), NODES)
     assert len(some.saved().node) == 0
 
 
 def test_before_the_alignment_nothing_is_checked() -> None:
     some = AlignmentMonitor(CONFIG)
-    some.find(NODES.odometry, fixes(range(1)), 'odom')
+    some.find(GRAPH, fixes(range(1)), 'odom')
     some.add(fixes(range(60)))
-    assert some.recheck(NODES.odometry, NODES) is None
+    assert some.recheck(GRAPH, NODES) is None
     assert some.saved().next_verdict == monitor.FIRST_RECHECK
 
 
 def test_what_find_has_done_is_undone_by_the_copy_from_before() -> None:
     some = AlignmentMonitor(CONFIG)
-    some.find(NODES.odometry, fixes(range(1)), 'odom')
+    some.find(GRAPH, fixes(range(1)), 'odom')
     before = some.copy()
-    first = some.find(NODES.odometry, fixes(range(12)), 'odom')
+    first = some.find(GRAPH, fixes(range(12)), 'odom')
     assert some.is_aligned
     some.restore(before)
     assert some.copy() == before
     assert some.state is AlignmentState.UNALIGNED
     # the next attempt finds the same
-    np.testing.assert_array_equal(some.find(NODES.odometry, fixes(range(12)), 'odom'), first)
+    np.testing.assert_array_equal(some.find(GRAPH, fixes(range(12)), 'odom'), first)
 
 
 @pytest.mark.parametrize('n', [0, 1, 20])
@@ -196,7 +206,7 @@ def test_a_saved_monitor_decides_as_the_first_one_would_have(n: int) -> None:
     one = AlignmentMonitor(CONFIG)
     if n > 0:
         first = [*fixes(range(min(n, 5)), wrong, 'gps'), *fixes(range(5, n), source='beacon')]
-        one.find(NODES.odometry, first[:5], 'odom')
+        one.find(GRAPH, first[:5], 'odom')
         one.add(first)
     other = AlignmentMonitor(CONFIG)
     other.load(one.saved())
@@ -205,8 +215,27 @@ def test_a_saved_monitor_decides_as_the_first_one_would_have(n: int) -> None:
     assert one.saved().sources == (('gps', 'beacon')[:min(n, 2)] if n != 1 else ('gps',))
     for each in (one, other):
         each.add(fixes(range(n, 50)))
-    results = [each.recheck(se2.compose(wrong, NODES.odometry), NODES) for each in (one, other)]
+    solved = graph_at(se2.compose(wrong, NODES.odometry))
+    results = [each.recheck(solved, NODES) for each in (one, other)]
     assert (results[0] is None) is (results[1] is None) is (n < 20)
     if n == 20:
         np.testing.assert_array_equal(results[0], results[1])
     assert_same_value(other.saved(), one.saved())
+
+
+def test_what_was_measured_on_nodes_that_have_left_is_no_evidence_any_more() -> None:
+    wrong = se2.compose(T_MAP_ODOM, np.array([0.0, 0.0, 1.5]))
+    nodes, graph = driven(70), graph_at(se2.compose(wrong, NODES.odometry))
+    some = aligned_with(fixes(range(5), wrong))
+    some.add(fixes(range(5, 65)))
+    some.forget(30)
+    assert some.saved().node.tolist() == list(range(30, 65))
+    nodes.forget(graph.poses[:30])
+    found = some.recheck(graph, nodes)
+    assert found is not None
+    turn = se2.wrap(found[30:, 2] - se2.compose(T_MAP_ODOM, NODES.odometry)[30:, 2])
+    assert np.max(np.abs(turn)) < 0.2
+    # what is still in the graph before them keeps its place in front of them
+    np.testing.assert_allclose(
+        se2.between(found[30], found[:30]), se2.between(graph.poses[30], graph.poses[:30]),
+        atol=1e-9)
