@@ -18,26 +18,32 @@ smaller as a whole until it is conservative, is where Newton's method starts, wi
 `-mu log det(I - A)` instead of the order (S. Boyd, L. Vandenberghe, "Convex optimization", 11.3).
 """
 
+import math
+
 import numpy as np
 
+from pose_graph_ros.core.compiled.jit import INTEGER, kernel, MATRICES, ROWS
 from pose_graph_ros.core.geometry.se2 import FloatArray
 
-# The barrier's weight falls by the factor from the first to the last value. It costs less than
-# r * mu / 2 of the divergence, and the last scaling gives part of that back.
-_FIRST_BARRIER, _LAST_BARRIER, _FACTOR = 0.3, 1e-3, 0.1
-_MAX_STEPS = 12
+# The barrier's weight falls to this in steps of a factor. It costs at most r mu / 2 of the
+# divergence, and the last scaling gives part of that back.
+_FIRST_BARRIER, _LAST_BARRIER = 0.03, 0.003
+_MAX_STEPS = 20
+# Part of the way to the border at which the descent starts.
+_START = 0.95
 # Newton's decrement, squared and per mu, at which a barrier's minimum is near enough.
-_CENTRED = 0.05
+_CENTRED = 1.0
+# A step must bring this part of what the slope promises.
+_DESCENT = 0.1
 # Rounding of the largest eigenvalue: nearer to 1 than that the closed form is exact.
 _ROUNDING = 1e-9
 # Eigenvalues of the measurements' Gram matrix below this part of the largest one count as zero.
 _RANK = 1e-10
 
-# Upper triangle of a symmetric 3x3 matrix, and factors that make products of two such triangles
-# those of the whole matrices.
-_P, _Q = np.array((0, 0, 0, 1, 1, 2)), np.array((0, 1, 2, 1, 2, 2))
-_TWICE = np.where(_P == _Q, 1.0, 2.0)
-_HESSIAN = np.where(_P == _Q, np.sqrt(0.5), np.sqrt(2.0))
+_FAST = {'reassoc', 'contract', 'nsz'}
+
+# Upper triangle of a symmetric 3x3 matrix.
+_P, _Q = (0, 0, 0, 1, 1, 2), (0, 1, 2, 1, 2, 2)
 
 
 def nearest_below(rows: FloatArray) -> FloatArray:
@@ -62,8 +68,13 @@ def nearest_below(rows: FloatArray) -> FloatArray:
     kept = values > _RANK * largest
     # coordinates in which the measurements determine everything
     stacked = vectors[:, kept] * np.sqrt(values[kept])
-    redundant = bool(np.count_nonzero(kept) < np.count_nonzero(used))
-    return _descend(stacked, start, redundant)
+    redundant = np.count_nonzero(kept) < np.count_nonzero(used)
+    blocks = _START * start
+    descend(np.ascontiguousarray(stacked), blocks, int(redundant))
+    weighted = np.matmul(blocks, stacked.reshape(n, 3, -1)).reshape(3 * n, -1)
+    # up to the border, and not beyond it by rounding
+    largest = float(np.linalg.eigvalsh(stacked.T @ weighted)[-1])
+    return np.asarray(blocks / (largest * (1.0 + 1e-14)))
 
 
 def divergence(rows: FloatArray, blocks: FloatArray) -> float:
@@ -83,84 +94,197 @@ def divergence(rows: FloatArray, blocks: FloatArray) -> float:
     return 0.5 * float(np.trace(information) - log_det - len(information))
 
 
-def _descend(stacked: FloatArray, start: FloatArray, redundant: bool) -> FloatArray:
-    """Return the minimum over the blocks, from a multiple of the closed form."""
-    blocks, mu = 0.9 * start, _FIRST_BARRIER
-    identity = np.eye(stacked.shape[1])
+@kernel(signature=(ROWS, MATRICES, INTEGER), allocates=True)
+def descend(stacked, blocks, redundant):  # type: ignore[no-untyped-def]
+    """
+    Move blocks, in place, to the minimum with the last barrier.
+
+    Parameters
+    ----------
+    stacked : ndarray, shape (3 M, r), J of all measurements; rows of zeros are padding
+    blocks : ndarray, shape (M, 3, 3), W with A < I, zero for padding
+    redundant : int, whether the W must be kept positive definite: a basis needs no barrier for it
+
+    """
+    n_rows, r = stacked.shape
+    # J A^-1 J^T and J (I - A)^-1 J^T
+    inside, gap = np.empty((n_rows, n_rows)), np.empty((n_rows, n_rows))
+    step, trial = np.zeros_like(blocks), np.empty_like(blocks)
+    mu = _FIRST_BARRIER
     while True:
         for _ in range(_MAX_STEPS):
-            step, decrement = _newton(stacked, blocks, mu, identity, redundant)
-            length = min(1.0, 1.5 / (1.0 + np.sqrt(decrement / mu)))
-            while not _is_inside(stacked, blocks + length * step, identity, redundant):
+            A = _information(stacked, blocks)
+            _products(stacked, A, inside)
+            for k in range(r):
+                for m in range(r):
+                    A[k, m] = -A[k, m]
+                A[k, k] += 1.0
+            _products(stacked, A, gap)
+            decrement = _newton(stacked, blocks, inside, gap, mu, redundant, step)
+            before, length = _value(stacked, blocks, mu, redundant), 1.0
+            while length > 1e-9:
+                for m in range(len(blocks)):
+                    for p in range(3):
+                        for q in range(3):
+                            trial[m, p, q] = blocks[m, p, q] + length * step[m, p, q]
+                if (_value(stacked, trial, mu, redundant)
+                        <= before - _DESCENT * length * decrement):
+                    blocks[:] = trial
+                    break
                 length *= 0.5
-            blocks = blocks + length * step
             if decrement < _CENTRED * mu:
                 break
         if mu <= _LAST_BARRIER:
-            break
-        mu = max(mu * _FACTOR, _LAST_BARRIER)
-    # up to the border, and not beyond it by rounding
-    information = _information(stacked, blocks)
-    return np.asarray(blocks / (np.linalg.eigvalsh(information)[-1] * (1.0 + 1e-14)))
+            return
+        mu = max(0.1 * mu, _LAST_BARRIER)
 
 
-def _information(stacked: FloatArray, blocks: FloatArray) -> FloatArray:
+@kernel(allocates=True, fastmath=_FAST)
+def _information(stacked, blocks):  # type: ignore[no-untyped-def]
     """Return A, shape (r, r)."""
-    n = len(blocks)
-    weighted = np.matmul(blocks, stacked.reshape(n, 3, -1)).reshape(3 * n, -1)
-    return np.asarray(stacked.T @ weighted)
+    r = stacked.shape[1]
+    A, weighted = np.zeros((r, r)), np.empty(r)
+    for m in range(len(blocks)):
+        for p in range(3):
+            row = stacked[3 * m + p]
+            for k in range(r):
+                weighted[k] = (blocks[m, p, 0] * stacked[3 * m, k]
+                               + blocks[m, p, 1] * stacked[3 * m + 1, k]
+                               + blocks[m, p, 2] * stacked[3 * m + 2, k])
+            for k in range(r):
+                value = row[k]
+                for q in range(r):
+                    A[k, q] += value * weighted[q]
+    return A
 
 
-def _newton(
-    stacked: FloatArray, blocks: FloatArray, mu: float, identity: FloatArray, redundant: bool,
-) -> tuple[FloatArray, float]:
-    """Return Newton's step of all blocks, shape (M, 3, 3), and its squared decrement."""
-    n = len(blocks)
-    information = _information(stacked, blocks)
-    both = np.linalg.inv(np.stack((information, identity - information)))
-    inside, gap = stacked @ both @ stacked.T
-    slope = stacked @ stacked.T - inside + mu * gap
-    at = 3 * np.arange(n)[:, None]
-    p, q = (at + _P).ravel(), (at + _Q).ravel()
-    scale = np.tile(_HESSIAN, n)
-    hessian = _second(inside, p, q) + mu * _second(gap, p, q)
-    if redundant:
-        inverse = np.zeros_like(slope)
-        padded = blocks + np.eye(3) * (np.diagonal(blocks, axis1=1, axis2=2) == 0.0)[:, :, None]
-        for k, block in enumerate(np.linalg.inv(padded)):
-            inverse[3 * k:3 * k + 3, 3 * k:3 * k + 3] = block
-        slope -= mu * inverse
-        hessian += mu * _second(inverse, p, q)
-    gradient = np.tile(_TWICE, n) * slope[p, q]
-    hessian *= scale[:, None] * scale
-    # padding has neither slope nor curvature
-    used = np.diagonal(stacked @ stacked.T) > 0.0
-    idle = ~(used[p] & used[q])
-    gradient[idle] = 0.0
-    hessian[idle] = hessian[:, idle] = 0.0
-    hessian[idle, idle] = 1.0
-    step = -np.linalg.solve(hessian, gradient)
-    full = np.zeros((n, 3, 3))
-    full[:, _P, _Q] = full[:, _Q, _P] = step.reshape(n, 6)
-    return full, -float(gradient @ step)
-
-
-def _second(product: FloatArray, p: FloatArray, q: FloatArray) -> FloatArray:
-    """Return the second derivatives of `-log det` by the blocks' triangles, not scaled yet."""
-    at_p, at_q = product[p], product[q]
-    return np.asarray(at_q[:, p] * at_p[:, q] + at_q[:, q] * at_p[:, p])
-
-
-def _is_inside(
-    stacked: FloatArray, blocks: FloatArray, identity: FloatArray, redundant: bool,
-) -> bool:
-    """Tell whether blocks are positive definite, and A between 0 and I."""
-    information = _information(stacked, blocks)
-    try:
-        np.linalg.cholesky(np.stack((information, identity - information)))
-        if redundant:
-            padding = np.diagonal(blocks, axis1=1, axis2=2) == 0.0
-            np.linalg.cholesky(blocks + np.eye(3) * padding[:, :, None])
-    except np.linalg.LinAlgError:
-        return False
+@kernel(fastmath=_FAST)
+def _factorize(A):  # type: ignore[no-untyped-def]
+    """Replace the lower triangle by L with `A = L L^T`; False if A is not positive definite."""
+    n = len(A)
+    for k in range(n):
+        for m in range(k + 1):
+            value = A[k, m]
+            for q in range(m):
+                value -= A[k, q] * A[m, q]
+            if m < k:
+                A[k, m] = value / A[m, m]
+            elif value > 0.0:
+                A[k, k] = math.sqrt(value)
+            else:
+                return False
     return True
+
+
+@kernel
+def _log_det(L):  # type: ignore[no-untyped-def]
+    total = 0.0
+    for k in range(len(L)):
+        total += math.log(L[k, k])
+    return 2.0 * total
+
+
+@kernel(allocates=True, fastmath=_FAST)
+def _products(stacked, A, out):  # type: ignore[no-untyped-def]
+    """Write `J A^-1 J^T`, shape (3 M, 3 M)."""
+    n_rows, r = stacked.shape
+    L, y = A.copy(), np.empty((n_rows, r))
+    _factorize(L)
+    for m in range(n_rows):
+        for k in range(r):
+            value = stacked[m, k]
+            for q in range(k):
+                value -= L[k, q] * y[m, q]
+            y[m, k] = value / L[k, k]
+    for m in range(n_rows):
+        for n in range(m + 1):
+            value = 0.0
+            for k in range(r):
+                value += y[m, k] * y[n, k]
+            out[m, n] = out[n, m] = value
+
+
+@kernel(allocates=True)
+def _value(stacked, blocks, mu, redundant):  # type: ignore[no-untyped-def]
+    """Return what is minimised; infinite where A or W are not inside."""
+    A = _information(stacked, blocks)
+    r = len(A)
+    other, total = -A, 0.0
+    for k in range(r):
+        other[k, k] += 1.0
+        total += A[k, k]
+    if not _factorize(A) or not _factorize(other):
+        return np.inf
+    total -= _log_det(A) + mu * _log_det(other)
+    if redundant != 0:
+        for m in range(len(blocks)):
+            W = _padded(blocks[m])
+            if not _factorize(W):
+                return np.inf
+            total -= mu * _log_det(W)
+    return total
+
+
+@kernel(allocates=True)
+def _padded(block):  # type: ignore[no-untyped-def]
+    """Return a block with ones on the diagonal of its padding."""
+    W = block.copy()
+    for k in range(3):
+        if W[k, k] == 0.0:
+            W[k, k] = 1.0
+    return W
+
+
+@kernel
+def _second(product, i, j, k, m):  # type: ignore[no-untyped-def]
+    """Return the second derivative of `-log det` by two entries of the blocks, not scaled."""
+    return product[i, k] * product[j, m] + product[i, m] * product[j, k]
+
+
+@kernel(allocates=True, fastmath=_FAST)
+def _newton(stacked, blocks, inside, gap, mu, redundant, step):  # type: ignore[no-untyped-def]
+    """Write Newton's step of all blocks, and return its squared decrement."""
+    n, r = len(blocks), stacked.shape[1]
+    gradient, hessian = np.zeros(6 * n), np.zeros((6 * n, 6 * n))
+    inverse = np.zeros((n, 3, 3))
+    if redundant != 0:
+        for m in range(n):
+            _products(np.eye(3), _padded(blocks[m]), inverse[m])
+    for m in range(n):
+        for a in range(6):
+            p, q = 3 * m + _P[a], 3 * m + _Q[a]
+            at = 6 * m + a
+            # padding has neither slope nor curvature
+            if inside[p, p] == 0.0 or inside[q, q] == 0.0:
+                hessian[at, at] = 1.0
+                continue
+            slope = mu * gap[p, q] - inside[p, q] - mu * inverse[m, _P[a], _Q[a]]
+            for k in range(r):
+                slope += stacked[p, k] * stacked[q, k]
+            gradient[at] = slope if p == q else 2.0 * slope
+            for other in range(m + 1):
+                for b in range(6):
+                    s, t = 3 * other + _P[b], 3 * other + _Q[b]
+                    value = _second(inside, p, q, s, t) + mu * _second(gap, p, q, s, t)
+                    if other == m:
+                        value += mu * _second(inverse[m], _P[a], _Q[a], _P[b], _Q[b])
+                    if s == t:
+                        value *= 0.5
+                    if p != q:
+                        value *= 2.0
+                    hessian[at, 6 * other + b] = value
+    _factorize(hessian)
+    decrement = 0.0
+    for k in range(6 * n):
+        for q in range(k):
+            gradient[k] -= hessian[k, q] * gradient[q]
+        gradient[k] /= hessian[k, k]
+        decrement += gradient[k]**2
+    for k in range(6 * n - 1, -1, -1):
+        for q in range(k + 1, 6 * n):
+            gradient[k] -= hessian[q, k] * gradient[q]
+        gradient[k] /= hessian[k, k]
+    for m in range(n):
+        for a in range(6):
+            step[m, _P[a], _Q[a]] = step[m, _Q[a], _P[a]] = -gradient[6 * m + a]
+    return decrement

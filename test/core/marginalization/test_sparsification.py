@@ -243,6 +243,6 @@ def test_poses_that_nothing_connects_stay_apart() -> None:
 
 
 def test_a_single_pose_without_an_anchor_tells_nothing() -> None:
-    prior = prior_of(1, 1, 'relative')
-    sparse = prior.sparsified()
+    sparse = sparsify(np.array([4]), np.zeros((1, 3)), np.zeros((3, 3)), np.zeros(3),
+                      anchored=False)
     assert len(sparse.edges) == len(sparse.observed) == 0
