@@ -43,6 +43,14 @@ class Setting:
         """As the tables have it."""
         return f'GTSAM skip {self.skip}'
 
+    def params(self, factorization: str) -> gtsam.ISAM2Params:
+        """Return the parameters of iSAM2 with a factorisation, `CHOLESKY` or `QR`."""
+        params = gtsam.ISAM2Params()
+        params.relinearizeSkip = self.skip
+        params.setRelinearizeThreshold(self.threshold)
+        params.setFactorization(factorization)
+        return params
+
     def __call__(self, world: World, plan: Plan) -> Run:
         """Run iSAM2 over a world, with its fastest factorisation that works."""
         try:
@@ -54,18 +62,14 @@ class Setting:
         return run
 
     def _run(self, world: World, plan: Plan, factorization: str) -> Run:
-        params = gtsam.ISAM2Params()
-        params.relinearizeSkip = self.skip
-        params.setRelinearizeThreshold(self.threshold)
-        params.setFactorization(factorization)
-        isam = gtsam.ISAM2(params)
+        isam = gtsam.ISAM2(self.params(factorization))
         models = Models()
         seconds = np.zeros(world.n_nodes)
         run = Run(self.name, seconds)
         total = 0.0
         with quiet():
             for k in range(world.n_nodes):
-                factors, values = _step(world, k, isam, models)
+                factors, values = step_of(world, k, isam, models)
                 begin = time.perf_counter()
                 try:
                     isam.update(factors, values)
@@ -101,10 +105,20 @@ class Models:
         return self._models[key]
 
 
-def _step(
-    world: World, k: int, isam: gtsam.ISAM2, models: Models,
+def step_of(
+    world: World, k: int, isam: gtsam.ISAM2 | gtsam.FixedLagSmoother, models: Models,
 ) -> tuple[gtsam.NonlinearFactorGraph, gtsam.Values]:
-    """Return what arrives in step k: factors, and the new node's initial guess."""
+    """
+    Return what arrives in a step: factors, and the new node's initial guess.
+
+    Parameters
+    ----------
+    world : World
+    k : int
+    isam : ISAM2 or FixedLagSmoother, which knows the nodes before
+    models : Models
+
+    """
     before = (int(world.edge_stops[k - 1]), int(world.observed_stops[k - 1])) if k else (0, 0)
     edges = world.edges.rows(slice(before[0], int(world.edge_stops[k])))
     observed = world.observed.rows(slice(before[1], int(world.observed_stops[k])))

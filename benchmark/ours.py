@@ -56,7 +56,7 @@ def run(world: World, plan: Plan, after_step: AfterStep | None = None) -> Run:
 
     """
     smoother = IncrementalSmoother()
-    steps = _Steps(world)
+    steps = Steps(world)
     seconds = np.zeros(world.n_nodes)
     done = Run(NAME, seconds)
     total = 0.0
@@ -156,7 +156,7 @@ def smoothed(world: World) -> IncrementalSmoother:
     return seen['last']
 
 
-class _Steps:
+class Steps:
     """What arrives in each step, as a caller has it: lists of arrays, nothing prepared."""
 
     def __init__(self, world: World) -> None:

@@ -1,0 +1,19 @@
+# Copyright 2026 The pose_graph_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""Windows by the names that the tables have."""
+
+from typing import Any
+
+from pose_graph_ros.core.config import Prior, WindowConfig
+
+UNITS = {'s': 'seconds', 'm': 'metres', 'nodes': 'nodes'}
+UNLIMITED = 'unlimited'
+
+
+def settings_of(window: str) -> dict[str, Any]:
+    """Return the arguments of `BackendConfig` for a window: `unlimited`, `90 s`, `90 s sparse`."""
+    if window == UNLIMITED:
+        return {}
+    size, unit, *rest = window.split()
+    return {'window': WindowConfig(
+        **{UNITS[unit]: int(size)}, prior=Prior.SPARSE if rest == ['sparse'] else Prior.DENSE)}
