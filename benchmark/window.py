@@ -21,14 +21,25 @@ from benchmark import (
     kept_sections,
     ours,
     report,
+    window_consistency,
+    window_memory,
     window_peers,
+    window_samples,
 )
 from benchmark.section import say, Section
 
 SECTIONS: dict[str, Callable[[argparse.Namespace], Section]] = {
     'peers': lambda chosen: window_peers.section(
         quick=chosen.quick, repeats=chosen.repeats, limit=chosen.limit),
-}
+    'consistency': lambda chosen: window_consistency.section(
+        quick=chosen.quick, seeds=chosen.seeds, cases=chosen.case),
+    'day': lambda chosen: window_memory.section(
+        hours=chosen.hours or (0.4 if chosen.quick else None), cases=chosen.case,
+        folder=chosen.out),
+    'samples': lambda chosen: window_samples.section(
+        chosen.samples or ([100_000] if chosen.quick else [1_000_000, 10_000_000]))}
+ROWS = ('consistency',)
+"""Sections of which rows that are not made again are kept."""
 
 
 def main(arguments: list[str]) -> int:
@@ -41,6 +52,14 @@ def main(arguments: list[str]) -> int:
                         help='peers: runs of each tool over each world (default %(default)s)')
     parser.add_argument('--limit', type=float, default=60.0, metavar='S',
                         help='peers: cut a run after so many seconds (default: %(default)s)')
+    parser.add_argument('--seeds', type=int, metavar='N', help='consistency: drives of each kind')
+    parser.add_argument('--hours', type=float, metavar='H',
+                        help='day: length of the drives (default: 24 hours, unlimited ones 2)')
+    parser.add_argument('--samples', type=int, metavar='N', action='append',
+                        help='samples of odometry (default: a million and ten million)')
+    parser.add_argument('--case', action='append', default=[], metavar='TEXT',
+                        help='consistency, day: only what has one of these in its name; other '
+                        'rows of the page stay')
     parser.add_argument('--out', type=Path, default=Path('build/benchmark/window'), metavar='DIR')
     chosen = parser.parse_args(arguments)
     chosen.out.mkdir(parents=True, exist_ok=True)
@@ -51,7 +70,9 @@ def main(arguments: list[str]) -> int:
         section = SECTIONS[name](chosen)
         section.notes.append(f'Made on {date.today().isoformat()} by `python -m '
                              f'benchmark.window {shlex.join(_shown(arguments))}`.')
-        sections = kept_sections.merged(chosen.out, {name: section}, tuple(SECTIONS))
+        sections = kept_sections.merged(
+            chosen.out, {name: section}, tuple(SECTIONS),
+            rows=name in ROWS and len(chosen.case) > 0)
     return report.conclude(sections, chosen.out, 'benchmark.window', ['--out', 'OUT'],
                            title='A graph that forgets', about=__doc__)
 

@@ -21,6 +21,7 @@ import numpy as np
 
 from benchmark.window_drive import Course, SECOND, START_NS
 from benchmark.window_owners import holdings
+from benchmark.window_settings import settings_of
 from pose_graph_ros.core.backend import PoseGraphBackend
 from pose_graph_ros.core.config import BackendConfig
 from pose_graph_ros.core.graph import tables as tb
@@ -139,20 +140,20 @@ def _hour(
         dict(holdings(backend).most_common(OWNERS)))
 
 
-def in_process(course: Course, settings: dict[str, Any], part: float) -> Iterator[Hour]:
+def in_process(course: Course, window: str, part: float) -> Iterator[Hour]:
     """
     Drive a course in a new process, and yield what became of each part of it.
 
     Parameters
     ----------
     course : Course
-    settings : dict, arguments of `BackendConfig`, as text
+    window : str, as in `window_settings`
     part : float, length of a part [h]
 
     """
     given = asdict(course)
     program = ('from benchmark.window_day import main\n'
-               f'main({given!r}, {settings!r}, {part!r})')
+               f'main({given!r}, {window!r}, {part!r})')
     with subprocess.Popen([sys.executable, '-c', program], stdout=subprocess.PIPE,
                           text=True) as child:
         assert child.stdout is not None
@@ -162,8 +163,8 @@ def in_process(course: Course, settings: dict[str, Any], part: float) -> Iterato
         raise RuntimeError(f'the drive ended with {child.returncode}')
 
 
-def main(course: dict[str, Any], settings: dict[str, Any], part: float) -> None:
+def main(course: dict[str, Any], window: str, part: float) -> None:
     """Drive a course and print what became of each part, as JSON; for a process of its own."""
     warm_up()
-    for hour in drive(Course(**course), BackendConfig(**settings), part):
+    for hour in drive(Course(**course), BackendConfig(**settings_of(window)), part):
         print(json.dumps(asdict(hour)), flush=True)

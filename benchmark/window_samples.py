@@ -1,0 +1,170 @@
+# Copyright 2026 The pose_graph_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""Memory of `pose-graph replay` over a very long bag, which is made for it and removed again."""
+
+from collections.abc import Iterator
+import json
+import os
+from pathlib import Path
+import subprocess
+import sys
+import tempfile
+import time
+
+import numpy as np
+from rosbags.rosbag2 import CompressionFormat, CompressionMode, StoragePlugin, Writer
+from rosbags.typesys import get_typestore, Stores
+
+from benchmark.metrics import ACCURACY, Metric
+from benchmark.section import say, Section, Table
+from benchmark.window_drive import Course, FIXES
+from pose_graph_ros.adapters.bag_writer import BAG_VERSION
+from pose_graph_ros.cli.bag_messages import fix_messages, loop_closure_messages, odometry_messages
+from pose_graph_ros.core.geometry.geodesy import TangentPlane
+from pose_graph_ros.core.geometry.se2 import FloatArray
+from pose_graph_ros.core.geometry.trajectory import Trajectory
+from pose_graph_ros.core.measurements import LoopClosure, Position
+
+PLANE = TangentPlane(50.7271, 7.0866, 61.0)
+RATE = 50.0
+"""Of odometry [Hz]."""
+FIX_PERIOD, CLOSURE_PERIOD = 1.0, 10.0
+LIMIT = 400.0
+"""Resident memory that is asked for [MB]."""
+WINDOW = 600
+"""[s]"""
+COMMAND = 'import sys; from pose_graph_ros.cli.main import main; sys.exit(main(sys.argv[1:]))'
+POSE, LINEAR, ANGULAR = 44, 388, 412
+"""Where in a message with the frames odom and base_link the pose begins, and the twist."""
+ODOMETRY, FIX = 'nav_msgs/msg/Odometry', 'sensor_msgs/msg/NavSatFix'
+POSE_TYPE = 'geometry_msgs/msg/PoseWithCovarianceStamped'
+LOOK_EVERY = 1.0
+"""At the memory of the process [s]."""
+
+
+def write_bag(folder: Path, samples: int, seed: int = 0) -> None:
+    """
+    Write a compressed bag piece by piece.
+
+    Parameters
+    ----------
+    folder : Path, which must not exist
+    samples : int, number of messages of odometry
+    seed : int
+
+    """
+    course = Course(samples / RATE, seed, odometry_rate=RATE, fix_period=FIX_PERIOD,
+                    closure_period=CLOSURE_PERIOD)
+    types = get_typestore(Stores.ROS2_JAZZY)
+    writer = Writer(folder, version=BAG_VERSION, storage_plugin=StoragePlugin.MCAP)
+    writer.set_compression(CompressionMode.STORAGE, CompressionFormat.ZSTD)
+    with writer:
+        topics = {topic: writer.add_connection(topic, kind, typestore=types) for topic, kind in (
+            ('/odom', ODOMETRY), ('/gps/fix', FIX), ('/loop_closure', POSE_TYPE))}
+        for times, poses, others in course.pieces():
+            stamps = course.stamps(times)
+            messages = [(stamp, '/odom', data) for stamp, data in zip(
+                stamps.tolist(), _odometry(stamps, poses, course.speed), strict=True)]
+            fixes = [each for source, each in others if source == FIXES]
+            found = [*_fixes([each for each in fixes if isinstance(each, Position)], course),
+                     *_closures([each for _, each in others if isinstance(each, LoopClosure)])]
+            messages += [(stamp, topic, bytes(types.serialize_cdr(message, kind)))
+                         for topic, kind, stamp, message in found]
+            # a closure or a fix after the odometry with its stamp
+            messages.sort(key=lambda message: message[:2] != '/odom' and message[0])
+            for stamp, topic, data in messages:
+                writer.write(topics[topic], stamp, data)
+
+
+def _odometry(stamps: np.ndarray, poses: FloatArray, speed: float) -> Iterator[bytes]:
+    """Yield serialised messages: one is made, the others differ from it in a few numbers."""
+    path = Trajectory(stamps[:2], poses[:2])
+    first = next(iter(odometry_messages('/odom', 'odom', path, (0.01,) * 6)))
+    data = np.frombuffer(get_typestore(Stores.ROS2_JAZZY).serialize_cdr(first[3], ODOMETRY),
+                         dtype=np.uint8)
+    table = np.tile(data, (len(stamps), 1))
+    seconds = np.stack((stamps // 10**9, stamps % 10**9), axis=1).astype(np.uint32)
+    table[:, 4:12] = seconds.view(np.uint8)
+    half = 0.5 * poses[:, 2]
+    zero = np.zeros(len(poses))
+    values = np.column_stack((poses[:, :2], zero, zero, zero, np.sin(half), np.cos(half)))
+    table[:, POSE:POSE + 56] = np.ascontiguousarray(values).view(np.uint8)
+    table[:, LINEAR:LINEAR + 8] = np.frombuffer(np.float64(speed).tobytes(), dtype=np.uint8)
+    for row in table:
+        yield row.tobytes()
+
+
+def _fixes(positions: list[Position], course: Course) -> Iterator[tuple]:
+    if len(positions) > 0:
+        where = PLANE.to_geodetic(np.array([each.position for each in positions]))
+        yield from fix_messages('/gps/fix', np.array([each.stamp_ns for each in positions]),
+                                where, course.fix_sigma)
+
+
+def _closures(closures: list[LoopClosure]) -> Iterator[tuple]:
+    if len(closures) > 0:
+        ends = np.array([(each.reference_ns, each.stamp_ns) for each in closures])
+        yield from loop_closure_messages(
+            '/loop_closure', ends, np.array([each.pose for each in closures]),
+            closures[0].covariance)
+
+
+def replay(bag: Path, out: Path, *arguments: str) -> tuple[float, float, FloatArray]:
+    """
+    Return the time of a replay [s], its largest memory [MB], and the memory on the way.
+
+    The last has the shape (K, 2): time [s] and resident memory [MB].
+
+    Parameters
+    ----------
+    bag, out : Path
+    arguments : str, further ones of `pose-graph replay`
+
+    """
+    begin = time.monotonic()
+    child = subprocess.Popen(
+        [sys.executable, '-c', COMMAND, 'replay', str(bag), '-o', str(out), *arguments],
+        stdout=subprocess.DEVNULL)
+    curve: list[tuple[float, float]] = []
+    while True:
+        pid, status, usage = os.wait4(child.pid, os.WNOHANG)
+        if pid != 0:
+            break
+        with open(f'/proc/{child.pid}/statm', encoding='ascii') as file:
+            pages = int(file.read().split()[1])
+        curve.append((time.monotonic() - begin, pages * os.sysconf('SC_PAGE_SIZE') * 1e-6))
+        time.sleep(LOOK_EVERY)
+    child.returncode = os.waitstatus_to_exitcode(status)
+    if child.returncode not in (0, 1):
+        raise RuntimeError(f'replay ended with {child.returncode}')
+    return time.monotonic() - begin, usage.ru_maxrss * 1.024e-3, np.array(curve)
+
+
+def section(samples: list[int]) -> Section:
+    """Replay bags with these numbers of messages of odometry."""
+    found = Section(
+        'A replay of very many samples',
+        f'`pose-graph replay` of a bag with odometry at {RATE:.0f} Hz, fixes at '
+        f'{1.0 / FIX_PERIOD:g} Hz and a loop closure every {CLOSURE_PERIOD:.0f} s, with a window '
+        f'of {WINDOW} s. Largest resident memory of the process. Asked for: below '
+        f'{LIMIT:.0f} MB with 10 million samples.')
+    table = Table('', ('samples', 'hours', 'bag MB', 'time s', 'us a sample', 'hidden nodes',
+                       'largest memory MB'))
+    for n in samples:
+        with tempfile.TemporaryDirectory() as scratch:
+            bag, out = Path(scratch, 'bag'), Path(scratch, 'out')
+            say(f'  writing {n} samples')
+            write_bag(bag, n)
+            size = sum(file.stat().st_size for file in bag.iterdir()) * 1e-6
+            say('  replaying')
+            seconds, memory, curve = replay(bag, out, '-p', f'window:={float(WINDOW)}')
+            summary = json.loads((out / 'summary.json').read_text(encoding='utf-8'))
+        table.add(str(n), f'{n / RATE / 3600.0:.1f}', f'{size:.0f}', f'{seconds:.0f}',
+                  f'{1e6 * seconds / n:.0f}', str(summary['hidden_nodes']), f'{memory:.0f}')
+        say('  ' + ' | '.join(table.rows[-1]))
+        found.metrics.append(Metric(
+            f'replay of {n} samples: memory', memory, ' MB', ACCURACY, LIMIT))
+        found.notes.append(f'{n} samples, memory [MB] after each tenth of the time: ' + ', '.join(
+            f'{value:.0f}' for value in curve[::max(len(curve) // 10, 1), 1]))
+    found.tables.append(table)
+    return found
