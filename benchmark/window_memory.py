@@ -32,7 +32,7 @@ class Case:
     """A drive of hours."""
 
     window: str
-    """As in `window_settings`; or one with thinning."""
+    """As in `window_settings`."""
     hours: float
     course: dict[str, object] = field(default_factory=dict)
     """What differs from the default course."""
@@ -45,7 +45,7 @@ HALL = {'length': 200.0, 'laps_back': (1, 2, 5, 20, 100), 'closure_period': 5.0,
 CASES = {
     'window of 10 minutes': Case('600 s', HOURS),
     'unlimited': Case(UNLIMITED, 2.0, limited=False),
-    'hall, with thinning': Case('thinning', HOURS, HALL),
+    'hall, with thinning': Case('thinning 2 m', HOURS, HALL),
     'hall, unlimited': Case(UNLIMITED, 2.0, HALL, limited=False)}
 
 

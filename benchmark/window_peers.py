@@ -126,8 +126,8 @@ def section(*, quick: bool, repeats: int, limit: float) -> Section:
         f'position) on every tenth node. *Laps*: {PER_LAP} nodes a lap, a closure to the lap '
         'before on every fifth node. Errors are of all steps (newest pose to truth) or of '
         'samples; the optimum is that of the unlimited graph at that step, each tool under its '
-        f'own error model. Asked for: at least {RATIO_ASKED:.0f} times as fast as the incremental one in '
-        'the mean, at no larger error.')
+        f'own error model. Asked for: at least {RATIO_ASKED:.0f} times as fast as the incremental '
+        'one in the mean, at no larger error.')
     times, wrong = Table('Time of a step [us]', TIMES), Table('Errors', ERRORS)
     found.tables = [times, wrong]
     chosen = tools(quick=quick)
