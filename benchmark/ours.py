@@ -28,7 +28,7 @@ from pose_graph_ros.core.elimination import symbolic
 from pose_graph_ros.core.geometry import se2
 from pose_graph_ros.core.geometry.se2 import FloatArray, IntArray
 from pose_graph_ros.core.graph import error_functions
-from pose_graph_ros.core.graph.constraints import Edges
+from pose_graph_ros.core.graph.constraints import Edges, ObservedKind, ObservedNodes
 from pose_graph_ros.core.graph.graph import Graph, GraphUpdate
 from pose_graph_ros.core.smoother.incremental import IncrementalSmoother, UpdateResult
 
@@ -157,11 +157,19 @@ def smoothed(world: World) -> IncrementalSmoother:
 
 
 class Steps:
-    """What arrives in each step, as a caller has it: lists of arrays, nothing prepared."""
+    """
+    What arrives in each step, as a caller has it: lists of arrays, nothing prepared.
 
-    def __init__(self, world: World) -> None:
+    Parameters
+    ----------
+    world : World
+    first_sigma : float, of a global pose of node 0 [m, rad]; 0: it is fixed
+
+    """
+
+    def __init__(self, world: World, first_sigma: float = 0.0) -> None:
         edges = world.edges
-        self.world = world
+        self.world, self.first_sigma = world, first_sigma
         self.edge_stops = [0, *world.edge_stops.tolist()]
         self.observed_stops = [0, *world.observed_stops.tolist()]
         self.i, self.j = edges.i.tolist(), edges.j.tolist()
@@ -174,6 +182,13 @@ class Steps:
             self.ahead.append(ahead)
             self.plain.append(ahead and edge_stop == edge + 1 and seen_stop == seen)
 
+    def _first(self) -> GraphUpdate:
+        first = self.world.first[None]
+        if self.first_sigma == 0.0:
+            return GraphUpdate(hidden=first, fix=(0,))
+        return GraphUpdate(hidden=first, observed=ObservedNodes(
+            [0], None, first, np.eye(3)[None] / self.first_sigma**2, [ObservedKind.GLOBAL_POSE]))
+
     def extending(self, smoother: IncrementalSmoother, k: int) -> UpdateResult:
         """Do a step that only adds a node to the end."""
         edge = self.edge_stops[k]
@@ -182,7 +197,7 @@ class Steps:
     def updating(self, smoother: IncrementalSmoother, k: int) -> UpdateResult:
         """Do any other step; a node that goes on from the last one is added along the chain."""
         if k == 0:
-            return smoother.update(GraphUpdate(hidden=self.world.first[None], fix=(0,)))
+            return smoother.update(self._first())
         changes: dict[str, Any] = {}
         begin, end = self.edge_stops[k:k + 2]
         if self.ahead[k]:

@@ -20,6 +20,10 @@ from pose_graph_ros.core.batch.optimizer import Status
 from pose_graph_ros.core.geometry.se2 import FloatArray, IntArray
 from pose_graph_ros.core.smoother.incremental import IncrementalSmoother
 
+FIRST_SIGMA = 1e-5
+"""Of the pose of node 0, as GTSAM has it; a fixed node could not go [m, rad]."""
+NEVER = 10**9
+
 
 @dataclass(slots=True)
 class LagRun:
@@ -45,18 +49,21 @@ class Ours:
     """Our smoother, from which nodes go that are older than the lag."""
 
     lag: int
+    """[nodes]; `NEVER` for the whole graph."""
     every: int = 1
     """Nodes that are let go at a time."""
 
     @property
     def name(self) -> str:
         """As the tables have it."""
+        if self.lag == NEVER:
+            return f'{ours.NAME}, unlimited'
         return ours.NAME if self.every == 1 else f'{ours.NAME}, {self.every} at a time'
 
     def __call__(self, world: World, plan: Plan) -> LagRun:
         """Run the smoother over a world; RuntimeError if a step fails."""
         smoother = IncrementalSmoother()
-        steps = ours.Steps(world)
+        steps = ours.Steps(world, FIRST_SIGMA)
         n, lag, every = world.n_nodes, self.lag, self.every
         run = LagRun(self.name, np.zeros(n), np.zeros((n, 3)))
         kept, total = 0, 0.0

@@ -11,7 +11,7 @@ from benchmark import excess
 from benchmark.metrics import ACCURACY, Metric, RATIO
 from benchmark.runs import MICROSECOND, Plan, sample_steps
 from benchmark.section import say, Section, Table
-from benchmark.window_lag import LagRun, Ours
+from benchmark.window_lag import LagRun, NEVER, Ours
 from benchmark.worlds import chain, laps, World
 from pose_graph_ros.core.batch import optimizer
 from pose_graph_ros.core.geometry import se2
@@ -99,7 +99,8 @@ def tools(*, quick: bool) -> dict[str, Tool]:
     from benchmark.gtsam_peer import CAREFUL, FAST  # noqa: PLC0415
     from benchmark.window_gtsam import FixedLag  # noqa: PLC0415
 
-    made = [Ours(LAG), Ours(LAG, TOGETHER), FixedLag(LAG, FAST), FixedLag(LAG, CAREFUL)]
+    made = [Ours(LAG), Ours(LAG, TOGETHER), Ours(NEVER),
+            FixedLag(LAG, FAST), FixedLag(LAG, CAREFUL)]
     if not quick:
         made.append(FixedLag(LAG, None))
     return {tool.name: tool for tool in made}
