@@ -27,27 +27,63 @@ EXACT = SmootherConfig(alpha=0.0, budget=1e-20, budget_share=1e-22, max_iteratio
 
 @dataclass(frozen=True)
 class SlowGraph:
-    """A pose graph that is solved with dense matrices."""
+    """
+    A pose graph that is solved with dense matrices.
+
+    Its rows are the ids of a `Graph`: what leaves keeps its row, without a weight.
+    """
 
     poses: FloatArray = field(default_factory=lambda: np.empty((0, 3)))
     fixed: Any = field(default_factory=lambda: np.zeros(0, dtype=bool))
     edges: Edges = field(default_factory=Edges)
     observed: ObservedNodes = field(default_factory=ObservedNodes)
+    gone: frozenset[int] = frozenset()
+    """Nodes that have left."""
+    dropped_edges: frozenset[int] = frozenset()
+    """Edges that have left without their nodes."""
+    dropped_observed: frozenset[int] = frozenset()
+
+    @property
+    def present(self) -> Any:
+        """Which nodes have not left."""
+        return ~np.isin(np.arange(len(self.poses)), list(self.gone))
+
+    def has_edges(self) -> Any:
+        """Return the edges that have not left."""
+        return np.flatnonzero(
+            self.present[self.edges.i] & self.present[self.edges.j]
+            & ~np.isin(np.arange(len(self.edges)), list(self.dropped_edges)))
+
+    def has_observed(self) -> Any:
+        """Return the observed nodes that have not left."""
+        return np.flatnonzero(
+            self.present[self.observed.node]
+            & ~np.isin(np.arange(len(self.observed)), list(self.dropped_observed)))
 
     def edited(self, update: GraphUpdate) -> 'SlowGraph':
         poses = np.vstack((self.poses, se2.wrapped(update.hidden), se2.wrapped(update.biases)))
         fixed = np.append(self.fixed, np.zeros(len(poses) - len(self.poses), dtype=bool))
         fixed[list(update.fix)] = True
         fixed[list(update.free)] = False
+        gone = list(self.gone.union(update.remove_nodes))
+        edges, observed = (table.joined([before, new]) for table, before, new in (
+            (Edges, self.edges, update.edges), (ObservedNodes, self.observed, update.observed)))
+        without = [np.flatnonzero(np.isin(edges.i, gone) | np.isin(edges.j, gone)),
+                   np.flatnonzero(np.isin(observed.node, gone))]
         return SlowGraph(
             poses, fixed,
-            _weighed(Edges.joined([self.edges, update.edges]),
-                     update.remove_edges, update.weigh_edges),
-            _weighed(ObservedNodes.joined([self.observed, update.observed]),
-                     update.remove_observed, update.weigh_observed))
+            _weighed(_weighed(edges, update.remove_edges, update.weigh_edges),
+                     [*update.drop_edges, *without[0]], {}),
+            _weighed(_weighed(observed, update.remove_observed, update.weigh_observed),
+                     [*update.drop_observed, *without[1]], {}),
+            frozenset(gone), self.dropped_edges.union(update.drop_edges),
+            self.dropped_observed.union(update.drop_observed))
 
     def at(self, poses: FloatArray) -> 'SlowGraph':
-        return replace(self, poses=poses.copy())
+        """Return the graph with other poses of the nodes that have not left."""
+        moved = self.poses.copy()
+        moved[self.present] = poses
+        return replace(self, poses=moved)
 
     def chi2(self) -> float:
         errors = (error_functions.edge_errors(self.poses, self.edges),
@@ -69,7 +105,7 @@ class SlowGraph:
     @property
     def unknown(self) -> Any:
         """Rows of H that belong to free nodes."""
-        return np.flatnonzero(np.repeat(~self.fixed, 3))
+        return np.flatnonzero(np.repeat(~self.fixed & self.present, 3))
 
     def scaled(self, H: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Return the free part of H with ones on its diagonal, and the scale of each row."""
@@ -100,7 +136,7 @@ class SlowGraph:
         graph = self
         for _ in range(steps):
             step = graph.step()
-            graph = graph.at(se2.wrapped(graph.poses + step))
+            graph = replace(graph, poses=se2.wrapped(graph.poses + step))
             if np.max(np.abs(step), initial=0.0) < 1e-11:
                 break
         return graph
@@ -111,6 +147,13 @@ class SlowGraph:
         full = np.zeros((3 * len(self.poses),) * 2)
         full[np.ix_(self.unknown, self.unknown)] = (
             np.linalg.inv(matrix) * scale * scale[:, None])
+        return full
+
+    def at_ids(self, H: FloatArray) -> FloatArray:
+        """Return a matrix of the nodes that have not left as one of all nodes."""
+        full, rows = np.zeros((3 * len(self.poses),) * 2), np.flatnonzero(
+            np.repeat(self.present, 3))
+        full[np.ix_(rows, rows)] = H
         return full
 
 
@@ -144,7 +187,7 @@ def information(graph: Graph, nodes: list[int] | None = None) -> FloatArray:
 
     Each constraint has its own linearization point in the tables, so it gets its own nodes here.
     """
-    edges, observed = graph.edges, graph.observed
+    edges, observed = graph.edges_by_row, graph.observed_by_row
     if nodes is not None:
         edges = _with_weight(edges, edges.weight * (
             np.isin(edges.i, nodes) | np.isin(edges.j, nodes)))
@@ -203,11 +246,14 @@ class World:
     """Factor on the information of each measurement."""
     biases: set[int] = field(default_factory=set)
     """Nodes that are biases."""
+    gone: set[int] = field(default_factory=set)
+    """Nodes that have left the graph."""
 
     @property
     def poses(self) -> list[int]:
         """Nodes that are poses."""
-        return [node for node in range(len(self.truth)) if node not in self.biases]
+        return [node for node in range(len(self.truth))
+                if node not in self.biases and node not in self.gone]
 
     def informative(self) -> FloatArray:
         root = self.rng.normal(size=(3, 3))
@@ -287,7 +333,7 @@ class World:
         spread = np.array([1.0, 1.0, 0.2])
         for _ in range(count):
             node = len(self.truth)
-            older = sorted(bias for bias in self.biases if bias < node)
+            older = sorted(bias for bias in self.biases - self.gone if bias < node)
             if len(older) > 0 and rng.random() < 0.8:
                 before, phi = older[-1 - int(rng.integers(min(len(older), 3)))], rng.uniform(
                     0.3, 0.98)
@@ -302,7 +348,7 @@ class World:
             self.biases.add(node)
             self.truth.append(truth)
             values.append(truth + 0.3 * spread * rng.normal(size=3))
-        biases = sorted(bias for bias in self.biases if bias < len(self.truth))
+        biases = sorted(bias for bias in self.biases - self.gone if bias < len(self.truth))
         edges += [self.biased(int(rng.choice(self.poses)), int(rng.choice(biases[-3:])))
                   for _ in range(measurements if len(biases) > 0 else 0)]
         return GraphUpdate(biases=np.reshape(values, (-1, 3)), edges=Edges.joined(edges),
@@ -335,23 +381,39 @@ class World:
             more = self.new_biases(int(rng.integers(0, 3)), int(rng.integers(0, 3)))
             update = self.joined(
                 update, biases=more.biases, edges=more.edges, observed=more.observed)
-        n, poses = len(self.truth), self.poses
+        poses = self.poses
         nodes = [poses[k] for k in rng.integers(0, len(poses), int(rng.integers(0, 3)))]
         update = self.joined(
             update, edges=self.edges(self.pairs(int(rng.integers(0, 3)))),
             observed=self.observed(nodes, position=bool(rng.random() < 0.4),
                                    offset=bool(rng.random() < 0.5)))
-        for table, remove, weigh in ((graph.edges, 'remove_edges', 'weigh_edges'),
-                                     (graph.observed, 'remove_observed', 'weigh_observed')):
-            if len(table) > 0 and rng.random() < 0.3:
-                update = update._replace(**{remove: [int(rng.integers(len(table)))]})
-            if len(table) > 0 and rng.random() < 0.4:
+        for rows, remove, weigh in (
+                (graph.has_edges(), 'remove_edges', 'weigh_edges'),
+                (graph.has_observed(), 'remove_observed', 'weigh_observed')):
+            if len(rows) > 0 and rng.random() < 0.3:
+                update = update._replace(**{remove: [int(rng.choice(rows))]})
+            if len(rows) > 0 and rng.random() < 0.4:
                 update = update._replace(**{weigh: {
-                    int(rng.integers(len(table))): float(rng.choice([0.0, 1.0, rng.uniform()]))}})
+                    int(rng.choice(rows)): float(rng.choice([0.0, 1.0, rng.uniform()]))}})
+        nodes = [node for node in range(len(self.truth)) if node not in self.gone]
         if rng.random() < 0.15:
-            update = update._replace(fix=[int(rng.integers(n))])
+            update = update._replace(fix=[int(rng.choice(nodes))])
         if rng.random() < 0.15:
-            update = update._replace(free=[int(rng.integers(n))])
+            update = update._replace(free=[int(rng.choice(nodes))])
+        return update
+
+    def leaving(self, graph: SlowGraph) -> GraphUpdate:
+        """Return an update that nodes and constraints leave the graph with, all but one pose."""
+        rng, poses, update = self.rng, self.poses, GraphUpdate()
+        nodes = [*poses, *self.biases - self.gone]
+        kept = int(rng.choice(poses))
+        if rng.random() < 0.8:
+            chosen = rng.choice(nodes, min(int(rng.integers(1, 5)), len(nodes)), replace=False)
+            update = update._replace(remove_nodes=[v for v in chosen.tolist() if v != kept])
+        for rows, drop in ((graph.has_edges(), 'drop_edges'),
+                           (graph.has_observed(), 'drop_observed')):
+            if len(rows) > 0 and rng.random() < 0.3:
+                update = update._replace(**{drop: [int(rng.choice(rows))]})
         return update
 
 
@@ -365,7 +427,8 @@ def world(seed: int, *, origin: tuple[float, float] = (0.0, 0.0), **how: Any) ->
 
 _USED = {'node_f': tb.N_NODES, 'node_i': tb.N_NODES, 'edge_f': tb.N_EDGES, 'edge_i': tb.N_EDGES,
          'observed_f': tb.N_OBSERVED, 'observed_i': tb.N_OBSERVED, 'touched': tb.N_TOUCHED,
-         'waiting': tb.N_WAITING}
+         'waiting': tb.N_WAITING, 'node_id': tb.N_NODES, 'edge_id': tb.N_EDGES,
+         'observed_id': tb.N_OBSERVED}
 
 
 @dataclass(frozen=True)
@@ -434,6 +497,7 @@ def state(graph: Graph) -> dict[str, bytes]:
         + c.R.tobytes() + c.rhs.tobytes() + c.update.tobytes()
         for row, c in cliques(graph).items())
     parts['newest'] = memory.head[tb.NEWEST].tobytes()
+    parts['next'] = memory.head[tb.NEXT_NODE:tb.N_LEAVING + 1].tobytes()
     parts['structure'] = bytes([int(memory.head[tb.STRUCTURE]) != 0])
     return parts
 

@@ -80,7 +80,7 @@ def unit_headings(graph: Graph) -> FloatArray:
 
 def _problem(graph: Graph) -> _Problem:
     n, is_bias, fixed = graph.n_nodes, graph.is_bias, graph.fixed
-    edges, observed = _of_poses(graph.edges, graph.observed, is_bias)
+    edges, observed = _of_poses(graph.edges_by_row, graph.observed_by_row, is_bias)
     edge_rows, observed_rows = np.arange(len(edges)), np.arange(len(observed))
     root_t = np.sqrt(_isotropic(edges.weighted_information))
     root_u = np.sqrt(edges.weighted_information[:, 2, 2])

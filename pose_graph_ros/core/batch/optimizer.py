@@ -260,8 +260,8 @@ def _check_before(graph: Graph) -> tuple[float, BatchResult | None]:
     node, count = symbolic.loose_part(head)
     if node >= 0:
         return chi2, _failed(
-            f'hidden node {node} and {count - 1} others are connected to no fixed and no '
-            f'observed node: their poses are not determined', chi2)
+            f'hidden node {graph.node_ids[node]} and {count - 1} others are connected to no fixed '
+            f'and no observed node: their poses are not determined', chi2)
     return chi2, None
 
 
@@ -288,7 +288,8 @@ def _minimize(
     symbolic.plant(head, cliques)
     termination, iterations, after = yield from minimize(head, chi2, config)
     if termination is Termination.UNDETERMINED:
-        return _failed(f'hidden node {head[tb.BAD_NODE]} is not determined', chi2)
+        node = graph.node_ids[head[tb.BAD_NODE]]
+        return _failed(f'hidden node {node} is not determined', chi2)
     return BatchResult(_STATUS[termination], '', iterations, after)
 
 

@@ -24,7 +24,7 @@ from pose_graph_ros.core.batch.optimizer import chi2_of, optimize, Status
 from pose_graph_ros.core.config import SolverConfig
 from pose_graph_ros.core.elimination import symbolic
 from pose_graph_ros.core.geometry.se2 import BoolArray, FloatArray, IntArray
-from pose_graph_ros.core.graph.error_functions import edge_errors, energies
+from pose_graph_ros.core.graph.error_functions import energies
 from pose_graph_ros.core.graph.graph import Graph, GraphUpdate
 
 # Value that 99 % of the energies of right constraints are below, by the rank of the information.
@@ -123,7 +123,7 @@ class TruncatedProblem:
 
     def energies(self) -> FloatArray:
         """Return r^2 at the present poses, shape (M,)."""
-        return energies(edge_errors(self.graph.poses, self.edges), self.edges.information)
+        return energies(self.graph.edge_errors(self.edges), self.edges.information)
 
     def shares(self) -> FloatArray:
         """Return r^2 / c^2 at the present poses, infinite for those that may not be believed."""
@@ -131,7 +131,7 @@ class TruncatedProblem:
 
     def errors(self, numbers: IntArray) -> FloatArray:
         """Return the errors of some of the edges at the present poses, shape (K, 3)."""
-        return edge_errors(self.graph.poses, self.edges.rows(numbers))
+        return self.graph.edge_errors(self.edges.rows(numbers))
 
     def choice(self, believed: BoolArray, config: SolverConfig = CONFIG) -> Choice | None:
         """

@@ -12,17 +12,18 @@ A *bias* is a hidden node that is not a pose but the time-correlated error of a 
 measurements, in units of its sigma. Edges of the kind `BIAS` lead to it.
 """
 
-from collections.abc import Sequence
-from dataclasses import dataclass, fields
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, fields, replace
 from enum import IntEnum
 from operator import attrgetter
-from typing import Annotated, Any, Self
+from typing import Annotated, Any, Self, TypeVar
 
 import numpy as np
 import numpy.typing as npt
 
 from pose_graph_ros.core.exceptions import GraphUpdateError
 from pose_graph_ros.core.geometry.se2 import BoolArray, FloatArray, IntArray
+from pose_graph_ros.core.graph.identities import Ids
 from pose_graph_ros.core.saved_columns import Choices
 
 KindArray = npt.NDArray[np.uint8]
@@ -87,6 +88,14 @@ class _Table:
         """Return a table of some rows."""
         return type(self)(*(column[index] for column in self.columns))
 
+    def renumbered(self, number: Callable[[IntArray], IntArray]) -> Self:
+        """Return the same constraints with other numbers for their nodes, e.g. rows for ids."""
+        return replace(self, **{
+            name: number(getattr(self, name))
+            for name in ('i', 'j', 'node') if hasattr(self, name)})
+
+
+Constraints = TypeVar('Constraints', bound=_Table)
 
 # The constructors of the frozen tables set columns by this.
 _set = object.__setattr__
@@ -237,7 +246,7 @@ _COLUMNS: dict[type, Any] = {
 _ROW_SHAPES = {'mean': (3,), 'offset': (3,), 'information': (3, 3), 'bias': (4,)}
 
 
-def check(table: Edges | ObservedNodes, is_bias: BoolArray) -> None:
+def check(table: Edges | ObservedNodes, is_bias: BoolArray, nodes: Ids | None = None) -> None:
     """
     Raise GraphUpdateError for invalid constraints, with the row, what was expected and the value.
 
@@ -248,10 +257,11 @@ def check(table: Edges | ObservedNodes, is_bias: BoolArray) -> None:
     Parameters
     ----------
     table : Edges or ObservedNodes
-    is_bias : ndarray of bool, shape (N,), which of the hidden nodes are biases
+    is_bias : ndarray of bool, shape (N,), which of the hidden nodes are biases, by row
+    nodes : Ids, optional, of the hidden nodes; by default they are the rows
 
     """
-    name, n_nodes = type(table).__name__, len(is_bias)
+    name, ids = type(table).__name__, Ids(len(is_bias)) if nodes is None else nodes
     columns = {item.name: getattr(table, item.name) for item in fields(table)}
     for key, column in columns.items():
         expected = (len(table), *_ROW_SHAPES.get(key, ()))
@@ -262,8 +272,12 @@ def check(table: Edges | ObservedNodes, is_bias: BoolArray) -> None:
         _refuse_rows(~np.isfinite(column), f'{name}.{key} is not finite', column)
     ends = (table.i, table.j) if isinstance(table, Edges) else (table.node,)
     for end in ends:
-        _refuse_rows((end < 0) | (end >= n_nodes),
-                     f'{name}: expected a hidden node in 0..{n_nodes - 1}', end)
+        _refuse_rows((end < 0) | (end >= ids.end),
+                     f'{name}: expected a hidden node in 0..{ids.end - 1}', end)
+        gone = np.flatnonzero(ids.rows(end) < 0)
+        if len(gone) > 0:
+            raise GraphUpdateError(
+                f'{name}: hidden node {end[gone[0]]} has left the graph; row {gone[0]}')
     known = KNOWN_EDGES if isinstance(table, Edges) else tuple(ObservedKind)
     _refuse_rows(~np.isin(table.kind, known),
                  f'{name}.kind is none of {", ".join(kind.name for kind in known)}', table.kind)
@@ -271,9 +285,10 @@ def check(table: Edges | ObservedNodes, is_bias: BoolArray) -> None:
     if isinstance(table, Edges):
         _refuse_rows(table.i == table.j, f'{name}: an edge leads from a node to itself', table.i)
         to_bias = table.kind == EdgeKind.BIAS
-        _refuse_rows(to_bias & ~is_bias[table.j],
+        i_is_bias, j_is_bias = is_bias[ids.rows(table.i)], is_bias[ids.rows(table.j)]
+        _refuse_rows(to_bias & ~j_is_bias,
                      f'{name}: expected an edge of kind BIAS to lead to a bias', table.j)
-        _refuse_rows(~to_bias & (is_bias[table.i] | is_bias[table.j]),
+        _refuse_rows(~to_bias & (i_is_bias | j_is_bias),
                      f'{name}: an edge of another kind than BIAS has a bias for an end',
                      np.column_stack((table.i, table.j)))
     _check_information(f'{name}.information', table.information)

@@ -8,6 +8,7 @@ import numpy as np
 
 from pose_graph_ros.core.exceptions import GraphUpdateError
 from pose_graph_ros.core.geometry.se2 import FloatArray, IntArray
+from pose_graph_ros.core.graph.identities import Ids
 
 
 def checked_poses(name: str, poses: FloatArray) -> FloatArray:
@@ -39,28 +40,32 @@ def values(weights: Mapping[int, float]) -> FloatArray:
     return np.fromiter(weights.values(), np.float64, len(weights))
 
 
-def check_ids(name: str, ids: Collection[int], what: str, end: int) -> None:
+def check_ids(name: str, ids: Collection[int], what: str, known: Ids) -> None:
     """
-    Raise GraphUpdateError unless all ids are integers in 0..end - 1.
+    Raise GraphUpdateError unless all ids are in use.
 
     Parameters
     ----------
     name, what : str, name of the part of the update, and what has the ids
     ids : collection of int
-    end : int, next id
+    known : Ids, with those of the new rows
 
     """
     if len(ids) == 0:
         return
-    array = np.array(list(ids))
+    array, end = np.array(list(ids)), known.end
     if array.dtype.kind not in 'iu' or not 0 <= array.min() <= array.max() < end:
         # looks for the first one, and lets integers of other types pass
         for number in ids:
             if not (isinstance(number, int | np.integer) and 0 <= number < end):
-                raise GraphUpdateError(f'{name}: expected {what} in 0..{end - 1}, got {number}')
+                raise GraphUpdateError(f'{name}: expected {what}s in 0..{end - 1}, got {number}')
+    if known.present is not None:
+        gone = known.rows(array) < 0
+        if np.any(gone):
+            raise GraphUpdateError(f'{name}: {what} {array[gone][0]} has left the graph')
 
 
-def check_weights(name: str, weights: Mapping[int, float], what: str, end: int) -> None:
+def check_weights(name: str, weights: Mapping[int, float], what: str, known: Ids) -> None:
     """
     Raise GraphUpdateError unless ids and weights are valid.
 
@@ -68,10 +73,10 @@ def check_weights(name: str, weights: Mapping[int, float], what: str, end: int) 
     ----------
     name, what : str, as for `check_ids`
     weights : mapping of int to float, by id
-    end : int, next id
+    known : Ids
 
     """
-    check_ids(name, weights, what, end)
+    check_ids(name, weights, what, known)
     numbers = values(weights)
     if not np.all(np.isfinite(numbers) & (numbers >= 0.0)):
         number, weight = next(item for item in weights.items() if not 0.0 <= item[1] < np.inf)

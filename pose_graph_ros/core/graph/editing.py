@@ -21,7 +21,7 @@ from pose_graph_ros.core.compiled.jit import (
     NUMBERS,
     ROWS,
 )
-from pose_graph_ros.core.graph import factors, rows, tables as tb, transaction_log
+from pose_graph_ros.core.graph import factors, identities, rows, tables as tb, transaction_log
 
 # Results of `add_rows`.
 ADDED, NO_ROOM, UNSOUND = range(3)
@@ -40,7 +40,7 @@ def touch(head, v):  # type: ignore[no-untyped-def]
 @kernel
 def _start_nodes(head, first, first_bias, last):  # type: ignore[no-untyped-def]
     """Initialise rows of new hidden nodes: the poses before `first_bias`, the biases from it."""
-    node_f, node_i = tb.node_f(head), tb.node_i(head)
+    node_f, node_i, node_id = tb.node_f(head), tb.node_i(head), tb.node_id(head)
     for v in range(first, last):
         f, i = node_f[v], node_i[v]
         factors.refer_to_pose(f)
@@ -49,6 +49,8 @@ def _start_nodes(head, first, first_bias, last):  # type: ignore[no-untyped-def]
         i[tb.CLIQUE] = i[tb.EDGE_LIST] = i[tb.OBSERVED_LIST] = -1
         i[tb.NODE_LOGGED] = head[tb.UPDATE]
         i[tb.IS_BIAS] = 1 if v >= first_bias else 0
+        node_id[v] = head[tb.NEXT_NODE]
+        head[tb.NEXT_NODE] += 1
         touch(head, v)
         head[tb.STRUCTURE] = 1
     if first_bias > first:
@@ -182,8 +184,16 @@ def _unlink_observed(head, k):  # type: ignore[no-untyped-def]
 
 
 @kernel
-def _weigh_edge(head, e, weight):  # type: ignore[no-untyped-def]
-    """Change the weight of an edge; at 0 it is in no list."""
+def weigh_edge(head, e, weight):  # type: ignore[no-untyped-def]
+    """
+    Change the weight of an edge; at 0 it is in no list.
+
+    Parameters
+    ----------
+    e : int, row
+    weight : float
+
+    """
     edge_f, scalars = tb.edge_f(head), tb.scalars(head)
     f = edge_f[e]
     before = f[tb.WEIGHT]
@@ -207,8 +217,16 @@ def _weigh_edge(head, e, weight):  # type: ignore[no-untyped-def]
 
 
 @kernel
-def _weigh_observed(head, k, weight):  # type: ignore[no-untyped-def]
-    """Change the weight of an observed node; at 0 it is in no list."""
+def weigh_one_observed(head, k, weight):  # type: ignore[no-untyped-def]
+    """
+    Change the weight of an observed node; at 0 it is in no list.
+
+    Parameters
+    ----------
+    k : int, row
+    weight : float
+
+    """
     observed_f, scalars, observed_i = tb.observed_f(head), tb.scalars(head), tb.observed_i(head)
     node_i = tb.node_i(head)
     f, v = observed_f[k], observed_i[k, tb.OBS_NODE]
@@ -235,31 +253,36 @@ def _weigh_observed(head, k, weight):  # type: ignore[no-untyped-def]
 @kernel
 def _start_edges(head, first, last):  # type: ignore[no-untyped-def]
     """Initialise new rows of edges, and add those with a weight to the graph."""
-    edge_f, edge_i = tb.edge_f(head), tb.edge_i(head)
+    edge_f, edge_i, edge_id = tb.edge_f(head), tb.edge_i(head), tb.edge_id(head)
     for e in range(first, last):
+        edge_id[e] = head[tb.NEXT_EDGE]
+        head[tb.NEXT_EDGE] += 1
         f, row = edge_f[e], edge_i[e]
         if row[tb.EDGE_KIND] != factors.BIAS:
             c, s = math.cos(f[tb.MEAN + 2]), math.sin(f[tb.MEAN + 2])
             f[tb.OWN_T] = c * f[tb.MEAN] + s * f[tb.MEAN + 1]
             f[tb.OWN_T + 1] = c * f[tb.MEAN + 1] - s * f[tb.MEAN]
         f[tb.ERROR2] = f[tb.ENERGY] = 0.0
-        row[tb.EDGE_CHECKED] = row[tb.EDGE_WAITS] = 0
+        row[tb.EDGE_CHECKED] = row[tb.EDGE_WAITS] = row[tb.EDGE_LEAVES] = 0
         row[tb.EDGE_LOGGED] = head[tb.UPDATE]
         weight, f[tb.WEIGHT] = f[tb.WEIGHT], 0.0
-        _weigh_edge(head, e, weight)
+        weigh_edge(head, e, weight)
 
 
 @kernel
 def _start_observed(head, first, last):  # type: ignore[no-untyped-def]
     """Initialise new rows of observed nodes, and add those with a weight to the graph."""
     observed_f, observed_i = tb.observed_f(head), tb.observed_i(head)
+    observed_id = tb.observed_id(head)
     for k in range(first, last):
+        observed_id[k] = head[tb.NEXT_OBSERVED]
+        head[tb.NEXT_OBSERVED] += 1
         f, row = observed_f[k], observed_i[k]
         f[tb.OBS_ERROR2] = f[tb.OBS_ENERGY] = 0.0
-        row[tb.OBS_WAITS] = 0
+        row[tb.OBS_WAITS] = row[tb.OBS_LEAVES] = 0
         row[tb.OBS_LOGGED] = head[tb.UPDATE]
         weight, f[tb.WEIGHT] = f[tb.WEIGHT], 0.0
-        _weigh_observed(head, k, weight)
+        weigh_one_observed(head, k, weight)
 
 
 @kernel(signature=(tb.HEAD, INTEGERS, NUMBERS))
@@ -269,11 +292,11 @@ def weigh_edges(head, edges, weights):  # type: ignore[no-untyped-def]
 
     Parameters
     ----------
-    edges, weights : ndarray, shape (M,), rows and weights; 0 removes an edge from the graph
+    edges, weights : ndarray, shape (M,), ids and weights; 0 takes an edge out of all lists
 
     """
     for m in range(len(edges)):
-        _weigh_edge(head, edges[m], weights[m])
+        weigh_edge(head, identities.edge_row(head, edges[m]), weights[m])
 
 
 @kernel(signature=(tb.HEAD, INTEGERS, NUMBERS))
@@ -287,7 +310,7 @@ def weigh_observed(head, observed, weights):  # type: ignore[no-untyped-def]
 
     """
     for m in range(len(observed)):
-        _weigh_observed(head, observed[m], weights[m])
+        weigh_one_observed(head, identities.observed_row(head, observed[m]), weights[m])
 
 
 @kernel(signature=(tb.HEAD, INTEGERS, FLAG))
@@ -297,12 +320,13 @@ def set_fixed(head, nodes, fixed):  # type: ignore[no-untyped-def]
 
     Parameters
     ----------
-    nodes : ndarray of int, shape (N,)
+    nodes : ndarray of int, shape (N,), ids
     fixed : bool
 
     """
     node_i = tb.node_i(head)
-    for v in nodes:
+    for node in nodes:
+        v = identities.node_row(head, node)
         if (node_i[v, tb.FIXED] != 0) != fixed:
             transaction_log.log_node(head, v)
             node_i[v, tb.FIXED] = 1 if fixed else 0

@@ -9,9 +9,11 @@ import numpy.typing as npt
 
 from pose_graph_ros.core.exceptions import GraphUpdateError
 from pose_graph_ros.core.geometry import se2
-from pose_graph_ros.core.geometry.se2 import BoolArray, FloatArray, IntArray
-from pose_graph_ros.core.graph import editing, identities, tables as tb, transaction_log
-from pose_graph_ros.core.graph.constraints import check, EdgeKind, Edges, full, ObservedNodes
+from pose_graph_ros.core.geometry.se2 import FloatArray, IntArray
+from pose_graph_ros.core.graph import editing, removal, tables as tb, transaction_log
+from pose_graph_ros.core.graph.compaction import compact
+from pose_graph_ros.core.graph.constraints import check
+from pose_graph_ros.core.graph.contents import GraphContents
 from pose_graph_ros.core.graph.edit_checks import (
     check_ids,
     check_weights,
@@ -19,9 +21,9 @@ from pose_graph_ros.core.graph.edit_checks import (
     integers,
     values,
 )
-from pose_graph_ros.core.graph.error_functions import edge_errors, energies, observed_errors
 from pose_graph_ros.core.graph.graph_update import (
     Energies,
+    FIRST_EDIT,
     GraphRows,
     GraphUpdate,
     NextIds,
@@ -30,7 +32,6 @@ from pose_graph_ros.core.graph.graph_update import (
     NO_WEIGHTS,
     NOTHING_OBSERVED,
 )
-from pose_graph_ros.core.graph.tables import Memory
 
 __all__ = [
     'NOTHING_OBSERVED',
@@ -44,193 +45,73 @@ __all__ = [
     'NextIds',
 ]
 
-# Columns of edge_f with the column `Edges.bias`.
-_BIAS_COLUMNS = [tb.BIAS_OFFSET, tb.BIAS_OFFSET + 1, tb.FACTOR_T, tb.FACTOR_TH]
+# Number of rows and next id of each table.
+_COUNTERS = {'node': (tb.N_NODES, tb.NEXT_NODE), 'edge': (tb.N_EDGES, tb.NEXT_EDGE),
+             'observed': (tb.N_OBSERVED, tb.NEXT_OBSERVED)}
 
 
-class Graph:
+class Graph(GraphContents):
     """
     A pose graph, edited by `GraphUpdate`s only, each applied whole or not at all.
-
-    Hidden nodes (biases included), edges and observed nodes have *ids*: one counter for each of
-    the three, ascending, and an id is never used again. The store has them in *rows*, in the
-    order of their ids; rows move when others leave. Whoever keeps a number keeps an id; arrays of
-    all nodes or constraints (`poses`, `weights`, `is_bias`, ...) are by row.
 
     Solvers work on its tables and write the poses of the hidden nodes.
     """
 
     def __init__(self) -> None:
-        self.memory = Memory()
+        super().__init__()
         self.n_moves = 0
         """How often `set_poses` has moved the nodes."""
-
-    @property
-    def n_nodes(self) -> int:
-        """Number of hidden nodes, biases included."""
-        return int(self.memory.head[tb.N_NODES])
-
-    @property
-    def newest_pose(self) -> int:
-        """Id of the newest hidden node that is not a bias, or -1."""
-        return int(self.memory.head[tb.NEWEST])
-
-    @property
-    def node_ids(self) -> IntArray:
-        """Ids of all hidden nodes, ascending, shape (N,), read-only."""
-        return identities.read_only(np.arange(self.n_nodes))
-
-    @property
-    def edge_ids(self) -> IntArray:
-        """Ids of all edges, ascending, shape (M,), read-only."""
-        return identities.read_only(np.arange(self.n_edges))
-
-    @property
-    def observed_ids(self) -> IntArray:
-        """Ids of all observed nodes, ascending, shape (K,), read-only."""
-        return identities.read_only(np.arange(self.n_observed))
-
-    @property
-    def next_ids(self) -> NextIds:
-        """Ids of the next new rows of an update."""
-        return NextIds(self.n_nodes, self.n_edges, self.n_observed)
-
-    def node_rows(self, ids: npt.ArrayLike) -> IntArray:
-        """Return the rows of hidden nodes, shape of `ids`; -1 where they have left the graph."""
-        return identities.rows_of(self.node_ids, ids)
-
-    def edge_rows(self, ids: npt.ArrayLike) -> IntArray:
-        """Return the rows of edges, shape of `ids`; -1 where they have left the graph."""
-        return identities.rows_of(self.edge_ids, ids)
-
-    def observed_rows(self, ids: npt.ArrayLike) -> IntArray:
-        """Return the rows of observed nodes, shape of `ids`; -1 where they have left the graph."""
-        return identities.rows_of(self.observed_ids, ids)
-
-    @property
-    def n_edges(self) -> int:
-        """Number of edges, removed ones included."""
-        return int(self.memory.head[tb.N_EDGES])
-
-    @property
-    def n_observed(self) -> int:
-        """Number of observed nodes, removed ones included."""
-        return int(self.memory.head[tb.N_OBSERVED])
-
-    @property
-    def has_touched(self) -> bool:
-        """Whether the next step of the smoother has nodes to eliminate again."""
-        return bool(self.memory.head[tb.N_TOUCHED] > 0)
-
-    @property
-    def poses(self) -> FloatArray:
-        """Estimates of all hidden nodes in the map, shape (N, 3) [m, m, rad], a read-only view."""
-        view = self.memory['node_f'][:self.n_nodes, tb.POSE:tb.POSE + 3]
-        view.flags.writeable = False
-        return view
-
-    def poses_of(self, ids: npt.ArrayLike) -> FloatArray:
-        """
-        Return a copy of the estimates of hidden nodes, shape (K, 3) for K ids, (3,) for one.
-
-        Raises ValueError if one has left the graph.
-        """
-        rows = identities.known(self.node_rows(ids), ids, 'hidden node')
-        return self.memory['node_f'][rows, tb.POSE:tb.POSE + 3]
-
-    @property
-    def fixed(self) -> BoolArray:
-        """Whether hidden nodes keep their pose, shape (N,)."""
-        return self.memory['node_i'][:self.n_nodes, tb.FIXED] != 0
-
-    @property
-    def is_bias(self) -> BoolArray:
-        """Whether hidden nodes are biases, not poses, shape (N,)."""
-        return self.memory['node_i'][:self.n_nodes, tb.IS_BIAS] != 0
-
-    @property
-    def edges(self) -> Edges:
-        """All edges, by row, with their weights; their ends are ids."""
-        return self._edges_in(slice(self.n_edges))
-
-    def edges_at(self, ids: npt.ArrayLike) -> Edges:
-        """Return edges by id; their ends are ids. Raises ValueError if one has left the graph."""
-        return self._edges_in(identities.known(self.edge_rows(ids), ids, 'edge'))
-
-    def _edges_in(self, rows: IntArray | slice) -> Edges:
-        """Return the edges in some rows."""
-        numbers, integers = self.memory['edge_f'][rows], self.memory['edge_i'][rows]
-        kind, bias = integers[:, tb.EDGE_KIND], np.zeros((len(integers), 4))
-        to_bias = np.flatnonzero(kind == EdgeKind.BIAS)
-        bias[to_bias] = numbers[to_bias[:, None], _BIAS_COLUMNS]
-        return Edges(
-            integers[:, tb.END_I], integers[:, tb.END_J], numbers[:, tb.MEAN:tb.MEAN + 3].copy(),
-            full(numbers[:, tb.INFO:tb.INFO + 6]), kind, numbers[:, tb.WEIGHT].copy(), bias)
-
-    @property
-    def observed(self) -> ObservedNodes:
-        """All observed nodes, by row, with their weights; their nodes are ids."""
-        return self._observed_in(slice(self.n_observed))
-
-    def observed_at(self, ids: npt.ArrayLike) -> ObservedNodes:
-        """Return observed nodes by id, as `edges_at` does."""
-        return self._observed_in(identities.known(self.observed_rows(ids), ids, 'observed node'))
-
-    def _observed_in(self, rows: IntArray | slice) -> ObservedNodes:
-        """Return the observed nodes in some rows."""
-        numbers, integers = self.memory['observed_f'][rows], self.memory['observed_i'][rows]
-        return ObservedNodes(
-            integers[:, tb.OBS_NODE], numbers[:, tb.OBS_OFFSET:tb.OBS_OFFSET + 3].copy(),
-            numbers[:, tb.MEAN:tb.MEAN + 3].copy(), full(numbers[:, tb.INFO:tb.INFO + 6]),
-            integers[:, tb.OBS_KIND], numbers[:, tb.WEIGHT].copy())
-
-    @property
-    def weights(self) -> tuple[FloatArray, FloatArray]:
-        """Weights of all edges and of all observed nodes."""
-        return (self.memory['edge_f'][:self.n_edges, tb.WEIGHT].copy(),
-                self.memory['observed_f'][:self.n_observed, tb.WEIGHT].copy())
 
     def set_weights(self, weights: tuple[FloatArray, FloatArray]) -> None:
         """Set the weights of all edges and observed nodes to what `weights` has returned."""
         edges, observed = (
-            {int(row): float(wanted[row]) for row in np.flatnonzero(wanted != present)}
-            for wanted, present in zip(weights, self.weights, strict=True))
+            dict(zip(ids[changed].tolist(), wanted[changed].tolist(), strict=True))
+            for ids, wanted, present in zip(
+                (self.edge_ids, self.observed_ids), weights, self.weights, strict=True)
+            for changed in (np.flatnonzero(wanted != present),))
         self.apply(GraphUpdate(weigh_edges=edges, weigh_observed=observed))
 
     def apply(self, update: GraphUpdate) -> None:
-        """Apply an update; a GraphUpdateError for an invalid part leaves the graph unchanged."""
-        hidden, edges, observed, *by_number, biases = update
-        edits = any(map(len, by_number))
+        """
+        Apply an update; a GraphUpdateError for an invalid part leaves the graph unchanged.
+
+        Between `begin` and `commit` or `rollback`, what leaves keeps its rows; `commit` takes them
+        out.
+        """
+        edits = any(map(len, update[FIRST_EDIT:]))
         if edits:
             self._check_edits(update)
-        columns, checked = (hidden, biases, *edges.columns, *observed.columns), False
+        columns, checked = (update.hidden, update.biases, *update.edges.columns,
+                            *update.observed.columns), False
         try:
             code = editing.add_rows(self.memory.head, *columns, checked)
         except (TypeError, ValueError):
             code = editing.UNSOUND  # arrays of types that the kernel is not compiled for
         while code != editing.ADDED:
             if code == editing.NO_ROOM:
-                self.ensure(*self._sizes_after(update))
+                self.ensure(
+                    self.n_nodes + len(update.hidden) + len(update.biases),
+                    self.n_edges + len(update.edges), self.n_observed + len(update.observed))
             else:
                 columns, checked = self._checked_columns(update), True
             code = editing.add_rows(self.memory.head, *columns, checked)
         if edits:
             self._edit(update)
 
-    def _sizes_after(self, update: GraphUpdate) -> tuple[int, int, int]:
-        """Return the numbers of hidden nodes, edges and observed nodes after an update."""
-        return (self.n_nodes + len(update.hidden) + len(update.biases),
-                self.n_edges + len(update.edges), self.n_observed + len(update.observed))
-
     def _check_edits(self, update: GraphUpdate) -> None:
-        """Raise GraphUpdateError for invalid numbers or weights; those of new rows are valid."""
-        n_nodes, n_edges, n_observed = self._sizes_after(update)
-        check_ids('fix', update.fix, 'hidden nodes', n_nodes)
-        check_ids('free', update.free, 'hidden nodes', n_nodes)
-        check_ids('remove_edges', update.remove_edges, 'edges', n_edges)
-        check_ids('remove_observed', update.remove_observed, 'observed nodes', n_observed)
-        check_weights('weigh_edges', update.weigh_edges, 'edges', n_edges)
-        check_weights('weigh_observed', update.weigh_observed, 'observed nodes', n_observed)
+        """Raise GraphUpdateError for unknown ids or invalid weights; new rows may be edited."""
+        nodes = self._nodes.extended(len(update.hidden) + len(update.biases))
+        edges = self._edges.extended(len(update.edges))
+        observed = self._observed.extended(len(update.observed))
+        for part in ('fix', 'free', 'remove_nodes'):
+            check_ids(part, getattr(update, part), 'hidden node', nodes)
+        for what, known_ids, parts in (
+                ('edge', edges, ('remove_edges', 'drop_edges')),
+                ('observed node', observed, ('remove_observed', 'drop_observed'))):
+            for part in parts:
+                check_ids(part, getattr(update, part), what, known_ids)
+        check_weights('weigh_edges', update.weigh_edges, 'edge', edges)
+        check_weights('weigh_observed', update.weigh_observed, 'observed node', observed)
 
     def _edit(self, update: GraphUpdate) -> None:
         """Apply the edits of existing rows, which have been checked."""
@@ -245,6 +126,17 @@ class Graph:
         for nodes, fixed in ((update.fix, True), (update.free, False)):
             if len(nodes) > 0:
                 editing.set_fixed(head, integers(nodes), fixed)
+        for remove, ids in ((removal.drop_edges, update.drop_edges),
+                            (removal.drop_observed, update.drop_observed),
+                            (removal.remove_nodes, update.remove_nodes)):
+            if len(ids) > 0:
+                remove(head, integers(ids))
+        if head[tb.LOG_I_END] == 0:     # not within an update
+            self._compact()
+
+    def _compact(self) -> None:
+        if self.memory.head[tb.N_LEAVING] > 0:
+            compact(self.memory.head)
 
     def _checked_columns(self, update: GraphUpdate) -> tuple[npt.NDArray[Any], ...]:
         """Return new rows as arrays for the kernel; raise GraphUpdateError if one is invalid."""
@@ -253,9 +145,10 @@ class Graph:
         edges, observed = update.edges, update.observed
         is_bias = np.concatenate((
             self.is_bias, np.zeros(len(hidden), dtype=bool), np.ones(len(biases), dtype=bool)))
+        nodes = self._nodes.extended(len(hidden) + len(biases))
         for table in (edges, observed):
             if len(table) > 0:
-                check(table, is_bias)
+                check(table, is_bias, nodes)
         edges = edges if len(edges) > 0 else NO_EDGES
         observed = observed if len(observed) > 0 else NOTHING_OBSERVED
         return tuple(np.array(column, order='C')
@@ -277,7 +170,7 @@ class Graph:
         for name, needed, used in (
                 ('node', n_nodes, self.n_nodes), ('edge', n_edges, self.n_edges),
                 ('observed', n_observed, self.n_observed)):
-            for suffix in ('_f', '_i'):
+            for suffix in ('_f', '_i', '_id'):
                 memory.ensure(name + suffix, needed, keep=used)
         nodes, edges, observed = (
             len(memory[name]) for name in ('node_f', 'edge_f', 'observed_f'))
@@ -311,74 +204,46 @@ class Graph:
         self.n_moves += 1
         editing.restart(self.memory.head)
 
-    def rows(self) -> GraphRows:
-        """Return a copy of all rows."""
-        return GraphRows(
-            self.poses.copy(), self.is_bias, self.fixed,
-            Edges(*(column.copy() for column in self.edges.columns)),
-            ObservedNodes(*(column.copy() for column in self.observed.columns)))
-
     def fill(self, rows: GraphRows) -> None:
-        """Add all rows of another graph to this empty one; GraphUpdateError if one is invalid."""
-        poses, is_bias, fixed, edges, observed = rows
-        self.append_nodes(poses, is_bias)
-        self.apply(GraphUpdate(
-            edges=edges, observed=observed, fix=np.flatnonzero(fixed).tolist()))
-
-    def append_nodes(self, poses: FloatArray, is_bias: BoolArray) -> None:
         """
-        Add hidden nodes, poses and biases in any order.
+        Add all rows of another graph, with their ids, to this one; fixed nodes are fixed.
 
-        Parameters
-        ----------
-        poses : ndarray, shape (N, 3), poses and values of biases
-        is_bias : ndarray of bool, shape (N,)
-
+        The ids must be above those that this graph has or had, as in an empty one, and ascending.
+        Raises GraphUpdateError if they are not, or a row is invalid.
         """
-        begin, newest = self.n_nodes, self.newest_pose
-        self.apply(GraphUpdate(hidden=poses))
-        self.memory['node_i'][begin:begin + len(poses), tb.IS_BIAS] = is_bias
-        rows = np.flatnonzero(~is_bias)
-        self.memory.head[tb.NEWEST] = begin + rows[-1] if len(rows) > 0 else newest
+        self._append('node', GraphUpdate(hidden=rows.poses), rows.node_ids, rows.next_ids.node)
+        is_bias, memory = rows.is_bias, self.memory
+        begin = self.n_nodes - len(is_bias)
+        memory['node_i'][begin:self.n_nodes, tb.IS_BIAS] = is_bias
+        poses = np.flatnonzero(~self.is_bias)
+        memory.head[tb.NEWEST] = poses[-1] if len(poses) > 0 else -1
+        self._append('edge', GraphUpdate(edges=rows.edges), rows.edge_ids, rows.next_ids.edge)
+        self._append('observed', GraphUpdate(observed=rows.observed), rows.observed_ids,
+                     rows.next_ids.observed)
+        self.apply(GraphUpdate(fix=self.node_ids[begin:][rows.fixed].tolist()))
 
-    def energies(self, poses: FloatArray | None = None) -> Energies:
-        """Return the energies of all constraints, at other poses, shape (N, 3), if given."""
-        poses = self.poses if poses is None else poses
-        edges, observed = self.edges, self.observed
-        return Energies(
-            energies(self.edge_errors(edges, poses), edges.weighted_information),
-            energies(self.observed_errors(observed, poses), observed.weighted_information))
-
-    def edge_errors(self, edges: Edges, poses: FloatArray | None = None) -> FloatArray:
-        """
-        Return the errors of edges at the estimate, shape (M, 3); see `error_functions`.
-
-        Parameters
-        ----------
-        edges : Edges, with ids for ends, in the graph or not
-        poses : ndarray, shape (N, 3), optional, of all hidden nodes, by row, in place of theirs
-
-        """
-        return edge_errors(self.poses if poses is None else poses, edges)
-
-    def observed_errors(
-        self, observed: ObservedNodes, poses: FloatArray | None = None,
-    ) -> FloatArray:
-        """
-        Return the errors of observed nodes at the estimate, shape (K, 3).
-
-        Parameters
-        ----------
-        observed, poses : ObservedNodes, ndarray, as for `edge_errors`
-
-        """
-        return observed_errors(self.poses if poses is None else poses, observed)
+    def _append(
+        self, name: str, update: GraphUpdate, ids: IntArray, next_id: int,
+    ) -> None:
+        """Add new rows of one table with given ids instead of the next ones."""
+        head, n_rows, counter = self.memory.head, *_COUNTERS[name]
+        begin, first = int(head[n_rows]), int(head[counter])
+        self.apply(update)
+        if len(ids) != head[n_rows] - begin or np.any(np.diff(ids, prepend=first - 1) <= 0):
+            raise GraphUpdateError(f'{name}: expected ascending ids from {first} on, one a row')
+        self.memory[f'{name}_id'][begin:head[n_rows]] = ids
+        head[counter] = max(next_id, first, int(ids[-1]) + 1 if len(ids) > 0 else 0)
 
     def begin(self) -> None:
         """Begin an update; `rollback` reverts all edits and steps after it."""
         if not transaction_log.begin(self.memory.head):
             self.memory.restart_stamps()
             transaction_log.begin(self.memory.head)
+
+    def commit(self) -> None:
+        """End an update: keep its changes, and take out the rows of what has left."""
+        transaction_log.commit(self.memory.head)
+        self._compact()
 
     def rollback(self) -> None:
         """Revert all edits and steps since `begin`, bit for bit."""

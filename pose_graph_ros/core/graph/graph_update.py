@@ -4,11 +4,11 @@
 
 from collections.abc import Mapping, Sequence
 from types import MappingProxyType
-from typing import Final, NamedTuple
+from typing import Final, NamedTuple, Self
 
 import numpy as np
 
-from pose_graph_ros.core.geometry.se2 import BoolArray, FloatArray
+from pose_graph_ros.core.geometry.se2 import BoolArray, FloatArray, IntArray
 from pose_graph_ros.core.graph.constraints import Edges, ObservedNodes
 
 # Empty parts of updates.
@@ -31,23 +31,39 @@ class GraphUpdate(NamedTuple):
     """New edges, possibly to the new hidden nodes."""
     observed: ObservedNodes = NOTHING_OBSERVED
     """New observed nodes, possibly on the new hidden nodes."""
-    fix: Sequence[int] = ()
-    """Hidden nodes that keep their pose from now on (the gauge)."""
-    free: Sequence[int] = ()
-    """Hidden nodes that are no longer fixed."""
-    remove_edges: Sequence[int] = ()
-    """Edges whose weight becomes 0; they keep their ids, and `weigh_edges` brings them back."""
-    remove_observed: Sequence[int] = ()
-    """Observed nodes whose weight becomes 0; they keep their ids."""
-    weigh_edges: Mapping[int, float] = NO_WEIGHTS
-    """New weights (factors on the information) of edges, by id; removed edges may get one."""
-    weigh_observed: Mapping[int, float] = NO_WEIGHTS
-    """New weights of observed nodes, by id."""
     biases: FloatArray = NO_POSES
     """
     Initial values of new biases, shape (S, 3) [sigma, sigma, rad]: hidden nodes that are numbered
     after those of `hidden`.
     """
+    fix: Sequence[int] = ()
+    """Hidden nodes that keep their pose from now on (the gauge)."""
+    free: Sequence[int] = ()
+    """Hidden nodes that are no longer fixed."""
+    remove_edges: Sequence[int] = ()
+    """
+    Edges whose weight becomes 0: they keep row and id, and `weigh_edges` brings them back.
+    `drop_edges` is for good.
+    """
+    remove_observed: Sequence[int] = ()
+    """Observed nodes whose weight becomes 0, as `remove_edges`."""
+    weigh_edges: Mapping[int, float] = NO_WEIGHTS
+    """New weights (factors on the information) of edges, by id; removed edges may get one."""
+    weigh_observed: Mapping[int, float] = NO_WEIGHTS
+    """New weights of observed nodes, by id."""
+    remove_nodes: Sequence[int] = ()
+    """
+    Hidden nodes that leave the graph for good, with all constraints on them, those with weight 0
+    included. What they told about the others is lost; see `marginalization`.
+    """
+    drop_edges: Sequence[int] = ()
+    """Edges that leave the graph for good."""
+    drop_observed: Sequence[int] = ()
+    """Observed nodes that leave the graph for good."""
+
+
+# Index of the first part of an update that edits what there is.
+FIRST_EDIT: Final = GraphUpdate._fields.index('fix')
 
 
 class Energies(NamedTuple):
@@ -80,4 +96,27 @@ class GraphRows(NamedTuple):
     is_bias: BoolArray
     fixed: BoolArray
     edges: Edges
+    """Their ends are ids."""
     observed: ObservedNodes
+    """Their nodes are ids."""
+    node_ids: IntArray
+    """Ids of the nodes, ascending, shape (N,)."""
+    edge_ids: IntArray
+    observed_ids: IntArray
+    next_ids: NextIds
+    """Ids of the next new rows; at least 1 more than the last."""
+
+    def since(self, first: NextIds) -> 'GraphRows':
+        """Return the rows that are new since the next ids were these."""
+        nodes, edges, observed = (
+            slice(int(np.searchsorted(ids, begin)), None) for ids, begin in zip(
+                (self.node_ids, self.edge_ids, self.observed_ids), first, strict=True))
+        return GraphRows(
+            self.poses[nodes], self.is_bias[nodes], self.fixed[nodes], self.edges.rows(edges),
+            self.observed.rows(observed), self.node_ids[nodes], self.edge_ids[edges],
+            self.observed_ids[observed], self.next_ids)
+
+    def with_edges(self, edges: Edges) -> Self:
+        """Return the same rows with other edges, which get the ids 0, 1..."""
+        return self._replace(edges=edges, edge_ids=np.arange(len(edges)),
+                             next_ids=self.next_ids._replace(edge=len(edges)))

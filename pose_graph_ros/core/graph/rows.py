@@ -10,7 +10,7 @@ A row is *valid* if it passes the quick checks in here. Rows that do not are che
 import math
 
 from pose_graph_ros.core.compiled.jit import kernel
-from pose_graph_ros.core.graph import factors, tables as tb
+from pose_graph_ros.core.graph import factors, identities, tables as tb
 from pose_graph_ros.core.graph.constraints import KNOWN_EDGES, ObservedKind
 
 # Tolerance of the symmetry and the eigenvalues of an information matrix whose diagonal is scaled
@@ -152,18 +152,19 @@ def write_edges(  # type: ignore[no-untyped-def]
     valid = True
     for k in range(len(i)):
         e = head[tb.N_EDGES] + k
-        inside = 0 <= i[k] < n_nodes and 0 <= j[k] < n_nodes and kind[k] in _EDGE_KINDS
+        a, b = identities.node_row(head, i[k]), identities.node_row(head, j[k])
+        inside = 0 <= a < n_nodes and 0 <= b < n_nodes and kind[k] in _EDGE_KINDS
         valid = write_edge(
-            head, e, i[k], j[k], mean[k], information[k], kind[k], weight[k]) and inside and valid
+            head, e, a, b, mean[k], information[k], kind[k], weight[k]) and inside and valid
         if kind[k] == factors.BIAS:
             f = edge_f[e]
             f[tb.BIAS_OFFSET], f[tb.BIAS_OFFSET + 1] = bias[k, 0], bias[k, 1]
             f[tb.FACTOR_T], f[tb.FACTOR_TH] = bias[k, 2], bias[k, 3]
             for m in range(4):
                 valid = _is_finite(bias[k, m]) and valid
-            valid = valid and _is_bias(head, j[k], first_bias)
+            valid = valid and _is_bias(head, b, first_bias)
         elif valid:
-            valid = not (_is_bias(head, i[k], first_bias) or _is_bias(head, j[k], first_bias))
+            valid = not (_is_bias(head, a, first_bias) or _is_bias(head, b, first_bias))
     return valid
 
 
@@ -182,8 +183,9 @@ def write_all_observed(  # type: ignore[no-untyped-def]
     """
     valid = True
     for k in range(len(node)):
-        inside = 0 <= node[k] < n_nodes and kind[k] in _OBSERVED_KINDS
-        if not (write_observed(head, head[tb.N_OBSERVED] + k, node[k], offset[k], mean[k],
+        v = identities.node_row(head, node[k])
+        inside = 0 <= v < n_nodes and kind[k] in _OBSERVED_KINDS
+        if not (write_observed(head, head[tb.N_OBSERVED] + k, v, offset[k], mean[k],
                                information[k], kind[k], weight[k]) and inside):
             valid = False
     return valid

@@ -59,8 +59,9 @@ POSE, DELTA, SEEN, CHECKED_TURN, SCALE_T, SCALE_R, REF, NODE_F = 0, 3, 6, 9, 10,
 #   NODE_LOGGED, SOLUTION_LOGGED: stamps (UPDATE) of the last log of the row, and of the columns
 #       before SCALE_T alone
 #   IS_BIAS: 1 for a bias, 0 for a pose
+#   NODE_LEAVES: 1 if `compaction` takes the node out after the update; it is in no list by then
 (CLIQUE, EDGE_LIST, OBSERVED_LIST, FIXED, TOUCHED, INDEX, FRONT, CHANGED, NODE_LOGGED,
- SOLUTION_LOGGED, IS_BIAS, NODE_I) = range(12)
+ SOLUTION_LOGGED, IS_BIAS, NODE_LEAVES, NODE_I) = range(13)
 
 # edge_f; th is the DELTA of a heading, and "linearized" means at the last linearization.
 #   MEAN (3): measured pose of j in i [m, m, rad]
@@ -90,8 +91,9 @@ BIAS_OFFSET, BIAS_ARM, FACTOR_T, FACTOR_TH = OWN_T, LIN_D, LIN_COS, LIN_SIN
 #   EDGE_LOGGED, ENERGY_LOGGED: stamps (UPDATE) of the last log of the row, and of ERROR2, ENERGY
 #       and EDGE_WAITS alone
 #   OWNER: row of the clique that the edge was assembled in
+#   EDGE_LEAVES: 1 if `compaction` takes the edge out, as it does all edges of nodes that leave
 (END_I, END_J, NEXT_I, NEXT_J, EDGE_KIND, EDGE_CHECKED, EDGE_WAITS, EDGE_LOGGED, ENERGY_LOGGED,
- OWNER, EDGE_I) = range(11)
+ OWNER, EDGE_LEAVES, EDGE_I) = range(12)
 
 # observed_f; MEAN, INFO and WEIGHT as for edges, the mean being the observed pose in the map.
 #   OBS_OFFSET (3): pose of the observed frame in the hidden node [m, m, rad]
@@ -103,13 +105,13 @@ OBS_OFFSET, OBS_TH, OBS_K, OBS_ERROR2, OBS_ENERGY, OBS_F = 10, 13, 14, 15, 16, 1
 #   OBS_NODE: hidden node that is observed
 #   OBS_NEXT: next entry of its list of observed nodes
 #   OBS_KIND: `ObservedKind`
-#   OBS_WAITS, OBS_LOGGED: as EDGE_WAITS and EDGE_LOGGED
-OBS_NODE, OBS_NEXT, OBS_KIND, OBS_WAITS, OBS_LOGGED, OBS_I = range(6)
+#   OBS_WAITS, OBS_LOGGED, OBS_LEAVES: as EDGE_WAITS, EDGE_LOGGED and EDGE_LEAVES
+OBS_NODE, OBS_NEXT, OBS_KIND, OBS_WAITS, OBS_LOGGED, OBS_LEAVES, OBS_I = range(7)
 
 # clique_i
 #   PARENT, CHILD, SIBLING: rows of the parent, the first child and the next child of the parent;
 #       in an unused row SIBLING is the next unused one
-#   N_FRONTAL, N_SEPARATOR: numbers of frontal nodes (0 in an unused row) and separator nodes
+#   N_FRONTAL, N_SEPARATOR: numbers of frontal and separator nodes, both 0 in an unused row
 #   NODES: index in pool_i of its nodes, frontal ones first
 #   VALUES: index in pool_f of its rows of R, with the update matrix behind them
 #   MARKED: stamp (FRONT_SERIAL) of the last marking for elimination; while marked cliques are
@@ -133,6 +135,7 @@ TURN_SEEN, TURN_ZERO, SLIP_ERROR2, SLIP_SCALE, DRIFT, CLIQUE_F = range(6)
 TURN = SLIP_ERROR2
 
 # Tables by name, with their numbers of columns. Those with one column are 1-D:
+#   node_id, edge_id, observed_id: ids of the rows, ascending
 #   pool_f, pool_i: values and node lists of cliques
 #   log_f, log_i: transaction log
 #   work_f, work_i: work space of kernels
@@ -144,7 +147,7 @@ FLOAT_TABLES: Final = {'node_f': NODE_F, 'edge_f': EDGE_F, 'observed_f': OBS_F, 
                        'log_f': 1, 'work_f': 1, 'scalars': 1, 'clique_f': CLIQUE_F}
 INT_TABLES: Final = {'node_i': NODE_I, 'edge_i': EDGE_I, 'observed_i': OBS_I,
                      'clique_i': CLIQUE_I, 'pool_i': 1, 'log_i': 1, 'work_i': 1, 'touched': 1,
-                     'freed': 1, 'waiting': 1}
+                     'freed': 1, 'waiting': 1, 'node_id': 1, 'edge_id': 1, 'observed_id': 1}
 NAMES: Final = (*FLOAT_TABLES, *INT_TABLES)
 
 # --- the head: addresses and capacities first, then counters ------------------------------------
@@ -170,11 +173,15 @@ NAMES: Final = (*FLOAT_TABLES, *INT_TABLES)
 #   LISTED: UPDATE that has listed all that the next iteration of a refinement linearizes again
 #   ROUND: number of iterations of the refinement so far
 #   INTERRUPT: set to 1 by another thread to end a refinement
+#   NEXT_NODE, NEXT_EDGE, NEXT_OBSERVED: ids of the next new rows
+#   N_LEAVING: number of rows that `compaction` takes out after the update, without those that
+#       leave because of the node that they are on
 (N_NODES, N_EDGES, N_OBSERVED, N_CLIQUES, FREE_CLIQUE, POOL_F_END, POOL_I_END, N_TOUCHED, N_FREED,
  N_WAITING, LOG_F_END, LOG_I_END, UPDATE, ITERATION, FRONT_SERIAL, STRUCTURE, NEED_F,
  NEED_I, NEED_WORK, BAD_NODE, N_RELINEARIZED, N_ELIMINATED, N_VISITED, N_ITERATIONS, N_ROOTS,
  N_CHECKS, N_CHANGED, N_TURNED, NODE_ROOM, EDGE_ROOM, OBSERVED_ROOM, NEWEST, SINCE, REFINED,
- LISTED, ROUND, INTERRUPT, COUNTERS_END) = range(2 * len(NAMES), 2 * len(NAMES) + 38)
+ LISTED, ROUND, INTERRUPT, NEXT_NODE, NEXT_EDGE, NEXT_OBSERVED, N_LEAVING, COUNTERS_END) = range(
+     2 * len(NAMES), 2 * len(NAMES) + 42)
 # Sizes of the blocks of the pools: exact up to 64 numbers, then in steps of an eighth.
 SIZES: Final = [*range(65)]
 while SIZES[-1] < 2**31:
@@ -265,6 +272,9 @@ work_i = _table('work_i')
 touched = _table('touched')
 freed = _table('freed')
 waiting = _table('waiting')
+node_id = _table('node_id')
+edge_id = _table('edge_id')
+observed_id = _table('observed_id')
 
 
 def _pages(shape: int | tuple[int, int], dtype: type[np.generic]) -> npt.NDArray[Any]:

@@ -20,7 +20,8 @@ _FLOATS = (tb.NODE_F, tb.EDGE_F, tb.OBS_F, tb.CLIQUE_F, 0, tb.SCALE_T, 2)
 _INTEGERS = (tb.NODE_I, tb.EDGE_I, tb.OBS_I, tb.CLIQUE_I, 0, 0, 1)
 # Counters in the first entry.
 STARTED_WITH = (
-    tb.N_NODES, tb.N_EDGES, tb.N_OBSERVED, tb.STRUCTURE, tb.N_TOUCHED, tb.N_WAITING, tb.NEWEST)
+    tb.N_NODES, tb.N_EDGES, tb.N_OBSERVED, tb.STRUCTURE, tb.N_TOUCHED, tb.N_WAITING, tb.NEWEST,
+    tb.NEXT_NODE, tb.NEXT_EDGE, tb.NEXT_OBSERVED, tb.N_LEAVING)
 
 
 @kernel
@@ -143,7 +144,7 @@ def _give_clique(head, c):  # type: ignore[no-untyped-def]
     row = clique_i[c]
     pools.give_nodes(head, row[tb.NODES], row[tb.N_FRONTAL] + row[tb.N_SEPARATOR])
     pools.give_values(head, row[tb.VALUES], pools.n_values(row[tb.N_FRONTAL], row[tb.N_SEPARATOR]))
-    row[tb.N_FRONTAL] = 0
+    row[tb.N_FRONTAL] = row[tb.N_SEPARATOR] = 0
     row[tb.SIBLING] = head[tb.FREE_CLIQUE]
     head[tb.FREE_CLIQUE] = c
 
@@ -225,7 +226,7 @@ def _restore_start(head):  # type: ignore[no-untyped-def]
         waiting[k] = log_i[head[tb.N_TOUCHED] + k]
 
 
-@kernel
+@kernel(signature=(tb.HEAD,))
 def commit(head):  # type: ignore[no-untyped-def]
     """End an update: keep its changes, and give the memory of replaced values and cliques back."""
     clique_i, freed = tb.clique_i(head), tb.freed(head)
@@ -255,7 +256,8 @@ def rollback(head):  # type: ignore[no-untyped-def]
             break
         end_i -= 2
         if code == TAKEN_CLIQUE:
-            if clique_i[row, tb.N_FRONTAL] > 0:  # else the same update has given it back
+            # else the same update has given it back
+            if clique_i[row, tb.N_FRONTAL] + clique_i[row, tb.N_SEPARATOR] > 0:
                 _give_clique(head, row)
         elif code == SOLUTION:
             end_f -= tb.SCALE_T

@@ -33,7 +33,7 @@ from pose_graph_ros.core.graph.constraints import (
     ObservedNodes,
     upper,
 )
-from pose_graph_ros.core.graph.graph import GraphRows
+from pose_graph_ros.core.graph.graph import GraphRows, NextIds
 from pose_graph_ros.core.io.atomic_files import write_files
 from pose_graph_ros.core.io.g2o import g2o_text, LAYOUT, NOT_USED
 from pose_graph_ros.core.io.json_values import annotations, decoded, encoded
@@ -242,7 +242,9 @@ def _graph_rows(rows: SavedRows, text: str) -> GraphRows:
     poses[~is_bias] = vertices[:, 1:]
     _fill(poses, rows.biases, rows.bias_values, 'biases')
     return GraphRows(poses, is_bias, fixed, _edges(rows, _numbers(lines, 'EDGE_SE2')),
-                     _observed(rows, lines))
+                     _observed(rows, lines), np.arange(n), np.arange(len(rows.edge_kind)),
+                     np.arange(len(rows.observed_kind)),
+                     NextIds(n, len(rows.edge_kind), len(rows.observed_kind)))
 
 
 def _edges(rows: SavedRows, numbers: FloatArray) -> Edges:

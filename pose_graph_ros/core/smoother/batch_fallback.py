@@ -37,6 +37,7 @@ def optimize_copy(graph: Graph, copy: Graph) -> bool:
     # the start if the linear start leads to a higher chi2
     transaction_log.poses_before(graph.memory.head, poses)
     copy.fill(graph.rows()._replace(poses=poses))
+    copy.apply(graph.leaving())
     if optimizer.optimize_from_linear_start(copy, _CONFIG, _STARTS).status is Status.FAILED:
         return False
     copy.set_poses(copy.poses)

@@ -38,6 +38,7 @@ def _write_node(head, v, last, mean):  # type: ignore[no-untyped-def]
     i[:] = 0
     i[tb.CLIQUE] = i[tb.EDGE_LIST] = i[tb.OBSERVED_LIST] = -1
     i[tb.NODE_LOGGED] = head[tb.UPDATE]
+    tb.node_id(head)[v] = head[tb.NEXT_NODE]
 
 
 @kernel
@@ -137,7 +138,8 @@ def extend(head, mean, information, weight):  # type: ignore[no-untyped-def]
     f = edge_f[e]
     cos, sin = math.cos(mean[2]), math.sin(mean[2])
     f[tb.OWN_T], f[tb.OWN_T + 1] = cos * mean[0] + sin * mean[1], cos * mean[1] - sin * mean[0]
-    edge_i[e, tb.EDGE_CHECKED] = edge_i[e, tb.EDGE_WAITS] = 0
+    tb.edge_id(head)[e] = head[tb.NEXT_EDGE]
+    edge_i[e, tb.EDGE_CHECKED] = edge_i[e, tb.EDGE_WAITS] = edge_i[e, tb.EDGE_LEAVES] = 0
     edge_i[e, tb.OWNER] = c
     edge_i[e, tb.EDGE_LOGGED] = head[tb.UPDATE]
     factors.linearize_edge(head, e)
@@ -163,6 +165,7 @@ def extend(head, mean, information, weight):  # type: ignore[no-untyped-def]
         bad = _eliminate_3(root, 3, least)
     if bad >= 0:
         node_f[last, tb.SCALE_T], node_f[last, tb.SCALE_R] = scale_t, scale_r
+        transaction_log.commit(head)
         return NOT_A_CHAIN
     # nothing can fail from here on
     values, nodes = old[tb.VALUES], old[tb.NODES]
@@ -183,6 +186,9 @@ def extend(head, mean, information, weight):  # type: ignore[no-untyped-def]
     edge_i[e, tb.NEXT_I], node_i[last, tb.EDGE_LIST] = node_i[last, tb.EDGE_LIST], 2 * e
     edge_i[e, tb.NEXT_J], node_i[v, tb.EDGE_LIST] = -1, 2 * e + 1
     head[tb.N_NODES], head[tb.N_EDGES], head[tb.NEWEST] = v + 1, e + 1, v
+    head[tb.NEXT_NODE] += 1
+    head[tb.NEXT_EDGE] += 1
+    transaction_log.commit(head)
     return EXTENDED
 
 

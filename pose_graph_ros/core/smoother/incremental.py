@@ -2,7 +2,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """The incremental smoother; `docs/solver.md` describes the method."""
 
-from typing import Any, NamedTuple
+from collections.abc import Sequence
+from typing import NamedTuple
 
 import numpy as np
 
@@ -10,7 +11,7 @@ from pose_graph_ros.core.batch.optimizer import chi2_of, Status
 from pose_graph_ros.core.config import SmootherConfig
 from pose_graph_ros.core.exceptions import GraphUpdateError
 from pose_graph_ros.core.geometry import se2
-from pose_graph_ros.core.geometry.se2 import FloatArray
+from pose_graph_ros.core.geometry.se2 import FloatArray, IntArray
 from pose_graph_ros.core.graph import tables as tb
 from pose_graph_ros.core.graph.constraints import EdgeKind, Edges
 from pose_graph_ros.core.graph.graph import Graph, GraphUpdate
@@ -134,7 +135,8 @@ class IncrementalSmoother:
         if self.graph.has_touched:
             self.graph.rollback()
             return False
-        return True     # no step has replaced values that a commit would give back
+        self.graph.commit()
+        return True
 
     def refine(self) -> Refinement:
         """
@@ -144,7 +146,7 @@ class IncrementalSmoother:
         After a failure or an interruption the graph is as before, bit for bit. Raises ValueError
         if edits of the graph wait for an update.
         """
-        self._require_eliminated()
+        self._eliminated()
         if self.graph.newest_pose < 0:
             return _NOT_REFINED
         code = refinement.MORE_MEMORY
@@ -175,7 +177,7 @@ class IncrementalSmoother:
         poses : ndarray, shape (N, 3), optional, where it starts
 
         """
-        self._require_eliminated()
+        self._eliminated()
         other = IncrementalSmoother(self._config)
         return Trial(self.graph, other.graph, update, other._eliminate, poses)
 
@@ -236,11 +238,11 @@ class IncrementalSmoother:
             self.graph.ensure(*(int(count) + 1 for count in head[tb.N_NODES:tb.N_OBSERVED + 1]))
             self._make_room(int(head[tb.POOL_F_END]) + 256, int(head[tb.POOL_I_END]) + 8, 256)
             return self.extend(mean, information, weight)
-        node, last = self.graph.n_nodes, self.graph.newest_pose
+        node, last = self.graph.next_ids.node, self.graph.newest_pose
         if last < 0:
             raise GraphUpdateError('extend: expected a graph with a hidden node to go on from')
         return self.update(GraphUpdate(
-            hidden=se2.compose(self.graph.poses[last], mean)[None],
+            hidden=se2.compose(self.graph.poses_of(last), mean)[None],
             edges=Edges([last], [node], mean[None], information[None], [EdgeKind.ODOMETRY],
                         [weight])))
 
@@ -258,9 +260,9 @@ class IncrementalSmoother:
 
         Raises ValueError if there is no such node, or edits of the graph are not solved for.
         """
-        self._require_eliminated(node)
+        row, = self._eliminated([node])
         out = np.empty((3, 3))
-        covariances.node_covariance(self._memory.head, node, out)
+        covariances.node_covariance(self._memory.head, row, out)
         return out
 
     def joint_covariance(self, i: int, j: int) -> FloatArray:
@@ -272,14 +274,14 @@ class IncrementalSmoother:
         i, j : int, the nodes; raises as `covariance`
 
         """
-        self._require_eliminated(i, j)
+        rows = self._eliminated([i, j])
         out = np.zeros((6, 6))
-        covariances.pair_covariance(self._memory.head, i, j, out)
+        covariances.pair_covariance(self._memory.head, *rows, out)
         return out
 
     def covariances(self) -> FloatArray:
         """Return those of all hidden nodes, shape (N, 3, 3); raises as `covariance`."""
-        self._require_eliminated()
+        self._eliminated()
         out = np.zeros((self.graph.n_nodes, 3, 3))
         all_covariances(self._memory.head, out)
         return out
@@ -290,20 +292,27 @@ class IncrementalSmoother:
 
         Raises as `covariance` does.
         """
-        self._require_eliminated(*edges.i, *edges.j)
-        return innovations.at_estimate(self._memory.head, edges)
+        return innovations.at_estimate(
+            self._memory.head, edges.renumbered(self._eliminated))
 
-    def _require_eliminated(self, *nodes: Any) -> None:
-        waiting, n_nodes = int(self._memory.head[tb.N_TOUCHED]), self.graph.n_nodes
+    def _eliminated(self, nodes: Sequence[int] | IntArray = ()) -> IntArray:
+        """Return the rows of hidden nodes in a graph whose edits have all been solved for."""
+        waiting = int(self._memory.head[tb.N_TOUCHED])
         if waiting > 0:
             raise ValueError(
                 f'covariances: expected a graph whose edits have all been solved for, got one '
                 f'with {waiting} hidden nodes that wait for the solver')
-        for node in nodes:
-            if not (isinstance(node, int | np.integer) and 0 <= node < n_nodes):
-                expected = (
-                    f'a hidden node in 0..{n_nodes - 1}' if n_nodes > 0 else 'a graph with nodes')
-                raise ValueError(f'covariances: expected {expected}, got {node}')
+        end = self.graph.next_ids.node
+        wrong = [node for node in nodes
+                 if not (isinstance(node, int | np.integer) and 0 <= node < end)]
+        if len(wrong) > 0:
+            expected = f'a hidden node in 0..{end - 1}' if end > 0 else 'a graph with nodes'
+            raise ValueError(f'covariances: expected {expected}, got {wrong[0]}')
+        rows = self.graph.node_rows(np.array(nodes, dtype=np.int64))
+        if np.any(rows < 0):
+            raise ValueError(
+                f'covariances: hidden node {nodes[int(np.argmin(rows))]} has left the graph')
+        return rows
 
     def chi2(self) -> float:
         """Return the energy of all constraints; see `chi2_of`."""
@@ -328,9 +337,11 @@ class IncrementalSmoother:
         if code == step.DIVERGED:
             return self._fall_back_to_batch()
         if code == step.BAD_PIVOT:
-            reason = f'hidden node {head[tb.BAD_NODE]} is not determined'
+            node = self.graph.node_ids[head[tb.BAD_NODE]]
+            reason = f'hidden node {node} is not determined'
             self.graph.rollback()
             return UpdateResult(Status.FAILED, reason, 0, 0, 0, 0)
+        self.graph.commit()
         status = Status.CONVERGED if code == step.SETTLED else Status.MAX_ITERATIONS
         relinearized, eliminated, visited, iterations = (
             head[tb.N_RELINEARIZED:tb.N_ITERATIONS + 1].tolist())

@@ -30,7 +30,7 @@ def mark(head):  # type: ignore[no-untyped-def]
     Mark the cliques from all touched nodes up to the roots.
 
     Return these cliques, in no particular order, and the affected nodes: their frontal nodes and
-    the touched nodes without a clique.
+    the touched nodes without a clique, but for those that leave the graph.
     """
     node_i, clique_i, pool_i = tb.node_i(head), tb.clique_i(head), tb.pool_i(head)
     touched = tb.touched(head)
@@ -60,13 +60,13 @@ def mark(head):  # type: ignore[no-untyped-def]
         row = clique_i[marked[k]]
         for m in range(row[tb.NODES], row[tb.NODES] + row[tb.N_FRONTAL]):
             affected[n_affected] = pool_i[m]
-            n_affected += 1
+            n_affected += 1 - node_i[pool_i[m], tb.NODE_LEAVES]
     for s in range(head[tb.N_TOUCHED]):
         v = touched[s]
-        if node_i[v, tb.CLIQUE] < 0:
+        if node_i[v, tb.CLIQUE] < 0 and node_i[v, tb.NODE_LEAVES] == 0:
             affected[n_affected] = v
             n_affected += 1
-    return marked[:n_marked], affected
+    return marked[:n_marked], affected[:n_affected]
 
 
 @kernel(allocates=True, inline='always')    # callees compile once

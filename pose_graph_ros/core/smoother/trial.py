@@ -10,7 +10,7 @@ with the graph, and adopted by the smoother with all that was added meanwhile
 (`IncrementalSmoother.adopt`); or it is dropped, without a trace.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import replace
 
 import numpy as np
@@ -19,7 +19,7 @@ from pose_graph_ros.core.batch import optimizer
 from pose_graph_ros.core.batch.optimizer import BatchResult, Parts, Start, Status
 from pose_graph_ros.core.config import SolverConfig
 from pose_graph_ros.core.geometry import se2
-from pose_graph_ros.core.geometry.se2 import FloatArray
+from pose_graph_ros.core.geometry.se2 import FloatArray, IntArray
 from pose_graph_ros.core.graph.graph import Graph, GraphUpdate
 
 # With more iterations it would converge where an update does not: at a minimum with errors so
@@ -84,43 +84,77 @@ class Trial:
 
     @property
     def is_outdated(self) -> bool:
-        """Whether the poses of the graph were set since, as an alignment with the map does."""
-        return self._graph.n_moves != self._moves
+        """
+        Whether the trial cannot be adopted any more.
+
+        That is so if the poses of the graph were set since, as an alignment with the map does, or
+        if all poses that it began with have left the graph.
+        """
+        poses = self.graph.node_ids[~self.graph.is_bias]
+        return self._graph.n_moves != self._moves or not np.any(self._graph.node_rows(poses) >= 0)
 
     def catch_up(self) -> None:
-        """Apply to the copy what has been done to the graph since; the smoother has to solve."""
-        now, before = self._graph, self._before
-        n, copy = len(before.poses), self.graph
-        copy.append_nodes(continued(now, copy.poses)[n:], now.is_bias[n:])
-        weights = []
-        for new, old, chosen in zip(
-                now.weights, (before.edges.weight, before.observed.weight),
-                (self._update.weigh_edges, self._update.weigh_observed), strict=True):
-            changed = np.flatnonzero(new[:len(old)] != old)
-            weights.append({row: float(new[row]) for row in changed.tolist() if row not in chosen})
-        fixed = now.fixed
-        was_fixed = np.zeros(now.n_nodes, dtype=bool)
-        was_fixed[:n] = before.fixed
-        copy.apply(GraphUpdate(
-            edges=now.edges_at(np.arange(len(before.edges), now.n_edges)),
-            observed=now.observed_at(np.arange(len(before.observed), now.n_observed)),
+        """
+        Apply to the copy what has been done to the graph since; the smoother has to solve.
+
+        What has left the graph leaves the copy. What is left of it in the graph, as priors, was
+        computed with the weights of the graph; so it is used as it is.
+        """
+        now, before, copy = self._graph.rows(), self._before, self.graph
+        poses = continued(self._graph, copy.poses, copy.node_ids)
+        copy.fill(now._replace(poses=poses).since(before.next_ids))
+        weights = [
+            _changed(ids_before, old, ids_now, new, chosen)
+            for ids_before, old, ids_now, new, chosen in (
+                (before.edge_ids, before.edges.weight, now.edge_ids, now.edges.weight,
+                 self._update.weigh_edges),
+                (before.observed_ids, before.observed.weight, now.observed_ids,
+                 now.observed.weight, self._update.weigh_observed))]
+        was_fixed = copy.fixed[copy.node_rows(now.node_ids)]
+        copy.apply(_gone(copy, self._graph)._replace(
             weigh_edges=weights[0], weigh_observed=weights[1],
-            fix=np.flatnonzero(fixed & ~was_fixed).tolist(),
-            free=np.flatnonzero(was_fixed & ~fixed).tolist()))
+            fix=self._graph.node_ids[now.fixed & ~was_fixed].tolist(),
+            free=self._graph.node_ids[was_fixed & ~now.fixed].tolist()))
 
 
-def continued(graph: Graph, poses: FloatArray) -> FloatArray:
+def _gone(copy: Graph, graph: Graph) -> GraphUpdate:
+    """Return the update that takes out of a copy what has left the graph."""
+    nodes, edges, observed = (ids[rows(ids) < 0].tolist() for ids, rows in (
+        (copy.node_ids, graph.node_rows), (copy.edge_ids, graph.edge_rows),
+        (copy.observed_ids, graph.observed_rows)))
+    return GraphUpdate(remove_nodes=nodes, drop_edges=edges, drop_observed=observed)
+
+
+def _changed(
+    ids_before: IntArray, old: FloatArray, ids_now: IntArray, new: FloatArray,
+    chosen: Mapping[int, float],
+) -> dict[int, float]:
+    """Return the weights that have changed and are not chosen, of what is still in the graph."""
+    ids, rows_before, rows_now = np.intersect1d(
+        ids_before, ids_now, assume_unique=True, return_indices=True)
+    weights = zip(ids.tolist(), old[rows_before].tolist(), new[rows_now].tolist(), strict=True)
+    return {number: weight for number, before, weight in weights
+            if weight != before and number not in chosen}
+
+
+def continued(graph: Graph, poses: FloatArray, ids: IntArray | None = None) -> FloatArray:
     """
     Return poses of all nodes: newer ones than those given move with the last of these.
 
     Parameters
     ----------
     graph : Graph, of N nodes
-    poses : ndarray, shape (K, 3), other poses of its first nodes, K <= N
+    poses : ndarray, shape (K, 3), other poses of nodes
+    ids : ndarray of int, shape (K,), optional
+        Ids of these nodes, some of which may have left the graph; by default its first K nodes.
 
     """
-    n, now, is_bias = len(poses), graph.poses, graph.is_bias
-    newer, last = now[n:].copy(), int(np.flatnonzero(~is_bias[:n])[-1])
-    moved = np.flatnonzero(~is_bias[n:])
-    newer[moved] = se2.compose(poses[last], se2.between(now[last], newer[moved]))
-    return np.concatenate((poses, newer))
+    rows = np.arange(len(poses)) if ids is None else graph.node_rows(ids)
+    moved, is_bias = graph.poses.copy(), graph.is_bias
+    n = int(np.max(rows)) + 1
+    last = int(rows[(rows >= 0) & ~is_bias[rows]][-1])
+    moved[rows[rows >= 0]] = poses[rows >= 0]
+    newer = n + np.flatnonzero(~is_bias[n:])
+    moved[newer] = se2.compose(
+        moved[last], se2.between(graph.poses[last], graph.poses[newer]))
+    return moved

@@ -14,6 +14,7 @@ from slow_smoother import differences, EXACT, information, SlowGraph, state, wor
 from pose_graph_ros.core.batch import optimizer
 from pose_graph_ros.core.batch.optimizer import Status
 from pose_graph_ros.core.config import SmootherConfig, SolverConfig
+from pose_graph_ros.core.exceptions import GraphUpdateError
 from pose_graph_ros.core.geometry import se2
 from pose_graph_ros.core.geometry.se2 import FloatArray
 from pose_graph_ros.core.graph import tables as tb
@@ -65,6 +66,7 @@ class Edits(RuleBasedStateMachine):
         assert (result.status, result.reason) == (Status.CONVERGED, '')
         self.spared.update(update)
         self.slow = after.at(self.smoother.poses)
+        self.world.gone.update(after.gone)
 
     @rule(seed=seeds, count=st.integers(1, 3))
     def drive(self, seed: int, count: int) -> None:
@@ -95,27 +97,41 @@ class Edits(RuleBasedStateMachine):
 
     @rule(seed=seeds, weight=st.sampled_from([0.0, 0.1, 1.0, 7.0]), of_edge=st.booleans())
     def weigh(self, seed: int, weight: float, of_edge: bool) -> None:
-        table = self.slow.edges if of_edge else self.slow.observed
+        table = self.slow.has_edges() if of_edge else self.slow.has_observed()
         if len(table) > 0:
-            row = seed % len(table)
+            row = table[seed % len(table)]
             self.update(GraphUpdate(
                 **{'weigh_edges' if of_edge else 'weigh_observed': {row: weight}}))
 
     @rule(seed=seeds, of_edge=st.booleans())
     def remove(self, seed: int, of_edge: bool) -> None:
-        table = self.slow.edges if of_edge else self.slow.observed
+        table = self.slow.has_edges() if of_edge else self.slow.has_observed()
         if len(table) > 0:
-            rows = sorted({seed % len(table), seed // 7 % len(table)})
+            rows = table[sorted({seed % len(table), seed // 7 % len(table)})].tolist()
             self.update(GraphUpdate(
                 **{'remove_edges' if of_edge else 'remove_observed': rows}))
 
     @rule(seed=seeds)
     def fix(self, seed: int) -> None:
-        self.update(GraphUpdate(fix=[seed % len(self.slow.poses)]))
+        nodes = self.smoother.graph.node_ids
+        self.update(GraphUpdate(fix=[nodes[seed % len(nodes)]]))
 
     @rule(seed=seeds)
     def free(self, seed: int) -> None:
-        self.update(GraphUpdate(free=[seed % len(self.slow.poses)]))
+        nodes = self.smoother.graph.node_ids
+        self.update(GraphUpdate(free=[nodes[seed % len(nodes)]]))
+
+    @rule(seed=seeds)
+    def let_some_leave(self, seed: int) -> None:
+        self.world.rng = np.random.default_rng(seed)
+        self.update(self.world.leaving(self.slow))
+
+    @rule(seed=seeds)
+    def ask_for_what_has_left(self, seed: int) -> None:
+        if len(self.slow.gone) > 0:
+            node = sorted(self.slow.gone)[seed % len(self.slow.gone)]
+            with pytest.raises(GraphUpdateError, match=f'hidden node {node} has left the graph'):
+                self.smoother.update(GraphUpdate(fix=[node]))
 
     @rule(seed=seeds)
     def do_everything_at_once(self, seed: int) -> None:
@@ -128,12 +144,15 @@ class Edits(RuleBasedStateMachine):
 
     @invariant()
     def is_at_the_minimum(self) -> None:
-        poses = self.smoother.poses
+        poses, graph = self.smoother.poses, self.smoother.graph
         if len(poses) == 0:
             return
+        assert graph.node_ids.tolist() == np.flatnonzero(self.slow.present).tolist()
+        assert graph.edge_ids.tolist() == self.slow.has_edges().tolist()
+        assert graph.observed_ids.tolist() == self.slow.has_observed().tolist()
         assert poses.tobytes() == self.spared.poses.tobytes()
         optimum = self.slow.optimized()
-        off = optimum.poses - poses
+        off = optimum.poses[optimum.present] - poses
         off[:, 2] = se2.wrap(off[:, 2])
         assert np.max(np.abs(off)) < CLOSE
         assert self.smoother.chi2() == pytest.approx(optimum.chi2(), rel=1e-9, abs=1e-9)
@@ -143,9 +162,9 @@ class Edits(RuleBasedStateMachine):
         graph = self.smoother.graph
         if graph.n_nodes == 0:
             return
-        covariance = self.slow.covariance(information(graph))
-        n = graph.n_nodes
-        blocks = covariance.reshape(n, 3, n, 3)[np.arange(n), :, np.arange(n)]
+        covariance = self.slow.covariance(self.slow.at_ids(information(graph)))
+        n, ids = len(self.slow.poses), graph.node_ids
+        blocks = covariance.reshape(n, 3, n, 3)[ids, :, ids]
         sigma = np.sqrt(np.einsum('nii->ni', blocks)) + 1e-30
         off = (self.smoother.covariances() - blocks) / sigma[:, :, None] / sigma[:, None, :]
         assert np.max(np.abs(off)) < 1e-6

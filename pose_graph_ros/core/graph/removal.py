@@ -1,0 +1,131 @@
+# Copyright 2026 The pose_graph_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""
+Removal of nodes and constraints for good, in two steps.
+
+Within an update they leave all lists, and with it the tree, but keep their rows, which are logged
+as any other edit; so a rollback brings them back. After the update `compaction` takes the rows
+out.
+"""
+
+from pose_graph_ros.core.compiled.jit import INTEGERS, kernel
+from pose_graph_ros.core.graph import identities, tables as tb, transaction_log
+from pose_graph_ros.core.graph.editing import touch, weigh_edge, weigh_one_observed
+
+
+@kernel
+def _holds(head, c, v):  # type: ignore[no-untyped-def]
+    """Tell whether a node is in the separator of a clique."""
+    clique_i, pool_i = tb.clique_i(head), tb.pool_i(head)
+    row = clique_i[c]
+    begin = row[tb.NODES] + row[tb.N_FRONTAL]
+    m, end = begin, begin + row[tb.N_SEPARATOR]
+    while m < end and pool_i[m] != v:
+        m += 1
+    return m < end
+
+
+@kernel
+def _touch_cliques_with(head, v):  # type: ignore[no-untyped-def]
+    """
+    Touch a node of each clique that has a given one, so that all of them are built anew.
+
+    They are a subtree below the clique that it is frontal in. A clique may have it in the
+    separator although no constraint below leads to it any more.
+    """
+    node_i, clique_i, pool_i = tb.node_i(head), tb.clique_i(head), tb.pool_i(head)
+    top = node_i[v, tb.CLIQUE]
+    if top < 0:
+        return
+    c = clique_i[top, tb.CHILD]
+    parent = top
+    while True:
+        if c >= 0 and _holds(head, c, v):
+            u = pool_i[clique_i[c, tb.NODES]]
+            transaction_log.log_node(head, u)
+            touch(head, u)
+            parent, c = c, clique_i[c, tb.CHILD]
+        elif c >= 0:
+            c = clique_i[c, tb.SIBLING]
+        elif parent == top:
+            return
+        else:
+            c, parent = clique_i[parent, tb.SIBLING], clique_i[parent, tb.PARENT]
+
+
+@kernel
+def _forget_newest(head):  # type: ignore[no-untyped-def]
+    """Let the newest pose be the last one that does not leave."""
+    node_i = tb.node_i(head)
+    v = head[tb.NEWEST]
+    while v >= 0 and (node_i[v, tb.NODE_LEAVES] != 0 or node_i[v, tb.IS_BIAS] != 0):
+        v -= 1
+    head[tb.NEWEST] = v
+
+
+@kernel(signature=(tb.HEAD, INTEGERS))
+def remove_nodes(head, nodes):  # type: ignore[no-untyped-def]
+    """
+    Take hidden nodes out of the graph with all their constraints; their rows leave later.
+
+    Parameters
+    ----------
+    nodes : ndarray of int, shape (N,), ids; none that has left
+
+    """
+    node_i = tb.node_i(head)
+    for node in nodes:
+        v = identities.node_row(head, node)
+        if node_i[v, tb.NODE_LEAVES] != 0:
+            continue
+        transaction_log.log_node(head, v)
+        while node_i[v, tb.EDGE_LIST] >= 0:
+            weigh_edge(head, node_i[v, tb.EDGE_LIST] >> 1, 0.0)
+        while node_i[v, tb.OBSERVED_LIST] >= 0:
+            weigh_one_observed(head, node_i[v, tb.OBSERVED_LIST], 0.0)
+        _touch_cliques_with(head, v)
+        touch(head, v)
+        node_i[v, tb.NODE_LEAVES] = 1
+        head[tb.N_LEAVING] += 1
+        head[tb.STRUCTURE] = 1
+    _forget_newest(head)
+
+
+@kernel(signature=(tb.HEAD, INTEGERS))
+def drop_edges(head, edges):  # type: ignore[no-untyped-def]
+    """
+    Take edges out of the graph; their rows leave later.
+
+    Parameters
+    ----------
+    edges : ndarray of int, shape (M,), ids; none that has left
+
+    """
+    edge_i = tb.edge_i(head)
+    for edge in edges:
+        e = identities.edge_row(head, edge)
+        if edge_i[e, tb.EDGE_LEAVES] == 0:
+            weigh_edge(head, e, 0.0)
+            transaction_log.log_edge(head, e)
+            edge_i[e, tb.EDGE_LEAVES] = 1
+            head[tb.N_LEAVING] += 1
+
+
+@kernel(signature=(tb.HEAD, INTEGERS))
+def drop_observed(head, observed):  # type: ignore[no-untyped-def]
+    """
+    Take observed nodes out of the graph; their rows leave later.
+
+    Parameters
+    ----------
+    observed : ndarray of int, shape (K,), ids; none that has left
+
+    """
+    observed_i = tb.observed_i(head)
+    for number in observed:
+        k = identities.observed_row(head, number)
+        if observed_i[k, tb.OBS_LEAVES] == 0:
+            weigh_one_observed(head, k, 0.0)
+            transaction_log.log_observed(head, k)
+            observed_i[k, tb.OBS_LEAVES] = 1
+            head[tb.N_LEAVING] += 1
