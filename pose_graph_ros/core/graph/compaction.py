@@ -17,72 +17,82 @@ from pose_graph_ros.core.compiled.jit import kernel
 from pose_graph_ros.core.graph import tables as tb
 
 
+@kernel(allocates=True)
+def _numbered(leaves):  # type: ignore[no-untyped-def]
+    """Write the numbers of the rows that stay, -1 where the entry is not 0; return the array."""
+    kept = 0
+    for k in range(len(leaves)):
+        if leaves[k] != 0:
+            leaves[k] = -1
+        else:
+            leaves[k] = kept
+            kept += 1
+    return leaves
+
+
+@kernel(allocates=True)
+def _new_node_rows(head):  # type: ignore[no-untyped-def]
+    """Return the new row of each node, -1 for those that leave."""
+    node_i = tb.node_i(head)
+    leaves = np.empty(head[tb.N_NODES], np.int32)
+    for v in range(head[tb.N_NODES]):
+        leaves[v] = node_i[v, tb.NODE_LEAVES]
+    return _numbered(leaves)
+
+
+@kernel(allocates=True)
+def _new_edge_rows(head, nodes):  # type: ignore[no-untyped-def]
+    """Return the new row of each edge, -1 for those that leave, with a node or alone."""
+    edge_i = tb.edge_i(head)
+    leaves = np.empty(head[tb.N_EDGES], np.int32)
+    for e in range(head[tb.N_EDGES]):
+        row = edge_i[e]
+        stays = nodes[row[tb.END_I]] >= 0 and nodes[row[tb.END_J]] >= 0
+        leaves[e] = 0 if stays and row[tb.EDGE_LEAVES] == 0 else 1
+    return _numbered(leaves)
+
+
+@kernel(allocates=True)
+def _new_observed_rows(head, nodes):  # type: ignore[no-untyped-def]
+    """Return the new row of each observed node, -1 for those that leave."""
+    observed_i = tb.observed_i(head)
+    leaves = np.empty(head[tb.N_OBSERVED], np.int32)
+    for k in range(head[tb.N_OBSERVED]):
+        row = observed_i[k]
+        leaves[k] = 0 if row[tb.OBS_LEAVES] == 0 and nodes[row[tb.OBS_NODE]] >= 0 else 1
+    return _numbered(leaves)
+
+
+@kernel(allocates=True)
+def _move(where, numbers, integers, ids):  # type: ignore[no-untyped-def]
+    """Move the rows of a table up; return the ids of those that leave."""
+    n = 0
+    for k in range(len(where)):
+        n += 1 if where[k] < 0 else 0
+    gone, n = np.empty(n, np.int32), 0
+    for k in range(len(where)):
+        to = where[k]
+        if to < 0:
+            gone[n] = ids[k]
+            n += 1
+        elif to != k:
+            for m in range(numbers.shape[1]):
+                numbers[to, m] = numbers[k, m]
+            for m in range(integers.shape[1]):
+                integers[to, m] = integers[k, m]
+            ids[to] = ids[k]
+    return gone
+
+
 @kernel
-def _move_row(numbers, integers, ids, k, to):  # type: ignore[no-untyped-def]
-    """Copy row k of the tables of nodes, edges or observed nodes."""
-    if k == to:
-        return
-    for m in range(numbers.shape[1]):
-        numbers[to, m] = numbers[k, m]
-    for m in range(integers.shape[1]):
-        integers[to, m] = integers[k, m]
-    ids[to] = ids[k]
-
-
-@kernel(allocates=True)
-def _move_nodes(head):  # type: ignore[no-untyped-def]
-    """Move the rows of nodes up; return where each has gone, -1 for those that leave."""
-    node_f, node_i, node_id = tb.node_f(head), tb.node_i(head), tb.node_id(head)
-    n = head[tb.N_NODES]
-    where, kept = np.empty(n, np.int32), 0
-    for v in range(n):
-        if node_i[v, tb.NODE_LEAVES] != 0:
-            where[v] = -1
-            continue
-        where[v] = kept
-        _move_row(node_f, node_i, node_id, v, kept)
-        kept += 1
-    head[tb.N_NODES] = kept
-    return where
-
-
-@kernel(allocates=True)
-def _move_edges(head, nodes):  # type: ignore[no-untyped-def]
-    """Move the rows of edges up, with the new rows of their ends; return as `_move_nodes`."""
-    edge_f, edge_i, edge_id = tb.edge_f(head), tb.edge_i(head), tb.edge_id(head)
-    n = head[tb.N_EDGES]
-    where, kept = np.empty(n, np.int32), 0
-    for e in range(n):
-        i, j = nodes[edge_i[e, tb.END_I]], nodes[edge_i[e, tb.END_J]]
-        if edge_i[e, tb.EDGE_LEAVES] != 0 or i < 0 or j < 0:
-            where[e] = -1
-            continue
-        where[e] = kept
-        _move_row(edge_f, edge_i, edge_id, e, kept)
-        edge_i[kept, tb.END_I], edge_i[kept, tb.END_J] = i, j
-        kept += 1
-    head[tb.N_EDGES] = kept
-    return where
-
-
-@kernel(allocates=True)
-def _move_observed(head, nodes):  # type: ignore[no-untyped-def]
-    """Move the rows of observed nodes up, as `_move_edges`."""
-    observed_f, observed_i = tb.observed_f(head), tb.observed_i(head)
-    observed_id = tb.observed_id(head)
-    n = head[tb.N_OBSERVED]
-    where, kept = np.empty(n, np.int32), 0
-    for k in range(n):
-        v = nodes[observed_i[k, tb.OBS_NODE]]
-        if observed_i[k, tb.OBS_LEAVES] != 0 or v < 0:
-            where[k] = -1
-            continue
-        where[k] = kept
-        _move_row(observed_f, observed_i, observed_id, k, kept)
-        observed_i[kept, tb.OBS_NODE] = v
-        kept += 1
-    head[tb.N_OBSERVED] = kept
-    return where
+def _rewrite_nodes(head, nodes):  # type: ignore[no-untyped-def]
+    """Rewrite the nodes of all constraints that stay."""
+    edge_i, observed_i = tb.edge_i(head), tb.observed_i(head)
+    for e in range(head[tb.N_EDGES]):
+        edge_i[e, tb.END_I] = nodes[edge_i[e, tb.END_I]]
+        edge_i[e, tb.END_J] = nodes[edge_i[e, tb.END_J]]
+    for k in range(head[tb.N_OBSERVED]):
+        observed_i[k, tb.OBS_NODE] = nodes[observed_i[k, tb.OBS_NODE]]
 
 
 @kernel
@@ -145,10 +155,20 @@ def _rewrite_waiting(head, edges, observed):  # type: ignore[no-untyped-def]
 
 @kernel(signature=(tb.HEAD,), allocates=True)
 def compact(head):  # type: ignore[no-untyped-def]
-    """Take out all rows that leave; the time is proportional to the size of the graph."""
-    nodes = _move_nodes(head)
-    edges = _move_edges(head, nodes)
-    observed = _move_observed(head, nodes)
+    """
+    Take out all rows that leave; return the ids of nodes, edges and observed nodes, ascending.
+
+    The time is proportional to the size of the graph.
+    """
+    nodes = _new_node_rows(head)
+    edges, observed = _new_edge_rows(head, nodes), _new_observed_rows(head, nodes)
+    gone = (_move(nodes, tb.node_f(head), tb.node_i(head), tb.node_id(head)),
+            _move(edges, tb.edge_f(head), tb.edge_i(head), tb.edge_id(head)),
+            _move(observed, tb.observed_f(head), tb.observed_i(head), tb.observed_id(head)))
+    head[tb.N_NODES] -= len(gone[0])
+    head[tb.N_EDGES] -= len(gone[1])
+    head[tb.N_OBSERVED] -= len(gone[2])
+    _rewrite_nodes(head, nodes)
     _rewrite_lists(head, edges, observed)
     _rewrite_cliques(head, nodes)
     _rewrite_touched(head, nodes)
@@ -156,3 +176,4 @@ def compact(head):  # type: ignore[no-untyped-def]
     if head[tb.NEWEST] >= 0:
         head[tb.NEWEST] = nodes[head[tb.NEWEST]]
     head[tb.N_LEAVING] = 0
+    return gone

@@ -26,10 +26,12 @@ from pose_graph_ros.core.graph.graph_update import (
     FIRST_EDIT,
     GraphRows,
     GraphUpdate,
+    Left,
     NextIds,
     NO_EDGES,
     NO_POSES,
     NO_WEIGHTS,
+    NOTHING_LEFT,
     NOTHING_OBSERVED,
 )
 
@@ -134,9 +136,11 @@ class Graph(GraphContents):
         if head[tb.LOG_I_END] == 0:     # not within an update
             self._compact()
 
-    def _compact(self) -> None:
-        if self.memory.head[tb.N_LEAVING] > 0:
-            compact(self.memory.head)
+    def _compact(self) -> Left:
+        """Take out the rows of what leaves."""
+        if self.memory.head[tb.N_LEAVING] == 0:
+            return NOTHING_LEFT
+        return Left(*(ids.astype(np.int64) for ids in compact(self.memory.head)))
 
     def _checked_columns(self, update: GraphUpdate) -> tuple[npt.NDArray[Any], ...]:
         """Return new rows as arrays for the kernel; raise GraphUpdateError if one is invalid."""
@@ -240,10 +244,10 @@ class Graph(GraphContents):
             self.memory.restart_stamps()
             transaction_log.begin(self.memory.head)
 
-    def commit(self) -> None:
-        """End an update: keep its changes, and take out the rows of what has left."""
+    def commit(self) -> Left:
+        """End an update and keep its changes; return what has left, whose rows are taken out."""
         transaction_log.commit(self.memory.head)
-        self._compact()
+        return self._compact()
 
     def rollback(self) -> None:
         """Revert all edits and steps since `begin`, bit for bit."""

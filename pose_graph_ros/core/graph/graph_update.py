@@ -62,6 +62,17 @@ class GraphUpdate(NamedTuple):
     """Observed nodes that leave the graph for good."""
 
 
+class Left(NamedTuple):
+    """Ids of what has left a graph, ascending."""
+
+    nodes: IntArray
+    edges: IntArray
+    """With those that were on these nodes, whatever their weight."""
+    observed: IntArray
+
+
+NOTHING_LEFT: Final = Left(*(np.empty(0, dtype=np.int64) for _ in range(3)))
+
 # Index of the first part of an update that edits what there is.
 FIRST_EDIT: Final = GraphUpdate._fields.index('fix')
 
@@ -117,6 +128,6 @@ class GraphRows(NamedTuple):
             self.observed_ids[observed], self.next_ids)
 
     def with_edges(self, edges: Edges) -> Self:
-        """Return the same rows with other edges, which get the ids 0, 1..."""
+        """Return the same rows with other edges, which get the ids 0, 1 and so on."""
         return self._replace(edges=edges, edge_ids=np.arange(len(edges)),
                              next_ids=self.next_ids._replace(edge=len(edges)))
