@@ -209,11 +209,13 @@ class GraphContents:
 
     def rows(self) -> GraphRows:
         """Return a copy of all rows."""
+        nodes, edges, observed = (
+            ids.astype(np.int64) for ids in (self.node_ids, self.edge_ids, self.observed_ids))
         return GraphRows(
             self.poses.copy(), self.is_bias, self.fixed,
             Edges(*(column.copy() for column in self.edges.columns)),
             ObservedNodes(*(column.copy() for column in self.observed.columns)),
-            self.node_ids.copy(), self.edge_ids.copy(), self.observed_ids.copy(), self.next_ids)
+            nodes, edges, observed, self.next_ids)
 
     def leaving(self) -> GraphUpdate:
         """Return what leaves the graph with the present update; it keeps its rows until then."""

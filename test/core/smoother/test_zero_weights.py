@@ -134,7 +134,8 @@ def test_adding_them_solves_nothing_and_a_rollback_restores_every_bit() -> None:
     assert result[2:] == (0, 0, 0, 0)
     np.testing.assert_array_equal(graph.memory['clique_i'], cliques)
     after = state(graph)
-    assert set(differences(before, after)) == {'edge_f', 'edge_i', 'observed_f', 'observed_i'}
+    assert set(differences(before, after)) == {
+        'edge_f', 'edge_i', 'edge_id', 'observed_f', 'observed_i', 'observed_id', 'next'}
     rows = dict.fromkeys(twins.idle_edges + twins.edges, 1.0)
     graph.begin()
     graph.apply(GraphUpdate(weigh_edges=rows, weigh_observed=dict.fromkeys(
@@ -161,7 +162,7 @@ def test_they_are_appended_without_a_step_but_nothing_that_needs_one_is() -> Non
     twins.idle_observed += range(graph.n_observed, graph.n_observed + 2)
     assert twins.full.append(GraphUpdate(edges=edges, observed=observed))
     assert set(differences(before, state(graph))) == {
-        'edge_f', 'edge_i', 'observed_f', 'observed_i'}
+        'edge_f', 'edge_i', 'edge_id', 'observed_f', 'observed_i', 'observed_id', 'next'}
     twins.drive(5)
     twins.check()
 
