@@ -39,7 +39,8 @@ from pose_graph_ros.core.refiner import Refiner
 from pose_graph_ros.core.relocation import relocate
 from pose_graph_ros.core.smoother.incremental import IncrementalSmoother, Refinement
 from pose_graph_ros.core.sources import constraint_names
-from pose_graph_ros.core.sources.factor_builder import FactorBuilder, Queue, QueuedEdge
+from pose_graph_ros.core.sources.constraint_queue import Queue, QueuedEdge
+from pose_graph_ros.core.sources.factor_builder import FactorBuilder
 from pose_graph_ros.core.sources.pipeline import MeasurementPipeline
 from pose_graph_ros.core.sources.source_report import SourceReport
 from pose_graph_ros.core.transaction import Transaction

@@ -22,6 +22,7 @@ from pose_graph_ros.core.geometry.se2 import FloatArray, IntArray
 from pose_graph_ros.core.graph import tables as tb
 from pose_graph_ros.core.graph.constraints import EdgeKind
 from pose_graph_ros.core.graph.graph import GraphUpdate
+from pose_graph_ros.core.graph.incidence import constraints_on
 from pose_graph_ros.core.graph.reweighting import Reweighting
 from pose_graph_ros.core.judgement.judge import Judge
 from pose_graph_ros.core.smoother.incremental import IncrementalSmoother
@@ -31,9 +32,9 @@ from pose_graph_ros.core.sources.gauss_markov import (
     Additions,
     CorrelatedErrors,
     GaussMarkovBias,
-    GraphSizes,
 )
-from pose_graph_ros.core.sources.source_constraints import SourceConstraints
+from pose_graph_ros.core.sources.past_path import PastPath
+from pose_graph_ros.core.sources.source_constraints import Held, SourceConstraints
 
 # Factor on the number of measurements from one estimate to the next.
 MORE = 1.3
@@ -55,8 +56,10 @@ class _Change:
     left: IntArray
     """Numbers of the measurements to be moved, the next ones last."""
     before: IntArray
-    """Row of the edge that held each measurement at the beginning, or -1."""
+    """Id of the edge that held each measurement at the beginning, or -1."""
     undoing: bool = False
+    failed: GaussMarkovBias | None = None
+    """The model that it was, if it is undone."""
 
 
 @dataclass(slots=True)
@@ -65,8 +68,8 @@ class _Search:
 
     source: str
     steps: error_estimate.Search
-    n: int
-    """Number of measurements when it began."""
+    next_estimate: int
+    """Number of measurements at which the next one is due."""
 
 
 class ErrorTuner:
@@ -95,6 +98,10 @@ class ErrorTuner:
         self.odometry_scale = 1.0
         """Factor on the sigmas of the primary odometry in the graph."""
         self._failed_scale = 0.0    # with which the solver failed
+        self._past: dict[str, PastPath] = {}
+        """Of each source, its positions that will have left the graph."""
+        self._n_bias_edges = 0
+        """Number of edges to biases that are about to leave."""
 
     @property
     def odometry_weight(self) -> float:
@@ -129,7 +136,7 @@ class ErrorTuner:
             except StopIteration as end:
                 search, self._search = self._search, None
                 constraints = self._factors.constraints(search.source)
-                constraints.next_estimate = math.ceil(MORE * search.n)
+                constraints.next_estimate = search.next_estimate
                 found: error_estimate.Estimate = end.value
                 if _far(constraints.odometry_scale, found.odometry_scale):
                     constraints.odometry_scale = found.odometry_scale
@@ -157,24 +164,82 @@ class ErrorTuner:
         sources = self._factors.finding()
         if len(sources) == 0:
             return
-        # moving the measurements of one source changes no rows of another one
+        # moving the measurements of one source changes none of another one
         weights = self._judge.final_weights()
         for source in sources:
             constraints = self._factors.constraints(source)
             found = to_the_end(self._steps(constraints, weights))
             constraints.next_estimate = max(
-                constraints.next_estimate, math.ceil(MORE * len(constraints)))
+                constraints.next_estimate, _next_estimate(constraints))
             constraints.odometry_scale = found.odometry_scale
             if found.errors != self._factors.errors_in_use(source):
                 self._begin(source, found.errors)
                 self.finish_change()
         self.finish_change()
 
+    def leave(self, nodes: IntArray) -> list[int]:
+        """
+        Return the ids of the biases that are to leave the graph with poses.
+
+        What the measurements on these show of the errors of their sources is kept, once `forget`
+        says that they have left. At least the newest bias of a source stays.
+
+        Parameters
+        ----------
+        nodes : ndarray of int, ids of the poses
+
+        """
+        graph = self._smoother.graph
+        edges, observed = constraints_on(graph, nodes)
+        stays = ~graph.is_bias
+        stays[graph.node_rows(nodes)] = False
+        first = int(graph.node_ids[np.argmax(stays)])
+        self._past = {}
+        for source in self._factors.finding():
+            constraints = self._factors.constraints(source)
+            gone = np.flatnonzero(self._factors.leaving(source, edges, observed))
+            used = gone[self._weights(constraints.held(gone), graph.weights) > 0.0]
+            stamps_ns, ids = constraints.rows.values[used].T
+            self._past[source] = error_estimate.left_behind(
+                graph, stamps_ns, ids, constraints.past, first)
+        change = self._change
+        model = None if change is None else change.model or change.failed
+        others = {} if change is None or model is None else {change.source: model}
+        biases = self._factors.leaving_biases(edges, observed, others)
+        left, _ = constraints_on(graph, np.append(nodes, biases).astype(np.int64))
+        self._n_bias_edges = int(np.count_nonzero(
+            graph.memory['edge_i'][graph.edge_rows(left), tb.EDGE_KIND] == EdgeKind.BIAS))
+        return biases
+
+    def forget(self, nodes: IntArray, edges: IntArray, observed: IntArray) -> None:
+        """
+        Forget what has left the graph after `leave`.
+
+        Parameters
+        ----------
+        nodes, edges, observed : ndarray of int, ids
+
+        """
+        kept, change = self._factors.forget(nodes, edges, observed), self._change
+        self._factors.n_bias_edges -= self._n_bias_edges
+        for source, past in self._past.items():
+            self._factors.constraints(source).past = past
+        self._past, self._n_bias_edges = {}, 0
+        if change is None:
+            return
+        for model in (change.model, change.failed):
+            if model is not None:
+                model.forget({*nodes.tolist()})
+        numbers = kept[change.source]
+        numbers = numbers[numbers < len(change.before)]
+        change.left = np.flatnonzero(np.isin(numbers, change.left))
+        change.before = change.before[numbers]
+
     def restored(self) -> None:
         """Follow the graph, which was loaded."""
         graph = self._smoother.graph
         # what a loss or the judge has changed has less weight
-        weight = np.max(graph.weights[0][self._primary_edges()], initial=0.0)
+        weight = np.max(graph.weights[0][self._primary_rows()], initial=0.0)
         if weight > 0.0:
             self._use_scale(float(weight)**-0.5)
 
@@ -193,9 +258,10 @@ class ErrorTuner:
         """Give all primary odometry in the graph the weight that is wanted; all or nothing."""
         graph, wanted = self._smoother.graph, self._wanted_scale()
         ratio = (self.odometry_scale / wanted)**2
-        rows = self._primary_edges()
+        rows = self._primary_rows()
+        ids = graph.edge_ids[rows]
         update = GraphUpdate(weigh_edges=dict(zip(
-            rows.tolist(), (ratio * graph.weights[0][rows]).tolist(), strict=True)))
+            ids.tolist(), (ratio * graph.weights[0][rows]).tolist(), strict=True)))
         try:
             failed = self._smoother.update(update).status is Status.FAILED
         except Exception:
@@ -204,14 +270,15 @@ class ErrorTuner:
             self.n_failures += 1
             self._failed_scale = wanted
             return
-        self._reweighting.scale_base_weights(rows, ratio)
+        self._reweighting.scale_base_weights(ids, ratio)
         self._use_scale(wanted)
 
-    def _primary_edges(self) -> IntArray:
+    def _primary_rows(self) -> IntArray:
         """Return the rows of the edges that the hidden nodes were made with."""
         graph = self._smoother.graph
         primary = graph.memory['edge_i'][:graph.n_edges, tb.EDGE_KIND] == EdgeKind.ODOMETRY
-        primary[np.concatenate([[], *self._factors.pose_edges()]).astype(np.int64)] = False
+        others = np.concatenate([[], *self._factors.pose_edges()]).astype(np.int64)
+        primary[graph.edge_rows(others)] = False
         return np.flatnonzero(primary)
 
     def _use_scale(self, scale: float) -> None:
@@ -222,22 +289,27 @@ class ErrorTuner:
         for source in self._factors.due_for_estimate():
             constraints = self._factors.constraints(source)
             steps = self._steps(constraints, self._smoother.graph.weights)
-            return _Search(source, steps, len(constraints))
+            return _Search(source, steps, _next_estimate(constraints))
         return None
 
     def _steps(
         self, constraints: SourceConstraints, by_row: tuple[FloatArray, FloatArray],
     ) -> error_estimate.Search:
         """Search with the measurements of a source whose edges or observed nodes have a weight."""
-        held = constraints.held(np.arange(len(constraints)))
-        edges, observed = by_row
-        weights = np.zeros(len(constraints))
-        weights[held.is_edge] = edges[held.rows[held.is_edge]]
-        weights[~held.is_edge] = observed[held.rows[~held.is_edge]]
+        weights = self._weights(constraints.held(np.arange(len(constraints))), by_row)
         used = constraints.rows.values[weights > 0.0]
         path = yield from error_estimate.measured_path(
-            self._smoother.graph, used[:, 0], used[:, 1])
+            self._smoother.graph, used[:, 0], used[:, 1], constraints.past)
         return (yield from error_estimate.search(path))
+
+    def _weights(
+        self, held: Held, by_row: tuple[FloatArray, FloatArray],
+    ) -> FloatArray:
+        """Return the weights of what holds some measurements, given those of a graph by row."""
+        graph, weights = self._smoother.graph, np.empty(len(held.ids))
+        weights[held.is_edge] = by_row[0][graph.edge_rows(held.ids[held.is_edge])]
+        weights[~held.is_edge] = by_row[1][graph.observed_rows(held.ids[~held.is_edge])]
+        return weights
 
     def _begin(self, source: str, errors: CorrelatedErrors | None) -> None:
         """Begin to change the error model of a source."""
@@ -265,41 +337,41 @@ class ErrorTuner:
             if len(change.left) == 0:
                 if not change.undoing:
                     self._factors.set_error_model(change.source, change.model)
+                elif change.failed is not None:
+                    self._factors.abandon(change.failed)
                 self._change = None
             return True
         if change.undoing:
             return False    # tried again at the next step
         self.n_failures += 1
         moved = np.flatnonzero(constraints.edges.values[:len(change.before)] != change.before)
-        change.undoing, change.left, change.model = True, moved, None
+        change.undoing, change.left, change.failed, change.model = True, moved, change.model, None
         return True
 
     def _apply(self, change: _Change, constraints: SourceConstraints, some: IntArray) -> bool:
-        """Have other rows hold some measurements; return whether the solver succeeded."""
+        """Have others hold some measurements; return whether the solver succeeded."""
         graph, model = self._smoother.graph, change.model
         held = constraints.held(some)
-        edges, observed = graph.weights
-        weights = np.where(held.is_edge, edges[np.where(held.is_edge, held.rows, 0)],
-                           observed[np.where(held.is_edge, 0, held.rows)])
-        additions = Additions(GraphSizes(graph.n_nodes, graph.n_edges, graph.n_observed))
-        rows = constraints.rows.values[some]
+        weights = self._weights(held, graph.weights)
+        additions = Additions(graph.next_ids)
+        added = constraints.rows.values[some]
         new = change.before[some] if change.undoing else np.full(len(some), -1)
         if model is not None:
             model.begin()
-            table = graph.observed_at(rows[:, 1])
+            table = graph.observed_at(added[:, 1])
             for k, (stamp_ns, weight) in enumerate(
-                    zip(rows[:, 0].tolist(), weights.tolist(), strict=True)):
+                    zip(added[:, 0].tolist(), weights.tolist(), strict=True)):
                 one = table.rows(slice(k, k + 1)).weighted(weight)
                 new[k] = model.add(stamp_ns, one, constraints.noise.values[some[k]], additions)
-        weigh_edges = dict.fromkeys(held.rows[held.is_edge].tolist(), 0.0)
-        weigh_observed = dict.fromkeys(held.rows[~held.is_edge].tolist(), 0.0)
+        weigh_edges = dict.fromkeys(held.ids[held.is_edge].tolist(), 0.0)
+        weigh_observed = dict.fromkeys(held.ids[~held.is_edge].tolist(), 0.0)
         if model is None:
-            for row, edge, weight in zip(
-                    rows[:, 1].tolist(), new.tolist(), weights.tolist(), strict=True):
+            for first, edge, weight in zip(
+                    added[:, 1].tolist(), new.tolist(), weights.tolist(), strict=True):
                 if edge >= 0:
                     weigh_edges[edge] = weight
                 else:
-                    weigh_observed[row] = weight
+                    weigh_observed[first] = weight
         update = additions.update()._replace(
             weigh_edges=weigh_edges, weigh_observed=weigh_observed)
         try:
@@ -314,11 +386,16 @@ class ErrorTuner:
         constraints.edges.values[some] = new
         after = constraints.held(some)
         self._judge.moved(held, after)
-        for row, is_edge, to_row, to_edge in zip(
-                held.rows.tolist(), held.is_edge.tolist(), after.rows.tolist(),
+        for one, is_edge, to, to_edge in zip(
+                held.ids.tolist(), held.is_edge.tolist(), after.ids.tolist(),
                 after.is_edge.tolist(), strict=True):
-            self._reweighting.move(row, to_row, edge=is_edge, to_edge=to_edge)
+            self._reweighting.move(one, to, edge=is_edge, to_edge=to_edge)
         return True
+
+
+def _next_estimate(constraints: SourceConstraints) -> int:
+    """Return at how many measurements of a source the estimate after the next one is due."""
+    return constraints.n_gone + math.ceil(MORE * len(constraints))
 
 
 def _far(one: float, other: float) -> bool:

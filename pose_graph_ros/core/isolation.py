@@ -14,7 +14,7 @@ from typing import NamedTuple
 
 from pose_graph_ros.core.batch.optimizer import Status
 from pose_graph_ros.core.estimate import UpdateReport
-from pose_graph_ros.core.sources.factor_builder import Queue
+from pose_graph_ros.core.sources.constraint_queue import Queue
 from pose_graph_ros.core.sources.pipeline import MeasurementPipeline
 
 # Maximum number of attempts in one search, which bounds the time of an update.

@@ -19,7 +19,7 @@ from pose_graph_ros.core.judgement.verdicts import (
 def verdict(source: str, kind: Judged, number: int, state: State) -> Verdict:
     return Verdict(
         f'{source}/{number}', kind, source, number * 10**9, None, state, 10**9, Decision.AUTO,
-        np.zeros(3), 1.0, (), (), edge=True, row=number)
+        np.zeros(3), 1.0, (), (), edge=True, number=number)
 
 
 VERDICTS = [

@@ -17,7 +17,7 @@ from pose_graph_ros.core.graph.graph import GraphUpdate
 from pose_graph_ros.core.isolation import isolate
 from pose_graph_ros.core.measurements import GlobalPose, LoopClosure, OdometrySample, Position
 from pose_graph_ros.core.smoother.incremental import IncrementalSmoother, UpdateResult
-from pose_graph_ros.core.sources.factor_builder import Queue, QueuedEdge
+from pose_graph_ros.core.sources.constraint_queue import Queue, QueuedEdge
 
 SECOND = 1_000_000_000
 # Mean of a constraint that the smoother of these tests cannot solve for [m].

@@ -33,7 +33,7 @@ STAMP = 1_800_000_000_000_000_007
 def verdict(number: int, state: State, decision: Decision = Decision.AUTO) -> Verdict:
     return Verdict(
         f'loop/{number}', Judged.LOOP_CLOSURE, 'loop', number * 10**9, None, state, STAMP,
-        decision, np.array([1.0, 2.0, np.nan]), 3.0, ('loop/1', 'loop/2'), (), edge=True, row=7)
+        decision, np.array([1.0, 2.0, np.nan]), 3.0, ('loop/1', 'loop/2'), (), edge=True, number=7)
 
 
 def test_a_message_is_read_as_what_it_is() -> None:

@@ -25,7 +25,7 @@ from pose_graph_ros.core.graph.constraints import (
 from pose_graph_ros.core.graph.graph import Graph
 from pose_graph_ros.core.odometry.hidden_nodes import HiddenNodes
 from pose_graph_ros.core.saved_columns import Integers, Rows3, Rows6
-from pose_graph_ros.core.sources.factor_builder import AttachedMeasurement
+from pose_graph_ros.core.sources.constraint_queue import AttachedMeasurement
 
 # Number of measurements beyond which the angle is not checked any more.
 LAST_RECHECK = 4096

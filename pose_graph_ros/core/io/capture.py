@@ -27,12 +27,8 @@ from pose_graph_ros.core.judgement.texts import is_notable, sentence
 from pose_graph_ros.core.judgement.verdicts import Judged
 from pose_graph_ros.core.odometry.hidden_nodes import HiddenNodes
 from pose_graph_ros.core.saved_columns import as_matrix
-from pose_graph_ros.core.sources.factor_builder import (
-    FactorBuilder,
-    Queue,
-    QueuedEdge,
-    SavedEdges,
-)
+from pose_graph_ros.core.sources.constraint_queue import Queue, QueuedEdge, SavedEdges
+from pose_graph_ros.core.sources.factor_builder import FactorBuilder
 from pose_graph_ros.core.sources.pipeline import MeasurementPipeline
 from pose_graph_ros.core.sources.source_constraints import SavedSource
 

@@ -12,7 +12,7 @@ it is believed weakly.
 import numpy as np
 
 from pose_graph_ros.core.geometry.se2 import BoolArray, FloatArray, IntArray
-from pose_graph_ros.core.judgement.closure_states import ClosureStates, DOUBTED, OUT
+from pose_graph_ros.core.judgement.closure_states import ClosureStates, OUT
 from pose_graph_ros.core.judgement.closures import ClosureTable
 from pose_graph_ros.core.judgement.retests import Retests
 from pose_graph_ros.core.judgement.verdicts import State
@@ -66,9 +66,7 @@ class BeliefRule:
 
     def _belief(self, number: int, chance: float) -> State:
         """Return the state of a closure that has passed the gate."""
-        of_source = self._states.source == self._states.source[number]
-        bad = int(np.sum((self._states.state == DOUBTED) & of_source))
-        good = int(np.sum(self._states.in_graph & of_source))
+        good, bad = self._states.record(int(self._states.source[number]))
         alone = (bad + 1.0) * chance < WRONG_ODDS * (good + 1.0)
         if (alone and chance <= WEAK) or self.is_corroborated(
                 number, self._states.decision != OUT):

@@ -7,7 +7,7 @@ Some beliefs cannot be changed in the time of an update, as its iterations diver
 are tried on a copy, part by part (`closure_trial`), and kept if they fit there.
 """
 
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 
 import numpy as np
 
@@ -15,10 +15,11 @@ from pose_graph_ros.core.batch.optimizer import Status
 from pose_graph_ros.core.geometry.se2 import BoolArray, FloatArray, IntArray
 from pose_graph_ros.core.graph.graph import GraphUpdate
 from pose_graph_ros.core.graph.reweighting import Reweighting
-from pose_graph_ros.core.judgement.closure_states import ClosureStates, DOUBTED, STATES
+from pose_graph_ros.core.judgement.closure_states import ClosureStates, DOUBTED, STATES, USED
 from pose_graph_ros.core.judgement.closure_trial import ClosureTrial
 from pose_graph_ros.core.judgement.closures import ClosureTable
 from pose_graph_ros.core.judgement.odometry_states import Doubt, OdometryStates
+from pose_graph_ros.core.judgement.residual_scale import ScaleLeft
 from pose_graph_ros.core.judgement.swaps import Found
 from pose_graph_ros.core.judgement.verdicts import State
 from pose_graph_ros.core.smoother.incremental import DIVERGED, IncrementalSmoother
@@ -51,6 +52,8 @@ class Beliefs:
         """Increases when more or less is believed, so that those that wait are tested again."""
         self.now_ns = 0
         self.trial = ClosureTrial(smoother)
+        self.scales_left: list[ScaleLeft] = []
+        """Of each source, what its closures have shown that have left the graph."""
         self._doubts: dict[int, Doubt] | None = None
         """Odometry that is doubted with the set that is tried, if that changes."""
         self._odometry_round = -1
@@ -63,7 +66,7 @@ class Beliefs:
     def set_base_weights(self, numbers: IntArray) -> None:
         """Tell robust losses the weights of closures, which the graph has already."""
         for number, weight in zip(numbers.tolist(), self.weights(numbers).tolist(), strict=True):
-            self._reweighting.set_base_weight(int(self._states.row[number]), weight, edge=True)
+            self._reweighting.set_base_weight(int(self._states.edge[number]), weight, edge=True)
 
     def apply(
         self, changes: Mapping[int, State], *, at_once: bool = False,
@@ -78,7 +81,7 @@ class Beliefs:
         ----------
         changes : mapping, new states by the numbers of closures
         at_once : bool
-        doubts : mapping, optional, the doubted odometry edges by row, if they change as well
+        doubts : mapping, optional, the doubted odometry edges by id, if they change as well
 
         """
         weights = self.weights_with(changes, doubts)
@@ -101,7 +104,7 @@ class Beliefs:
         ----------
         inside : ndarray of bool, shape (M,), which closures are believed
         poses : ndarray, shape (N, 3)
-        doubts : mapping, doubted odometry edges by row
+        doubts : mapping, doubted odometry edges by id
 
         """
         graph = self._smoother.graph
@@ -119,16 +122,16 @@ class Beliefs:
         changes, graph = self._states.changes_to(found.inside), self._smoother.graph
         self._doubts = None if found.jump is None else {
             **self._odometry.doubts, **self._odometry.doubted(
-                graph, (found.jump,), self.now_ns, np.arange(len(self._states)))}
+                graph, (found.jump,), self.now_ns, self._states.name)}
         self.trial.begin(changes, self.weights_with(changes, self._doubts),
-                         continued(graph, found.poses))
+                         continued(graph, found.poses[graph.node_rows(found.nodes) >= 0]))
 
     def believe_odometry_again(self) -> bool:
         """Believe odometry that no believed closure leads over; tell whether there was any."""
         if self.round == self._odometry_round or len(self._odometry.doubts) == 0:
             return False
         self._odometry_round = self.round
-        edges = self._smoother.graph.edges_at(self._states.row[self._states.in_graph])
+        edges = self._smoother.graph.edges_at(self._states.edge[self._states.in_graph])
         left = self._odometry.still_doubted(edges)
         return len(left) < len(self._odometry.doubts) and self.apply({}, doubts=left)
 
@@ -136,7 +139,7 @@ class Beliefs:
         self, changes: Mapping[int, State], doubts: Mapping[int, Doubt] | None = None,
     ) -> dict[int, float]:
         """
-        Return the weights of edges, by row, after a change of states.
+        Return the weights of edges, by id, after a change of states.
 
         Parameters
         ----------
@@ -149,7 +152,7 @@ class Beliefs:
         weights = self.weights(numbers).tolist()
         self._states.state[numbers] = before
         odometry = {} if doubts is None else self._odometry.weights_with(doubts)
-        return {**dict(zip(self._states.row[numbers].tolist(), weights, strict=True)), **odometry}
+        return {**dict(zip(self._states.edge[numbers].tolist(), weights, strict=True)), **odometry}
 
     def _keep(
         self, changes: Mapping[int, State], doubts: Mapping[int, Doubt] | None,
@@ -161,8 +164,8 @@ class Beliefs:
             self._states.announce(number, before, self.now_ns)
         self.set_base_weights(np.array(sorted(changes), dtype=np.int64))
         if doubts is not None:
-            for row, weight in self._odometry.weights_with(doubts).items():
-                self._reweighting.set_base_weight(row, weight, edge=True)
+            for edge, weight in self._odometry.weights_with(doubts).items():
+                self._reweighting.set_base_weight(edge, weight, edge=True)
             self._odometry.keep(doubts, self._smoother.graph)
         self.round += 1
 
@@ -192,6 +195,28 @@ class Beliefs:
             later |= set(changes) - set(bad) if len(bad) > 0 else set()
         self.end_trial()
         return sorted(later)
+
+    def closures_left(self, numbers: IntArray) -> None:
+        """Keep what believed closures have shown of the errors of their sources."""
+        states = self._states
+        for source in np.unique(states.source[numbers]).tolist():
+            used = USED[states.state[numbers]] & (states.source[numbers] == source)
+            self.scales_left[source].add(int(np.count_nonzero(used)), self.scales[source])
+
+    def forget(self, edges: Collection[int], numbers: Collection[int]) -> None:
+        """
+        Forget what has left the graph.
+
+        Parameters
+        ----------
+        edges : collection of int, ids
+        numbers : collection of int, closures
+
+        """
+        self.trial.forget(edges, numbers)
+        if self._doubts is not None:
+            self._doubts = {edge: doubt for edge, doubt in self._doubts.items()
+                            if edge not in edges}
 
     def end_trial(self) -> None:
         """Forget what is tried."""

@@ -15,18 +15,15 @@ import numpy as np
 
 from pose_graph_ros.core.compiled.growing_array import GrowingArray
 from pose_graph_ros.core.config import BackendConfig
-from pose_graph_ros.core.geometry.se2 import BoolArray, FloatArray, IntArray
-from pose_graph_ros.core.graph import tables as tb
+from pose_graph_ros.core.geometry.se2 import FloatArray, IntArray
 from pose_graph_ros.core.graph.constraints import EdgeKind, Edges
 from pose_graph_ros.core.graph.reweighting import Reweighting
-from pose_graph_ros.core.judgement import final, relative
+from pose_graph_ros.core.judgement import decisions, final, relative
 from pose_graph_ros.core.judgement.belief_rule import BeliefRule
 from pose_graph_ros.core.judgement.beliefs import Beliefs
 from pose_graph_ros.core.judgement.closure_reports import ClosureReports
 from pose_graph_ros.core.judgement.closure_states import (
-    AUTO,
     ClosureStates,
-    DECISIONS,
     DOUBTED,
     SavedClosures,
     STATES,
@@ -34,19 +31,21 @@ from pose_graph_ros.core.judgement.closure_states import (
 )
 from pose_graph_ros.core.judgement.closures import chances, claims, ClosureTable, GATE
 from pose_graph_ros.core.judgement.consistency import OdometryChain
+from pose_graph_ros.core.judgement.listing import MOST_OTHERS
 from pose_graph_ros.core.judgement.odometry_states import OdometryStates
+from pose_graph_ros.core.judgement.residual_scale import ScaleLeft
 from pose_graph_ros.core.judgement.retests import Retests
 from pose_graph_ros.core.judgement.scale_learner import ScaleLearner
 from pose_graph_ros.core.judgement.set_search import SetSearch
-from pose_graph_ros.core.judgement.texts import sentence
 from pose_graph_ros.core.judgement.verdicts import (
     Decision,
     SourceVerdicts,
     State,
+    Verdict,
 )
-from pose_graph_ros.core.measurements import Answer, AnswerStatus, rejected
+from pose_graph_ros.core.measurements import Answer
 from pose_graph_ros.core.smoother.incremental import IncrementalSmoother
-from pose_graph_ros.core.sources.factor_builder import NewConstraint
+from pose_graph_ros.core.sources.constraint_queue import NewConstraint
 
 # Numbers of new closures that are tested before an update, and of those that are tested later: in
 # an update, and in a part of the work. Without closures the tree is as deep as the path is long,
@@ -55,6 +54,9 @@ MOST_NEW, IN_UPDATE, IN_PART, NODES_IN_PART = 32, 16, 32, 160_000
 # Number of nodes above which an update adds closures with weight 0 and leaves all tests to the
 # work after it, so that it has nothing to solve for but what is new.
 LARGE = 500
+# Of closures that leave the graph: rounds of tests, and how many stay in the tables at least
+# until these are compacted.
+MOST_ROUNDS, MOST_LEFT = 4, 64
 
 
 class ClosureJudge:
@@ -81,7 +83,7 @@ class ClosureJudge:
         self._retests = Retests()
         self._rule = BeliefRule(self._states, self._table, self._retests)
         self._final = (0, 0, 0, -1)
-        """Sizes of the graph and round at the last final decision."""
+        """Next ids of the graph and round at the last final decision."""
         self._n_staged = 0
         self._corroborated = GrowingArray((), np.bool_)
         """Whether a clique of closures outside of the graph supports one that is doubted."""
@@ -230,9 +232,15 @@ class ClosureJudge:
     def _throw_out(self) -> bool:
         """Take out of the graph what does not fit any more; tell whether there was any."""
         # where the graph cannot be solved without them, that is not tried for ever
-        resting = self._retests.resting(self._smoother.graph.n_nodes)
+        resting = self._retests.resting(self._smoother.graph.next_ids.node)
         inside = np.flatnonzero(self._states.in_graph & self._states.judged & ~resting)
-        inside = inside[self._may_not_fit(inside)]
+        return self._throw_out_of(inside)
+
+    def _throw_out_of(self, inside: IntArray) -> bool:
+        """Take those of some closures out of the graph that do not fit; tell if there was any."""
+        # the smoother knows the energies; raised covariances make the residuals only smaller
+        inside = inside[relative.are_above(
+            self._smoother.graph, self._states.edge[inside], 0.5 * GATE)]
         fit = relative.residuals(self._smoother.graph, self._table.rows(inside))
         bad = inside[fit > GATE]
         if not self._change(dict.fromkeys(bad.tolist(), State.DOUBTED)):
@@ -242,25 +250,18 @@ class ClosureJudge:
         self._table.forget_spread()
         return True
 
-    def _may_not_fit(self, numbers: IntArray) -> BoolArray:
-        """Tell whose squared residuals, by the claimed covariances, are above half of the gate."""
-        # the smoother knows the energies; raised covariances make the residuals only smaller
-        rows, edges = self._states.row[numbers], self._smoother.graph.memory['edge_f']
-        return np.asarray(edges[rows, tb.ENERGY] > 0.5 * GATE * edges[rows, tb.WEIGHT])
-
     def _test_again(self, most: int) -> bool:
         """Test some closures that wait; tell whether some are left."""
         if self._beliefs.trial.keeps_others_out:
             return False
         waiting = np.flatnonzero(
             ~self._states.in_graph & self._states.judged
-            & self._retests.due(self._beliefs.round, self._smoother.graph.n_nodes,
+            & self._retests.due(self._beliefs.round, self._smoother.graph.next_ids.node,
                                 failed=not self._beliefs.trial.is_pausing))
         if len(waiting) == 0:
             return False
-        some, errors = self._table.rows(waiting), np.empty((len(waiting), 3))
-        relative.errors_at(self._smoother.graph.memory.head, some.i, some.j, some.mean,
-                           errors)
+        some = self._table.rows(waiting)
+        errors = relative.errors_of(self._smoother.graph, some)
         # covariances only shrink while more is believed, so this is a lower bound
         spread, least = self._table.spread(waiting), np.empty(len(waiting))
         relative.distances(errors, spread + some.noise, least)
@@ -286,8 +287,70 @@ class ClosureJudge:
             return False
         done = self._beliefs.apply(states)
         if not done:
-            self._retests.failed(states, self._smoother.graph.n_nodes)
+            graph = self._smoother.graph
+            self._retests.failed(states, graph.n_nodes, graph.next_ids.node)
         return done
+
+    def decide_leaving(self, edges: IntArray) -> list[Verdict]:
+        """
+        Decide on closures that are about to leave the graph, with what is known now.
+
+        What is believed then stays as it is weighted. Returns the verdicts on all others.
+
+        Parameters
+        ----------
+        edges : ndarray of int, ids of all edges that leave
+
+        """
+        states, graph = self._states, self._smoother.graph
+        self._chain.extend(graph)
+        leaving = np.flatnonzero(np.isin(states.edge, edges) & ~states.left)
+        if len(leaving) == 0:
+            return []
+        judged = leaving[states.judged[leaving]]
+        if not graph.has_touched:
+            self._throw_out_of(judged[states.in_graph[judged]])
+            for _ in range(MOST_ROUNDS):
+                due = self._retests.due(self._beliefs.round, graph.next_ids.node)
+                waiting = judged[~states.in_graph[judged] & due[judged]]
+                if len(waiting) == 0 or graph.has_touched or not self._change(
+                        self._rule.choose(*self._test(waiting[:IN_UPDATE]))):
+                    break
+        return self.reports.of(graph, leaving[~states.in_graph[leaving]][-MOST_OTHERS:].tolist())
+
+    def forget(self, nodes: IntArray, edges: IntArray) -> IntArray:
+        """
+        Return the nodes of believed closures that have left the graph, and forget all that have.
+
+        Parameters
+        ----------
+        nodes, edges : ndarray of int, ids
+
+        """
+        states, ends = self._states, np.empty((0, 2), np.int64)
+        used = states.in_graph
+        gone = states.leave(edges)
+        if len(gone) > 0:
+            left = self._table.rows(gone[used[gone]])
+            ends = np.column_stack((left.i, left.j))
+            self._table.forget(gone[~states.forgotten[gone]])
+            self._beliefs.closures_left(gone)
+        self._beliefs.forget(set(edges.tolist()), set(gone.tolist()))
+        self._chain.forget(nodes)
+        n_left = int(np.count_nonzero(self._states.left))
+        if n_left > MOST_LEFT and 2 * n_left > len(self._states):
+            self._select(np.flatnonzero(~self._states.left))
+        return ends
+
+    def _select(self, kept: IntArray) -> None:
+        """Keep some closures, which get other numbers."""
+        new = np.full(len(self._states), -1)
+        new[kept] = np.arange(len(kept))
+        for table in (self._states, self._table, self._retests, self._corroborated):
+            table.select(kept)
+        self._beliefs.trial.renumber(new)
+        self._search = SetSearch(self._states, self._table)
+        self.reports.forget()
 
     def decide_finally(self) -> None:
         """
@@ -297,20 +360,21 @@ class ClosureJudge:
         """
         smoother, states = self._smoother, self._states
         graph, judged = smoother.graph, np.flatnonzero(states.judged)
-        present = graph.n_nodes, graph.n_edges, graph.n_observed, self._beliefs.round
+        present = *graph.next_ids, self._beliefs.round
         if len(judged) == 0 or present == self._final:
             return
-        forced = states.row[states.in_graph & ~states.judged]
+        forced = states.edge[states.in_graph & ~states.judged]
         inside = states.in_graph
         choice, jumps = final.decide(
-            graph, self._reweighting, states.row[judged], forced, inside[judged],
-            odometry=self._odometry.weights_with({}))
+            graph, self._reweighting, states.edge[judged], forced, inside[judged],
+            odometry=self._odometry.weights_with(self._odometry.final))
         if choice is None:
             return
         inside[judged] = choice.believed
         self._scales.begin()
-        doubts = self._odometry.doubts if jumps is None else self._odometry.doubted(
-            graph, jumps, self._beliefs.now_ns, judged)
+        doubts = self._odometry.doubts if jumps is None else self._odometry.final | (
+            self._odometry.doubted(
+                graph, jumps, self._beliefs.now_ns, lambda k: states.name(int(judged[k]))))
         if not self._beliefs.change_to(inside, choice.poses, doubts):
             return
         self._scales.learn_all()
@@ -347,7 +411,7 @@ class ClosureJudge:
 
     def restore(self, saved: SavedClosures, now_ns: int) -> None:
         """
-        Restore what `saved` has returned, for a graph with the same rows.
+        Restore what `saved` has returned, for the same graph.
 
         Parameters
         ----------
@@ -360,6 +424,8 @@ class ClosureJudge:
         self._table.append(claims(self._smoother.graph.edges_at(saved.rows)))
         self._states.restore(saved)
         self._scales.set_state(saved.scales.tolist(), [0] * len(saved.scales))
+        used = saved.left[:, 1].tolist() or [0] * len(saved.scales)
+        self._beliefs.scales_left[:] = map(ScaleLeft, used, saved.scales.tolist())
         self._append_unknown(len(saved.rows))
 
     def totals(self) -> dict[str, SourceVerdicts]:
@@ -379,22 +445,5 @@ class ClosureJudge:
         decision : Decision
 
         """
-        number = self._states.find(name)
-        if number < 0:
-            return rejected('unknown_id', 'expected the id of a verdict, such as loop_closure/17, '
-                                          f'got {name!r}')
-        before = int(self._states.decision[number])
-        state = {Decision.IN: State.BELIEVED, Decision.OUT: State.DOUBTED,
-                 Decision.AUTO: State.WAITING}[decision]
-        forced = decision is not Decision.AUTO or before != AUTO
-        self._states.decision[number] = DECISIONS.index(decision)
-        if self._states.forgotten[number]:
-            self._states.forgotten[number] = False
-            self._table.bring_back(np.array([number]), claims(
-                self._smoother.graph.edges_at(self._states.row[number:number + 1])))
-        if forced and not self._beliefs.apply({number: state}, at_once=True):
-            self._states.decision[number] = before
-            return rejected('failed', 'the solver failed with it')
-        self._beliefs.round += 1
-        verdict, = self.reports.of(self._smoother.graph, [number])
-        return Answer(AnswerStatus.ACCEPTED, detail=f'{name}: {sentence(verdict)}')
+        return decisions.decide(name, decision, (self._states, self._table, self._beliefs),
+                                self.reports, self._smoother.graph)

@@ -8,7 +8,6 @@ import math
 import numpy as np
 
 from pose_graph_ros.core.geometry.se2 import FloatArray
-from pose_graph_ros.core.graph.error_functions import edge_errors
 from pose_graph_ros.core.graph.graph import Graph
 from pose_graph_ros.core.graph.graph_view import DrawnRows
 from pose_graph_ros.core.judgement.closure_states import (
@@ -62,9 +61,10 @@ class ClosureReports:
         most_believed : int or None
 
         """
-        states = self._states
-        numbers = listed(
-            states.source, states.state == BELIEVED, states.decision != AUTO, most_believed)
+        states, here = self._states, np.flatnonzero(~self._states.left)
+        numbers = here[listed(
+            states.source[here], states.state[here] == BELIEVED, states.decision[here] != AUTO,
+            most_believed)]
         return self.of(graph, numbers.tolist())
 
     def of(self, graph: Graph, numbers: Sequence[int]) -> list[Verdict]:
@@ -77,9 +77,9 @@ class ClosureReports:
         numbers : sequence of int
 
         """
-        edges = graph.edges_at(self._states.row[list(numbers)])
+        edges = graph.edges_at(self._states.edge[list(numbers)])
         return [self._verdict(number, residual) for number, residual in zip(
-            numbers, edge_errors(graph.poses, edges), strict=True)]
+            numbers, graph.edge_errors(edges), strict=True)]
 
     def _verdict(self, number: int, residual: FloatArray) -> Verdict:
         states = self._states
@@ -98,7 +98,7 @@ class ClosureReports:
             residual=residual, distance=math.sqrt(states.distance[number]),
             supported_by=tuple(states.name(other) for other in agree[:MOST_NAMED]),
             contradicted_by=tuple(contradicted[:MOST_NAMED]), edge=True,
-            row=int(states.row[number]))
+            number=int(states.edge[number]))
 
     def _neighbours(self, number: int) -> tuple[list[int], list[int]]:
         """Return which closures agree with one and which do not; kept until there are more."""
@@ -113,15 +113,18 @@ class ClosureReports:
         """Return what is believed of each source, given the factors on their sigmas."""
         totals = {}
         for k, source in enumerate(self._states.sources):
-            own = self._states.source == k
+            own = (self._states.source == k) & ~self._states.left
+            n_left, n_unused = self._states.n_left(k)
             counts = np.bincount(self._states.state[own], minlength=len(STATES))
             # wrong closures among right ones are what place recognition is like
             totals[source] = SourceVerdicts(
                 dict(zip(STATES, counts.tolist(), strict=True)), scales[k], doubting=False,
-                n_forgotten=int(np.count_nonzero(self._states.forgotten[own])))
+                n_forgotten=int(np.count_nonzero(self._states.forgotten[own])),
+                n_left=n_left, n_left_unused=n_unused)
         return totals
 
-    def drawn_rows(self) -> DrawnRows:
-        """Return the rows of edges that are drawn in another way than believed ones."""
-        row, state = self._states.row, self._states.state
-        return DrawnRows(*(row[state == each].tolist() for each in (WEAK, WAITING, DOUBTED)))
+    def drawn_ids(self) -> DrawnRows:
+        """Return the ids of edges that are drawn in another way than believed ones."""
+        here = ~self._states.left
+        edge, state = self._states.edge[here], self._states.state[here]
+        return DrawnRows(*(edge[state == each].tolist() for each in (WEAK, WAITING, DOUBTED)))

@@ -4,7 +4,7 @@
 
 from collections import deque
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Annotated
 
 import numpy as np
@@ -13,13 +13,13 @@ from pose_graph_ros.core.compiled.growing_array import GrowingArray
 from pose_graph_ros.core.geometry.se2 import BoolArray, FloatArray, IntArray
 from pose_graph_ros.core.judgement.closures import GATE
 from pose_graph_ros.core.judgement.verdicts import Change, Decision, Judged, State
-from pose_graph_ros.core.saved_columns import Choices, Integers, Numbers, Pairs
-from pose_graph_ros.core.sources.factor_builder import NewConstraint
+from pose_graph_ros.core.saved_columns import Choices, Integers, Numbers, Pairs, Triples
+from pose_graph_ros.core.sources.constraint_queue import NewConstraint
 
 STATES, DECISIONS = tuple(State), tuple(Decision)
 WAITING, DOUBTED = STATES.index(State.WAITING), STATES.index(State.DOUBTED)
 AUTO, OUT = DECISIONS.index(Decision.AUTO), DECISIONS.index(Decision.OUT)
-_IN_GRAPH = np.array([state.in_graph for state in STATES])
+USED = np.array([state.in_graph for state in STATES])
 # Largest number of closures of a source that are not believed and judged again, and how many are
 # left when there are more.
 MOST_WAITING, LEFT = 20_000, 18_000
@@ -37,7 +37,7 @@ class SavedClosures:
     scales: Numbers
     """Of each source, the factor on its sigmas."""
     rows: Integers
-    """Rows of the edges in the graph."""
+    """Ids of the edges."""
     source: Integers
     """Index into `sources`."""
     stamps_ns: Pairs
@@ -47,6 +47,19 @@ class SavedClosures:
     decision: Annotated[IntArray, Choices(Decision)]
     distance: Numbers
     """Mahalanobis distance when it was tested last, -1 if it was not [sigma]."""
+    numbers: Integers = field(default_factory=lambda: np.empty(0, dtype=np.int64))
+    """Those in their names; empty if they are counted from 0 in each source."""
+    left: Triples = field(default_factory=lambda: np.empty((0, 3), dtype=np.int64))
+    """Of each source, how many have left the graph, how many of these used, and doubted."""
+
+
+@dataclass(slots=True)
+class Tally:
+    """Closures of a source that have left the graph."""
+
+    n: int = 0
+    n_used: int = 0
+    n_doubted: int = 0
 
 
 class ClosureStates:
@@ -54,20 +67,25 @@ class ClosureStates:
 
     def __init__(self) -> None:
         self.sources: list[str] = []
-        self._row, self._source, self._number, self._state, self._since_ns, self._decision = (
+        self._edge, self._source, self._number, self._state, self._since_ns, self._decision = (
             GrowingArray((), np.int64) for _ in range(6))
         self._stamps_ns = GrowingArray((2,), np.int64)
         self._distance = GrowingArray((), np.float64)
-        self._forgotten = GrowingArray((), np.bool_)
+        self._forgotten, self._left = (GrowingArray((), np.bool_) for _ in range(2))
+        self._gone: list[Tally] = []
+        """Of each source, its closures that have left the graph, and the table."""
+        self._columns = (
+            self._edge, self._source, self._number, self._state, self._since_ns, self._decision,
+            self._stamps_ns, self._distance, self._forgotten, self._left)
         self._changes: deque[Change] = deque(maxlen=MOST_CHANGES)
 
     def __len__(self) -> int:
-        return len(self._row)
+        return len(self._edge)
 
     @property
-    def row(self) -> IntArray:
-        """Rows of the edges in the graph, shape (M,)."""
-        return self._row.values
+    def edge(self) -> IntArray:
+        """Ids of the edges, shape (M,)."""
+        return self._edge.values
 
     @property
     def source(self) -> IntArray:
@@ -101,12 +119,17 @@ class ClosureStates:
 
     @property
     def in_graph(self) -> BoolArray:
-        """Whether they have a weight above 0."""
-        return _IN_GRAPH[self.state]
+        """Whether they are in the graph with a weight above 0."""
+        return USED[self.state] & ~self.left
 
     def in_graph_at(self, number: int) -> bool:
-        """Return whether one of them has a weight above 0."""
-        return bool(_IN_GRAPH[self.state[number]])
+        """Return whether one of them is in the graph with a weight above 0."""
+        return bool(USED[self.state[number]] and not self.left[number])
+
+    @property
+    def left(self) -> BoolArray:
+        """Whether they have left the graph, with their nodes."""
+        return self._left.values
 
     @property
     def forgotten(self) -> BoolArray:
@@ -115,8 +138,44 @@ class ClosureStates:
 
     @property
     def judged(self) -> BoolArray:
-        """Whether they are judged: no person has decided on them, and they are not forgotten."""
-        return (self.decision == AUTO) & ~self.forgotten
+        """Whether they are judged: no person has decided on them, and they are known."""
+        return (self.decision == AUTO) & self.known
+
+    @property
+    def known(self) -> BoolArray:
+        """Whether they are in the graph and not forgotten."""
+        return ~(self.forgotten | self.left)
+
+    def record(self, source: int) -> tuple[int, int]:
+        """Return how many closures of a source, by its index, are or were used, and doubted."""
+        own = self.state[self.source == source]
+        gone = self._gone[source]
+        return (gone.n_used + int(np.count_nonzero(USED[own])),
+                gone.n_doubted + int(np.count_nonzero(own == DOUBTED)))
+
+    def n_left(self, source: int) -> tuple[int, int]:
+        """Return how many closures of a source have left the graph, and how many unused."""
+        own, gone = (self.source == source) & self.left, self._gone[source]
+        unused = own & ~USED[self.state]
+        return (gone.n + int(np.count_nonzero(own)),
+                gone.n - gone.n_used + int(np.count_nonzero(unused)))
+
+    def leave(self, edges: IntArray) -> IntArray:
+        """Note that edges, by their ids, have left the graph; return the numbers of closures."""
+        numbers = np.flatnonzero(np.isin(self.edge, edges) & ~self.left)
+        self.left[numbers] = True
+        return numbers
+
+    def select(self, kept: IntArray) -> None:
+        """Keep some closures; all others have left the graph, and are only counted."""
+        dropped = np.setdiff1d(np.arange(len(self)), kept)
+        for number in dropped.tolist():
+            gone = self._gone[self.source[number]]
+            gone.n += 1
+            gone.n_used += int(USED[self.state[number]])
+            gone.n_doubted += int(self.state[number] == DOUBTED)
+        for column in self._columns:
+            column.select(kept)
 
     def forget(self, source: int, supported: BoolArray) -> IntArray:
         """
@@ -142,7 +201,7 @@ class ClosureStates:
 
     def changes_to(self, inside: BoolArray) -> dict[int, State]:
         """Return the states of another set of believed ones, also of those that stay in it."""
-        now = self.in_graph[:len(inside)]
+        now, inside = self.in_graph[:len(inside)], inside & ~self.left[:len(inside)]
         return {
             k: (STATES[self.state[k]] if now[k] else State.BELIEVED) if inside[k]
             else State.DOUBTED for k in np.flatnonzero(inside | now).tolist()}
@@ -152,13 +211,26 @@ class ClosureStates:
         return f'{self.sources[self.source[number]]}/{self._number.values[number]}'
 
     def find(self, name: str) -> int:
-        """Return the number of the closure with an id, -1 if there is none."""
+        """Return the number of the closure with an id, -1 if there is none in the graph."""
         source, _, text = name.rpartition('/')
         if source not in self.sources or not text.isdecimal():
             return -1
         found = np.flatnonzero((self.source == self.sources.index(source))
-                               & (self._number.values == int(text)))
+                               & (self._number.values == int(text)) & ~self.left)
         return int(found[0]) if len(found) > 0 else -1
+
+    def has_left(self, name: str) -> bool:
+        """Return whether the closure with an id was in the graph, and is no more."""
+        source, _, text = name.rpartition('/')
+        return (source in self.sources and text.isdecimal() and self.find(name) < 0
+                and int(text) < self._next_number(self.sources.index(source)))
+
+    def _next_number(self, source: int) -> int:
+        return self._gone[source].n + int(np.count_nonzero(self.source == source))
+
+    def _add_source(self, name: str) -> None:
+        self.sources.append(name)
+        self._gone.append(Tally())
 
     def append(self, new: Sequence[NewConstraint], now_ns: int) -> None:
         """
@@ -172,10 +244,10 @@ class ClosureStates:
         """
         for one in new:
             if one.source not in self.sources:
-                self.sources.append(one.source)
+                self._add_source(one.source)
             source = self.sources.index(one.source)
-            self._number.append_one(int(np.count_nonzero(self.source == source)))
-            self._row.append_one(one.row)
+            self._number.append_one(self._next_number(source))
+            self._edge.append_one(one.number)
             self._source.append_one(source)
             self._stamps_ns.append_one((one.stamp_ns, one.reference_ns))
             self._state.append_one(WAITING)
@@ -183,13 +255,13 @@ class ClosureStates:
             self._decision.append_one(AUTO)
             self._distance.append_one(np.nan)
             self._forgotten.append_one(False)
+            self._left.append_one(False)
 
     def drop(self, count: int) -> None:
         """Remove the newest closures again."""
         size = len(self) - count
-        for array in (self._row, self._source, self._number, self._state, self._since_ns,
-                      self._decision, self._stamps_ns, self._distance, self._forgotten):
-            array.truncate(size)
+        for column in self._columns:
+            column.truncate(size)
 
     def announce(self, number: int, before: int, now_ns: int) -> None:
         """
@@ -240,26 +312,38 @@ class ClosureStates:
         self._changes.extend(changes)
 
     def saved(self, scales: Sequence[float]) -> SavedClosures:
-        """Return all columns, with the scales of the sources."""
-        distance = np.sqrt(self.distance)
+        """Return those that are in the graph, with the scales of the sources."""
+        distance, kept = np.sqrt(self.distance), np.flatnonzero(~self.left)
+        distance = np.where(np.isnan(distance), -1.0, distance)
+        gone = []
+        for source in range(len(self.sources)):
+            n, n_unused = self.n_left(source)
+            doubted = (self.source == source) & self.left & (self.state == DOUBTED)
+            gone.append((n, n - n_unused,
+                         self._gone[source].n_doubted + int(np.count_nonzero(doubted))))
         return SavedClosures(
-            tuple(self.sources), np.array(scales, dtype=np.float64), self.row.copy(),
-            self.source.copy(), self.stamps_ns.copy(), self.state.copy(), self.since_ns.copy(),
-            self.decision.copy(), np.where(np.isnan(distance), -1.0, distance))
+            tuple(self.sources), np.array(scales, dtype=np.float64), self.edge[kept],
+            self.source[kept], self.stamps_ns[kept], self.state[kept], self.since_ns[kept],
+            self.decision[kept], distance[kept], self._number.values[kept],
+            np.array(gone, dtype=np.int64).reshape(-1, 3))
 
     def restore(self, saved: SavedClosures) -> None:
         """Fill an empty table with saved columns."""
-        self.sources = list(saved.sources)
+        for name in saved.sources:
+            self._add_source(name)
+        for gone, numbers in zip(self._gone, saved.left.tolist(), strict=False):
+            gone.n, gone.n_used, gone.n_doubted = numbers
         for array, values in (
-                (self._row, saved.rows), (self._source, saved.source), (self._state, saved.state),
+                (self._edge, saved.rows), (self._source, saved.source), (self._state, saved.state),
                 (self._since_ns, saved.since_ns), (self._decision, saved.decision),
                 (self._stamps_ns, saved.stamps_ns)):
             array.append(values)
         self._distance.append(np.where(
             saved.distance < 0.0, np.nan, np.square(saved.distance)))
         self._forgotten.append(np.zeros(len(saved.source), dtype=bool))
+        self._left.append(np.zeros(len(saved.source), dtype=bool))
         order = np.zeros(len(saved.source), dtype=np.int64)
         for source in range(len(self.sources)):
             chosen = np.flatnonzero(saved.source == source)
             order[chosen] = np.arange(len(chosen))
-        self._number.append(order)
+        self._number.append(saved.numbers if len(saved.numbers) > 0 else order)

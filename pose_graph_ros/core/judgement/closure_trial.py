@@ -9,13 +9,13 @@ that could do without, have longer and longer pauses: also where nothing else su
 they take a time in proportion to the drive.
 """
 
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 import math
 
 import numpy as np
 
 from pose_graph_ros.core.batch.optimizer import Status
-from pose_graph_ros.core.geometry.se2 import FloatArray
+from pose_graph_ros.core.geometry.se2 import FloatArray, IntArray
 from pose_graph_ros.core.graph.graph import GraphUpdate
 from pose_graph_ros.core.judgement import relative
 from pose_graph_ros.core.judgement.closures import ClosureTable, GATE
@@ -45,7 +45,7 @@ class ClosureTrial:
         self.changes: dict[int, State] = {}
         """The states that are tried, by the numbers of closures."""
         self.weights: dict[int, float] = {}
-        """The weights that are tried, by the rows of edges."""
+        """The weights that are tried, by the ids of edges."""
         self._is_set = False
         """Whether it is a whole set, whose residuals were compared already."""
         self.later: set[int] = set()
@@ -53,7 +53,7 @@ class ClosureTrial:
         self._n_diverged = 0
         """Updates that have diverged, times `MAKE_UP`, less those that have not."""
         self._next_at = 0
-        """Size of the graph from which on there may be another trial."""
+        """Next id of a node from which on there may be another trial."""
 
     def begin(
         self, changes: Mapping[int, State], weights: Mapping[int, float],
@@ -67,7 +67,7 @@ class ClosureTrial:
         Parameters
         ----------
         changes : mapping, the states of closures that are tried, by number
-        weights : mapping, the weights of their edges, by row
+        weights : mapping, the weights of their edges, by id
         poses : ndarray, shape (N, 3), optional, where it starts
 
         """
@@ -79,9 +79,10 @@ class ClosureTrial:
                 self._n_diverged + MAKE_UP, MAKE_UP * (WITHOUT_PAUSE + MOST_DOUBLINGS))
             if self.is_pausing:
                 return
-            n_nodes = self._smoother.graph.n_nodes
+            graph = self._smoother.graph
             doublings = max(self._n_diverged // MAKE_UP - WITHOUT_PAUSE, 0)
-            self._next_at = n_nodes + math.ceil(PAUSE * n_nodes * 2**doublings)
+            self._next_at = graph.next_ids.node + math.ceil(
+                PAUSE * graph.n_nodes * 2**doublings)
         self.changes, self.weights = dict(changes), dict(weights)
         self._is_set = poses is not None
         self._trial = self._smoother.trial(GraphUpdate(weigh_edges=self.weights), poses)
@@ -90,7 +91,7 @@ class ClosureTrial:
     def is_pausing(self) -> bool:
         """Whether the graph has to grow until the next trial, as too many updates diverge."""
         return (self._n_diverged >= MAKE_UP * WITHOUT_PAUSE
-                and self._smoother.graph.n_nodes < self._next_at)
+                and self._smoother.graph.next_ids.node < self._next_at)
 
     def was_not_needed(self) -> None:
         """Shorten the next pause, as an update has changed beliefs without a trial."""
@@ -133,6 +134,26 @@ class ClosureTrial:
         """Replace the graph by the copy; tell whether that was possible."""
         assert self._trial is not None
         return self._smoother.adopt(self._trial).status is not Status.FAILED
+
+    def forget(self, edges: Collection[int], numbers: Collection[int]) -> None:
+        """
+        Try no longer what has left the graph.
+
+        Parameters
+        ----------
+        edges : collection of int, ids
+        numbers : collection of int, closures
+
+        """
+        self.weights = {edge: weight for edge, weight in self.weights.items()
+                        if edge not in edges}
+        self.changes = {k: state for k, state in self.changes.items() if k not in numbers}
+        self.later -= {*numbers}
+
+    def renumber(self, new: IntArray) -> None:
+        """Follow closures that have other numbers now: `new`, shape (M,), by the old ones."""
+        self.changes = {int(new[k]): state for k, state in self.changes.items()}
+        self.later = {int(new[k]) for k in self.later}
 
     def end(self) -> None:
         """Forget the trial, and who has waited."""

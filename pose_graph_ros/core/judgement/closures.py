@@ -176,6 +176,14 @@ class ClosureTable:
             array.select(slots[kept])
         slots[kept] = np.arange(len(kept))
 
+    def select(self, kept: IntArray) -> None:
+        """Keep some closures, by number; all others have been forgotten."""
+        new = np.full(len(self), -1)
+        new[kept] = np.arange(len(kept))
+        for numbers in self._cells.values():
+            numbers[:] = new[numbers].tolist()
+        self._slot.select(kept)
+
     def _cells_around(self, number: int) -> list[Sequence[int]]:
         slot = int(self._slot.values[number])
         if slot < 0:

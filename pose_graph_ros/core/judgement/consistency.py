@@ -32,7 +32,7 @@ from pose_graph_ros.core.compiled.jit import (
 from pose_graph_ros.core.geometry import se2
 from pose_graph_ros.core.geometry.se2 import FloatArray, IntArray
 from pose_graph_ros.core.graph import factors, tables as tb
-from pose_graph_ros.core.graph.constraints import EdgeKind, full
+from pose_graph_ros.core.graph.constraints import EdgeKind, full, upper
 from pose_graph_ros.core.graph.graph import Graph
 
 # Weight that one of 0 counts as.
@@ -63,26 +63,31 @@ class OdometryChain:
     weighted : bool
         Whether an edge counts with its present weight; by default it counts with the information
         that odometry claims.
+    by_row : bool
+        Whether nodes are given by row instead of by id, as long as none leaves the graph.
 
     """
 
-    def __init__(self, *, weighted: bool = False) -> None:
-        self._weighted = weighted
-        self._rows = GrowingArray((), np.int64)
+    def __init__(self, *, weighted: bool = False, by_row: bool = False) -> None:
+        self._weighted, self._by_row = weighted, by_row
+        self._nodes = GrowingArray((), np.int64)
         self._poses = GrowingArray((3,), np.float64)
         self._sums = GrowingArray((6,), np.float64)
         self._travel = GrowingArray((), np.float64)
-        self._n_edges = 0
+        self._next_edge = 0
+        """Id of the first edge that was not looked at."""
+        self._n_gone = 0
+        """Number of nodes that were forgotten since the poses were made relative to the first."""
         self.noise_factor = 1.0
         """On the covariances of odometry."""
 
     def __len__(self) -> int:
-        return len(self._rows)
+        return len(self._nodes)
 
     @property
     def nodes(self) -> IntArray:
-        """Rows of the nodes in the graph, in their order."""
-        return self._rows.values
+        """Ids of the nodes, in their order."""
+        return self._nodes.values
 
     @property
     def poses(self) -> FloatArray:
@@ -100,28 +105,58 @@ class OdometryChain:
             first = np.flatnonzero(~graph.is_bias)[:1]
             if len(first) == 0:
                 return
-            self._rows.append(first)
+            self._nodes.append(first if self._by_row else graph.node_ids[first])
             self._poses.append(np.zeros((1, 3)))
             self._sums.append(np.zeros((1, 6)))
             self._travel.append(np.zeros(1))
-        head, begin = graph.memory.head, self._n_edges
-        self._n_edges = graph.n_edges
-        ends = graph.memory['edge_i'][begin:self._n_edges]
+        head, begin = graph.memory.head, int(np.searchsorted(graph.edge_ids, self._next_edge))
+        self._next_edge = graph.next_ids.edge
+        ends = graph.memory['edge_i'][begin:graph.n_edges]
         last = len(self) - 1
+        end = int(self._nodes.values[last])
+        if not self._by_row:
+            end = int(graph.node_rows(end))
         new = begin + np.flatnonzero((ends[:, tb.EDGE_KIND] == EdgeKind.ODOMETRY)
-                                     & (ends[:, tb.END_J] > self._rows.values[last]))
+                                     & (ends[:, tb.END_J] > end))
         if len(new) == 0:
             return
         new = new[np.argsort(graph.memory['edge_i'][new, tb.END_J], kind='stable')]
         rows, travel = np.empty(len(new), np.int64), np.empty(len(new))
         poses, sums = np.empty((len(new), 3)), np.empty((len(new), 6))
         n = _extend(
-            head, new, int(self._rows.values[last]), self._poses.values[last],
+            head, new, end, self._poses.values[last],
             self._sums.values[last], self._weighted, rows, poses, sums, travel)
-        self._rows.append(rows[:n])
+        self._nodes.append(rows[:n] if self._by_row else graph.node_ids[rows[:n]])
         self._poses.append(poses[:n])
         self._sums.append(sums[:n])
         self._travel.append(self._travel.values[last] + travel[:n])
+
+    def forget(self, nodes: IntArray) -> None:
+        """Forget nodes that have left the graph; the motion between all others stays known."""
+        gone = np.isin(self._nodes.values, nodes)
+        n = int(np.count_nonzero(gone))
+        if n == 0:
+            return
+        for column in (self._nodes, self._poses, self._sums, self._travel):
+            if np.all(gone[:n]):
+                column.drop_first(n)
+            else:
+                column.select(np.flatnonzero(~gone))
+        self._n_gone += n
+        if self._n_gone > len(self):
+            self._begin_anew()
+
+    def _begin_anew(self) -> None:
+        """Make poses and sums those in the first node, as they lose digits far away from it."""
+        self._n_gone = 0
+        if len(self) == 0:
+            self._next_edge = 0
+            return
+        first, sums = self._poses.values[:1].copy(), self._sums.values
+        adjoint = se2.adjoint(se2.inverse(first))
+        self._poses.values[:] = se2.between(first, self._poses.values)
+        self._sums.values[:] = upper(
+            adjoint @ full(sums - sums[0]) @ np.swapaxes(adjoint, 1, 2))
 
     def travel(self, nodes: IntArray) -> FloatArray:
         """Return the lengths of the path to nodes by odometry, shape (M,) [m]."""
@@ -136,7 +171,7 @@ class OdometryChain:
 
         Parameters
         ----------
-        i, j : ndarray of int, shape (M,), rows in the graph, in any order
+        i, j : ndarray of int, shape (M,), ids, in any order
 
         """
         at_i, at_j = self._places(i), self._places(j)
@@ -177,11 +212,11 @@ class OdometryChain:
 
     def _places(self, nodes: IntArray) -> IntArray:
         """Return the places of nodes in the chain, -1 for those that are not in it."""
-        rows = self._rows.values
-        if len(rows) == 0:
+        own = self._nodes.values
+        if len(own) == 0:
             return np.full(len(nodes), -1)
-        at = np.minimum(np.searchsorted(rows, nodes), len(rows) - 1)
-        return np.where(rows[at] == nodes, at, -1)
+        at = np.minimum(np.searchsorted(own, nodes), len(own) - 1)
+        return np.where(own[at] == nodes, at, -1)
 
 
 @kernel(signature=(

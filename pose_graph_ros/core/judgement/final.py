@@ -24,6 +24,11 @@ from pose_graph_ros.core.graph.constraints import Edges
 from pose_graph_ros.core.graph.graph import Graph, GraphUpdate
 from pose_graph_ros.core.graph.reweighting import Reweighting
 from pose_graph_ros.core.judgement import jumps
+from pose_graph_ros.core.judgement.copies import (
+    copied_rows,
+    losses_in_rows,
+    weights_in_rows,
+)
 from pose_graph_ros.core.judgement.floors import floored, forward
 from pose_graph_ros.core.judgement.jumps import Jump
 
@@ -33,11 +38,11 @@ MOST, RETESTS = 30_000, 3
 
 
 def decide(
-    graph: Graph, reweighting: Reweighting, rows: IntArray, forced: IntArray, inside: BoolArray,
+    graph: Graph, reweighting: Reweighting, ids: IntArray, forced: IntArray, inside: BoolArray,
     *, odometry: Mapping[int, float],
 ) -> tuple[Choice | None, tuple[Jump, ...] | None]:
     """
-    Return which loop closures to believe, and which odometry not to.
+    Return which loop closures to believe, and which odometry not to; poses are by row.
 
     There is no choice if the graph cannot be solved. With more than `MOST` nodes and closures it
     is `inside`, improved, and the same odometry is doubted as before: None.
@@ -46,22 +51,22 @@ def decide(
     ----------
     graph : Graph, it is not changed
     reweighting : Reweighting, of its constraints with a robust loss; it is not changed
-    rows : ndarray of int, shape (M,), edges that may be doubted; their weights do not matter
-    forced : ndarray of int, edges that a person has decided to believe
-    inside : ndarray of bool, shape (M,), which of `rows` are believed now
+    ids : ndarray of int, shape (M,), edges that may be doubted; their weights do not matter
+    forced : ndarray of int, ids of edges that a person has decided to believe
+    inside : ndarray of bool, shape (M,), which of `ids` are believed now
     odometry : mapping, weights of the odometry edges that are doubted now, as if they were not
 
     """
+    rows, forced = graph.edge_rows(ids), graph.edge_rows(forced)
     copy = _copy(graph, np.union1d(rows, forced))
     if graph.n_nodes + len(rows) > MOST:
         problem = TruncatedProblem(copy, rows, start=copy.poses.copy())
         present = problem.choice(inside)
         return None if present is None else problem.improved(present, RETESTS), None
     weights = dict.fromkeys(rows.tolist(), 0.0) | dict.fromkeys(
-        forced.tolist(), 1.0) | dict(odometry)
+        forced.tolist(), 1.0) | weights_in_rows(graph, odometry)
     copy.apply(GraphUpdate(weigh_edges=weights))
-    others = Reweighting()
-    others.restore(*reweighting.saved())
+    others = losses_in_rows(graph, reweighting)
     for row, weight in weights.items():
         others.set_base_weight(row, weight, edge=True)
     starts = (Start.CHORDAL, Start.JOINT, Start.PRESENT)
@@ -71,12 +76,13 @@ def decide(
     if result.status is Status.FAILED:
         return None, None
     problem = TruncatedProblem(copy, rows, start=copy.poses.copy())
-    return jumps.best(problem)
+    choice, found = jumps.best(problem)
+    return choice, tuple(jump.with_ids(graph.edge_ids, graph.node_ids) for jump in found)
 
 
 def _copy(graph: Graph, closures: IntArray) -> Graph:
-    """Return a copy of a graph in which closures have the information to decide by."""
-    rows, copy = graph.rows(), Graph()
+    """Return a copy of a graph in which closures have the information to decide by; by row."""
+    rows, copy = copied_rows(graph), Graph()
     edges = rows.edges
     columns = edges.i.copy(), edges.j.copy(), edges.mean.copy(), edges.information.copy()
     own = floored(forward(edges.rows(closures)))

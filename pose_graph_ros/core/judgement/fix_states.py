@@ -3,7 +3,7 @@
 """What is decided on each position and pose in the map: one record each, as they were added."""
 
 from collections import deque
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Annotated
 
 import numpy as np
@@ -18,14 +18,15 @@ from pose_graph_ros.core.judgement.verdicts import (
     SourceVerdicts,
     State,
 )
-from pose_graph_ros.core.saved_columns import Choices, Integers, Numbers
-from pose_graph_ros.core.sources.factor_builder import NewConstraint
+from pose_graph_ros.core.saved_columns import Choices, Integers, Numbers, Pairs
+from pose_graph_ros.core.sources.constraint_queue import NewConstraint
 from pose_graph_ros.core.sources.source_constraints import Held
 
 DECISIONS = tuple(Decision)
 AUTO, IN = DECISIONS.index(Decision.AUTO), DECISIONS.index(Decision.IN)
-# Columns of the records. `OBSERVED` is the row of the observed node, if it was added as one.
-ROW, EDGE, SOURCE, NUMBER, STAMP, RUN, BELIEVED, SINCE, DECISION, OBSERVED = range(10)
+# Columns of the records. `HELD` is the id of what holds it, an edge if `EDGE` is 1; `OBSERVED` is
+# that of the observed node that it was added as, -1 if it was added as an edge.
+HELD, EDGE, SOURCE, NUMBER, STAMP, RUN, BELIEVED, SINCE, DECISION, OBSERVED = range(10)
 # Run of a measurement that is in none.
 LONE = -1
 # Largest number of changes that are kept for the announcement.
@@ -42,7 +43,7 @@ class SavedFixes:
 
     sources: tuple[str, ...]
     rows: Integers
-    """Rows in the graph."""
+    """Ids of what holds them."""
     edges: Integers
     """1 for those of edges, to a bias; 0 for those of observed nodes."""
     source: Integers
@@ -52,22 +53,34 @@ class SavedFixes:
     since_ns: Integers
     decision: Annotated[IntArray, Choices(Decision)]
     observed: Integers
-    """Rows of the observed nodes that they were added as; -1 for those added as edges."""
+    """Ids of the observed nodes that they were added as; -1 for those added as edges."""
     distance: Numbers
     """Mahalanobis distance when it was judged first [sigma]."""
     loosened: Integers
-    """Rows of odometry edges that are believed less than claimed."""
+    """Ids of odometry edges that are believed less than claimed."""
     weights: Numbers
     """Their weights."""
+    numbers: Integers = field(default_factory=lambda: np.empty(0, dtype=np.int64))
+    """Those in their names; empty if they are counted from 0 in each source."""
+    left: Pairs = field(default_factory=lambda: np.empty((0, 2), dtype=np.int64))
+    """Of each source, how many have left the graph, and how many of these unused."""
 
 
 class _Tally:
     """What is believed of one source."""
 
-    def __init__(self) -> None:
+    def __init__(self, n_left: int = 0, n_left_unused: int = 0) -> None:
         self.n = self.n_believed = 0
+        """In the graph."""
+        self.n_left, self.n_left_unused = n_left, n_left_unused
+        """Those that have left it."""
         self.newest: deque[int] = deque(maxlen=NEWEST)
         """Numbers of its newest records."""
+
+    @property
+    def next_number(self) -> int:
+        """Number of the next one."""
+        return self.n + self.n_left
 
 
 class FixStates:
@@ -121,9 +134,9 @@ class FixStates:
             self.sources.append(one.source)
             self._tallies.append(_Tally())
         index = self.sources.index(one.source)
-        held = (one.held_by, True) if one.held_by >= 0 else (one.row, one.is_edge)
-        self._append((*held, index, self._tallies[index].n, one.stamp_ns, run, believed, now_ns,
-                      AUTO, -1 if one.is_edge else one.row), distance)
+        held = (one.held_by, True) if one.held_by >= 0 else (one.number, one.is_edge)
+        self._append((*held, index, self._tallies[index].next_number, one.stamp_ns, run,
+                      believed, now_ns, AUTO, -1 if one.is_edge else one.number), distance)
 
     def _append(self, record: tuple[int, ...], distance: float) -> None:
         tally = self._tallies[record[SOURCE]]
@@ -135,12 +148,43 @@ class FixStates:
 
     def _count(self) -> None:
         """Count the records anew."""
-        self._tallies = [_Tally() for _ in self.sources]
+        self._tallies = [_Tally(each.n_left, each.n_left_unused) for each in self._tallies]
         for index, tally in enumerate(self._tallies):
             numbers = np.flatnonzero(self.records[:, SOURCE] == index)
             tally.n = len(numbers)
             tally.n_believed = int(np.count_nonzero(self.records[numbers, BELIEVED]))
             tally.newest.extend(numbers[-NEWEST:].tolist())
+
+    def leaving(self, edges: IntArray, observed: IntArray) -> BoolArray:
+        """
+        Return which records leave with constraints, shape (M,).
+
+        Parameters
+        ----------
+        edges, observed : ndarray of int, ids
+
+        """
+        held, edge, first = self.records[:, HELD], self.records[:, EDGE], self.records[:, OBSERVED]
+        return np.asarray(np.where(edge != 0, np.isin(held, edges), np.isin(held, observed))
+                          | np.isin(first, observed))
+
+    def leave(self, gone: BoolArray) -> None:
+        """Remove records of measurements that have left the graph; only their number is kept."""
+        if not np.any(gone):
+            return
+        for source, believed in self.records[gone][:, (SOURCE, BELIEVED)].tolist():
+            self._tallies[source].n_left += 1
+            self._tallies[source].n_left_unused += 1 - believed
+        kept = np.flatnonzero(~gone)
+        self._records.select(kept)
+        self._distances.select(kept)
+        self._count()
+
+    def has_left(self, name: str) -> bool:
+        """Return whether the measurement with an id was in the graph, and is no more."""
+        source, _, text = name.rpartition('/')
+        return (source in self.sources and text.isdecimal() and self.find(name) < 0
+                and int(text) < self._tallies[self.sources.index(source)].next_number)
 
     def keep(self, numbers: IntArray) -> None:
         """Remember some records that are about to be changed, until `forget` or `undo`."""
@@ -189,7 +233,7 @@ class FixStates:
         self, first: int, reweighting: Reweighting,
     ) -> tuple[dict[int, float], dict[int, float]]:
         """
-        Return weights that change, of edges and of observed nodes by row.
+        Return weights that change, of edges and of observed nodes by id.
 
         Parameters
         ----------
@@ -200,8 +244,8 @@ class FixStates:
         weights: tuple[dict[int, float], dict[int, float]] = {}, {}
         doubted = np.flatnonzero(self.records[first:, BELIEVED] == 0) + first
         for number in (*doubted.tolist(), *self._after_return(), *self.changed):
-            row, edge, believed = self.records[number, (ROW, EDGE, BELIEVED)].tolist()
-            weights[0 if edge else 1][row] = (
+            held, edge, believed = self.records[number, (HELD, EDGE, BELIEVED)].tolist()
+            weights[0 if edge else 1][held] = (
                 self._base_weight(number, reweighting) if believed else 0.0)
         return weights
 
@@ -216,12 +260,12 @@ class FixStates:
 
         """
         for number in (*range(first, len(self)), *self.changed):
-            row, edge, believed = self.records[number, (ROW, EDGE, BELIEVED)].tolist()
+            held, edge, believed = self.records[number, (HELD, EDGE, BELIEVED)].tolist()
             if not believed:
-                reweighting.set_base_weight(row, 0.0, edge=bool(edge))
+                reweighting.set_base_weight(held, 0.0, edge=bool(edge))
             elif number < first:
                 base = self._base_weight(number, reweighting)
-                reweighting.set_base_weight(row, base, edge=bool(edge))
+                reweighting.set_base_weight(held, base, edge=bool(edge))
 
     def _after_return(self) -> list[int]:
         """
@@ -237,10 +281,10 @@ class FixStates:
 
     def _base_weight(self, number: int, reweighting: Reweighting) -> float:
         """Return the base weight of a believed record, or else that of one next to it."""
-        row, edge, source = self.records[number, (ROW, EDGE, SOURCE)].tolist()
+        held, edge, source = self.records[number, (HELD, EDGE, SOURCE)].tolist()
         if edge:
             return 1.0
-        own = reweighting.base_weight(row)
+        own = reweighting.base_weight(held)
         if own:
             return own
         first = max(number - NEAR, 0)
@@ -249,7 +293,7 @@ class FixStates:
                                        & (near[:, SOURCE] == source))
         for other in alike[np.argsort(np.abs(alike - number), kind='stable')].tolist():
             if other not in self.changed:
-                return reweighting.base_weight(int(self.records[other, ROW])) or 1.0
+                return reweighting.base_weight(int(self.records[other, HELD])) or 1.0
         return 1.0
 
     def name(self, number: int) -> str:
@@ -267,19 +311,19 @@ class FixStates:
 
     def moved(self, before: Held, after: Held) -> None:
         """
-        Have records follow measurements that other rows of the graph hold now.
+        Have records follow measurements that others hold now.
 
         Parameters
         ----------
-        before, after : Held, rows of the same measurements
+        before, after : Held, of the same measurements
 
         """
-        held = 2 * self.records[:, ROW] + self.records[:, EDGE]
-        wanted = 2 * before.rows + before.is_edge
+        held = 2 * self.records[:, HELD] + self.records[:, EDGE]
+        wanted = 2 * before.ids + before.is_edge
         numbers = np.flatnonzero(np.isin(held, wanted))
         order = np.argsort(wanted)
         at = order[np.searchsorted(wanted, held[numbers], sorter=order)]
-        self.records[numbers, ROW], self.records[numbers, EDGE] = after.rows[at], after.is_edge[at]
+        self.records[numbers, HELD], self.records[numbers, EDGE] = after.ids[at], after.is_edge[at]
 
     def announce(self, number: int, before: State | None) -> None:
         """
@@ -307,7 +351,8 @@ class FixStates:
         """Return what is believed of each source."""
         return {source: SourceVerdicts(
             {State.BELIEVED: tally.n_believed, State.DOUBTED: tally.n - tally.n_believed}, 1.0,
-            tally.n > 0 and not any(self.records[number, BELIEVED] for number in tally.newest))
+            tally.n > 0 and not any(self.records[number, BELIEVED] for number in tally.newest),
+            n_left=tally.n_left, n_left_unused=tally.n_left_unused)
             for source, tally in zip(self.sources, self._tallies, strict=True)}
 
     def state(self) -> tuple[IntArray, list[Change]]:
@@ -330,22 +375,27 @@ class FixStates:
         self._changes.extend(changes)
 
     def saved(self, loosened: dict[int, float]) -> SavedFixes:
-        """Return all records, and the weights of odometry edges by row."""
+        """Return all records, and the weights of odometry edges by id."""
         records = self.records.copy().T
         return SavedFixes(
-            tuple(self.sources), records[ROW], records[EDGE], records[SOURCE], records[STAMP],
+            tuple(self.sources), records[HELD], records[EDGE], records[SOURCE], records[STAMP],
             records[BELIEVED], records[SINCE], records[DECISION], records[OBSERVED],
             self.distances.copy(),
             np.array(list(loosened), dtype=np.int64),
-            np.array(list(loosened.values()), dtype=np.float64))
+            np.array(list(loosened.values()), dtype=np.float64), records[NUMBER],
+            np.array([(tally.n_left, tally.n_left_unused) for tally in self._tallies],
+                     dtype=np.int64).reshape(-1, 2))
 
     def restore(self, saved: SavedFixes) -> None:
         """Fill empty records with saved ones; they belong to no run."""
         self.sources = list(saved.sources)
-        self._tallies = [_Tally() for _ in self.sources]
+        left = saved.left.tolist() or [(0, 0)] * len(self.sources)
+        self._tallies = [_Tally(*each) for each in left]
         columns = (saved.rows, saved.edges, saved.source, saved.stamps_ns, saved.believed,
                    saved.since_ns, saved.decision, saved.observed, saved.distance)
-        for row, edge, source, stamp_ns, believed, since_ns, decision, observed, distance in zip(
+        for held, edge, source, stamp_ns, believed, since_ns, decision, observed, distance in zip(
                 *(column.tolist() for column in columns), strict=True):
-            self._append((row, edge, source, self._tallies[source].n, stamp_ns, LONE, believed,
-                          since_ns, decision, observed), distance)
+            self._append((held, edge, source, self._tallies[source].next_number, stamp_ns, LONE,
+                          believed, since_ns, decision, observed), distance)
+        if len(saved.numbers) > 0:
+            self.records[:, NUMBER] = saved.numbers

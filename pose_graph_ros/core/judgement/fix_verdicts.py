@@ -5,7 +5,6 @@
 import numpy as np
 
 from pose_graph_ros.core.geometry.se2 import FloatArray, IntArray
-from pose_graph_ros.core.graph.error_functions import edge_errors, observed_errors
 from pose_graph_ros.core.graph.graph import Graph
 from pose_graph_ros.core.graph.graph_view import DrawnRows
 from pose_graph_ros.core.judgement.fix_states import (
@@ -15,8 +14,8 @@ from pose_graph_ros.core.judgement.fix_states import (
     DECISIONS,
     EDGE,
     FixStates,
+    HELD,
     LONE,
-    ROW,
     RUN,
     SINCE,
     SOURCE,
@@ -43,9 +42,9 @@ def verdicts(states: FixStates, graph: Graph, most_believed: int | None) -> list
     return verdicts_on(states, graph, numbers)
 
 
-def drawn_rows(states: FixStates, others: DrawnRows) -> DrawnRows:
+def drawn_ids(states: FixStates, others: DrawnRows) -> DrawnRows:
     """
-    Return rows that are drawn apart, with those of measurements that are not used.
+    Return ids of what is drawn apart, with those of measurements that are not used.
 
     Parameters
     ----------
@@ -55,8 +54,8 @@ def drawn_rows(states: FixStates, others: DrawnRows) -> DrawnRows:
     """
     unused = states.records[~states.believed]
     edge = unused[:, EDGE] != 0
-    return others._replace(unused_edges=unused[edge, ROW].tolist(),
-                           unused_observed=unused[~edge, ROW].tolist())
+    return others._replace(unused_edges=unused[edge, HELD].tolist(),
+                           unused_observed=unused[~edge, HELD].tolist())
 
 
 def believed_after(states: FixStates, stamp_ns: int) -> tuple[str, ...]:
@@ -85,7 +84,7 @@ def verdicts_on(states: FixStates, graph: Graph, numbers: IntArray) -> list[Verd
     numbers : ndarray of int, shape (K,)
 
     """
-    residuals = _residuals(graph, *states.records[numbers][:, (ROW, EDGE)].T)
+    residuals = _residuals(graph, *states.records[numbers][:, (HELD, EDGE)].T)
     return [_verdict(states, number, residual)
             for number, residual in zip(numbers.tolist(), residuals, strict=True)]
 
@@ -109,17 +108,17 @@ def _verdict(states: FixStates, number: int, residual: FloatArray) -> Verdict:
         residual=residual,
         distance=float(states.distances[number]),
         supported_by=tuple(states.name(other) for other in near.tolist()),
-        contradicted_by=('odometry',) if contradicted else (), edge=edge, row=int(record[ROW]))
+        contradicted_by=('odometry',) if contradicted else (), edge=edge, number=int(record[HELD]))
 
 
-def _residuals(graph: Graph, rows: IntArray, is_edge: IntArray) -> FloatArray:
+def _residuals(graph: Graph, held: IntArray, is_edge: IntArray) -> FloatArray:
     """Return the errors at the estimate, shape (K, 3), nan where nothing is measured."""
-    residuals = np.empty((len(rows), 3))
+    residuals = np.empty((len(held), 3))
     some = is_edge != 0
-    biased, observed = graph.edges_at(rows[some]), graph.observed_at(rows[~some])
+    biased, observed = graph.edges_at(held[some]), graph.observed_at(held[~some])
     for which, error, information in (
-            (some, edge_errors(graph.poses, biased), biased.information),
-            (~some, observed_errors(graph.poses, observed), observed.information)):
+            (some, graph.edge_errors(biased), biased.information),
+            (~some, graph.observed_errors(observed), observed.information)):
         measured = np.diagonal(information, axis1=1, axis2=2) > 0.0
         residuals[which] = np.where(measured, error, np.nan)
     return residuals

@@ -19,16 +19,17 @@ from pose_graph_ros.core.graph.constraints import Edges, ObservedNodes
 from pose_graph_ros.core.graph.graph import GraphUpdate
 from pose_graph_ros.core.graph.reweighting import Reweighting
 from pose_graph_ros.core.judgement import fix_states as fs, fix_verdicts
-from pose_graph_ros.core.judgement.run_set import RunSet, Turn
+from pose_graph_ros.core.judgement.listing import MOST_OTHERS
+from pose_graph_ros.core.judgement.run_set import NOWHERE, RunSet, Turn
 from pose_graph_ros.core.judgement.runs import odometry_between
-from pose_graph_ros.core.judgement.texts import sentence
+from pose_graph_ros.core.judgement.texts import sentence, unknown
 from pose_graph_ros.core.judgement.tracks import (
     biased_observations,
     Observation,
     observations,
     Track,
 )
-from pose_graph_ros.core.judgement.verdicts import Decision, State
+from pose_graph_ros.core.judgement.verdicts import Decision, State, Verdict
 from pose_graph_ros.core.measurements import (
     Answer,
     AnswerStatus,
@@ -37,7 +38,7 @@ from pose_graph_ros.core.measurements import (
     rejected,
 )
 from pose_graph_ros.core.smoother.incremental import IncrementalSmoother
-from pose_graph_ros.core.sources.factor_builder import NewConstraint
+from pose_graph_ros.core.sources.constraint_queue import NewConstraint
 
 # Largest number of measurements that are all judged again at the end of a stream.
 MOST_AGAIN = 100_000
@@ -78,16 +79,20 @@ class FixJudge:
         self.states = self._states = fs.FixStates()
         self._runs = RunSet()
         self._loosened: dict[int, float] = {}
-        """Weights of odometry edges by row; replaced, never changed, so that it is not copied."""
+        """Weights of odometry edges by id; replaced, never changed, so that it is not copied."""
         self.odometry_weight = 1.0  # in the graph, where it is not loosened
         self._restore: _Before | None = None
         self._decided: _Decided | None = None
+        self._cut: tuple[int, Track] | None = None
+        """Stamp [ns] of the newest believed measurement that has left, and where the robot was."""
+        self._leaving: tuple[int, Track] | None = None
+        """The same after those that are about to leave."""
         self._now_ns, self._again = -1, -1
         """Newest stamp of odometry, and the record that is judged again, -1 for a new one."""
 
     @property
     def loosened(self) -> Mapping[int, float]:
-        """Weights of the odometry edges, by row, that are believed less than claimed."""
+        """Weights of the odometry edges, by id, that are believed less than claimed."""
         return self._loosened
 
     def configure(self, config: BackendConfig) -> None:
@@ -119,9 +124,9 @@ class FixJudge:
         self._runs.chain.extend(graph)
         first, loosened = len(self._states), self._loosened
         is_edge = np.array([one.is_edge for one in judged])
-        rows = np.array([one.row for one in judged])
-        seen = _both(change.edges.rows(rows[is_edge] - graph.n_edges),
-                     change.observed.rows(rows[~is_edge] - graph.n_observed), is_edge)
+        numbers, begin = np.array([one.number for one in judged]), graph.next_ids
+        seen = _both(change.edges.rows(numbers[is_edge] - begin.edge),
+                     change.observed.rows(numbers[~is_edge] - begin.observed), is_edge)
         for one, each in zip(judged, seen, strict=True):
             self._judge(one.stamp_ns, each, one, solved=solved)
         for number in range(first, len(self._states)):
@@ -134,15 +139,15 @@ class FixJudge:
     ) -> GraphUpdate:
         """Return an update with the weights of new records and of those that have changed."""
         edges, observed = self._states.weights(first, self._reweighting)
-        for row in () if loosened is self._loosened else {*loosened, *self._loosened}:
-            if loosened.get(row) != self._loosened.get(row):
-                edges[row] = self.weight_of_odometry(row)
+        for edge in () if loosened is self._loosened else {*loosened, *self._loosened}:
+            if loosened.get(edge) != self._loosened.get(edge):
+                edges[edge] = self.weight_of_odometry(edge)
         return change._replace(weigh_edges={**change.weigh_edges, **edges},
                                weigh_observed={**change.weigh_observed, **observed})
 
-    def weight_of_odometry(self, row: int) -> float:
-        """Return the weight that an odometry edge has, as far as fixes know."""
-        return self.odometry_weight * self._loosened.get(row, 1.0)
+    def weight_of_odometry(self, edge: int) -> float:
+        """Return the weight that an odometry edge has, by its id, as far as fixes know."""
+        return self.odometry_weight * self._loosened.get(edge, 1.0)
 
     def _begin(self) -> None:
         self._restore, self._decided = self._copy(), None
@@ -203,7 +208,7 @@ class FixJudge:
             self._apply(given.turn)
 
     def _of_graph(self, node: int, *, solved: bool) -> Track:
-        pose = self._smoother.graph.poses[node].copy()
+        pose = self._smoother.graph.poses_of(node)
         if not solved:
             return Track(node, pose, np.zeros((3, 3)))
         return Track(node, pose, np.ascontiguousarray(
@@ -222,8 +227,8 @@ class FixJudge:
             self._states.believe(np.flatnonzero(records[:, fs.RUN] == number),
                                  believed=believed, now_ns=self._now_ns)
         self._loosened = {
-            row: 1.0 / scale for begin, end, scale in turn.jumps
-            for row in odometry_between(self._smoother.graph, begin, end).tolist()}
+            edge: 1.0 / scale for begin, end, scale in turn.jumps
+            for edge in odometry_between(self._smoother.graph, begin, end).tolist()}
 
     def finish(self) -> None:
         """
@@ -254,16 +259,18 @@ class FixJudge:
             self.commit()
 
     def final_weights(self) -> tuple[FloatArray, FloatArray]:
-        """Return the weights that `finish` would give."""
-        weights, records = self._smoother.graph.weights, self._states.records
+        """Return the weights that `finish` would give, by row."""
+        graph, records = self._smoother.graph, self._states.records
+        weights = graph.weights
         if not self._can_judge_all():
             return weights
         self._begin()
         self._states.keep(np.arange(len(self._states)))
         self._judge_all()
-        for kind, table in ((1, weights[0]), (0, weights[1])):
+        for kind, table, row_of in ((1, weights[0], graph.edge_rows),
+                                    (0, weights[1], graph.observed_rows)):
             some = records[records[:, fs.EDGE] == kind]
-            table[some[:, fs.ROW]] = some[:, fs.BELIEVED]
+            table[row_of(some[:, fs.HELD])] = some[:, fs.BELIEVED]
         decided = _Decided(records[:, fs.RUN].copy(), records[:, fs.BELIEVED].copy(),
                            self._runs, self._loosened)
         self.rollback()
@@ -282,15 +289,69 @@ class FixJudge:
         graph, states = self._smoother.graph, self._states
         self._runs, self._loosened = self._runs.empty(), {}
         self._runs.chain.extend(graph)
+        if self._cut is not None:
+            self._runs.begin_with(*self._cut)
         states.records[:, fs.RUN] = fs.LONE
         order = states.by_stamp()
-        rows, observed, stamps_ns = states.records[order][:, (fs.ROW, fs.OBSERVED, fs.STAMP)].T
+        held, observed, stamps_ns = states.records[order][:, (fs.HELD, fs.OBSERVED, fs.STAMP)].T
         is_edge = observed < 0
-        seen = _both(graph.edges_at(rows[is_edge]), graph.observed_at(observed[~is_edge]), is_edge)
+        seen = _both(graph.edges_at(held[is_edge]), graph.observed_at(observed[~is_edge]), is_edge)
         for self._again, stamp_ns, one in zip(
                 order.tolist(), stamps_ns.tolist(), seen, strict=True):
             self._judge(stamp_ns, one, None)
         self._again = -1
+
+    def decide_leaving(self, edges: IntArray, observed: IntArray) -> list[Verdict]:
+        """
+        Return the verdicts on measurements that are about to leave the graph unused.
+
+        Parameters
+        ----------
+        edges, observed : ndarray of int, ids of what leaves
+
+        """
+        graph, states = self._smoother.graph, self._states
+        self._runs.chain.extend(graph)
+        leaving = states.leaving(edges, observed)
+        self._leaving = self._after(np.flatnonzero(leaving & states.believed))
+        unused = np.flatnonzero(leaving & ~states.believed)
+        return fix_verdicts.verdicts_on(states, graph, unused[-MOST_OTHERS:])
+
+    def _after(self, numbers: IntArray) -> tuple[int, Track] | None:
+        """Return where the robot was after some believed measurements, by what was before."""
+        graph, chain, cut = self._smoother.graph, self._runs.chain, self._cut
+        records = self._states.records[numbers]
+        records = records[np.argsort(records[:, fs.STAMP], kind='stable')]
+        is_edge = records[:, fs.OBSERVED] < 0
+        seen = _both(graph.edges_at(records[is_edge, fs.HELD]),
+                     graph.observed_at(records[~is_edge, fs.OBSERVED]), is_edge)
+        for stamp_ns, one in zip(records[:, fs.STAMP].tolist(), seen, strict=True):
+            if one is None or (cut is not None and one.node < cut[1].node):
+                continue
+            track = Track(one.node, graph.poses_of(one.node), np.diag((NOWHERE, NOWHERE, 0.3**2)))
+            if cut is not None:
+                track = cut[1].moved(chain, one.node)
+            cut = stamp_ns, track.updated(track.innovation(one))
+        return cut
+
+    def forget(self, nodes: IntArray, edges: IntArray, observed: IntArray) -> None:
+        """
+        Forget measurements that have left the graph, and the path there.
+
+        Parameters
+        ----------
+        nodes, edges, observed : ndarray of int, ids
+
+        """
+        self._states.leave(self._states.leaving(edges, observed))
+        self._cut, self._decided = self._leaving, None
+        if self._cut is not None:
+            self._cut = self._cut[0], self._cut[1].carried(self._runs.chain, nodes)
+        self._runs.forget(nodes)
+        gone = {*edges.tolist()}
+        if not gone.isdisjoint(self._loosened):
+            self._loosened = {edge: weight for edge, weight in self._loosened.items()
+                              if edge not in gone}
 
     def decide(self, name: str, decision: Decision) -> Answer:
         """
@@ -304,7 +365,7 @@ class FixJudge:
         """
         number = self._states.find(name)
         if number < 0:
-            return rejected('unknown_id', f'expected the id of a verdict, got {name!r}')
+            return unknown(name, has_left=self._states.has_left(name))
         record = self._states.records[number]
         believed = decision is Decision.IN or (
             decision is Decision.AUTO and self._runs.believes(int(record[fs.RUN])))
@@ -330,7 +391,7 @@ class FixJudge:
 
     def restore(self, saved: fs.SavedFixes, now_ns: int) -> None:
         """
-        Restore what `saved` has returned, for a graph with the same rows.
+        Restore what `saved` has returned, for the same graph.
 
         Parameters
         ----------

@@ -9,9 +9,9 @@ update the judge is called three times: `before` weighs the new rows by what is 
 changed. It does a bounded part of that; `work` does the rest, part by part, between two updates.
 """
 
+from collections import deque
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
-from functools import partial
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -21,12 +21,14 @@ from pose_graph_ros.core.geometry.se2 import FloatArray, IntArray
 from pose_graph_ros.core.graph.constraints import EdgeKind, Edges
 from pose_graph_ros.core.graph.graph import GraphUpdate
 from pose_graph_ros.core.graph.graph_view import DrawnRows
+from pose_graph_ros.core.graph.incidence import constraints_on
 from pose_graph_ros.core.graph.reweighting import Reweighting
 from pose_graph_ros.core.judgement import fix_verdicts
 from pose_graph_ros.core.judgement.closure_judge import ClosureJudge
 from pose_graph_ros.core.judgement.closure_states import SavedClosures
 from pose_graph_ros.core.judgement.fix_states import SavedFixes
 from pose_graph_ros.core.judgement.fixes import FixJudge
+from pose_graph_ros.core.judgement.listing import MOST_OTHERS
 from pose_graph_ros.core.judgement.odometry_states import OdometryStates, SavedOdometry
 from pose_graph_ros.core.judgement.verdicts import Change, Decision, SourceVerdicts, Verdict
 from pose_graph_ros.core.measurements import Answer, LoopClosure
@@ -36,7 +38,7 @@ from pose_graph_ros.core.smoother.incremental import (
     IncrementalSmoother,
     UpdateResult,
 )
-from pose_graph_ros.core.sources.factor_builder import NewConstraint
+from pose_graph_ros.core.sources.constraint_queue import NewConstraint
 from pose_graph_ros.core.sources.source_constraints import Held
 
 
@@ -73,6 +75,10 @@ class Judge:
         self._closures = ClosureJudge(smoother, reweighting, config, self._odometry)
         self._staged = np.empty(0, dtype=np.int64)
         """The judged closures of the last `before`, by their numbers among its edges."""
+        self._leaving: list[Verdict] = []
+        """On what is about to leave the graph unused."""
+        self._left: deque[Verdict] = deque(maxlen=MOST_OTHERS)
+        """On the newest of what has."""
 
     def configure(self, config: BackendConfig) -> None:
         """Set the settings for later constraints."""
@@ -95,12 +101,12 @@ class Judge:
         """
         change = self._fixes.before(new, change, now_ns)
         change = change._replace(weigh_edges=self._odometry.kept(change.weigh_edges))
-        first = self._smoother.graph.n_edges
+        first = self._smoother.graph.next_ids.edge
         closures = [
             one for one in new if one.is_edge and self._is_judged_closure(one, change, first)]
         if len(closures) == 0:
             return change
-        self._staged = np.array([one.row - first for one in closures])
+        self._staged = np.array([one.number - first for one in closures])
         return _weighed(change, self._staged, self._closures.before(
             closures, change.edges.rows(self._staged), now_ns))
 
@@ -125,7 +131,7 @@ class Judge:
         return self._smoother.update(change)
 
     def _is_judged_closure(self, one: NewConstraint, change: GraphUpdate, first: int) -> bool:
-        number = one.row - first
+        number = one.number - first
         # one without a position, such as of the walls of a building, recognises no place
         return (change.edges.kind[number] == EdgeKind.LOOP_CLOSURE
                 and bool(change.edges.information[number, 0, 0] > 0.0)
@@ -160,18 +166,20 @@ class Judge:
         return self._closures.work()
 
     def verdicts(self, most_believed: int | None = None) -> list[Verdict]:
-        """Return the verdicts that are listed; see `listing.listed`."""
+        """Return the verdicts that are listed, see `listing.listed`, and on what left unused."""
         graph = self._smoother.graph
         return [*self._closures.reports.verdicts(graph, most_believed),
-                *self._odometry.verdicts(
-                    graph, self._closures.states.name,
-                    partial(fix_verdicts.believed_after, self._fixes.states)),
-                *fix_verdicts.verdicts(self._fixes.states, graph, most_believed)]
+                *self._odometry.verdicts(graph, self._believed_after),
+                *fix_verdicts.verdicts(self._fixes.states, graph, most_believed), *self._left]
 
     def drawn_rows(self) -> DrawnRows:
         """Return the rows of constraints that are drawn in another way than believed ones."""
-        return fix_verdicts.drawn_rows(
-            self._fixes.states, self._odometry.drawn_rows(self._closures.reports.drawn_rows()))
+        graph = self._smoother.graph
+        ids = fix_verdicts.drawn_ids(
+            self._fixes.states, self._odometry.drawn_ids(self._closures.reports.drawn_ids()))
+        weak, waiting, doubted, unused = (graph.edge_rows(each).tolist() for each in ids[:-1])
+        return DrawnRows(weak, waiting, doubted, unused,
+                         graph.observed_rows(ids.unused_observed).tolist())
 
     def changes(self) -> list[Change]:
         """Return the changes of verdicts since the last call."""
@@ -193,8 +201,43 @@ class Judge:
         decision : Decision
 
         """
-        judge = self._fixes if self._fixes.states.find(name) >= 0 else self._closures
+        fixes = self._fixes.states
+        is_fix = fixes.find(name) >= 0 or fixes.has_left(name)
+        judge = self._fixes if is_fix else self._closures
         return judge.decide(name, decision)
+
+    def decide_leaving(self, nodes: IntArray) -> None:
+        """
+        Decide on all constraints on nodes that are about to leave the graph, ids, shape (K,).
+
+        What is believed then stays as it is weighted. All else leaves unused, for which `verdicts`
+        has it after `forget`.
+        """
+        graph = self._smoother.graph
+        edges, observed = constraints_on(graph, nodes)
+        unused = [
+            *self._closures.decide_leaving(edges), *self._fixes.decide_leaving(edges, observed),
+            *self._odometry.decide_leaving(graph, edges, self._believed_after)]
+        self._leaving = [replace(each, left=True, since_ns=self._nodes.newest_ns)
+                         for each in unused]
+
+    def forget(self, nodes: IntArray, edges: IntArray, observed: IntArray) -> None:
+        """
+        Forget what has left the graph after `decide_leaving`.
+
+        Parameters
+        ----------
+        nodes, edges, observed : ndarray of int, ids
+
+        """
+        closures = self._closures.forget(nodes, edges)
+        self._fixes.forget(nodes, edges, observed)
+        self._odometry.forget(self._smoother.graph, edges, closures, self._fixes.loosened)
+        self._left.extend(self._leaving)
+        self._leaving = []
+
+    def _believed_after(self, stamp_ns: int) -> tuple[str, ...]:
+        return fix_verdicts.believed_after(self._fixes.states, stamp_ns)
 
     def saved(self) -> SavedJudgement:
         """Return the state; what is left to be done is not part of it."""
@@ -203,7 +246,7 @@ class Judge:
 
     def restore(self, saved: SavedJudgement, now_ns: int) -> None:
         """
-        Restore what `saved` has returned, for a graph with the same rows.
+        Restore what `saved` has returned, for the same graph.
 
         Parameters
         ----------
@@ -223,11 +266,11 @@ class Judge:
 
     def moved(self, before: Held, after: Held) -> None:
         """
-        Follow measurements that other rows of the graph hold now, with the same weights.
+        Follow measurements that others hold now, with the same weights.
 
         Parameters
         ----------
-        before, after : Held, rows of the same measurements
+        before, after : Held, of the same measurements
 
         """
         self._fixes.states.moved(before, after)

@@ -10,14 +10,13 @@ from pose_graph_ros.core.batch import optimizer
 from pose_graph_ros.core.batch.optimizer import Status
 from pose_graph_ros.core.config import SolverConfig
 from pose_graph_ros.core.geometry import se2
-from pose_graph_ros.core.geometry.se2 import BoolArray
-from pose_graph_ros.core.graph.constraints import Edges
 from pose_graph_ros.core.graph.graph import Graph
 from pose_graph_ros.core.judgement import jumps, strain
 from pose_graph_ros.core.judgement.closures import GATE
+from pose_graph_ros.core.judgement.copies import copied_rows, in_rows
 from pose_graph_ros.core.judgement.jumps import Jump
 from pose_graph_ros.core.judgement.odometry_motions import Odometry
-from pose_graph_ros.core.judgement.swaps import Found, Swap
+from pose_graph_ros.core.judgement.swaps import Found, residuals, Swap, write
 
 CONFIG = SolverConfig(max_iterations=20, step_tolerance=1e-3)
 # Number of doubted closures that all others are compared with, and of comparisons in a part.
@@ -34,7 +33,12 @@ def search(present: Swap, graph: Graph) -> Generator[None, None, Found | None]:
     graph : Graph, it is not changed
 
     """
-    edges, odometry, poses = present.edges, Odometry(graph), graph.poses.copy()
+    odometry, poses = Odometry(graph), graph.poses.copy()
+    rows, closures = copied_rows(graph), graph.edge_rows(present.ids)
+    nodes, edge_ids = graph.node_ids.copy(), graph.edge_ids.copy()
+    if np.any(closures < 0):
+        return None     # some have left since
+    edges = in_rows(graph, present.closures)
     yield
     free_or_in = present.free | present.before
     most_seeds = MOST_COMPARED // max(int(np.sum(free_or_in)), 1)
@@ -49,17 +53,17 @@ def search(present: Swap, graph: Graph) -> Generator[None, None, Found | None]:
         inside[against[present.free[against]]], inside[members] = False, True
         motion, = odometry.motion_at(
             np.array([place.at]), place.first, place.last, place.total)
-        copy, rows = Graph(), graph.rows()
-        _write(rows.edges, present, inside)
+        copy = Graph()
+        write(rows.edges, closures, edges, inside)
         copy.fill(jumps.rows_with_motion(rows, odometry, place.at, motion, jumps.LOOSE))
         yield
         result = yield from optimizer.in_parts(copy, CONFIG)
         yield
         if result.status is Status.FAILED:
             continue
-        residual = present.residuals(copy)
+        residual = residuals(copy, edges)
         fit = members[residual[members] <= GATE]
-        if (present.truncated(copy, residual) + strain.PRICE >= present.cost
+        if (present.truncated(copy, closures, residual) + strain.PRICE >= present.cost
                 or len(fit) < jumps.MOST_FIT * len(members)
                 or strain.n_places(copy.poses, edges.rows(fit)) < strain.PLACES):
             continue
@@ -68,13 +72,6 @@ def search(present: Swap, graph: Graph) -> Generator[None, None, Found | None]:
             place.first, place.last, place.first, place.last, total)
         first, last = odometry.nodes[[place.first, place.last]].tolist()
         inside = np.where(present.free, residual <= GATE, inside)
-        return Found(inside, copy.poses.copy(), Jump(
-            int(odometry.rows[at]), (first, last), motion, fit))
+        jump = Jump(int(odometry.rows[at]), (first, last), motion, fit)
+        return Found(inside, nodes, copy.poses.copy(), jump.with_ids(edge_ids, nodes))
     return None
-
-
-def _write(edges: Edges, present: Swap, inside: BoolArray) -> None:
-    own = present.edges
-    columns = (own.i, own.j, own.mean, own.information, own.kind, inside.astype(np.float64))
-    for column, values in zip(edges.columns, columns, strict=False):
-        column[present.rows] = values

@@ -60,14 +60,26 @@ FURTHER, MOST_CUTS = 2, 16
 class Jump(NamedTuple):
     """An odometry edge that is doubted."""
 
-    row: int
-    """The edge."""
+    edge: int
+    """Its row in a copy of the graph, or its id."""
     ends: tuple[int, int]
     """Nodes between which it is; the closures do not tell which edge it is."""
     motion: FloatArray
     """What has moved the robot along the edge, by the closures, shape (3,) [m, m, rad]."""
     seen_by: IntArray
     """Numbers of the closures that the jump was found by."""
+
+    def with_ids(self, edges: IntArray, nodes: IntArray) -> 'Jump':
+        """
+        Return the jump with ids in place of rows.
+
+        Parameters
+        ----------
+        edges, nodes : ndarray of int, ids by row
+
+        """
+        begin, end = nodes[list(self.ends)].tolist()
+        return self._replace(edge=int(edges[self.edge]), ends=(begin, end))
 
 
 def best(problem: TruncatedProblem) -> tuple[Choice | None, tuple[Jump, ...]]:

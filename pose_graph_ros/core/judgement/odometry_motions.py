@@ -18,7 +18,7 @@ SIGMAS = 2.0 * np.array(CLOSURE_FLOORS)
 
 class Odometry:
     """
-    The chain of odometry of a graph, with its edges.
+    The chain of odometry of a graph, with its edges; nodes and edges are given by row.
 
     Parameters
     ----------
@@ -27,7 +27,7 @@ class Odometry:
     """
 
     def __init__(self, graph: Graph) -> None:
-        self.chain = OdometryChain()
+        self.chain = OdometryChain(by_row=True)
         self.chain.extend(graph)
         self.nodes = self.chain.nodes
         ends, n = graph.memory['edge_i'][:graph.n_edges], max(len(self.nodes) - 1, 0)
@@ -38,7 +38,7 @@ class Odometry:
         self.rows[at[is_chained][::-1] - 1] = rows[is_chained][::-1]
         if np.any(self.rows < 0):   # an edge was removed: a chain with a gap is none
             self.nodes, self.rows = self.nodes[:1], self.rows[:0]
-        self.motions = graph.edges_at(self.rows).mean
+        self.motions = graph.memory['edge_f'][self.rows, tb.MEAN:tb.MEAN + 3]
         self.poses = integrated(self.motions)
 
     def places(self, nodes: IntArray) -> IntArray:

@@ -9,15 +9,14 @@ is believed less over a gap between them (`fixes`), whose weights are kept there
 
 from collections import Counter
 from collections.abc import Callable, Iterable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
 from pose_graph_ros.core.geometry import se2
 from pose_graph_ros.core.geometry.se2 import IntArray
-from pose_graph_ros.core.graph import tables as tb
 from pose_graph_ros.core.graph.constraints import Edges
-from pose_graph_ros.core.graph.error_functions import edge_errors, energies
+from pose_graph_ros.core.graph.error_functions import energies
 from pose_graph_ros.core.graph.graph import Graph
 from pose_graph_ros.core.graph.graph_view import DrawnRows
 from pose_graph_ros.core.judgement.jumps import Jump
@@ -43,27 +42,36 @@ class SavedOdometry:
     """Saved state of the doubted odometry edges; who has contradicted them is not part of it."""
 
     rows: Integers
-    """Rows of the edges in the graph."""
+    """Ids of the edges."""
     ends: Pairs
     """Nodes between which odometry is wrong."""
     weights: Numbers
     """Factors on the weights of the edges."""
     since_ns: Integers
+    final: Integers = field(default_factory=lambda: np.empty(0, dtype=np.int64))
+    """1 for doubts that stay, whatever closures show; empty if there is none."""
 
 
 @dataclass(frozen=True, slots=True)
 class Doubt:
     """Doubted odometry."""
 
-    rows: tuple[int, ...]
-    """Of the edges that are believed less; one where closures contradict it."""
+    edges: tuple[int, ...]
+    """Ids of those that are believed less; one where closures contradict it."""
     ends: tuple[int, int]
     """Nodes between which odometry is wrong; which edge it is cannot be told."""
     weight: float
     """Factor on the weights of the edges."""
     since_ns: int
-    seen_by: tuple[int, ...] = ()
-    """Numbers of the closures that contradict it."""
+    seen_by: tuple[str, ...] = ()
+    """Ids of closures that contradict it."""
+    is_final: bool = False
+    """Whether a believed closure over it has left the graph, so that the prior knows the jump."""
+
+    def is_under(self, ends: IntArray) -> bool:
+        """Return whether one of some closures, given by their nodes, shape (K, 2), is over it."""
+        first, last = np.sort(ends, axis=1).T
+        return bool(np.any((first <= self.ends[0]) & (last >= self.ends[1])))
 
 
 class OdometryStates:
@@ -73,31 +81,33 @@ class OdometryStates:
     Parameters
     ----------
     nodes : HiddenNodes, with the stamps and the name of the odometry
-    weight_of : callable, returns the weight that an edge would have, by its row
+    weight_of : callable, returns the weight that an edge would have, by its id
 
     """
 
     def __init__(self, nodes: HiddenNodes, weight_of: Callable[[int], float]) -> None:
         self._nodes, self._weight_of = nodes, weight_of
         self.doubts: dict[int, Doubt] = {}
-        """By closures, by the rows of the edges; replaced, never changed."""
+        """By closures, by the ids of the edges; replaced, never changed."""
         self._gaps: dict[int, Doubt] = {}
-        """By fixes, by the row of the first edge."""
+        """By fixes, by the id of the first edge."""
         self._loosened: Mapping[int, float] = {}
         self._changes: list[Change] = []
+        self._left = Counter[str]()
+        """Number of edges of each source that have left the graph doubted."""
 
     def weights_with(self, doubts: Mapping[int, Doubt]) -> dict[int, float]:
-        """Return the weights of edges that are doubted, or were and no longer are, by row."""
-        return {row: self._weight_of(row) * (doubts[row].weight if row in doubts else 1.0)
-                for row in sorted({*self.doubts, *doubts})}
+        """Return the weights of edges that are doubted, or were and no longer are, by id."""
+        return {edge: self._weight_of(edge) * (doubts[edge].weight if edge in doubts else 1.0)
+                for edge in sorted({*self.doubts, *doubts})}
 
     def kept(self, weights: Mapping[int, float]) -> dict[int, float]:
         """Return new weights of edges, in which doubted ones have no more than they have."""
-        return {row: weight * (self.doubts[row].weight if row in self.doubts else 1.0)
-                for row, weight in weights.items()}
+        return {edge: weight * (self.doubts[edge].weight if edge in self.doubts else 1.0)
+                for edge, weight in weights.items()}
 
     def doubted(
-        self, graph: Graph, jumps: Iterable[Jump], now_ns: int, numbers: IntArray,
+        self, graph: Graph, jumps: Iterable[Jump], now_ns: int, name: Callable[[int], str],
     ) -> dict[int, Doubt]:
         """
         Return the doubts that jumps give; those that are there already keep their stamps.
@@ -107,26 +117,77 @@ class OdometryStates:
         graph : Graph
         jumps : iterable of Jump
         now_ns : int, stamp of the newest odometry
-        numbers : ndarray of int, shape (M,), numbers of the closures that jumps were found by
+        name : callable, returns the id of a closure by its number among those of the jumps
 
         """
         doubts = {}
         for jump in jumps:
-            edge = graph.edges_at(np.array([jump.row]))
-            error = se2.between(edge.mean, jump.motion[None])
-            size = float(energies(error, edge.information)[0])
-            before = self.doubts.get(jump.row)
-            doubts[jump.row] = Doubt(
-                (jump.row,), jump.ends, 1.0 / max(size, 1.0),
+            own = graph.edges_at(np.array([jump.edge]))
+            error = se2.between(own.mean, jump.motion[None])
+            size = float(energies(error, own.information)[0])
+            before = self.doubts.get(jump.edge)
+            doubts[jump.edge] = Doubt(
+                (jump.edge,), jump.ends, 1.0 / max(size, 1.0),
                 now_ns if before is None else before.since_ns,
-                tuple(numbers[jump.seen_by].tolist()))
+                tuple(map(name, jump.seen_by[:MOST_NAMED].tolist())))
         return doubts
 
     def still_doubted(self, closures: Edges) -> dict[int, Doubt]:
         """Return the doubts over which one of the closures that are believed leads."""
-        first, last = np.minimum(closures.i, closures.j), np.maximum(closures.i, closures.j)
-        return {row: doubt for row, doubt in self.doubts.items()
-                if np.any((first <= doubt.ends[0]) & (last >= doubt.ends[1]))}
+        ends = np.column_stack((closures.i, closures.j))
+        return {edge: doubt for edge, doubt in self.doubts.items()
+                if doubt.is_final or doubt.is_under(ends)}
+
+    @property
+    def final(self) -> dict[int, Doubt]:
+        """Those that stay, whatever closures show."""
+        return {edge: doubt for edge, doubt in self.doubts.items() if doubt.is_final}
+
+    def decide_leaving(
+        self, graph: Graph, edges: IntArray, fixes: Callable[[int], tuple[str, ...]],
+    ) -> list[Verdict]:
+        """
+        Return the verdicts on doubted odometry that is about to leave the graph.
+
+        Parameters
+        ----------
+        graph : Graph
+        edges : ndarray of int, ids of what leaves
+        fixes : callable, as in `verdicts`
+
+        """
+        gone = {*edges.tolist()}
+        if gone.isdisjoint(self._gaps) and gone.isdisjoint(self.doubts):
+            return []
+        return [each for each in self.verdicts(graph, fixes) if each.number in gone]
+
+    def forget(
+        self, graph: Graph, edges: IntArray, closures: IntArray, loosened: Mapping[int, float],
+    ) -> None:
+        """
+        Forget edges that have left the graph.
+
+        Parameters
+        ----------
+        graph : Graph, without them
+        edges : ndarray of int, ids
+        closures : ndarray of int, shape (K, 2), nodes of believed closures that have left
+        loosened : mapping, as in `keep_gaps`
+
+        """
+        gone, self._loosened = {*edges.tolist()}, loosened
+        for doubt in self._every():
+            self._left[self._source(doubt.ends[1])] += len(gone.intersection(doubt.edges))
+        self.doubts = {
+            edge: replace(doubt, is_final=doubt.is_final or doubt.is_under(closures))
+            for edge, doubt in self.doubts.items() if edge not in gone}
+        gaps, self._gaps = self._gaps, {}
+        for doubt in gaps.values():
+            left = tuple(edge for edge in doubt.edges if edge not in gone)
+            if len(left) > 0:
+                first = int(graph.edges_at(np.array(left[:1])).i[0])
+                ends = doubt.ends if left == doubt.edges else (first, doubt.ends[1])
+                self._gaps[left[0]] = replace(doubt, edges=left, ends=ends)
 
     def keep(self, doubts: Mapping[int, Doubt], graph: Graph) -> None:
         """
@@ -134,7 +195,7 @@ class OdometryStates:
 
         Parameters
         ----------
-        doubts : mapping, by row
+        doubts : mapping, by the ids of edges
         graph : Graph
 
         """
@@ -147,7 +208,7 @@ class OdometryStates:
 
         Parameters
         ----------
-        loosened : mapping, factors on weights by row; another one after each change
+        loosened : mapping, factors on weights by id; another one after each change
         graph : Graph
         now_ns : int, stamp of the newest odometry
 
@@ -155,26 +216,26 @@ class OdometryStates:
         if loosened is self._loosened:
             return
         before, self._gaps, self._loosened = self._gaps, {}, loosened
-        rows = np.array(sorted(row for row, factor in loosened.items() if factor < MUCH_LESS),
-                        dtype=np.int64)
-        edges = graph.edges_at(rows)
+        ids = np.array(sorted(edge for edge, factor in loosened.items() if factor < MUCH_LESS),
+                       dtype=np.int64)
+        edges = graph.edges_at(ids)
         cuts = np.flatnonzero(edges.i[1:] != edges.j[:-1]) + 1
-        for part in np.split(np.arange(len(rows)), cuts) if len(rows) > 0 else ():
-            row = int(rows[part[0]])
-            self._gaps[row] = Doubt(
-                tuple(rows[part].tolist()), (int(edges.i[part[0]]), int(edges.j[part[-1]])),
-                loosened[row], before[row].since_ns if row in before else now_ns)
+        for part in np.split(np.arange(len(ids)), cuts) if len(ids) > 0 else ():
+            first = int(ids[part[0]])
+            self._gaps[first] = Doubt(
+                tuple(ids[part].tolist()), (int(edges.i[part[0]]), int(edges.j[part[-1]])),
+                loosened[first], before[first].since_ns if first in before else now_ns)
         self._note(before, self._gaps, graph)
 
     def _note(
         self, before: Mapping[int, Doubt], after: Mapping[int, Doubt], graph: Graph,
     ) -> None:
-        for row in sorted(before.keys() ^ after.keys()):
+        for edge in sorted(before.keys() ^ after.keys()):
             states = State.BELIEVED, State.DOUBTED
-            old, new = states[::-1] if row in before else states
-            end = (before.get(row) or after[row]).ends[1]
+            old, new = states[::-1] if edge in before else states
+            end = (before.get(edge) or after[edge]).ends[1]
             self._changes.append(Change(
-                self.name(graph, row), Judged.ODOMETRY, self._source(end), self._stamp_ns(end),
+                self.name(graph, edge), Judged.ODOMETRY, self._source(end), self._stamp_ns(end),
                 old, new))
 
     def take_changes(self) -> list[Change]:
@@ -192,17 +253,17 @@ class OdometryStates:
             self._changes = list(changes)
         return bring_back
 
-    def name(self, graph: Graph, row: int) -> str:
+    def name(self, graph: Graph, edge: int) -> str:
         """
-        Return the id of an edge: edges are counted along the path.
+        Return the name of an edge: edges are counted along the path.
 
         Parameters
         ----------
         graph : Graph
-        row : int
+        edge : int, id
 
         """
-        end = int(graph.memory['edge_i'][row, tb.END_J])
+        end = int(graph.edges_at(np.array([edge])).j[0])
         return f'{self._source(end)}/{np.searchsorted(self._nodes.ids, end) - 1}'
 
     def _stamp_ns(self, node: int) -> int:
@@ -213,8 +274,7 @@ class OdometryStates:
         return self._nodes.primary_at(self._stamp_ns(node))
 
     def verdicts(
-        self, graph: Graph, closure: Callable[[int], str],
-        fixes: Callable[[int], tuple[str, ...]],
+        self, graph: Graph, fixes: Callable[[int], tuple[str, ...]],
     ) -> list[Verdict]:
         """
         Return the verdicts on doubted odometry.
@@ -222,46 +282,46 @@ class OdometryStates:
         Parameters
         ----------
         graph : Graph
-        closure : callable, returns the id of a closure by its number
         fixes : callable, returns the ids of the first fixes that are believed after a stamp
 
         """
         verdicts = []
-        for row, doubt in sorted({**self._gaps, **self.doubts}.items()):
-            edges = graph.edges_at(np.array(doubt.rows))
-            begin, end = graph.poses[list(doubt.ends)] if len(doubt.rows) > 1 else (
-                graph.poses[edges.i[0]], graph.poses[edges.j[0]])
+        for edge, doubt in sorted({**self._gaps, **self.doubts}.items()):
+            edges = graph.edges_at(np.array(doubt.edges))
+            begin, end = graph.poses_of((edges.i[0], edges.j[-1]))
             measured = integrated(edges.mean)[-1]
-            against = fixes(self._stamp_ns(doubt.ends[1])) if row not in self.doubts else tuple(
-                map(closure, doubt.seen_by[:MOST_NAMED]))
+            against = (doubt.seen_by if edge in self.doubts
+                       else fixes(self._stamp_ns(doubt.ends[1])))
             distance = np.sqrt(np.sum(energies(
-                edge_errors(graph.poses, edges), edges.information)))
+                graph.edge_errors(edges), edges.information)))
             verdicts.append(Verdict(
-                id=self.name(graph, row), kind=Judged.ODOMETRY,
+                id=self.name(graph, edge), kind=Judged.ODOMETRY,
                 source=self._source(doubt.ends[1]), stamp_ns=self._stamp_ns(doubt.ends[1]),
                 reference_ns=self._stamp_ns(doubt.ends[0]), state=State.DOUBTED,
                 since_ns=doubt.since_ns, decision=Decision.AUTO,
                 residual=se2.between(measured, se2.between(begin, end)),
                 distance=float(distance), supported_by=(), contradicted_by=against, edge=True,
-                row=row))
+                number=edge))
         return verdicts
 
     def _every(self) -> list[Doubt]:
         return [doubt for _, doubt in sorted({**self._gaps, **self.doubts}.items())]
 
-    def drawn_rows(self, others: DrawnRows) -> DrawnRows:
-        """Return rows that are drawn apart, with the doubted edges of odometry."""
+    def drawn_ids(self, others: DrawnRows) -> DrawnRows:
+        """Return ids of what is drawn apart, with the doubted edges of odometry."""
         return others._replace(doubted=[*others.doubted, *(
-            row for doubt in self._every() for row in doubt.rows)])
+            edge for doubt in self._every() for edge in doubt.edges)])
 
     def totals(self) -> dict[str, SourceVerdicts]:
         """Return how many edges of each source are doubted."""
         counts = Counter[str]()
         for doubt in self._every():
-            counts[self._source(doubt.ends[1])] += len(doubt.rows)
+            counts[self._source(doubt.ends[1])] += len(doubt.edges)
+        n, n_left = len(self._nodes) - 1, self._nodes.n_frozen
         return {source: SourceVerdicts(
-            {State.BELIEVED: len(self._nodes) - 1 - count, State.DOUBTED: count}, 1.0,
-            doubting=False) for source, count in counts.items()}
+            {State.BELIEVED: n - n_left - counts[source], State.DOUBTED: counts[source]}, 1.0,
+            doubting=False, n_left=n_left, n_left_unused=self._left[source])
+            for source in (counts | self._left)}
 
     def saved(self) -> SavedOdometry:
         """Return all doubts."""
@@ -270,12 +330,15 @@ class OdometryStates:
             np.array(list(self.doubts), dtype=np.int64),
             np.array([each.ends for each in every], dtype=np.int64).reshape(-1, 2),
             np.array([each.weight for each in every], dtype=np.float64),
-            np.array([each.since_ns for each in every], dtype=np.int64))
+            np.array([each.since_ns for each in every], dtype=np.int64),
+            np.array([int(each.is_final) for each in every], dtype=np.int64))
 
     def restore(self, saved: SavedOdometry) -> None:
-        """Restore what `saved` has returned, for a graph with the same rows and weights."""
-        self.doubts = {row: Doubt((row,), (ends[0], ends[1]), weight, since_ns)
-                       for row, ends, weight, since_ns in zip(*(
+        """Restore what `saved` has returned, for the same graph."""
+        final = saved.final if len(saved.final) > 0 else np.zeros(len(saved.rows), np.int64)
+        self.doubts = {edge: Doubt((edge,), (ends[0], ends[1]), weight, since_ns,
+                                   is_final=bool(is_final))
+                       for edge, ends, weight, since_ns, is_final in zip(*(
                            column.tolist() for column in (
-                               saved.rows, saved.ends, saved.weights, saved.since_ns)),
+                               saved.rows, saved.ends, saved.weights, saved.since_ns, final)),
                            strict=True)}

@@ -13,7 +13,7 @@ import math
 import numpy as np
 
 from pose_graph_ros.core.compiled.jit import INTEGERS, kernel, MATRICES, NUMBERS, ROWS
-from pose_graph_ros.core.geometry.se2 import FloatArray
+from pose_graph_ros.core.geometry.se2 import BoolArray, FloatArray, IntArray
 from pose_graph_ros.core.graph import tables as tb
 from pose_graph_ros.core.graph.factors import wrap
 from pose_graph_ros.core.graph.graph import Graph
@@ -39,7 +39,7 @@ def errors_at(head, first, second, mean, errors):  # type: ignore[no-untyped-def
 
     Parameters
     ----------
-    first, second : ndarray of int, shape (M,), nodes
+    first, second : ndarray of int, shape (M,), rows of nodes
     mean : ndarray, shape (M, 3), poses of the second nodes in the first ones [m, m, rad]
     errors : ndarray, shape (M, 3), output [m, m, rad]
 
@@ -84,6 +84,22 @@ def distances(errors, covariances, out):  # type: ignore[no-untyped-def]
         out[k] = _quadratic_form(errors[k], covariances[k])
 
 
+def errors_of(graph: Graph, some: Closures) -> FloatArray:
+    """
+    Return the errors of closures at the estimate of a graph, shape (M, 3) [m, m, rad].
+
+    Parameters
+    ----------
+    graph : Graph
+    some : Closures, M of them
+
+    """
+    errors = np.empty((len(some.i), 3))
+    errors_at(graph.memory.head, graph.node_rows(some.i), graph.node_rows(some.j), some.mean,
+              errors)
+    return errors
+
+
 def residuals(graph: Graph, some: Closures) -> FloatArray:
     """
     Return squared residuals at the estimate of a graph, by the floored covariances, shape (M,).
@@ -94,7 +110,21 @@ def residuals(graph: Graph, some: Closures) -> FloatArray:
     some : Closures, M of them
 
     """
-    errors, out = np.empty((len(some.i), 3)), np.empty(len(some.i))
-    errors_at(graph.memory.head, some.i, some.j, some.mean, errors)
+    errors, out = errors_of(graph, some), np.empty(len(some.i))
     distances(errors, some.noise, out)
     return out
+
+
+def are_above(graph: Graph, edges: IntArray, limit: float) -> BoolArray:
+    """
+    Tell which squared residuals of edges, by their own covariances, are above a limit.
+
+    Parameters
+    ----------
+    graph : Graph
+    edges : ndarray of int, shape (M,), ids
+    limit : float
+
+    """
+    rows, table = graph.edge_rows(edges), graph.memory['edge_f']
+    return np.asarray(table[rows, tb.ENERGY] > limit * table[rows, tb.WEIGHT])

@@ -25,6 +25,7 @@ seen.
 All are too small if anything, so the largest one counts.
 """
 
+from dataclasses import dataclass
 import math
 
 import numpy as np
@@ -41,6 +42,8 @@ from pose_graph_ros.core.smoother import innovations
 
 # Median of chi2 with three degrees of freedom.
 MEDIAN = 2.366
+# Largest number of closures that count of those that have left the graph.
+MOST_COUNTED = 100
 # Smallest number of closures, or sum of their redundancies, that says anything.
 LEAST = 10
 # What is left of the mean of chi2 with three degrees of freedom that counts up to `GATE`.
@@ -60,6 +63,29 @@ _SINGULAR = 1e-12
 # Largest factor, and the ratio of successive ones: few values, so that closures are rarely weighed
 # anew, and the factor does not depend on rounding.
 LARGEST, RATIO = 10.0, 1.2
+
+
+@dataclass(slots=True)
+class ScaleLeft:
+    """A factor on sigmas, and how many closures that have left have shown it."""
+
+    n: int = 0
+    scale: float = 1.0
+
+    def add(self, n: int, scale: float) -> None:
+        """
+        Add closures.
+
+        Parameters
+        ----------
+        n : int
+        scale : float, factor that they were used with
+
+        """
+        self.n += n
+        if n > 0:
+            part = n / min(self.n, MOST_COUNTED)
+            self.scale *= (scale / self.scale)**min(part, 1.0)
 
 
 def give_scale(graph: Graph, closures: IntArray) -> float:
@@ -198,3 +224,22 @@ def _believed(shown: float, n: float) -> float:
     """Return the factor to use if n closures show one."""
     steps = round(math.log(max(shown, 1e-3)) * n / (n + PRIOR) / math.log(RATIO))
     return min(RATIO ** max(steps, 0), LARGEST)
+
+
+def together(shown: float, n: float, left: ScaleLeft) -> float:
+    """
+    Return the factor that closures in the graph and those that have left it show.
+
+    Parameters
+    ----------
+    shown : float, by those in the graph
+    n : float, their number
+    left : ScaleLeft
+
+    """
+    n_left = min(left.n, MOST_COUNTED)
+    if n_left == 0:
+        return shown
+    logarithm = ((n + PRIOR) * math.log(shown) + n_left * math.log(left.scale)) / (
+        n + (PRIOR if n > 0.0 else 0.0) + n_left)
+    return min(RATIO ** max(round(logarithm / math.log(RATIO)), 0), LARGEST)

@@ -42,23 +42,28 @@ class Retests:
         for column in self._columns:
             column.truncate(size)
 
-    def due(self, now: int, n_nodes: int, *, failed: bool = True) -> BoolArray:
+    def select(self, kept: IntArray) -> None:
+        """Keep some closures, by number."""
+        for column in self._columns:
+            column.select(kept)
+
+    def due(self, now: int, next_node: int, *, failed: bool = True) -> BoolArray:
         """
         Return which closures may be tested, shape (M,).
 
         Parameters
         ----------
         now : int, a number that increases with what is believed
-        n_nodes : int, size of the graph
+        next_node : int, next id of a node of the graph
         failed : bool, whether also those that have failed before
 
         """
         return np.asarray((self._round.values < now) & (self._turns.values < MOST_TURNS)
-                          & ~self.resting(n_nodes) & (failed | (self._failures.values == 0)))
+                          & ~self.resting(next_node) & (failed | (self._failures.values == 0)))
 
-    def resting(self, n_nodes: int) -> BoolArray:
-        """Return which closures wait for a graph of more nodes than this, shape (M,)."""
-        return np.asarray(self._resting.values > n_nodes)
+    def resting(self, next_node: int) -> BoolArray:
+        """Return which closures wait for a node with an id from this on, shape (M,)."""
+        return np.asarray(self._resting.values > next_node)
 
     def failures(self, numbers: IntArray) -> IntArray:
         """Return with how many updates some closures have failed."""
@@ -85,7 +90,7 @@ class Retests:
         """Note that closures were taken out of the graph as they do not fit any more."""
         self._turns.values[numbers] += 1
 
-    def failed(self, numbers: Iterable[int], n_nodes: int) -> None:
+    def failed(self, numbers: Iterable[int], n_nodes: int, next_node: int) -> None:
         """
         Let closures rest, as the iterations diverge where their belief is changed.
 
@@ -93,13 +98,14 @@ class Retests:
         ----------
         numbers : iterable of int
         n_nodes : int, size of the graph
+        next_node : int, next id of a node
 
         """
         chosen = [*numbers]
         doublings = np.minimum(self._failures.values[chosen], MOST_DOUBLINGS)
         self._failures.values[chosen] += 1
         self._round.values[chosen] = _NEVER
-        self._resting.values[chosen] = n_nodes + np.maximum(
+        self._resting.values[chosen] = next_node + np.maximum(
             (REST * n_nodes * 2.0**doublings).astype(np.int64), LEAST_REST)
 
     def begin_turns(self) -> None:

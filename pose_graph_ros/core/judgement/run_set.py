@@ -14,9 +14,11 @@ from typing import NamedTuple
 
 import numpy as np
 
+from pose_graph_ros.core.geometry.se2 import IntArray
 from pose_graph_ros.core.judgement.consistency import OdometryChain
 from pose_graph_ros.core.judgement.fix_states import LONE
-from pose_graph_ros.core.judgement.runs import best_runs, EVENT, remembered, Run
+from pose_graph_ros.core.judgement.run_choice import best_runs, remembered, without_old
+from pose_graph_ros.core.judgement.runs import EVENT, Run
 from pose_graph_ros.core.judgement.stated_noise import StatedNoise
 from pose_graph_ros.core.judgement.tracks import Innovation, Observation, Track
 
@@ -237,8 +239,34 @@ class RunSet:
             run.believed, run.contradicted = not run.believed, False
         self._main = chosen[-1][0]
         return Turn(cuts, [(run.number, run.believed) for run in turned], [
-            (before.track.node, run.first.node, way.scale)
-            for (before, _), (run, way) in pairwise(chosen) if way.scale > 1.0])
+            *chosen[0][0].jumps_before, *(
+                (before.track.node, run.first.node, way.scale)
+                for (before, _), (run, way) in pairwise(chosen) if way.scale > 1.0)])
+
+    def forget(self, nodes: IntArray) -> None:
+        """Forget nodes that have left the graph, with the runs that ended there."""
+        stay = self.chain.nodes[~np.isin(self.chain.nodes, nodes)]
+        if len(stay) > 0 and len(stay) < len(self.chain):
+            first = int(stay[0])
+            self._runs = without_old(self._runs, first, self._main, self.chain)
+            for run in self._runs:
+                run.carry(self.chain, nodes)
+                run.jumps_before = tuple(jump for jump in run.jumps_before if jump[1] >= first)
+        self.chain.forget(nodes)
+
+    def begin_with(self, stamp_ns: int, track: Track) -> None:
+        """
+        Begin with where the robot is by measurements that have left the graph.
+
+        Parameters
+        ----------
+        stamp_ns : int, of the newest of these
+        track : Track
+
+        """
+        self._main = Run(self._next_number(), stamp_ns, track, believed=True)
+        self._main.seconds = KNOWN_BEFORE
+        self._runs.append(self._main)
 
     def _cut(self, run: Run, state: int) -> tuple[int, int, int]:
         """Doubt the members of a run after a state."""

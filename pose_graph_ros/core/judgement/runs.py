@@ -14,7 +14,7 @@ price in units of chi2:
   little way, a jump is unlikely, however large. It is less where the measurements go on as a robot
   moves: a receiver that goes wrong would hardly do so next to where it was right.
 
-The set of runs with the lowest price is a shortest path through the runs in the order of time.
+`run_choice` finds the set of runs with the lowest price.
 """
 
 from collections.abc import Sequence
@@ -52,11 +52,6 @@ FAR = 60.0
 NOTED_EVERY_NS, NOTED_RATIO, NOTED = 3_000_000_000, 1.4, 20
 # Price of a transition above which the earlier run may have ended with wrong members.
 CUT_ABOVE = 6.0
-# Number of runs that are remembered; time after which those of few members are forgotten [ns].
-MOST_RUNS = 24
-SHORT_LIVED_NS = 30_000_000_000
-# Excess of the price of a believed run over that of a hopeless one.
-HOPELESS = 50.0
 # Squared sigmas that the direction of a run may be off for nothing, and the highest price of it.
 TURN_ALLOWED, MOST_OF_TURN = 9.0, 40.0
 # Time for which a run must keep its direction for that, as errors drift as well [s].
@@ -111,6 +106,12 @@ class Run:
         """Stamps [ns] and tracks at some earlier times, the newest last."""
         self.members: tuple[Observation, ...] = ()
         """The first ones, while they may tell the heading."""
+        self.before = 0.0
+        """Price of what is believed before it, of runs that have left the graph."""
+        self.jumps_before: tuple[tuple[int, int, float], ...] = ()
+        """Jumps of odometry up to it with these; see `run_set.Turn`."""
+        self._turned: float | None = None
+        """Price of its direction, once its first member has left the graph."""
         self.restart(stamp_ns)
 
     def restart(self, stamp_ns: int) -> None:
@@ -209,6 +210,8 @@ class Run:
 
         Positions that are off by the same vector keep the direction of the path.
         """
+        if self._turned is not None:
+            return self._turned
         if self.expected is None or self.seconds < TURN_AFTER:
             return 0.0
         heading, variance = self.expected
@@ -239,7 +242,8 @@ class Run:
         chain : OdometryChain
 
         """
-        if other.end_ns > self.begin_ns or self.first.node < other.track.node:
+        if other.end_ns > self.begin_ns or (
+                other.number not in self.prices and self.first.node < other.track.node):
             return ()
         if other.number not in self.prices:
             self.prices[other.number] = self._ways_after(other, chain)
@@ -289,6 +293,25 @@ class Run:
         variance = 0.5 * float(cov[0, 0] + cov[1, 1]) + way**2
         return max(2.0 * math.log(FAR**2 / variance) - float(moved @ moved) / variance, 0.0)
 
+    def carry(self, chain: OdometryChain, nodes: IntArray) -> None:
+        """
+        Take poses at nodes that leave the graph to the next ones that stay.
+
+        Parameters
+        ----------
+        chain : OdometryChain, with the nodes that leave
+        nodes : ndarray of int, ids of these
+
+        """
+        gone = {*nodes.tolist()}
+        self.states = [state for state in self.states if state[1].node not in gone]
+        if any(member.node in gone for member in self.members):
+            self.members = ()
+        if self.first.node in gone:
+            self._turned = self.turned
+            self.first = self.first.carried(chain, nodes)
+        self.track = self.track.carried(chain, nodes)
+
     def cut_after(self, state: int, number: int) -> 'Run':
         """
         Return a run of the members after a noted state, after taking them away from this one.
@@ -304,7 +327,7 @@ class Run:
         rest.track, rest.end_ns = self.track, self.end_ns
         rest.seconds = (self.end_ns - stamp_ns) * 1e-9
         rest.n = max(int(self.n * rest.seconds / max(self.seconds, 1e-9)), 1)
-        rest.contradicted = True
+        rest.contradicted, rest.before, rest.jumps_before = True, self.before, self.jumps_before
         self.seconds = max(self.seconds - rest.seconds, 0.0)
         self.end_ns, self.track, self.states = stamp_ns - 1, track, self.states[:state]
         return rest
@@ -366,72 +389,18 @@ def _way(chain: OdometryChain, begin: int, end: int) -> float:
     return float(last - first)
 
 
-def best_runs(runs: list[Run], chain: OdometryChain) -> list[tuple[Run, Transition]]:
-    """
-    Return the runs to believe, in the order of time, each with the way from the one before.
-
-    Parameters
-    ----------
-    runs : list of Run, at least one
-    chain : OdometryChain
-
-    """
-    ordered = sorted(runs, key=lambda run: (run.begin_ns, run.number))
-    total: list[float] = []
-    before: list[tuple[int, Transition]] = []
-    for k, run in enumerate(ordered):
-        cost, best = 0.0, (-1, Transition(0.0))
-        for m, other in enumerate(ordered[:k]):
-            for way in run.ways_after(other, chain):
-                price = total[m] + way.price
-                if way.cut >= 0:
-                    lasted = (other.end_ns - other.states[way.cut][0]) * 1e-9
-                    if not any(wrong.n > 1 and wrong.seconds >= lasted
-                               for wrong in ordered[m + 1:k]):
-                        price += EVENT  # no wrong run follows that they could be the beginning of
-                if price < cost:
-                    cost, best = price, (m, way)
-        total.append(cost - run.price)
-        before.append(best)
-    k, chosen = int(np.argmin(total)), []
-    while k >= 0:
-        chosen.append((ordered[k], before[k][1]))
-        k = before[k][0]
-    return chosen[::-1]
-
-
-def remembered(runs: list[Run], stamp_ns: int) -> list[Run]:
-    """
-    Return the runs without those that cannot win any more, and at most `MOST_RUNS` of them.
-
-    Parameters
-    ----------
-    runs : list of Run
-    stamp_ns : int, of the newest measurement
-
-    """
-    price = max((run.price for run in runs if run.believed), default=0.0)
-    runs = [run for run in runs if run.believed or not (
-        (run.n < LEAST_MEMBERS and stamp_ns - run.end_ns > SHORT_LIVED_NS)
-        or (run.contradicted and price > run.price + HOPELESS))]
-    while len(runs) > MOST_RUNS:
-        doubted = [run for run in runs if not run.believed]
-        runs.remove(min(doubted, key=lambda run: run.seconds) if len(doubted) > 0
-                    else min(runs, key=lambda run: run.begin_ns))
-    return runs
-
-
 def odometry_between(graph: Graph, begin: int, end: int) -> IntArray:
     """
-    Return the rows of odometry edges between two nodes, or of those around them if they are one.
+    Return the ids of odometry edges between two nodes, or of those around them if they are one.
 
     Parameters
     ----------
     graph : Graph
-    begin, end : int, rows of the nodes, `end` not before `begin`
+    begin, end : int, ids of the nodes, `end` not before `begin`; either may have left the graph
 
     """
     ends = graph.memory['edge_i'][:graph.n_edges]
-    i, j = ends[:, tb.END_I], ends[:, tb.END_J]
+    odometry = np.flatnonzero(ends[:, tb.EDGE_KIND] == EdgeKind.ODOMETRY)
+    i, j = (graph.node_ids[ends[odometry, column]] for column in (tb.END_I, tb.END_J))
     inside = (i < end) & (j > begin) if end > begin else (i == end) | (j == end)
-    return np.flatnonzero(inside & (ends[:, tb.EDGE_KIND] == EdgeKind.ODOMETRY))
+    return np.asarray(graph.edge_ids[odometry[inside]])

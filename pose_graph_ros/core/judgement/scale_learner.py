@@ -15,13 +15,15 @@ from pose_graph_ros.core.judgement.residual_scale import (
     places,
     residual_scale,
     ROUNDS,
+    ScaleLeft,
+    together,
 )
 from pose_graph_ros.core.measurements import LoopClosure
 from pose_graph_ros.core.smoother.incremental import IncrementalSmoother
 
-# A source is looked at again when this many times as many of its closures are believed as the
-# last time, and this many more.
-MORE, AND_MORE = 1.25, 5
+# A source is looked at again when so many more of its closures are believed than the last time: a
+# share of those in the graph, and this number.
+MORE, AND_MORE = 0.25, 5
 # Largest number of closures that are looked at at the end.
 MOST_AT_END = 1000
 
@@ -55,12 +57,16 @@ class ScaleLearner:
 
     def add_sources(self) -> None:
         """Give new sources a factor, 1 if none is set."""
-        for name in self._states.sources[len(self._learnt_from):]:
-            self._beliefs.scales.append(self._fixed(name) or 1.0)
+        for source in range(len(self._learnt_from), len(self._states.sources)):
+            if source == len(self._beliefs.scales_left):
+                self._beliefs.scales_left.append(ScaleLeft())
+            self._beliefs.scales.append(
+                self._fixed(self._states.sources[source])
+                or together(1.0, 0.0, self._beliefs.scales_left[source]))
             self._learnt_from.append(0)
 
     def begin(self) -> None:
-        """Forget what was learnt."""
+        """Forget what was learnt from closures that are in the graph."""
         self._beliefs.scales.clear()
         self._learnt_from.clear()
         self.add_sources()
@@ -88,9 +94,10 @@ class ScaleLearner:
     def learn(self) -> bool:
         """Learn the factor of a source with many more closures; tell whether one has changed."""
         for source in range(len(self._states.sources)):
-            n_believed = int(np.sum(self._of(source)))
-            if n_believed >= MORE * self._learnt_from[source] + AND_MORE:
-                self._learnt_from[source] = n_believed
+            n_believed, before = int(np.sum(self._of(source))), self._learnt_from[source]
+            n = n_believed + self._beliefs.scales_left[source].n
+            if n - before >= MORE * min(n_believed, before) + AND_MORE:
+                self._learnt_from[source] = n
                 if self._learn(source):
                     return True
         return False
@@ -103,8 +110,9 @@ class ScaleLearner:
         that is larger.
         """
         for source in range(len(self._states.sources)):
-            self._learnt_from[source] = int(np.sum(self._of(source)))
-            if self._learnt_from[source] >= AND_MORE:
+            n_believed = int(np.sum(self._of(source)))
+            self._learnt_from[source] = n_believed + self._beliefs.scales_left[source].n
+            if n_believed >= AND_MORE:
                 for _ in range(ROUNDS):
                     if not self._learn(source, larger=True):
                         break
@@ -133,15 +141,16 @@ class ScaleLearner:
         """Return the factor that the believed closures of a source show."""
         states, graph = self._states, self._smoother.graph
         some, group = self._sample(numbers, most)
-        edges, inside = graph.edges_at(states.row[some]), self._of(source)
-        return max(
+        edges, inside = graph.edges_at(states.edge[some]), self._of(source)
+        return together(max(
             residual_scale(*self._smoother.edge_innovations(edges), edges.information, group,
                            self._beliefs.scales[source]),
-            agreement_scale(self._table, some, inside, graph.edges_at(states.row[inside])))
+            agreement_scale(self._table, some, inside, graph.edges_at(states.edge[inside]))),
+            float(len(some)), self._beliefs.scales_left[source])
 
     def _sample(self, numbers: IntArray, most: int) -> tuple[IntArray, IntArray]:
         """Return at most so many closures, from all along the path, and the group of each."""
-        group = places(self._table, self._smoother.graph.edges_at(self._states.row[numbers]))
+        group = places(self._table, self._smoother.graph.edges_at(self._states.edge[numbers]))
         n_groups = int(group.max()) + 1
         n_chosen = min(max(n_groups * most // len(numbers), 1), n_groups)
         chosen = np.linspace(0, n_groups - 1, n_chosen).astype(np.int64)

@@ -76,8 +76,8 @@ class SetSearch:
             other = self._table.support(number, ~states.in_graph & states.judged).clique
             clique = other if len(other) > len(clique) else clique
             yield
-        known, n = np.flatnonzero(~states.forgotten), len(states)
-        swap = Swap(graph, self._table.rows(known), states.row[known], states.in_graph[known],
+        known, n = np.flatnonzero(states.known), len(states)
+        swap = Swap(graph, self._table.rows(known), states.edge[known], states.in_graph[known],
                     states.judged[known])
         while swap.step(np.searchsorted(known, clique)):
             yield
@@ -87,4 +87,4 @@ class SetSearch:
         inside = np.zeros(n, dtype=bool)
         inside[known] = found.inside
         jump = found.jump and found.jump._replace(seen_by=known[found.jump.seen_by])
-        return Found(inside, found.poses, jump)
+        return Found(inside, found.nodes, found.poses, jump)

@@ -21,10 +21,11 @@ from pose_graph_ros.core.batch.optimizer import Parts, Status
 from pose_graph_ros.core.config import SolverConfig
 from pose_graph_ros.core.geometry.se2 import BoolArray, FloatArray, IntArray
 from pose_graph_ros.core.graph.constraints import Edges
-from pose_graph_ros.core.graph.error_functions import edge_errors, energies
+from pose_graph_ros.core.graph.error_functions import energies
 from pose_graph_ros.core.graph.graph import Graph, GraphRows, GraphUpdate
 from pose_graph_ros.core.judgement.closures import GATE
 from pose_graph_ros.core.judgement.consistency import Closures
+from pose_graph_ros.core.judgement.copies import copied_rows, in_rows
 from pose_graph_ros.core.judgement.jumps import Jump
 
 _CONFIG = SolverConfig(max_iterations=20, step_tolerance=1e-3)
@@ -40,8 +41,10 @@ class Found:
 
     inside: BoolArray
     """Which closures are in it, shape (M,)."""
+    nodes: IntArray
+    """Ids of the hidden nodes of the copy, shape (N,)."""
     poses: FloatArray
-    """Of all hidden nodes, shape (N, 3)."""
+    """Their poses, shape (N, 3)."""
     jump: Jump | None = None
     """Odometry that is doubted with it."""
 
@@ -50,28 +53,31 @@ class Swap:
     """
     A trial: at each step the copy is filled, or an iteration of its optimisations is done.
 
+    In the copy nodes and edges are numbered by row.
+
     Parameters
     ----------
     graph : Graph
     closures : Closures, M judged ones, with floored covariances
-    rows : ndarray of int, shape (M,), their edges in the graph
+    ids : ndarray of int, shape (M,), of their edges
     inside, free : ndarray of bool, shape (M,), which are believed, and which may change
 
     """
 
     def __init__(
-        self, graph: Graph, closures: Closures, rows: IntArray, inside: BoolArray,
+        self, graph: Graph, closures: Closures, ids: IntArray, inside: BoolArray,
         free: BoolArray,
     ) -> None:
-        self.rows, self.before, self.free = rows, inside, free
-        copied = graph.rows()
-        information = np.linalg.inv(closures.noise)
-        kinds, weights = copied.edges.kind[rows], inside.astype(np.float64)
-        self.edges = Edges(
-            closures.i, closures.j, closures.mean, information, kinds, np.ones(len(rows)))
-        columns = (closures.i, closures.j, closures.mean, information, kinds, weights)
-        for column, values in zip(copied.edges.columns, columns, strict=False):
-            column[rows] = values
+        self.ids, self.before, self.free = ids, inside, free
+        self.nodes = graph.node_ids.copy()
+        """Ids of the nodes of the copy."""
+        self.closures = Edges(
+            closures.i, closures.j, closures.mean, np.linalg.inv(closures.noise),
+            graph.edges_at(ids).kind, np.ones(len(ids)))
+        """With ids for ends."""
+        self._rows, self._edges = graph.edge_rows(ids), in_rows(graph, self.closures)
+        copied = copied_rows(graph)
+        write(copied.edges, self._rows, self._edges, inside)
         self._graph = Graph()
         self._parts = self._first(copied)
         self._n_steps, self.cost = 0, np.inf
@@ -95,9 +101,9 @@ class Swap:
 
     def _goes_on(self, clique: IntArray) -> bool:
         """Compare the set that was optimised, and choose the next one; tell if there is any."""
-        residual = self.residuals(self._graph)
+        residual = residuals(self._graph, self._edges)
         if self._n_steps == 0:
-            self.cost = self.truncated(self._graph, residual)
+            self.cost = self.truncated(self._graph, self._rows, residual)
             self._choose(self.before, clique)
             self._n_steps = 1
             return True
@@ -105,9 +111,9 @@ class Swap:
             return False
         limit = GATE * NARROWING[self._n_steps - 1]
         settled = limit <= GATE
-        if settled and self.truncated(self._graph, residual) < self.cost - GAIN:
-            self.found = Found(self._inside.copy(), self._graph.poses.copy())
-            self.cost = self.truncated(self._graph, residual)
+        if settled and self.truncated(self._graph, self._rows, residual) < self.cost - GAIN:
+            self.found = Found(self._inside.copy(), self.nodes, self._graph.poses.copy())
+            self.cost = self.truncated(self._graph, self._rows, residual)
         self._n_steps += 1
         before = self._inside
         self._choose(residual < limit,
@@ -120,26 +126,53 @@ class Swap:
         self._inside[forced] = True
         changed = np.flatnonzero(self._inside != before)
         self._graph.apply(GraphUpdate(weigh_edges=dict(zip(
-            self.rows[changed].tolist(), self._inside[changed].astype(float).tolist(),
+            self._rows[changed].tolist(), self._inside[changed].astype(float).tolist(),
             strict=True))))
 
-    def residuals(self, graph: Graph) -> FloatArray:
-        """Return r^2 of all closures in a copy, shape (M,)."""
-        return energies(edge_errors(graph.poses, self.edges), self.edges.information)
-
-    def truncated(self, graph: Graph, residual: FloatArray) -> float:
+    def truncated(self, graph: Graph, rows: IntArray, residual: FloatArray) -> float:
         """
         Return the truncated cost of a copy.
 
         Parameters
         ----------
         graph : Graph
+        rows : ndarray of int, shape (M,), of the closures in it
         residual : ndarray, shape (M,), of `residuals`
 
         """
         others = np.ones(graph.n_edges, dtype=bool)
-        others[self.rows] = False
+        others[rows] = False
         all_energies = graph.energies()
         chi2 = float(np.sum(all_energies.edges[others]) + np.sum(all_energies.observed))
         return chi2 + float(np.sum(np.minimum(residual[self.free], GATE))) + float(
             np.sum(residual[~self.free & self.before]))
+
+
+def residuals(graph: Graph, edges: Edges) -> FloatArray:
+    """
+    Return r^2 of closures in a copy, shape (M,).
+
+    Parameters
+    ----------
+    graph : Graph
+    edges : Edges, M of them
+
+    """
+    return energies(graph.edge_errors(edges), edges.information)
+
+
+def write(edges: Edges, rows: IntArray, closures: Edges, inside: BoolArray) -> None:
+    """
+    Write closures over those of a copy, with weight 1 or 0.
+
+    Parameters
+    ----------
+    edges : Edges, all of the copy; they are changed
+    rows : ndarray of int, shape (M,), of the closures
+    closures : Edges, M of them
+    inside : ndarray of bool, shape (M,), which of them are believed
+
+    """
+    columns = (*closures.columns[:5], inside.astype(np.float64))
+    for column, values in zip(edges.columns, columns, strict=False):
+        column[rows] = values

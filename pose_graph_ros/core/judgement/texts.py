@@ -13,6 +13,7 @@ from pose_graph_ros.core.judgement.verdicts import (
     State,
     Verdict,
 )
+from pose_graph_ros.core.measurements import Answer, rejected
 
 NANOSECONDS = 1_000_000_000
 NOUNS = {Judged.LOOP_CLOSURE: 'closure', Judged.FIX: 'fix', Judged.ODOMETRY: 'odometry edge'}
@@ -68,6 +69,10 @@ def sentence(verdict: Verdict) -> str:
         f'; {joined(verdict.supported_by)} {_agree(verdict.supported_by)} with it')
     contradicted = '' if len(verdict.contradicted_by) == 0 else (
         f'; it contradicts {joined(verdict.contradicted_by)}')
+    if verdict.left:
+        how = 'doubted' if verdict.kind is Judged.ODOMETRY else 'unused'
+        return (f'Left the window {how} at {since}: {_jump(verdict) or far}{contradicted}'
+                f'{supported}.')
     if verdict.decision is not Decision.AUTO:
         used = 'Used' if verdict.decision is Decision.IN else 'Not used'
         return f'{used} since {since}, as a person has decided: {far}{contradicted}{supported}.'
@@ -101,6 +106,23 @@ def _agree(names: Sequence[str]) -> str:
 def _far(distance: float) -> str:
     return 'it has not been compared with the path yet' if math.isnan(distance) else (
         f'it was {distance:.1f} sigma from the path without it')
+
+
+def unknown(name: str, *, has_left: bool) -> Answer:
+    """
+    Return the answer to a decision on a constraint that is not in the graph.
+
+    Parameters
+    ----------
+    name : str, `Verdict.id`, or anything else
+    has_left : bool, whether it was in the graph
+
+    """
+    if has_left:
+        return rejected('left_window', f'{name} has left the window of the graph, so nothing can '
+                                       'be decided on it any more')
+    return rejected('unknown_id', 'expected the id of a verdict, such as loop_closure/17, '
+                                  f'got {name!r}')
 
 
 def details(verdict: Verdict) -> dict[str, str]:
@@ -138,6 +160,8 @@ def totals_text(totals: SourceVerdicts) -> str:
              if totals.counts.get(state, 0) > 0]
     if totals.n_forgotten > 0:
         parts.append(f'{totals.n_forgotten} forgotten')
+    if totals.n_left > 0:
+        parts.append(f'{totals.n_left} left the window, {totals.n_left_unused} of them unused')
     if totals.scale != 1.0:
         parts.append(f'sigmas times {totals.scale:.3g}')
     return ', '.join(parts)
@@ -157,6 +181,9 @@ def total_values(totals: Mapping[str, SourceVerdicts]) -> dict[str, str]:
             f'{source}.scale': f'{each.scale:.3g}'}
         if each.n_forgotten > 0:
             values[f'{source}.forgotten'] = str(each.n_forgotten)
+        if each.n_left > 0:
+            values |= {f'{source}.left': str(each.n_left),
+                       f'{source}.left_unused': str(each.n_left_unused)}
     return values
 
 

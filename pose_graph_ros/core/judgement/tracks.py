@@ -14,7 +14,7 @@ import numpy as np
 import numpy.typing as npt
 
 from pose_graph_ros.core.compiled.jit import INTEGER, INTEGERS, kernel, NUMBER, NUMBERS, ROWS
-from pose_graph_ros.core.geometry.se2 import FloatArray
+from pose_graph_ros.core.geometry.se2 import FloatArray, IntArray
 from pose_graph_ros.core.graph import factors
 from pose_graph_ros.core.graph.constraints import Edges, ObservedKind, ObservedNodes
 from pose_graph_ros.core.judgement.consistency import OdometryChain
@@ -30,7 +30,7 @@ class Observation(NamedTuple):
     """A position or a pose in the map, as it is judged."""
 
     node: int
-    """Row of the hidden node before it."""
+    """Id of the hidden node before it."""
     offset: FloatArray
     """Pose of what was measured in the node, shape (3,) [m, m, rad]."""
     mean: FloatArray
@@ -75,7 +75,7 @@ class Track(NamedTuple):
         Parameters
         ----------
         chain : OdometryChain
-        node : int, row of the node in the graph
+        node : int, id of the node
 
         """
         if node == self.node:
@@ -85,6 +85,21 @@ class Track(NamedTuple):
                      self.pose, self.cov, pose, cov):
             raise KeyError('expected nodes that are chained by odometry')
         return Track(node, pose, cov)
+
+    def carried(self, chain: OdometryChain, nodes: IntArray) -> 'Track':
+        """
+        Return the track at the next node that stays, if its own leaves the graph.
+
+        Parameters
+        ----------
+        chain : OdometryChain, with the nodes that leave
+        nodes : ndarray of int, ids of these
+
+        """
+        if self.node not in nodes:
+            return self
+        later = chain.nodes[np.searchsorted(chain.nodes, self.node):]
+        return self.moved(chain, int(later[~np.isin(later, nodes)][0]))
 
     def bent(self, begin: FloatArray) -> 'Track':
         """

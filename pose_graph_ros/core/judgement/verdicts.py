@@ -78,9 +78,11 @@ class Verdict:
     contradicted_by: tuple[str, ...]
     """Ids of what contradicts it, at most five; `odometry` stands for the estimate without it."""
     edge: bool
-    """Whether `row` is one of an edge; else of an observed node."""
-    row: int
-    """Its row in the graph."""
+    """Whether `number` is that of an edge; else of an observed node."""
+    number: int
+    """Its id in the graph."""
+    left: bool = False
+    """Whether it has left the window of the graph, so that nothing of this changes any more."""
 
 
 class Change(NamedTuple):
@@ -107,3 +109,7 @@ class SourceVerdicts(NamedTuple):
     """Whether its newest measurements are doubted or wait, while the estimate goes on."""
     n_forgotten: int = 0
     """Number of hopeless loop closures that are not judged again."""
+    n_left: int = 0
+    """Number of its constraints that have left the window of the graph; `counts` is without."""
+    n_left_unused: int = 0
+    """How many of these were not believed then."""

@@ -12,7 +12,8 @@ from pose_graph_ros.core.graph.constraints import EdgeKind
 from pose_graph_ros.core.graph.graph import Graph
 from pose_graph_ros.core.graph.graph_view import constraint_tables, ConstraintTable, DIAGONAL
 from pose_graph_ros.core.odometry.hidden_nodes import HiddenNodes
-from pose_graph_ros.core.sources.factor_builder import ConstraintOrigin, FactorBuilder, Queue
+from pose_graph_ros.core.sources.constraint_queue import Queue
+from pose_graph_ros.core.sources.factor_builder import ConstraintOrigin, FactorBuilder
 
 
 @dataclass(frozen=True, slots=True)

@@ -20,9 +20,9 @@ from typing import NamedTuple
 
 import numpy as np
 
-from pose_graph_ros.core.geometry.se2 import BoolArray, IntArray
+from pose_graph_ros.core.geometry.se2 import BoolArray, FloatArray, IntArray
 from pose_graph_ros.core.graph import tables as tb
-from pose_graph_ros.core.graph.constraints import EdgeKind, ObservedKind
+from pose_graph_ros.core.graph.constraints import EdgeKind, ObservedKind, ObservedNodes
 from pose_graph_ros.core.graph.graph import Graph
 from pose_graph_ros.core.sources.error_likelihood import (
     chain_motions,
@@ -30,6 +30,7 @@ from pose_graph_ros.core.sources.error_likelihood import (
     MeasuredPath,
 )
 from pose_graph_ros.core.sources.gauss_markov import CorrelatedErrors
+from pose_graph_ros.core.sources.past_path import no_past, PastPath
 
 # Number of measurements that are used: the newest ones, and as many of all older ones.
 NEWEST = OLDER = 2000
@@ -92,24 +93,25 @@ class _Minimum(NamedTuple):
     point: Point
 
 
-def measured_path(graph: Graph, stamps_ns: IntArray, rows: IntArray) -> PathSteps:
+def measured_path(
+    graph: Graph, stamps_ns: IntArray, ids: IntArray, past: PastPath | None = None,
+) -> PathSteps:
     """
     Return the positions of a source along the path by odometry, sorted by stamp, after some steps.
 
     Parameters
     ----------
-    graph : Graph, the rows of its odometry stay as they are from step to step
+    graph : Graph, whose nodes may leave between two steps
     stamps_ns : ndarray of int64, shape (K,)
-    rows : ndarray of int64, shape (K,), of the observed nodes; headings among them are left out
+    ids : ndarray of int64, shape (K,), of the observed nodes; headings among them are left out
+    past : PastPath, optional, positions that have left the graph
 
     """
-    placed = graph.memory['observed_i'][rows, tb.OBS_KIND] != ObservedKind.HEADING
-    stamps_ns, rows = stamps_ns[placed], rows[placed]
-    where = graph.memory['observed_f'][rows, tb.MEAN:tb.MEAN + 2]
-    order = np.lexsort((where[:, 1], where[:, 0], stamps_ns))
-    order = order[_chosen(len(order))]
-    stamps_ns, observed = stamps_ns[order], graph.observed_at(rows[order])
-    until, edge_after = _odometry(graph, observed.node)
+    stamps_ns, observed = _sorted(graph, stamps_ns, ids)
+    chosen = _chosen(len(observed))
+    stamps_ns, observed = stamps_ns[chosen], observed.rows(chosen)
+    begin_at = None if past is None else past.node
+    until, edge_after = _odometry(graph, observed.node, begin_at)
     yield
     n = len(until)
     joined, spread = np.zeros((n, 3)), np.zeros((n, 3, 3))
@@ -117,15 +119,67 @@ def measured_path(graph: Graph, stamps_ns: IntArray, rows: IntArray) -> PathStep
     while begin < n:
         most = until[max(begin - 1, 0)] + NODES_PER_STEP
         end = max(int(np.searchsorted(until, most)), begin + 1)
+        # those of nodes that have left since count as unknown
+        rows_after = graph.edge_rows(edge_after)
         chain_motions(
-            graph.memory['edge_f'], edge_after, until, begin, end, joined, spread)
+            graph.memory['edge_f'], rows_after, until, begin, end, joined, spread)
         begin = end
         yield
+    if past is not None:
+        return past.continued(stamps_ns, _path(stamps_ns, observed, joined[1:], spread[1:]))
+    return _path(stamps_ns, observed, joined, spread)
+
+
+def left_behind(
+    graph: Graph, stamps_ns: IntArray, ids: IntArray, past: PastPath | None, node: int,
+) -> PastPath:
+    """
+    Return the positions of a source before a node, when those before it leave the graph.
+
+    Parameters
+    ----------
+    graph : Graph, with the nodes that leave
+    stamps_ns : ndarray of int64, shape (K,)
+    ids : ndarray of int64, shape (K,), of the observed nodes that leave
+    past : PastPath, optional, those that have left before
+    node : int, id of the first node that stays
+
+    """
+    stamps_ns, observed = _sorted(graph, stamps_ns, ids)
+    before = np.flatnonzero(observed.node < node)
+    stamps_ns, observed = stamps_ns[before], observed.rows(before)
+    if past is None:
+        past = no_past(int(observed.node[0]) if len(observed) > 0 else node)
+    until, edge_after = _odometry(graph, np.append(observed.node, node), past.node)
+    n = len(until)
+    motion, noise = np.zeros((n, 3)), np.zeros((n, 3, 3))
+    chain_motions(
+        graph.memory['edge_f'], graph.edge_rows(edge_after), until, 0, n, motion, noise)
+    return past.extended(stamps_ns, _path(stamps_ns, observed, motion[1:], noise[1:]), node)
+
+
+def _sorted(
+    graph: Graph, stamps_ns: IntArray, ids: IntArray,
+) -> tuple[IntArray, ObservedNodes]:
+    """Return those of some observed nodes that are in the graph, and no headings, by stamp."""
+    rows = graph.observed_rows(ids)
+    stamps_ns, rows = stamps_ns[rows >= 0], rows[rows >= 0]
+    placed = graph.memory['observed_i'][rows, tb.OBS_KIND] != ObservedKind.HEADING
+    stamps_ns, rows = stamps_ns[placed], rows[placed]
+    where = graph.memory['observed_f'][rows, tb.MEAN:tb.MEAN + 2]
+    order = np.lexsort((where[:, 1], where[:, 0], stamps_ns))
+    return stamps_ns[order], graph.observed_at(graph.observed_ids[rows[order]])
+
+
+def _path(
+    stamps_ns: IntArray, observed: ObservedNodes, motion: FloatArray, noise: FloatArray,
+) -> MeasuredPath:
+    """Return the path of some positions."""
     covariance = np.linalg.inv(observed.information[:, :2, :2])
     seconds = np.asarray((stamps_ns - stamps_ns[:1]) * 1e-9, dtype=np.float64)
     return MeasuredPath(
         seconds, observed.mean[:, :2].copy(), 0.5 * np.trace(covariance, axis1=1, axis2=2),
-        observed.offset[:, :2].copy(), joined, spread)
+        observed.offset[:, :2].copy(), motion, noise)
 
 
 def _chosen(n: int) -> IntArray | slice:
@@ -136,11 +190,20 @@ def _chosen(n: int) -> IntArray | slice:
     return np.concatenate((older, np.arange(n - NEWEST, n)))
 
 
-def _odometry(graph: Graph, nodes: IntArray) -> tuple[IntArray, IntArray]:
-    """Return where nodes are among the poses of a path, and the row of the edge after each."""
-    at = np.cumsum(~graph.is_bias) - 1
-    first = int(at[np.min(nodes)]) if len(nodes) > 0 else 0
-    until = np.maximum.accumulate(at[nodes] - first)
+def _odometry(
+    graph: Graph, nodes: IntArray, begin: int | None = None,
+) -> tuple[IntArray, IntArray]:
+    """
+    Return where nodes are among the poses of a path, and the id of the edge after each.
+
+    With `begin`, the id of a node that is still there, that is the first of them.
+    """
+    at, rows = np.cumsum(~graph.is_bias) - 1, graph.node_rows(nodes)
+    if begin is not None:
+        rows = np.append(graph.node_rows(begin), rows)
+        rows = np.maximum(rows, rows[0])
+    first = int(at[np.min(rows)]) if len(rows) > 0 else 0
+    until = np.maximum.accumulate(at[rows] - first)
     edge_after = np.full(int(until[-1]) if len(until) > 0 else 0, -1)
     table = graph.memory['edge_i'][:graph.n_edges]
     edges = np.flatnonzero(table[:, tb.EDGE_KIND] == EdgeKind.ODOMETRY)
@@ -148,7 +211,7 @@ def _odometry(graph: Graph, nodes: IntArray) -> tuple[IntArray, IntArray]:
     inside: BoolArray = ((start >= 0) & (start < len(edge_after))
                          & (at[table[edges, tb.END_J]] - first == start + 1))
     # of several edges the first is that of the primary odometry
-    edge_after[start[inside][::-1]] = edges[inside][::-1]
+    edge_after[start[inside][::-1]] = graph.edge_ids[edges[inside]][::-1]
     return until, edge_after
 
 

@@ -2,9 +2,9 @@
 # SPDX-License-Identifier: Apache-2.0
 """From attached measurements to one update of the graph."""
 
-from collections.abc import Mapping
-from dataclasses import dataclass, field, replace
-from typing import Final, NamedTuple
+from collections.abc import Collection, Mapping
+from dataclasses import replace
+from typing import NamedTuple
 
 import numpy as np
 
@@ -15,97 +15,36 @@ from pose_graph_ros.core.config import (
     MeasurementSource,
     OdometrySource,
 )
-from pose_graph_ros.core.geometry.se2 import FloatArray, IntArray
+from pose_graph_ros.core.geometry.se2 import BoolArray, IntArray
 from pose_graph_ros.core.graph import tables as tb
-from pose_graph_ros.core.graph.constraints import EdgeKinds, Edges, ObservedNodes
 from pose_graph_ros.core.graph.graph import Graph, GraphUpdate
 from pose_graph_ros.core.graph.reweighting import Reweighting
-from pose_graph_ros.core.measurements import Absolute, GlobalPose, LoopClosure, Measurement
-from pose_graph_ros.core.odometry.motion import Attachment
-from pose_graph_ros.core.saved_columns import Integers, Pairs, Rows3, Rows6
+from pose_graph_ros.core.measurements import GlobalPose, LoopClosure
 from pose_graph_ros.core.sources import source_report
+from pose_graph_ros.core.sources.constraint_queue import (
+    AttachedMeasurement,
+    NewConstraint,
+    NO_NOISE,
+    Queue,
+)
 from pose_graph_ros.core.sources.error_estimate import LEAST_POSITIONS
+from pose_graph_ros.core.sources.error_models import (
+    ErrorModel,
+    InflatedWeights,
+    new_error_model,
+)
 from pose_graph_ros.core.sources.gauss_markov import (
     Additions,
     CorrelatedErrors,
-    ErrorModel,
     GaussMarkovBias,
-    GraphSizes,
-    InflatedWeights,
     LEAST_WHITE,
-    new_error_model,
 )
 from pose_graph_ros.core.sources.measurement_constraints import motion_noise
 from pose_graph_ros.core.sources.source_constraints import SavedSource, SourceConstraints
 from pose_graph_ros.core.sources.source_report import SourceReport
 
-NO_NOISE: Final[FloatArray] = np.zeros(2)
-
-# A report is renewed when the number of measurements has grown by this factor.
-MORE_RESIDUALS = 1.05
-
-
-@dataclass(frozen=True, slots=True)
-class SavedEdges:
-    """Edges that are not in the graph yet."""
-
-    sources: tuple[str, ...]
-    i: Integers
-    j: Integers
-    mean: Rows3
-    information: Rows6
-    kind: EdgeKinds
-    stamps_ns: Pairs
-    """Of a loop closure and of its other end [ns]; -1 for odometry."""
-
-
-class QueuedEdge(NamedTuple):
-    """An edge between hidden nodes for the next update."""
-
-    source: str
-    edge: Edges
-    stamp_ns: int = -1
-    """Of the loop closure [ns]; -1 for an edge of odometry."""
-    reference_ns: int = -1
-    """Stamp of its other end [ns]."""
-
-
-class AttachedMeasurement(NamedTuple):
-    """A measurement that is attached to a hidden node."""
-
-    source: str
-    observed: ObservedNodes
-    """Its constraint if its error is treated as white."""
-    measurement: Absolute
-    attachment: Attachment
-
-
-@dataclass(slots=True)
-class Queue:
-    """Constraints for the next update, with their sources."""
-
-    edges: list[QueuedEdge] = field(default_factory=list)
-    observed: list[AttachedMeasurement] = field(default_factory=list)
-
-    def __len__(self) -> int:
-        return len(self.edges) + len(self.observed)
-
-    def extend(self, other: 'Queue') -> None:
-        """Append all constraints of another queue."""
-        self.edges += other.edges
-        self.observed += other.observed
-
-    def joined(self, other: 'Queue') -> 'Queue':
-        """Return a new queue with the constraints of this one, then those of another one."""
-        return Queue([*self.edges, *other.edges], [*self.observed, *other.observed])
-
-    def halves(self) -> 'tuple[Queue, Queue]':
-        """Return the first half of the constraints and the rest, as new queues."""
-        half = len(self) // 2
-        n_edges = min(half, len(self.edges))
-        n_observed = half - n_edges
-        return (Queue(self.edges[:n_edges], self.observed[:n_observed]),
-                Queue(self.edges[n_edges:], self.observed[n_observed:]))
+# A report is renewed after so many more measurements, as a share of those in the graph.
+MORE_RESIDUALS = 0.05
 
 
 class ConstraintOrigin(NamedTuple):
@@ -114,25 +53,6 @@ class ConstraintOrigin(NamedTuple):
     source: str
     stamp_ns: int
     """[ns]; -1 for an edge between poses."""
-
-
-class NewConstraint(NamedTuple):
-    """A constraint in the update that was built last."""
-
-    is_edge: bool
-    row: int
-    """Its row in the graph once the update is applied."""
-    source: str
-    stamp_ns: int
-    """Of the measurement [ns]; -1 for an edge of odometry."""
-    kind: type[Measurement]
-    """`LoopClosure` for all edges between poses."""
-    reference_ns: int = -1
-    """Stamp of the other end of a loop closure [ns]; else -1."""
-    noise: FloatArray = NO_NOISE
-    """What the motion since the node adds to its variances; see `motion_noise`."""
-    held_by: int = -1
-    """Row of the edge that holds it instead of the observed node in `row`, or -1."""
 
 
 class FactorBuilder:
@@ -158,12 +78,14 @@ class FactorBuilder:
         """Of the sources whose errors are correlated in time."""
         self._constraints: dict[str, SourceConstraints] = {}
         self._pose_edges: dict[str, GrowingArray] = {}
-        """Rows of the edges between poses, by source."""
+        """Ids of the edges between poses, by source."""
         self.new: list[NewConstraint] = []
         """Constraints of the update that was built last."""
         self._n_new_bias_edges = 0
+        self._abandoned: list[int] = []
+        """Ids of biases that hold no measurement any more."""
         self._new_weights: dict[int, float] = {}
-        """Weights of observed nodes, by row, that the update sets."""
+        """Weights of observed nodes, by id, that the update sets."""
         self.n_bias_edges = 0
         """Number of edges of the graph that end at a bias."""
 
@@ -185,7 +107,7 @@ class FactorBuilder:
         settle : bool, whether to set all weights that older measurements wait for
 
         """
-        additions = Additions(GraphSizes(graph.n_nodes, graph.n_edges, graph.n_observed))
+        additions = Additions(graph.next_ids)
         for model in self._error_models.values():
             model.begin()
         self.new = [
@@ -197,12 +119,12 @@ class FactorBuilder:
         for model in self._error_models.values() if settle else ():
             if isinstance(model, InflatedWeights):
                 model.settle(additions)
-        present = graph.memory['observed_f'][:graph.n_observed, tb.WEIGHT]
+        present = _weights_of(graph, additions.weigh_observed)
         self._new_weights = {
-            row: weight for row, weight in additions.weigh_observed.items()
-            if row >= graph.n_observed or self._reweighting.uses(row, float(present[row]))}
+            each: weight for each, weight in additions.weigh_observed.items()
+            if each not in present or self._reweighting.uses(each, present[each])}
         return additions.update()._replace(
-            weigh_observed=self._changed_weights(self._new_weights, graph))
+            weigh_observed=self._changed_weights(self._new_weights, present))
 
     def _add(self, attached: AttachedMeasurement, additions: Additions) -> NewConstraint:
         """Add a measurement to an update, as the errors of its source ask for."""
@@ -213,31 +135,31 @@ class FactorBuilder:
         if settings.correlation_time != 0.0:
             noise = motion_noise(measurement, attachment)
         if isinstance(model, InflatedWeights):
-            row = model.add(stamp_ns, observed, additions)
-            return NewConstraint(False, row, source, stamp_ns, kind, noise=noise)
+            added = model.add(stamp_ns, observed, additions)
+            return NewConstraint(False, added, source, stamp_ns, kind, noise=noise)
         if model is None:
-            row = additions.add_observed(observed)
-            return NewConstraint(False, row, source, stamp_ns, kind, noise=noise)
+            added = additions.add_observed(observed)
+            return NewConstraint(False, added, source, stamp_ns, kind, noise=noise)
         edge = model.add(stamp_ns, observed, noise, additions)
         if not settings.finds_correlation:
             return NewConstraint(True, edge, source, stamp_ns, kind)
-        row = additions.add_observed(observed.weighted(0.0))
-        return NewConstraint(False, row, source, stamp_ns, kind, noise=noise, held_by=edge)
+        added = additions.add_observed(observed.weighted(0.0))
+        return NewConstraint(False, added, source, stamp_ns, kind, noise=noise, held_by=edge)
 
     def _changed_weights(
-        self, base_weights: Mapping[int, float], graph: Graph,
+        self, base_weights: Mapping[int, float], present: Mapping[int, float],
     ) -> dict[int, float]:
         """Return the weights that differ from those in the graph, given the new base weights."""
-        present, changed = graph.memory['observed_f'][:graph.n_observed, tb.WEIGHT], {}
-        for row, wanted in base_weights.items():
-            if row >= graph.n_observed:
-                changed[row] = wanted
+        changed = {}
+        for each, wanted in base_weights.items():
+            if each not in present:
+                changed[each] = wanted
                 continue
-            base, weight = self._reweighting.base_weight(row), float(present[row])
+            base, weight = self._reweighting.base_weight(each), present[each]
             # what a robust loss has taken off stays off
             target = wanted if base is None else wanted * (weight / base)
             if target != weight:
-                changed[row] = target
+                changed[each] = target
         return changed
 
     def _error_model(self, source: str, settings: MeasurementSource) -> ErrorModel | None:
@@ -253,12 +175,12 @@ class FactorBuilder:
     def finding(self) -> list[str]:
         """Return the sources whose errors are estimated and that have measurements."""
         return [source for source, constraints in self._constraints.items()
-                if len(constraints) >= LEAST_POSITIONS
+                if constraints.n_ever >= LEAST_POSITIONS
                 and self._settings(source).finds_correlation]
 
     def due_for_estimate(self) -> list[str]:
         """Return those of `finding` with enough new measurements for another estimate."""
-        return [source for source in self.finding() if len(self._constraints[source])
+        return [source for source in self.finding() if self._constraints[source].n_ever
                 >= self._constraints[source].next_estimate]
 
     def constraints(self, source: str) -> SourceConstraints:
@@ -266,7 +188,7 @@ class FactorBuilder:
         return self._constraints[source]
 
     def pose_edges(self) -> list[IntArray]:
-        """Return the rows of all edges between poses but those of the primary odometry."""
+        """Return the ids of all edges between poses but those of the primary odometry."""
         return [edges.values for edges in self._pose_edges.values()]
 
     def correlation(self, source: str) -> Correlation:
@@ -288,10 +210,77 @@ class FactorBuilder:
         model : GaussMarkovBias or InflatedWeights, optional, with all measurements of the source
 
         """
-        self._error_models.pop(source, None)
+        old = self._error_models.pop(source, None)
+        if isinstance(old, GaussMarkovBias):
+            self.abandon(old)
         if model is not None:
             self._error_models[source] = model
         self._constraints[source].n_reported = 0
+
+    def abandon(self, model: GaussMarkovBias) -> None:
+        """Let the states of a bias that holds no measurement leave with the next nodes."""
+        self._abandoned += model.nodes
+
+    def leaving_biases(
+        self, edges: IntArray, observed: IntArray, others: Mapping[str, GaussMarkovBias],
+    ) -> list[int]:
+        """
+        Return the ids of the biases that nothing needs once constraints have left the graph.
+
+        Parameters
+        ----------
+        edges, observed : ndarray of int, ids of the constraints
+        others : mapping, further models of sources, which are not in use yet
+
+        """
+        biases = [*self._abandoned]
+        for source, constraints in self._constraints.items():
+            models = [each[source] for each in (self._error_models, others) if source in each]
+            left = constraints.rows.values[~self.leaving(source, edges, observed), 0]
+            oldest_ns = int(np.min(left)) if len(left) > 0 else None
+            for model in models:
+                if isinstance(model, GaussMarkovBias):
+                    biases += model.leaving(oldest_ns)
+        return biases
+
+    def leaving(self, source: str, edges: IntArray, observed: IntArray) -> BoolArray:
+        """
+        Return which measurements of a source leave with constraints, shape (K,).
+
+        Parameters
+        ----------
+        source : str, that has some
+        edges, observed : ndarray of int, ids of the constraints
+
+        """
+        return self._constraints[source].leaving(
+            edges, observed, added_as_edges=self._has_given_bias(source))
+
+    def forget(
+        self, nodes: IntArray, edges: IntArray, observed: IntArray,
+    ) -> dict[str, IntArray]:
+        """
+        Return the numbers of the measurements that are left, after forgetting the others.
+
+        Parameters
+        ----------
+        nodes, edges, observed : ndarray of int, ids
+
+        """
+        gone, kept = {*nodes.tolist()}, {}
+        self._abandoned = [node for node in self._abandoned if node not in gone]
+        for source, constraints in self._constraints.items():
+            model, left = self._error_models.get(source), self.leaving(source, edges, observed)
+            if isinstance(model, GaussMarkovBias):
+                model.forget(gone)
+            elif model is not None and np.any(left):
+                model.forget(constraints.rows.values[left])
+            kept[source] = constraints.forget(left)
+        for ties in self._pose_edges.values():
+            here = ~np.isin(ties.values, edges)
+            if not np.all(here):
+                ties.select(np.flatnonzero(here))
+        return kept
 
     def inflate(self, source: str, errors: CorrelatedErrors | None) -> None:
         """
@@ -316,53 +305,53 @@ class FactorBuilder:
     def commit(self) -> None:
         """Record the constraints of the update that was built last."""
         self.n_bias_edges += self._n_new_bias_edges
-        for is_edge, row, source, stamp_ns, kind, _, noise, held_by in self.new:
+        for is_edge, number, source, stamp_ns, kind, _, noise, held_by in self.new:
             odometry = self.config.odometry.get(source) if stamp_ns < 0 else None
             settings = odometry or self.config.measurement_source(source, kind)
             loss = (settings.loss if isinstance(settings, OdometrySource)
                     else settings.applied_loss)
             threshold = settings.rejection_threshold
-            self._reweighting.add(row, loss, threshold, edge=is_edge)
+            self._reweighting.add(number, loss, threshold, edge=is_edge)
             if held_by >= 0:
                 self._reweighting.add(held_by, loss, threshold, edge=True)
-                self._reweighting.set_base_weight(row, 0.0)
+                self._reweighting.set_base_weight(number, 0.0)
             if kind is not LoopClosure:
                 constraints = self._constraints.setdefault(source, SourceConstraints())
-                constraints.append(stamp_ns, row, noise, held_by)
+                constraints.append(stamp_ns, number, noise, held_by)
             else:
                 edges = self._pose_edges.setdefault(source, GrowingArray((), np.int64))
-                edges.append_one(row)
-        for row, weight in self._new_weights.items():
-            self._reweighting.set_base_weight(row, weight)
+                edges.append_one(number)
+        for each, weight in self._new_weights.items():
+            self._reweighting.set_base_weight(each, weight)
         # from here on there is nothing that `rollback` could forget
         for model in self._error_models.values():
             model.begin()
 
-    def origin(self, row: int, *, edge: bool) -> ConstraintOrigin | None:
+    def origin(self, number: int, *, edge: bool) -> ConstraintOrigin | None:
         """
         Return where a constraint comes from; None if this builder has not added it.
 
         Parameters
         ----------
-        row : int, in the table of edges or of observed nodes
+        number : int, id of an edge or of an observed node
         edge : bool, whether it is an edge
 
         """
         for source, constraints in self._constraints.items():
             stamp_ns = constraints.stamp_ns(
-                row, edge=edge, added_as_edges=self._has_given_bias(source))
+                number, edge=edge, added_as_edges=self._has_given_bias(source))
             if stamp_ns is not None:
                 return ConstraintOrigin(source, stamp_ns)
         for source, edges in self._pose_edges.items() if edge else ():
-            at = int(np.searchsorted(edges.values, row))
-            if at < len(edges) and edges.values[at] == row:
+            at = int(np.searchsorted(edges.values, number))
+            if at < len(edges) and edges.values[at] == number:
                 return ConstraintOrigin(source, -1)
         return None
 
-    def bias_origin(self, row: int) -> ConstraintOrigin | None:
-        """Return the source of a bias, by its row in the graph, and when its bin begins."""
+    def bias_origin(self, node: int) -> ConstraintOrigin | None:
+        """Return the source of a bias, by its id, and when its bin begins."""
         for source, model in self._error_models.items():
-            begin_ns = model.begin_ns(row) if isinstance(model, GaussMarkovBias) else None
+            begin_ns = model.begin_ns(node) if isinstance(model, GaussMarkovBias) else None
             if begin_ns is not None:
                 return ConstraintOrigin(source, begin_ns)
         return None
@@ -376,13 +365,15 @@ class FactorBuilder:
             edges = self._pose_edges.get(source, GrowingArray((), np.int64))
             saved = SavedSource(
                 none, none, constraints.rows.values.copy(), constraints.n_otherwise,
-                edges.values.copy(), model.saved() if isinstance(model, GaussMarkovBias) else None)
+                edges.values.copy(),
+                model.saved() if isinstance(model, GaussMarkovBias) else None,
+                n_gone=constraints.n_gone)
             if self._settings(source).finds_correlation:
                 saved = replace(
                     saved, errors=self.errors_in_use(source),
                     noise=constraints.noise.values.copy(), edges=constraints.edges.values.copy(),
                     next_estimate=constraints.next_estimate,
-                    odometry_scale=constraints.odometry_scale)
+                    odometry_scale=constraints.odometry_scale, past=constraints.past)
             result[source] = saved
         return result
 
@@ -435,8 +426,8 @@ class FactorBuilder:
         """Return how well the newest measurements of each source fit the estimate."""
         reports = {}
         for source, constraints in self._constraints.items():
-            n = len(constraints)
-            if n > MORE_RESIDUALS * constraints.n_reported:
+            n, before = constraints.n_ever, constraints.n_reported
+            if n - before > MORE_RESIDUALS * min(len(constraints), before):
                 biased = self._has_given_bias(source)
                 used = constraints.used(graph, added_as_edges=biased)
                 constraints.n_reported = n if np.any(used) else 0
@@ -448,3 +439,12 @@ class FactorBuilder:
             if constraints.report is not None and constraints.report.energy > 0.0:
                 reports[source] = constraints.report
         return reports
+
+
+def _weights_of(graph: Graph, observed: Collection[int]) -> dict[int, float]:
+    """Return the weights of those of some observed nodes, given by their ids, that are there."""
+    ids = np.fromiter(observed, np.int64, len(observed))
+    rows = graph.observed_rows(ids)
+    there = rows >= 0
+    weights = graph.memory['observed_f'][rows[there], tb.WEIGHT]
+    return dict(zip(ids[there].tolist(), weights.tolist(), strict=True))

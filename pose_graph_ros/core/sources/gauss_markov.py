@@ -16,25 +16,22 @@ from the time between t and the middle of the bin. The bin of a measurement depe
 alone, and the state of a bin that is filled later is inserted between its neighbours, so the order
 of arrival does not matter.
 
-`InflatedWeights` is a cheap approximation: each of n measurements within 2 tau has the weight
-1 / n, because together they are worth about one measurement with an independent error. A new
-measurement changes the weights of all others. To bound the work, each one sets those of `RENEWED`
-others, in turn, so that no weight is off by more than about 1 / `RENEWED`; `settle` sets the rest.
+Where older states have left the graph, its prior holds what is known of the first one that stays.
+The process is the same backwards in time, so a late state before that one hangs on the next one.
 """
 
 import bisect
+from collections.abc import Collection
 from dataclasses import dataclass, field
-import itertools
 import math
 from typing import NamedTuple
 
 import numpy as np
 
-from pose_graph_ros.core.config import Correlation
 from pose_graph_ros.core.geometry import covariance, se2
-from pose_graph_ros.core.geometry.se2 import FloatArray, IntArray
+from pose_graph_ros.core.geometry.se2 import FloatArray
 from pose_graph_ros.core.graph.constraints import EdgeKind, Edges, ObservedKind, ObservedNodes
-from pose_graph_ros.core.graph.graph import GraphUpdate
+from pose_graph_ros.core.graph.graph import GraphUpdate, NextIds
 from pose_graph_ros.core.saved_columns import Integers
 
 # Number of bins in one time constant.
@@ -43,12 +40,12 @@ BINS = 64
 LEAST_WHITE = 1e-3
 # Lower bound of the variance of a measurement without the motion since its node, as a share.
 LEAST_OWN = 0.01
+# Instead of the id of a transition: the prior of the graph is on the state.
+NO_TRANSITION = -1
 # Unit of the third number of a state, the error of the heading, in sigmas. Its variance is then
 # 1 / STRETCH^2: the number is wrapped like an angle and must stay well below pi.
 STRETCH = 10.0
 _INFORMATION = np.diag((1.0, 1.0, STRETCH**2))
-# Number of older weights in its bin that a measurement renews, and of such weights in other bins.
-RENEWED = 32
 
 
 class CorrelatedErrors(NamedTuple):
@@ -70,27 +67,20 @@ class SavedBins:
     numbers: Integers
     """Bin numbers, increasing: bin k begins at the stamp k `width_ns`."""
     rows: Integers
-    """Row of each state in the graph."""
+    """Id of each state."""
     ties: Integers
     """
-    Row of the edge from each state to the one before; for the first state the row of the observed
-    node that is its prior.
+    Id of the edge from each state to the one before; for the first state that of the observed
+    node that is its prior, -1 if the prior of the graph has it.
     """
-
-
-class GraphSizes(NamedTuple):
-    """Numbers of rows in the graph before an update, which are the first new row numbers."""
-
-    n_nodes: int
-    n_edges: int
-    n_observed: int
 
 
 @dataclass(slots=True)
 class Additions:
     """Changes of one update, collected row by row; for the fields see `GraphUpdate`."""
 
-    sizes: GraphSizes
+    first: NextIds
+    """Ids of the first new rows."""
     biases: list[FloatArray] = field(default_factory=list)
     edges: list[Edges] = field(default_factory=list)
     observed: list[ObservedNodes] = field(default_factory=list)
@@ -106,29 +96,29 @@ class Additions:
             remove_observed=self.remove_observed)
 
     def add_bias(self) -> int:
-        """Add a bias state and return its row in the graph."""
+        """Add a bias state and return its id."""
         self.biases.append(np.zeros(3))
-        return self.sizes.n_nodes + len(self.biases) - 1
+        return self.first.node + len(self.biases) - 1
 
     def add_edge(self, edge: Edges) -> int:
-        """Add an edge and return its row in the graph."""
+        """Add an edge and return its id."""
         self.edges.append(edge)
-        return self.sizes.n_edges + len(self.edges) - 1
+        return self.first.edge + len(self.edges) - 1
 
     def add_observed(self, observed: ObservedNodes) -> int:
-        """Add an observed node and return its row in the graph."""
+        """Add an observed node and return its id."""
         self.observed.append(observed)
-        return self.sizes.n_observed + len(self.observed) - 1
+        return self.first.observed + len(self.observed) - 1
 
 
 @dataclass(slots=True)
 class _Bin:
     """One state of a bias."""
 
-    row: int
-    """Row of the state in the graph."""
+    node: int
+    """Id of the state."""
     transition: int
-    """Row of the edge to the state before; for the first state that of its prior."""
+    """Id of the edge to the state before; for the first state that of its prior."""
 
 
 class GaussMarkovBias:
@@ -139,11 +129,41 @@ class GaussMarkovBias:
         self._width_ns = max(round(errors.tau * 1e9 / BINS), 1)
         self._numbers: list[int] = []
         self._bins: dict[int, _Bin] = {}
+        self._carried: int | None = None
+        """Number of the bin that the prior of the graph is on, as older ones have left."""
         self._log: list[tuple[int, int | None, int]] = []
         """
-        Numbers of the bins made since `begin`, each with the number of the next bin and the
-        transition that the next bin had.
+        Numbers of the bins made since `begin`, each with the number of the neighbour that got
+        another transition, and the one that it had.
         """
+
+    @property
+    def nodes(self) -> list[int]:
+        """Ids of all states, in the order of time."""
+        return [self._bins[number].node for number in self._numbers]
+
+    def leaving(self, oldest_ns: int | None) -> list[int]:
+        """
+        Return the ids of the states that no measurement needs, but never that of the newest bin.
+
+        `oldest_ns` is the oldest stamp of a measurement that is left [ns], None if there is none.
+        """
+        last = max(len(self._numbers) - 1, 0)
+        end = last if oldest_ns is None else min(
+            bisect.bisect_left(self._numbers, oldest_ns // self._width_ns), last)
+        return self.nodes[:end]
+
+    def forget(self, nodes: Collection[int]) -> None:
+        """Forget states that have left the graph, the oldest ones, by their ids."""
+        gone = {number for number in self._numbers if self._bins[number].node in nodes}
+        for number in gone:
+            del self._bins[number]
+        self._numbers = [number for number in self._numbers if number not in gone]
+        if len(gone) == 0 or (self._carried is not None and self._carried not in gone):
+            return
+        self._carried = self._numbers[0] if len(self._numbers) > 0 else None
+        if self._carried is not None:
+            self._bins[self._carried].transition = NO_TRANSITION
 
     def begin(self) -> None:
         """Begin an update that `rollback` can revert."""
@@ -151,17 +171,17 @@ class GaussMarkovBias:
 
     def rollback(self) -> None:
         """Remove what was added since `begin`."""
-        for number, after, transition in reversed(self._log):
+        for number, neighbour, transition in reversed(self._log):
             self._numbers.remove(number)
             del self._bins[number]
-            if after is not None:
-                self._bins[after].transition = transition
+            if neighbour is not None:
+                self._bins[neighbour].transition = transition
         self._log.clear()
 
     def saved(self) -> SavedBins:
         """Return the states of all bins."""
         numbers, rows, ties = np.array(
-            [(number, self._bins[number].row, self._bins[number].transition)
+            [(number, self._bins[number].node, self._bins[number].transition)
              for number in self._numbers], dtype=np.int64).reshape(-1, 3).T.copy()
         return SavedBins(self._width_ns, numbers, rows, ties)
 
@@ -170,16 +190,18 @@ class GaussMarkovBias:
         if saved.width_ns != self._width_ns:
             return False
         self._numbers = saved.numbers.tolist()
-        for number, row, transition in zip(
+        for number, node, transition in zip(
                 self._numbers, saved.rows.tolist(), saved.ties.tolist(), strict=True):
-            self._bins[number] = _Bin(row, transition)
+            self._bins[number] = _Bin(node, transition)
+            if transition == NO_TRANSITION:
+                self._carried = number
         return True
 
     def add(
         self, stamp_ns: int, observed: ObservedNodes, noise: FloatArray, additions: Additions,
     ) -> int:
         """
-        Return the row of the edge that is added, from a measurement's node to its bin's state.
+        Return the id of the edge that is added, from a measurement's node to its bin's state.
 
         Parameters
         ----------
@@ -197,24 +219,32 @@ class GaussMarkovBias:
             self._make_bin(number, additions)
         phi = self._phi(abs(rest_ns - self._width_ns / 2))
         return additions.add_edge(_biased_constraint(
-            observed, noise, self._bins[number].row, phi, self.errors))
+            observed, noise, self._bins[number].node, phi, self.errors))
 
-    def begin_ns(self, row: int) -> int | None:
-        """Return when the bin of a state begins [ns], by its row; None for another source's."""
+    def begin_ns(self, node: int) -> int | None:
+        """Return when the bin of a state begins [ns], by its id; None for another source's."""
         return next((number * self._width_ns for number, made in self._bins.items()
-                     if made.row == row), None)
+                     if made.node == node), None)
 
     def _phi(self, gap_ns: float) -> float:
         return math.exp(-gap_ns * 1e-9 / self.errors.tau)
 
     def _make_bin(self, number: int, additions: Additions) -> None:
-        """Add the state of a bin between its neighbours in time."""
+        """
+        Add the state of a bin between its neighbours in time.
+
+        Transitions lead away from the state with the prior: back to it, or, from late states
+        before one that the prior of the graph is on, forward.
+        """
         at = bisect.bisect(self._numbers, number)
         before = self._numbers[at - 1] if at > 0 else None
         after = self._numbers[at] if at < len(self._numbers) else None
-        row = additions.add_bias()
-        made = _Bin(row, self._add_transition(row, number, before, additions))
-        self._log.append((number, after, -1 if after is None else self._bins[after].transition))
+        if self._carried is not None and number < self._carried:
+            before, after = after, before
+        node = additions.add_bias()
+        made = _Bin(node, self._add_transition(node, number, before, additions))
+        self._log.append((
+            number, after, NO_TRANSITION if after is None else self._bins[after].transition))
         self._numbers.insert(at, number)
         self._bins[number] = made
         if after is not None:
@@ -223,137 +253,20 @@ class GaussMarkovBias:
                 additions.remove_observed.append(old.transition)
             else:
                 additions.remove_edges.append(old.transition)
-            old.transition = self._add_transition(old.row, after, number, additions)
+            old.transition = self._add_transition(old.node, after, number, additions)
 
     def _add_transition(
-        self, row: int, number: int, before: int | None, additions: Additions,
+        self, node: int, number: int, before: int | None, additions: Additions,
     ) -> int:
         """Add the edge from a state to that of the bin before, or its prior if it is first."""
         if before is None:
             return additions.add_observed(ObservedNodes(
-                [row], None, np.zeros((1, 3)), _INFORMATION[None], [ObservedKind.GLOBAL_POSE]))
-        phi = self._phi((number - before) * self._width_ns)
+                [node], None, np.zeros((1, 3)), _INFORMATION[None], [ObservedKind.GLOBAL_POSE]))
+        phi = self._phi(abs(number - before) * self._width_ns)
         return additions.add_edge(Edges(
-            [row], [self._bins[before].row], np.zeros((1, 3)),
+            [node], [self._bins[before].node], np.zeros((1, 3)),
             _INFORMATION[None] / (1.0 - phi * phi), [EdgeKind.BIAS],
             bias=np.array([(0.0, 0.0, phi, phi)])))
-
-
-@dataclass(slots=True)
-class _WeightBin:
-    """The measurements within 2 tau."""
-
-    rows: list[int] = field(default_factory=list)
-    """Rows of their observed nodes."""
-    next: int = 0
-    """Index of the weight that is renewed next."""
-    n_waiting: int = 0
-    """Number of weights, from there on and in a circle, that are not yet 1 / n."""
-
-
-class InflatedWeights:
-    """Weights of the measurements of one source, lower the more of them lie within 2 tau."""
-
-    def __init__(self, errors: CorrelatedErrors) -> None:
-        self.errors = errors
-        self._width_ns = max(round(2e9 * errors.tau), 1)
-        self._bins: dict[int, _WeightBin] = {}
-        self._waiting: dict[int, None] = {}
-        """Numbers of the bins with weights that wait to be renewed, the first one first."""
-        self._log: list[tuple[int, int, int, int]] = []
-        """Number of each bin that has changed since `begin`, and what it was like."""
-
-    def begin(self) -> None:
-        """Begin an update that `rollback` can revert."""
-        self._log.clear()
-
-    def rollback(self) -> None:
-        """Remove what was added since `begin`."""
-        for number, size, at, n_waiting in reversed(self._log):
-            made = self._bins[number]
-            del made.rows[size:]
-            made.next, made.n_waiting = at, n_waiting
-            self._note(number)
-        self._log.clear()
-
-    def restore(self, rows: IntArray) -> None:
-        """Restore the measurements of a loaded graph: stamps [ns] and rows, shape (K, 2)."""
-        for stamp_ns, row in rows.tolist():
-            number = stamp_ns // self._width_ns
-            made = self._bins.setdefault(number, _WeightBin())
-            made.rows.append(row)
-            made.n_waiting += 1     # which of them waited is not saved
-            self._note(number)
-
-    def add(self, stamp_ns: int, observed: ObservedNodes, additions: Additions) -> int:
-        """
-        Return the row of the observed node that is added.
-
-        Parameters
-        ----------
-        stamp_ns : int
-        observed : ObservedNodes, one row
-        additions : Additions, receives the row, its weight and some weights of older measurements
-
-        """
-        row = additions.add_observed(observed)
-        number = stamp_ns // self._width_ns
-        made = self._bins.setdefault(number, _WeightBin())
-        self._log.append((number, len(made.rows), made.next, made.n_waiting))
-        made.rows.append(row)
-        made.n_waiting = len(made.rows)
-        additions.weigh_observed[row] = 1.0 / len(made.rows)
-        self._renew(number, RENEWED, additions)
-        left = RENEWED
-        for other in list(itertools.islice(self._waiting, RENEWED)):
-            if other != number and left > 0:
-                left -= self._renew(other, left, additions)
-        return row
-
-    def settle(self, additions: Additions) -> None:
-        """Add the weights of all measurements, as other ones may be believed than before."""
-        for number, made in self._bins.items():
-            if len(made.rows) == 0:
-                continue    # all of it was rolled back
-            self._log.append((number, len(made.rows), made.next, made.n_waiting))
-            made.n_waiting = len(made.rows)
-            self._renew(number, len(made.rows), additions)
-
-    def _renew(self, number: int, most: int, additions: Additions) -> int:
-        """Add some weights of a bin that wait to be renewed, and return how many."""
-        made = self._bins[number]
-        self._log.append((number, len(made.rows), made.next, made.n_waiting))
-        count = min(most, made.n_waiting)
-        for k in range(made.next, made.next + count):
-            additions.weigh_observed[made.rows[k % len(made.rows)]] = 1.0 / len(made.rows)
-        made.next = (made.next + count) % len(made.rows)
-        made.n_waiting -= count
-        self._note(number)
-        return count
-
-    def _note(self, number: int) -> None:
-        """Keep the list of bins with weights that wait up to date."""
-        if self._bins[number].n_waiting > 0:
-            self._waiting[number] = None
-        else:
-            self._waiting.pop(number, None)
-
-
-ErrorModel = GaussMarkovBias | InflatedWeights
-
-
-def new_error_model(errors: CorrelatedErrors, correlation: Correlation) -> ErrorModel:
-    """
-    Return a model of correlated errors, without measurements.
-
-    Parameters
-    ----------
-    errors : CorrelatedErrors
-    correlation : Correlation
-
-    """
-    inflates = correlation is Correlation.INFLATE
-    return InflatedWeights(errors) if inflates else GaussMarkovBias(errors)
 
 
 def _biased_constraint(

@@ -22,7 +22,7 @@ from pose_graph_ros.core.measurements import (
 )
 from pose_graph_ros.core.odometry.hidden_nodes import HiddenNodes
 from pose_graph_ros.core.odometry.motion import Attachment
-from pose_graph_ros.core.sources.factor_builder import AttachedMeasurement, Queue, QueuedEdge
+from pose_graph_ros.core.sources.constraint_queue import AttachedMeasurement, Queue, QueuedEdge
 from pose_graph_ros.core.sources.measurement_constraints import (
     absolute_constraint,
     attach,

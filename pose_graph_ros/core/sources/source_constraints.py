@@ -1,6 +1,6 @@
 # Copyright 2026 The pose_graph_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""The measurements of one source in the graph, and which row holds each of them."""
+"""The measurements of one source in the graph, and what holds each of them."""
 
 from dataclasses import dataclass, field
 from typing import NamedTuple
@@ -13,6 +13,7 @@ from pose_graph_ros.core.graph.graph import Graph
 from pose_graph_ros.core.saved_columns import Integers, Pairs, Rows2
 from pose_graph_ros.core.sources.error_estimate import LEAST_POSITIONS
 from pose_graph_ros.core.sources.gauss_markov import CorrelatedErrors, SavedBins
+from pose_graph_ros.core.sources.past_path import PastPath
 from pose_graph_ros.core.sources.source_report import SourceReport
 
 
@@ -26,13 +27,13 @@ class SavedSource:
     """For each stamp the reference of the loop closure, 0 for others; see `waiting`."""
     rows: Pairs
     """
-    Stamp [ns] and row of each constraint, shape (K, 2). The rows are those of edges if a bias with
+    Stamp [ns] and id of each constraint, shape (K, 2). The ids are those of edges if a bias with
     a given correlation time was estimated, else those of observed nodes.
     """
     n_otherwise: int
     """Number of constraints that were added under other settings."""
     ties: Integers
-    """Rows of its edges between hidden nodes, except those of the primary odometry."""
+    """Ids of its edges between hidden nodes, except those of the primary odometry."""
     bins: SavedBins | None
     """States of its bias, if it has one."""
     errors: CorrelatedErrors | None = None
@@ -40,17 +41,21 @@ class SavedSource:
     noise: Rows2 = field(default_factory=lambda: np.empty((0, 2)))
     """What the motion since the node adds to the variances, or empty; see `motion_noise`."""
     edges: Integers = field(default_factory=lambda: np.empty(0, dtype=np.int64))
-    """With estimated statistics, rows of the edges that hold the measurements, or empty."""
+    """With estimated statistics, ids of the edges that hold the measurements, or empty."""
     next_estimate: int = LEAST_POSITIONS
     """Number of measurements at which its errors are estimated next."""
     odometry_scale: float = 1.0
     """Factor on the sigmas of odometry that its measurements show."""
+    n_gone: int = 0
+    """Number of its measurements that have left the graph."""
+    past: PastPath | None = None
+    """Their positions, where its errors are estimated."""
 
 
 class Held(NamedTuple):
-    """The row in the graph that holds each of some measurements."""
+    """The constraint that holds each of some measurements."""
 
-    rows: IntArray
+    ids: IntArray
     is_edge: BoolArray
 
 
@@ -64,15 +69,19 @@ class SourceConstraints:
 
     def __init__(self) -> None:
         self.rows = GrowingArray((2,), np.int64)
-        """Stamp [ns] of each measurement, and the row that it was first added as."""
+        """Stamp [ns] of each measurement, and the id of what it was first added as."""
         self.noise = GrowingArray((2,), np.float64)
         """What the motion since the node adds to its variances; see `motion_noise`."""
         self.edges = GrowingArray((), np.int64)
-        """Row of the edge that holds it instead, or -1."""
+        """Id of the edge that holds it instead, or -1."""
         self.report: SourceReport | None = None
         """The newest report."""
         self.n_reported = 0
         """Number of measurements when it was made; 0 if none of them was used."""
+        self.n_gone = 0
+        """Number of measurements that have left the graph."""
+        self.past: PastPath | None = None
+        """Their positions, where the errors are estimated."""
         self.n_otherwise = 0
         """Constraints of a loaded graph that were added under other settings."""
         self.next_estimate = LEAST_POSITIONS
@@ -83,24 +92,50 @@ class SourceConstraints:
     def __len__(self) -> int:
         return len(self.rows)
 
-    def append(self, stamp_ns: int, row: int, noise: FloatArray, edge: int) -> None:
+    @property
+    def n_ever(self) -> int:
+        """Number of measurements, with those that have left the graph."""
+        return len(self) + self.n_gone
+
+    def leaving(self, edges: IntArray, observed: IntArray, *, added_as_edges: bool) -> BoolArray:
+        """
+        Return which measurements leave with constraints, shape (K,).
+
+        Parameters
+        ----------
+        edges, observed : ndarray of int, ids
+        added_as_edges : bool, whether the measurements were first added as edges
+
+        """
+        return np.asarray(np.isin(self.rows.values[:, 1], edges if added_as_edges else observed))
+
+    def forget(self, gone: BoolArray) -> IntArray:
+        """Return the numbers of the measurements that are left, after forgetting the others."""
+        kept = np.flatnonzero(~gone)
+        if len(kept) < len(self):
+            self.n_gone += len(self) - len(kept)
+            for column in (self.rows, self.noise, self.edges):
+                column.select(kept)
+        return kept
+
+    def append(self, stamp_ns: int, number: int, noise: FloatArray, edge: int) -> None:
         """
         Append a measurement.
 
         Parameters
         ----------
         stamp_ns : int
-        row : int, row that it was added as
+        number : int, id of what it was added as
         noise : ndarray, shape (2,), see `motion_noise`
-        edge : int, row of the edge that holds it instead, or -1
+        edge : int, id of the edge that holds it instead, or -1
 
         """
-        self.rows.append_one((stamp_ns, row))
+        self.rows.append_one((stamp_ns, number))
         self.noise.append_one(noise)
         self.edges.append_one(edge)
 
     def held(self, which: IntArray) -> Held:
-        """Return the rows that hold some measurements, given by their numbers."""
+        """Return what holds some measurements, given by their numbers."""
         edges = self.edges.values[which]
         return Held(np.where(edges >= 0, edges, self.rows.values[which, 1]), edges >= 0)
 
@@ -117,29 +152,29 @@ class SourceConstraints:
         held = self.held(np.arange(len(self)))
         is_edge = held.is_edge | added_as_edges
         used = np.empty(len(self), dtype=bool)
-        used[is_edge] = graph.edges_at(held.rows[is_edge]).weight > 0.0
-        used[~is_edge] = graph.observed_at(held.rows[~is_edge]).weight > 0.0
+        used[is_edge] = graph.edges_at(held.ids[is_edge]).weight > 0.0
+        used[~is_edge] = graph.observed_at(held.ids[~is_edge]).weight > 0.0
         return used
 
-    def stamp_ns(self, row: int, *, edge: bool, added_as_edges: bool) -> int | None:
+    def stamp_ns(self, number: int, *, edge: bool, added_as_edges: bool) -> int | None:
         """
-        Return the stamp of the measurement that a row holds [ns], or None.
+        Return the stamp of the measurement that a constraint holds [ns], or None.
 
         Parameters
         ----------
-        row : int
-        edge : bool, whether it is the row of an edge
+        number : int, id
+        edge : bool, whether it is that of an edge
         added_as_edges : bool, whether the measurements were first added as edges
 
         """
         if edge is added_as_edges:
-            # rows are appended in increasing order
-            at = int(np.searchsorted(self.rows.values[:, 1], row))
-            found = at < len(self.rows) and self.rows.values[at, 1] == row
+            # ids are appended in increasing order
+            at = int(np.searchsorted(self.rows.values[:, 1], number))
+            found = at < len(self.rows) and self.rows.values[at, 1] == number
             return int(self.rows.values[at, 0]) if found else None
         if not edge:
             return None
-        found_at = np.flatnonzero(self.edges.values == row)
+        found_at = np.flatnonzero(self.edges.values == number)
         return int(self.rows.values[found_at[0], 0]) if len(found_at) > 0 else None
 
     def restore(self, saved: SavedSource) -> None:
@@ -148,5 +183,6 @@ class SourceConstraints:
         self.rows.append(saved.rows)
         self.noise.append(saved.noise if len(saved.noise) == n else np.zeros((n, 2)))
         self.edges.append(saved.edges if len(saved.edges) == n else np.full(n, -1))
+        self.n_gone, self.past = saved.n_gone, saved.past
         self.next_estimate = saved.next_estimate
         self.odometry_scale = saved.odometry_scale

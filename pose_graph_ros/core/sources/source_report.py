@@ -8,7 +8,6 @@ import numpy as np
 
 from pose_graph_ros.core.geometry import se2
 from pose_graph_ros.core.geometry.se2 import FloatArray, IntArray
-from pose_graph_ros.core.graph import error_functions
 from pose_graph_ros.core.graph.constraints import Edges, ObservedNodes
 from pose_graph_ros.core.graph.graph import Graph
 from pose_graph_ros.core.sources import autocorrelation
@@ -56,7 +55,7 @@ def report(
     ----------
     graph : Graph
     rows : ndarray of int64, shape (K, 2)
-        Stamp [ns] and row of each measurement that is used, in the order of their addition.
+        Stamp [ns] and id of each measurement that is used, in the order of their addition.
     biased : bool, whether the constraints are edges to a bias; else they are observed nodes
     in_use : CorrelatedErrors, optional, statistics in use; None for white errors
     found : bool, whether these are estimated from the errors
@@ -77,7 +76,7 @@ def report(
 
 def _residuals(graph: Graph, observed: ObservedNodes) -> tuple[FloatArray, FloatArray]:
     """Return residuals of positions in map axes, shape (K, 2), and their information."""
-    errors = error_functions.observed_errors(graph.poses, observed)
+    errors = graph.observed_errors(observed)
     turn = se2.rotation(observed.mean[:, 2])
     residuals = np.einsum('kij,kj->ki', turn, errors[:, :2])
     information = turn @ observed.information[:, :2, :2] @ np.swapaxes(turn, 1, 2)
@@ -91,10 +90,9 @@ def _biased_residuals(graph: Graph, edges: Edges) -> tuple[FloatArray, FloatArra
     The residual is the whole error of the measurement: the part that the bias explains and the
     white rest.
     """
-    poses = graph.poses
-    errors = error_functions.edge_errors(poses, edges)[:, :2]
+    errors = graph.edge_errors(edges)[:, :2]
     factor = edges.bias[:, 2]
-    total = errors - factor[:, None] * poses[edges.j, :2]
+    total = errors - factor[:, None] * graph.poses_of(edges.j)[:, :2]
     variance = factor**2 + 1.0 / (0.5 * np.trace(
         edges.information[:, :2, :2], axis1=1, axis2=2) + 1e-12)
     return total, np.eye(2) / variance[:, None, None]

@@ -139,6 +139,12 @@ class SeenStamps:
         if at >= 0:
             del self._stamps[source][at], self._references[source][at]
 
+    def forget(self, before_ns: int) -> None:
+        """Forget all stamps before one [ns]: such measurements are refused for another reason."""
+        for source, stamps in self._stamps.items():
+            n = bisect.bisect_left(stamps, before_ns)
+            del stamps[:n], self._references[source][:n]
+
     def saved(
         self, without: list[tuple[str, Measurement]],
     ) -> dict[str, tuple[IntArray, IntArray]]:

@@ -94,7 +94,7 @@ def test_reasons_are_those_of_an_engine_that_keeps_none() -> None:
 
 def test_what_is_drawn_apart_is_what_the_verdicts_say() -> None:
     backend = driven(0.0, 0.0, 0.0, 8.0, -7.0)
-    by_state = {state: [each.row for each in backend.verdicts() if each.state is state]
+    by_state = {state: [each.number for each in backend.verdicts() if each.state is state]
                 for state in State}
     assert backend._judge.drawn_rows() == DrawnRows(
         by_state[State.WEAKLY_BELIEVED], by_state[State.WAITING], by_state[State.DOUBTED],
@@ -199,7 +199,7 @@ def test_of_many_hopeless_closures_the_oldest_are_forgotten(
     assert sorted(kept) == [0, *range(7, 13)]
     assert {len(column) for column in judge._table._columns} == {7}
     assert judge._table.crowd(1) == 0
-    assert not np.any(backend.graph.edges.weight[judge.states.row[:9]])
+    assert not np.any(backend.graph.edges.weight[judge.states.edge[:9]])
     # whom a person decides on is judged again when that is taken back
     for decision in (Decision.OUT, Decision.AUTO):
         assert backend.decide('loop/1', decision).status is AnswerStatus.ACCEPTED

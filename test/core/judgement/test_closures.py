@@ -279,9 +279,9 @@ def test_a_saved_graph_goes_on_with_its_judgement(tmp_path: Path) -> None:
     backend = run(closures, last=150)
     write_graph(backend.saved(), tmp_path / 'map')
     other = PoseGraphBackend.restored(CONFIG, read_graph(tmp_path / 'map'))
-    kept = [(each.id, each.state, each.since_ns, each.decision, each.row)
+    kept = [(each.id, each.state, each.since_ns, each.decision, each.number)
             for each in backend.verdicts()]
-    assert kept == [(each.id, each.state, each.since_ns, each.decision, each.row)
+    assert kept == [(each.id, each.state, each.since_ns, each.decision, each.number)
                     for each in other.verdicts()]
     for each in (backend, other):
         run(closures, begin=each, first=150)

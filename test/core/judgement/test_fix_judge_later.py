@@ -79,7 +79,7 @@ def doubted(backend: PoseGraphBackend) -> set[int]:
 
 def used(backend: PoseGraphBackend, verdict: Verdict) -> bool:
     """Tell whether the row of a verdict has a weight."""
-    return bool(backend.graph.weights[0 if verdict.edge else 1][verdict.row] > 0.0)
+    return bool(backend.graph.weights[0 if verdict.edge else 1][verdict.number] > 0.0)
 
 
 def assert_weights_are_as_decided(backend: PoseGraphBackend) -> None:
@@ -87,11 +87,11 @@ def assert_weights_are_as_decided(backend: PoseGraphBackend) -> None:
     constraints = backend._factors.constraints('fix')
     held = constraints.held(np.arange(len(constraints)))
     rows = {stamp: (row, edge) for stamp, row, edge in zip(
-        constraints.rows.values[:, 0].tolist(), held.rows.tolist(), held.is_edge.tolist(),
+        constraints.rows.values[:, 0].tolist(), held.ids.tolist(), held.is_edge.tolist(),
         strict=True)}
     observed = backend.graph.weights[1]
     for verdict in backend.verdicts():
-        assert (verdict.row, verdict.edge) == rows[verdict.stamp_ns]
+        assert (verdict.number, verdict.edge) == rows[verdict.stamp_ns]
         assert used(backend, verdict) is verdict.state.in_graph
     as_edges = constraints.rows.values[held.is_edge, 1]
     assert np.all(observed[as_edges] == 0.0)

@@ -8,7 +8,7 @@ import numpy as np
 from pose_graph_ros.core.judgement.fix_states import BELIEVED, FixStates, NEWEST, SOURCE
 from pose_graph_ros.core.judgement.verdicts import SourceVerdicts, State
 from pose_graph_ros.core.measurements import Position
-from pose_graph_ros.core.sources.factor_builder import NewConstraint
+from pose_graph_ros.core.sources.constraint_queue import NewConstraint
 
 
 def counted(states: FixStates) -> dict[str, SourceVerdicts]:

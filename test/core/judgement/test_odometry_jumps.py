@@ -174,7 +174,7 @@ def test_a_jump_is_told_once_saved_and_goes_when_the_evidence_turns() -> None:
     backend.optimize()
     assert not any(each.kind is Judged.ODOMETRY for each in backend.verdict_changes())
     verdict, = jumps_in(backend)
-    assert backend.graph.weights[0][verdict.row] < 0.01
+    assert backend.graph.weights[0][verdict.number] < 0.01
     saved = backend.saved()
     saved.check()
     again, = jumps_in(PoseGraphBackend.restored(CONFIG, saved))
@@ -187,7 +187,7 @@ def test_a_jump_is_told_once_saved_and_goes_when_the_evidence_turns() -> None:
         401 * SECOND, np.zeros(3), np.diag(SIGMA**2), reference_ns=398 * SECOND), 'scan')
     backend.optimize()
     assert jumps_in(backend) == []
-    assert backend.graph.weights[0][verdict.row] == 1.0
+    assert backend.graph.weights[0][verdict.number] == 1.0
     change, = (each for each in backend.verdict_changes() if each.kind is Judged.ODOMETRY)
     assert (change.before, change.after) == (State.DOUBTED, State.BELIEVED)
 

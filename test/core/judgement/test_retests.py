@@ -22,7 +22,7 @@ def test_one_that_always_fails_is_tried_ever_more_rarely(begin: int, step: int) 
     them, tries = retests(), 0
     for n_nodes in range(begin, begin + 20_000, step):
         if them.due(n_nodes, n_nodes)[1]:
-            them.failed([1], n_nodes)
+            them.failed([1], n_nodes, n_nodes)
             tries += 1
     # the last waits are for two thirds more nodes each, the first ones for ten nodes and more
     assert 1 <= tries <= 40
@@ -54,10 +54,10 @@ def test_those_that_take_turns_wait_for_another_closure() -> None:
 
 def test_after_a_failure_it_is_tested_when_the_graph_has_grown_or_it_is_asked_for() -> None:
     them = retests()
-    them.failed(EACH, 1000)
+    them.failed(EACH, 1000, 1000)
     assert not np.any(them.due(0, 1019))
     assert np.all(them.due(0, 1020))
-    them.failed(EACH, 1000)
+    them.failed(EACH, 1000, 1000)
     assert np.all(them.resting(1039))
     them.again([2])
     np.testing.assert_array_equal(them.resting(1000), [True, True, False])

@@ -24,6 +24,7 @@ from pose_graph_ros.core.config import (
 from pose_graph_ros.core.exceptions import ConfigError
 from pose_graph_ros.core.geometry import se2
 from pose_graph_ros.core.graph.constraints import EdgeKind, ObservedNodes
+from pose_graph_ros.core.graph.graph import NextIds
 from pose_graph_ros.core.measurements import (
     GlobalPose,
     HeadingOnly,
@@ -32,14 +33,13 @@ from pose_graph_ros.core.measurements import (
     Position,
 )
 from pose_graph_ros.core.odometry.motion import Attachment
-from pose_graph_ros.core.sources import gauss_markov
+from pose_graph_ros.core.sources import error_models
+from pose_graph_ros.core.sources.error_models import InflatedWeights
 from pose_graph_ros.core.sources.gauss_markov import (
     Additions,
     BINS,
     CorrelatedErrors,
     GaussMarkovBias,
-    GraphSizes,
-    InflatedWeights,
 )
 from pose_graph_ros.core.sources.measurement_constraints import absolute_constraint
 
@@ -65,24 +65,24 @@ def transitions(stamps: list[float]) -> set[tuple[object, ...]]:
     rows: dict[int, int] = {}
     edges: dict[int, tuple[object, ...]] = {}
     priors: dict[int, int] = {}
-    sizes = GraphSizes(1, 0, 0)
+    sizes = NextIds(1, 0, 0)
     for stamp in stamps:
         additions = Additions(sizes)
         chain.begin()
         edge = chain.add(round(stamp * SECOND), observed(stamp), NO_NOISE, additions)
-        for number, table in enumerate(additions.edges, sizes.n_edges):
+        for number, table in enumerate(additions.edges, sizes.edge):
             edges[number] = (int(table.i[0]), int(table.j[0]), table.information.tobytes(),
                              table.bias.tobytes())
         rows[edges[edge][1]] = round(stamp)
-        for number, table in enumerate(additions.observed, sizes.n_observed):
+        for number, table in enumerate(additions.observed, sizes.observed):
             priors[number] = int(table.node[0])
         for number in additions.remove_edges:
             del edges[number]
         for number in additions.remove_observed:
             del priors[number]
-        sizes = GraphSizes(sizes.n_nodes + len(additions.biases),
-                           sizes.n_edges + len(additions.edges),
-                           sizes.n_observed + len(additions.observed))
+        sizes = NextIds(sizes.node + len(additions.biases),
+                          sizes.edge + len(additions.edges),
+                          sizes.observed + len(additions.observed))
     return ({(rows.get(i, 'pose'), rows[j], *rest) for i, j, *rest in edges.values()}
             | {('prior', rows[node]) for node in priors.values()})
 
@@ -100,7 +100,7 @@ def test_the_additions_of_a_failed_update_are_rolled_back(
     model: type[GaussMarkovBias] | type[InflatedWeights],
 ) -> None:
     def add(chain: GaussMarkovBias | InflatedWeights, seconds: float) -> Additions:
-        additions = Additions(GraphSizes(10, 20, 30))
+        additions = Additions(NextIds(10, 20, 30))
         if isinstance(chain, InflatedWeights):
             chain.add(round(seconds * SECOND), None, additions)  # type: ignore[arg-type]
         else:
@@ -127,9 +127,9 @@ def test_the_additions_of_a_failed_update_are_rolled_back(
 def test_the_weights_of_measurements_within_two_time_constants_add_up_to_one() -> None:
     inflated = InflatedWeights(ERRORS._replace(tau=5.0))
     weights: dict[int, float] = {}
-    sizes = GraphSizes(1, 0, 0)
+    sizes = NextIds(1, 0, 0)
     for k, seconds in enumerate((20.5, 29.0, 31.0, 22.0)):
-        additions = Additions(sizes._replace(n_observed=k))
+        additions = Additions(sizes._replace(observed=k))
         inflated.add(round(seconds * SECOND), None, additions)  # type: ignore[arg-type]
         weights |= additions.weigh_observed
     assert weights == {0: 1 / 3, 1: 1 / 3, 2: 1.0, 3: 1 / 3}
@@ -146,10 +146,10 @@ def test_weights_are_renewed_in_turn_and_all_of_them_in_the_end(
 ) -> None:
     """Against the slow oracle, which sets all weights of a bin at each measurement."""
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(gauss_markov, 'RENEWED', renewed)
+        patch.setattr(error_models, 'RENEWED', renewed)
         inflated, weights, bins = InflatedWeights(ERRORS._replace(tau=5.0)), {}, {}
         for tenths, what in steps:
-            additions = Additions(GraphSizes(1, 0, len(weights)))
+            additions = Additions(NextIds(1, 0, len(weights)))
             inflated.begin()
             row = inflated.add(tenths * SECOND // 10, None, additions)  # type: ignore[arg-type]
             assert len(additions.weigh_observed) <= 2 * renewed + 1
@@ -162,12 +162,12 @@ def test_weights_are_renewed_in_turn_and_all_of_them_in_the_end(
                 n, least = len(rows), len(rows) - math.ceil(len(rows) / renewed)
                 assert all(1 / n <= weights[each] <= 1 / max(least, 1) for each in rows)
             if what == 2:
-                additions = Additions(GraphSizes(1, 0, len(weights)))
+                additions = Additions(NextIds(1, 0, len(weights)))
                 inflated.begin()
                 inflated.settle(additions)
                 weights |= additions.weigh_observed
                 assert weights == {row: 1 / len(rows) for rows in bins.values() for row in rows}
-        additions = Additions(GraphSizes(1, 0, len(weights)))
+        additions = Additions(NextIds(1, 0, len(weights)))
         inflated.settle(additions)
         weights |= additions.weigh_observed
         assert weights == {row: 1 / len(rows) for rows in bins.values() for row in rows}

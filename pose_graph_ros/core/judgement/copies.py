@@ -1,0 +1,65 @@
+# Copyright 2026 The pose_graph_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""
+Copies of a graph to decide on, in which nodes and constraints are numbered by their rows.
+
+What works on such a copy indexes arrays with these numbers; only its result is given ids again.
+"""
+
+from collections.abc import Mapping
+from dataclasses import replace
+
+from pose_graph_ros.core.graph.constraints import Edges, ObservedNodes
+from pose_graph_ros.core.graph.graph import Graph, GraphRows
+from pose_graph_ros.core.graph.reweighting import Reweighting
+
+
+def copied_rows(graph: Graph) -> GraphRows:
+    """Return copies of all rows of a graph, with rows in place of ids."""
+    rows = graph.rows()
+    observed = rows.observed
+    return rows._replace(edges=in_rows(graph, rows.edges), observed=ObservedNodes(
+        graph.node_rows(observed.node), *observed.columns[1:]))
+
+
+def in_rows(graph: Graph, edges: Edges) -> Edges:
+    """
+    Return edges whose ends are rows instead of ids.
+
+    Parameters
+    ----------
+    graph : Graph, that has the nodes
+    edges : Edges
+
+    """
+    return Edges(graph.node_rows(edges.i), graph.node_rows(edges.j), *edges.columns[2:])
+
+
+def weights_in_rows(graph: Graph, weights: Mapping[int, float]) -> dict[int, float]:
+    """
+    Return weights of edges by row instead of by id.
+
+    Parameters
+    ----------
+    graph : Graph
+    weights : mapping
+
+    """
+    return dict(zip(graph.edge_rows([*weights]).tolist(), weights.values(), strict=True))
+
+
+def losses_in_rows(graph: Graph, reweighting: Reweighting) -> Reweighting:
+    """
+    Return a copy of the losses of a graph, by row instead of by id.
+
+    Parameters
+    ----------
+    graph : Graph
+    reweighting : Reweighting, of its constraints
+
+    """
+    edges, observed = reweighting.saved()
+    copy = Reweighting()
+    copy.restore(replace(edges, rows=graph.edge_rows(edges.rows)),
+                 replace(observed, rows=graph.observed_rows(observed.rows)))
+    return copy

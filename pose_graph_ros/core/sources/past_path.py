@@ -1,0 +1,118 @@
+# Copyright 2026 The pose_graph_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""
+The positions of a source that have left the graph, with the motion by odometry between them.
+
+The statistics of its errors are estimated from these as well, as a window may be shorter than the
+time in which errors change. Their number is bounded: every second one is dropped when there are
+too many, and the motions on both sides of it are joined.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from pose_graph_ros.core.geometry import se2
+from pose_graph_ros.core.geometry.se2 import FloatArray, IntArray
+from pose_graph_ros.core.graph.constraints import full, upper
+from pose_graph_ros.core.saved_columns import Integers, Numbers, Rows2, Rows3, Rows6
+from pose_graph_ros.core.sources.error_likelihood import MeasuredPath
+
+# Number of positions that are left when some are dropped.
+KEPT = 1000
+
+
+@dataclass(frozen=True, slots=True)
+class PastPath:
+    """K positions in the order of their stamps; for the columns see `MeasuredPath`."""
+
+    stamps_ns: Integers
+    position: Rows2
+    variance: Numbers
+    offset: Rows2
+    motion: Rows3
+    """Shape (K + 1, 3); the last one leads to `node`."""
+    noise: Rows6
+    """Upper triangles of the covariances of the motions, shape (K + 1, 6)."""
+    node: int
+    """Id of the first node that is left in the graph."""
+
+    def continued(self, stamps_ns: IntArray, path: MeasuredPath) -> MeasuredPath:
+        """
+        Return the path with these positions before those that are in the graph.
+
+        Parameters
+        ----------
+        stamps_ns : ndarray of int, shape (M,)
+        path : MeasuredPath, whose first motion leads from `node` to the first position
+
+        """
+        motion, noise = _with_next(self, path.motion, path.noise)
+        stamps_ns = np.maximum.accumulate(np.concatenate((self.stamps_ns, stamps_ns)))
+        seconds = np.asarray((stamps_ns - stamps_ns[:1]) * 1e-9, dtype=np.float64)
+        return MeasuredPath(
+            seconds, np.concatenate((self.position, path.position)),
+            np.concatenate((self.variance, path.variance)),
+            np.concatenate((self.offset, path.offset)), motion, noise)
+
+    def extended(
+        self, stamps_ns: IntArray, path: MeasuredPath, node: int,
+    ) -> 'PastPath':
+        """
+        Return these positions with further ones.
+
+        Parameters
+        ----------
+        stamps_ns : ndarray of int, shape (M,)
+        path : MeasuredPath, with one more motion, to `node`; the first leads from the present one
+        node : int, id of the first node that is left then
+
+        """
+        motion, noise = _with_next(self, path.motion, path.noise)
+        grown = PastPath(
+            np.concatenate((self.stamps_ns, stamps_ns)),
+            np.concatenate((self.position, path.position)),
+            np.concatenate((self.variance, path.variance)),
+            np.concatenate((self.offset, path.offset)), motion, upper(noise), node)
+        return grown.thinned() if len(grown.stamps_ns) > 2 * KEPT else grown
+
+    def thinned(self) -> 'PastPath':
+        """Return every second position."""
+        n = len(self.stamps_ns) // 2 * 2
+        first, second = self.motion[:n:2], self.motion[1:n:2]
+        noises = full(self.noise)
+        joined, noise = _joined(first, noises[:n:2], second, noises[1:n:2])
+        rest, kept = slice(n, None), slice(1, n, 2)
+        every = np.arange(len(self.stamps_ns))
+        which = np.append(every[kept], every[rest])
+        return PastPath(
+            self.stamps_ns[which], self.position[which], self.variance[which],
+            self.offset[which], np.concatenate((joined, self.motion[rest])),
+            upper(np.concatenate((noise, noises[rest]))), self.node)
+
+
+def no_past(node: int) -> PastPath:
+    """Return a path without positions before a node, given by its id."""
+    return PastPath(np.empty(0, np.int64), np.empty((0, 2)), np.empty(0), np.empty((0, 2)),
+                    np.zeros((1, 3)), np.zeros((1, 6)), node)
+
+
+def _with_next(
+    past: PastPath, motion: FloatArray, noise: FloatArray,
+) -> tuple[FloatArray, FloatArray]:
+    """Return the motions of a path, the last of which is joined with the first of others."""
+    noises = full(past.noise)
+    if len(motion) == 0:
+        return past.motion[:-1], noises[:-1]
+    joined, joint_noise = _joined(past.motion[-1:], noises[-1:], motion[:1], noise[:1])
+    return (np.concatenate((past.motion[:-1], joined, motion[1:])),
+            np.concatenate((noises[:-1], joint_noise, noise[1:])))
+
+
+def _joined(
+    first: FloatArray, noise_first: FloatArray, second: FloatArray, noise_second: FloatArray,
+) -> tuple[FloatArray, FloatArray]:
+    """Return motions one after the other, and their covariances in the frames at their ends."""
+    adjoint = se2.adjoint(se2.inverse(second))
+    return (np.asarray(se2.compose(first, second)),
+            adjoint @ noise_first @ np.swapaxes(adjoint, 1, 2) + noise_second)
