@@ -124,7 +124,7 @@ class Beliefs:
             **self._odometry.doubts, **self._odometry.doubted(
                 graph, (found.jump,), self.now_ns, self._states.name)}
         self.trial.begin(changes, self.weights_with(changes, self._doubts),
-                         continued(graph, found.poses[graph.node_rows(found.nodes) >= 0]))
+                         continued(graph, found.poses, found.nodes))
 
     def believe_odometry_again(self) -> bool:
         """Believe odometry that no believed closure leads over; tell whether there was any."""

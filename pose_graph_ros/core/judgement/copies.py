@@ -9,8 +9,10 @@ What works on such a copy indexes arrays with these numbers; only its result is 
 from collections.abc import Mapping
 from dataclasses import replace
 
+import numpy as np
+
 from pose_graph_ros.core.graph.constraints import Edges, ObservedNodes
-from pose_graph_ros.core.graph.graph import Graph, GraphRows
+from pose_graph_ros.core.graph.graph import Graph, GraphRows, NextIds
 from pose_graph_ros.core.graph.reweighting import Reweighting
 
 
@@ -18,8 +20,12 @@ def copied_rows(graph: Graph) -> GraphRows:
     """Return copies of all rows of a graph, with rows in place of ids."""
     rows = graph.rows()
     observed = rows.observed
-    return rows._replace(edges=in_rows(graph, rows.edges), observed=ObservedNodes(
-        graph.node_rows(observed.node), *observed.columns[1:]))
+    n_nodes, n_edges, n_observed = len(rows.poses), len(rows.edges), len(observed)
+    return rows._replace(
+        edges=in_rows(graph, rows.edges), observed=ObservedNodes(
+            graph.node_rows(observed.node), *observed.columns[1:]),
+        node_ids=np.arange(n_nodes), edge_ids=np.arange(n_edges),
+        observed_ids=np.arange(n_observed), next_ids=NextIds(n_nodes, n_edges, n_observed))
 
 
 def in_rows(graph: Graph, edges: Edges) -> Edges:
