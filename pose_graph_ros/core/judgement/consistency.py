@@ -102,7 +102,7 @@ class OdometryChain:
     def extend(self, graph: Graph) -> None:
         """Append the nodes that were added to the graph since; the work is linear in these."""
         if len(self) == 0:
-            first = np.flatnonzero(~graph.is_bias)[:1]
+            first = _first(graph)
             if len(first) == 0:
                 return
             self._nodes.append(first if self._by_row else graph.node_ids[first])
@@ -217,6 +217,16 @@ class OdometryChain:
             return np.full(len(nodes), -1)
         at = np.minimum(np.searchsorted(own, nodes), len(own) - 1)
         return np.where(own[at] == nodes, at, -1)
+
+
+def _first(graph: Graph) -> IntArray:
+    """Return the row of the pose that odometry begins at, shape (1,), or (0,) without poses."""
+    ends = graph.memory['edge_i'][:graph.n_edges]
+    odometry = ends[ends[:, tb.EDGE_KIND] == EdgeKind.ODOMETRY]
+    if len(odometry) == 0:
+        return np.flatnonzero(~graph.is_bias)[:1]
+    # a node before it may have no odometry any more, as all nodes in between have left
+    return odometry[np.argmin(odometry[:, tb.END_J])][[tb.END_I]].copy()
 
 
 @kernel(signature=(

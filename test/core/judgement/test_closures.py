@@ -201,7 +201,8 @@ def test_a_closure_that_fits_outside_of_the_graph_only_does_not_keep_the_judge_b
     rng = np.random.default_rng(16)
     backend = run(true_ones(rng), last=200)
     judge = backend._judge._closures
-    monkeypatch.setattr(judge, '_may_not_fit', lambda numbers: numbers == 7)
+    monkeypatch.setattr(
+        relative, 'are_above', lambda graph, edges, limit: edges == judge.states.edge[7])
     monkeypatch.setattr(relative, 'residuals', lambda _, some: np.full(len(some.i), 2.0 * GATE))
     rounds = 0
     while judge.work():

@@ -24,5 +24,6 @@ def test_every_residual_above_the_gate_is_looked_at(seed: int) -> None:
             1.0, 1.0, 0.1)
         backend.graph.set_poses(se2.wrapped(poses))
         bad = relative.residuals(backend.graph, judge._table.rows(inside)) > GATE
-        assert np.all(judge._may_not_fit(inside)[bad])
+        assert np.all(relative.are_above(
+            backend.graph, judge._states.edge[inside], 0.5 * GATE)[bad])
     assert np.any(bad)
