@@ -208,10 +208,11 @@ class PoseGraphBackend:
         self._pipeline.attach_due()
 
     def _make_node(self, mean: FloatArray, information: FloatArray | None, source: str) -> int:
-        """Append a hidden node to the graph; return its row, or -1 if the solver failed."""
+        """Append a hidden node to the graph; return its id, or -1 if the solver failed."""
         if information is None:
-            self._smoother.update(GraphUpdate(hidden=mean[None], fix=(0,)))
-            return 0
+            first = self.graph.next_ids.node
+            self._smoother.update(GraphUpdate(hidden=mean[None], fix=(first,)))
+            return first
         result = self._smoother.extend(mean, information, self._tuner.odometry_weight)
         if result.status is Status.FAILED:
             # the next sample tries again, with a longer motion
@@ -308,7 +309,7 @@ class PoseGraphBackend:
             if T_map_graph is not None:
                 transaction.move_graph(T_map_graph)
             # once aligned, measurements fix the gauge, and the first node is no longer fixed
-            freed = () if T_map_graph is None else (0,)
+            freed = () if T_map_graph is None else self.graph.node_ids[self.graph.fixed].tolist()
             change = self._factors.build(queue, self.graph)._replace(free=freed)
             change = self._judge.before(self._factors.new, change, self._nodes.newest_ns)
             transaction.solved(self._judge.solve(change))

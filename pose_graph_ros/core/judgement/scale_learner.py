@@ -96,7 +96,8 @@ class ScaleLearner:
         for source in range(len(self._states.sources)):
             n_believed, before = int(np.sum(self._of(source))), self._learnt_from[source]
             n = n_believed + self._beliefs.scales_left[source].n
-            if n - before >= MORE * min(n_believed, before) + AND_MORE:
+            if n_believed >= AND_MORE and n - before >= (
+                    MORE * min(n_believed, before) + AND_MORE):
                 self._learnt_from[source] = n
                 if self._learn(source):
                     return True
