@@ -1,0 +1,133 @@
+# Copyright 2026 The pose_graph_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""What judgement keeps of nodes and constraints that have left the graph."""
+
+import math
+
+from hypothesis import given, settings, strategies as st
+import numpy as np
+from test_consistency import Drive
+
+from pose_graph_ros.core.judgement.closure_states import ClosureStates, STATES
+from pose_graph_ros.core.judgement.consistency import OdometryChain
+from pose_graph_ros.core.judgement.residual_scale import ScaleLeft, together
+from pose_graph_ros.core.judgement.run_choice import best_runs, without_old
+from pose_graph_ros.core.judgement.runs import Run, Transition
+from pose_graph_ros.core.judgement.tracks import Track
+from pose_graph_ros.core.judgement.verdicts import State
+from pose_graph_ros.core.measurements import LoopClosure
+from pose_graph_ros.core.sources.constraint_queue import NewConstraint
+
+SECOND = 1_000_000_000
+seeds = st.integers(0, 2**32 - 1)
+
+
+@settings(max_examples=15)
+@given(seeds)
+def test_the_motion_between_nodes_that_stay_is_known_as_before(seed: int) -> None:
+    drive, chain, whole = Drive(seed, 30), OdometryChain(), OdometryChain()
+    for each in (chain, whole):
+        each.extend(drive.smoother.graph)
+    left = np.array(drive.rows)
+    while len(left) > 2:
+        # from the beginning, and some from the middle
+        gone = np.unique(np.append(left[:-1][:3], drive.rng.choice(left[:-1], 1)))
+        chain.forget(gone)
+        left = np.setdiff1d(left, gone)
+        assert chain.nodes.tolist() == left.tolist()
+        i, j = np.meshgrid(left, left)
+        for one, other in zip(chain.between(i.ravel(), j.ravel()),
+                              whole.between(i.ravel(), j.ravel()), strict=True):
+            np.testing.assert_allclose(one, other, atol=1e-9)
+        np.testing.assert_array_equal(chain.travel(left), whole.travel(left))
+    drive.smoother.extend(np.array([1.0, 0.2, 0.1]), np.eye(3))
+    for each in (chain, whole):
+        each.extend(drive.smoother.graph)
+    assert len(chain) == len(left) + 1
+    ends = chain.nodes[[0]], chain.nodes[[-1]]
+    for one, other in zip(chain.between(*ends), whole.between(*ends), strict=True):
+        np.testing.assert_allclose(one, other, atol=1e-9)
+
+
+def track(node: int) -> Track:
+    return Track(node, np.zeros(3), np.eye(3))
+
+
+def some_runs(rng: np.random.Generator) -> list[Run]:
+    """Return runs of some seconds each, with the prices to believe one after another."""
+    runs = []
+    for number in range(7):
+        begin = int(rng.integers(0, 60))
+        run = Run(number, begin * SECOND, track(begin), believed=False)
+        end = begin + int(rng.integers(1, 20))
+        run.end_ns, run.track, run.seconds = end * SECOND, track(end), float(end - begin)
+        runs.append(run)
+    for run in runs:
+        run.prices = {other.number: [Transition(
+            float(rng.uniform(0.0, 25.0)), float(rng.choice([1.0, 9.0])))] for other in runs}
+    return runs
+
+
+@given(seeds)
+def test_the_best_runs_stay_the_best_when_old_ones_are_forgotten(seed: int) -> None:
+    rng, chain = np.random.default_rng(seed), OdometryChain()
+    runs = some_runs(rng)
+    newest = max(runs, key=lambda run: run.end_ns)
+    expected = best_runs(runs, chain)
+    for node in (20, 35, 50):
+        runs = without_old(runs, node, newest, chain)
+        assert all(run.track.node >= node or run is newest for run in runs)
+        chosen = best_runs(runs, chain)
+        if not any(run in runs for run, _ in expected):
+            break   # what is the best at present has left as a whole
+        assert [run.number for run, _ in chosen] == [
+            run.number for run, _ in expected if run in runs]
+        # with what was jumped over up to there
+        jumps = [way.scale for (_, way), (run, _) in zip(expected[1:], expected[1:], strict=True)
+                 if way.scale > 1.0]
+        found = [scale for _, _, scale in chosen[0][0].jumps_before] + [
+            way.scale for _, way in chosen[1:] if way.scale > 1.0]
+        assert found == jumps
+
+
+def added(states: ClosureStates, edges: range) -> None:
+    states.append([NewConstraint(True, edge, 'scan', edge * SECOND, LoopClosure, 0)
+                   for edge in edges], 0)
+
+
+def test_closures_that_have_left_are_counted_and_keep_their_names() -> None:
+    states = ClosureStates()
+    added(states, range(10, 20))
+    believed, doubted = STATES.index(State.BELIEVED), STATES.index(State.DOUBTED)
+    states.state[:] = [believed, doubted] * 5
+    states.leave(np.array([10, 11, 12, 99]))
+    assert states.n_left(0) == (3, 1)
+    assert states.record(0) == (5, 5)
+    assert np.count_nonzero(states.in_graph) == 3
+    for _ in range(2):
+        assert (states.find('scan/1'), states.has_left('scan/1')) == (-1, True)
+        assert states.name(states.find('scan/4')) == 'scan/4'
+        assert not states.has_left('scan/10')
+        assert states.n_left(0) == (3, 1)
+        states.select(np.flatnonzero(~states.left))
+        assert len(states) == 7
+    saved, again = states.saved([1.5]), ClosureStates()
+    again.restore(saved)
+    for each in (states, again):
+        added(each, range(30, 31))
+        assert each.name(7) == 'scan/10'
+        assert each.record(0) == (5, 5)
+        assert each.n_left(0) == (3, 1)
+        assert each.has_left('scan/2')
+
+
+def test_the_scale_of_a_source_outlives_its_closures() -> None:
+    left = ScaleLeft()
+    assert together(1.44, 30.0, left) == 1.44
+    left.add(50, 1.2**3)
+    assert together(1.0, 0.0, left) == 1.2**3
+    # those in the graph count as well
+    assert 1.2 <= together(1.0, 40.0, left) < 1.2**3
+    for _ in range(10):
+        left.add(50, 1.0)
+    assert math.isclose(left.scale, 1.0, rel_tol=1e-3)
