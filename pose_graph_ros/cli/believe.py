@@ -2,7 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Which loop closures of a graph from a file to believe; part of the tool `pose-graph solve`."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -50,11 +50,13 @@ def believe(graph: Graph, sigmas: FloatArray) -> BelievedEdges | None:
 
     """
     edges = forward(graph.edges)
-    is_closure = np.abs(edges.j - edges.i) != 1
-    kind = np.where(is_closure, EdgeKind.LOOP_CLOSURE, EdgeKind.ODOMETRY).astype(np.uint8)
+    is_motion = edges.kind <= EdgeKind.LOOP_CLOSURE
+    is_closure = is_motion & (np.abs(edges.j - edges.i) != 1)
+    kind = np.where(is_closure, EdgeKind.LOOP_CLOSURE, np.where(
+        is_motion, EdgeKind.ODOMETRY, edges.kind)).astype(np.uint8)
     given, softened = edges.information, floored(edges, sigmas).information
     information = np.where(is_closure[:, None, None], softened, given)
-    edges = Edges(edges.i, edges.j, edges.mean, information, kind, edges.weight, edges.bias)
+    edges = replace(edges, information=information, kind=kind)
     closures = np.flatnonzero(is_closure & (edges.weight > 0.0) & (edges.i != edges.j))
     parts = _Parts(graph.n_nodes)
     parts.join(edges.rows(~is_closure))
@@ -70,8 +72,7 @@ def believe(graph: Graph, sigmas: FloatArray) -> BelievedEdges | None:
     doubted = best_rows[~best.believed]
     believed = ~np.isin(closures, doubted)
     copy = Graph()
-    copy.fill(graph.rows()._replace(edges=Edges(
-        edges.i, edges.j, edges.mean, given, kind, edges.weight, edges.bias)))
+    copy.fill(graph.rows()._replace(edges=replace(edges, information=given)))
     copy.apply(GraphUpdate(remove_edges=doubted.tolist()))
     copy.set_poses(best.poses)
     scale = give_scale(copy, closures[believed])

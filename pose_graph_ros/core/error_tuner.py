@@ -126,7 +126,7 @@ class ErrorTuner:
                 self._move(PART)
             else:
                 self._weigh_odometry()
-            moved = np.abs(graph.poses[:len(before)] - before)[~graph.is_bias[:len(before)], :2]
+            moved = np.abs(graph.poses[:len(before)] - before)[graph.is_pose[:len(before)], :2]
             return float(np.max(moved, initial=0.0))
         if self._search is None:
             self._search = self._next_search()
@@ -191,7 +191,7 @@ class ErrorTuner:
         """
         graph = self._smoother.graph
         edges, observed = constraints_on(graph, nodes)
-        stays = ~graph.is_bias
+        stays = graph.is_pose
         stays[graph.node_rows(nodes)] = False
         first = int(graph.node_ids[np.argmax(stays)])
         self._past = {}

@@ -120,7 +120,7 @@ class Refiner:
                 result = self._smoother.update(
                     GraphUpdate(weigh_edges=edges, weigh_observed=observed))
                 self.finished = result.status is Status.FAILED
-                by_weights = np.max(np.abs(graph.poses - before)[~graph.is_bias, :2], initial=0.0)
+                by_weights = np.max(np.abs(graph.poses - before)[graph.is_pose, :2], initial=0.0)
                 return Refinement(finished=self.finished, moved=max(moved, float(by_weights)))
             self._unchanged, self._cursor = self._unchanged + PART, (self._cursor + PART) % size
         self.finished = True

@@ -198,15 +198,13 @@ def information(graph: Graph, nodes: list[int] | None = None) -> FloatArray:
     # the constraints of a clique turn with its frame
     turn = np.array([frame_turn(graph, c) for c in graph.memory['edge_i'][:m, tb.OWNER]])
     ends[:m, 2] = (np.arctan2(rows[:, tb.LIN_SIN], rows[:, tb.LIN_COS]) - edges.mean[:, 2] + turn)
-    # the heading of an edge to a bias follows from its arm
+    # an edge to a bias has the heading itself
     to_bias = edges.kind == EdgeKind.BIAS
     assert np.all(turn[to_bias & (edges.weight > 0.0)] == 0.0)
-    ends[:m][to_bias, 2] = (
-        np.arctan2(rows[to_bias, tb.BIAS_ARM + 1], rows[to_bias, tb.BIAS_ARM])
-        - np.arctan2(edges.bias[to_bias, 1], edges.bias[to_bias, 0]))
-    difference = rows[:, tb.LIN_D:tb.LIN_D + 2]
+    ends[:m][to_bias, 2] += edges.mean[to_bias, 2]
+    difference = rows[:, tb.LIN_ARM:tb.LIN_ARM + 2]
     ends[m:, :2] = np.einsum('mij,mj->mi', se2.rotation(turn), difference)
-    hidden[:, 2] = graph.memory['node_f'][observed.node, tb.REF + 2] + unary[:, tb.OBS_TH]
+    hidden[:, 2] = graph.memory['node_f'][observed.node, tb.REF + 2] + unary[:, tb.LIN_TH]
     edge = jacobians.linearize_edges(ends, Edges(
         np.arange(m), m + np.arange(m), edges.mean, edges.information, edges.kind,
         bias=edges.bias))

@@ -38,7 +38,7 @@ def chordal(graph: Graph, cliques: symbolic.Cliques) -> FloatArray:
     Return initial poses, shape (N, 3), from the constraints and the poses of fixed nodes alone.
 
     Raises LinearSolveError if headings or positions are not determined, for example if only
-    positions are observed, or if the graph has biases.
+    positions are observed, or if the graph has nodes that are no poses.
 
     Parameters
     ----------
@@ -47,8 +47,8 @@ def chordal(graph: Graph, cliques: symbolic.Cliques) -> FloatArray:
 
     """
     head = graph.memory.head
-    if _n_biases(head) > 0:
-        raise LinearSolveError('chordal start: a bias has no heading')
+    if _n_others(head) > 0:
+        raise LinearSolveError('chordal start: a bias or a landmark has no heading')
     u, bad = complex_system.solve(head, cliques, _rotation_terms(head))
     length = np.hypot(u[:, 0], u[:, 1])
     if bad >= 0:
@@ -65,10 +65,10 @@ def chordal(graph: Graph, cliques: symbolic.Cliques) -> FloatArray:
 
 
 @kernel(signature=(tb.HEAD,))
-def _n_biases(head):  # type: ignore[no-untyped-def]
+def _n_others(head):  # type: ignore[no-untyped-def]
     node_i, n = tb.node_i(head), 0
     for v in range(head[tb.N_NODES]):
-        n += node_i[v, tb.IS_BIAS]
+        n += node_i[v, tb.NODE_KIND] != 0
     return n
 
 
@@ -89,7 +89,7 @@ def _rotation_terms(head):  # type: ignore[no-untyped-def]
     of_observed = np.empty((head[tb.N_OBSERVED], 3))
     for k in range(head[tb.N_OBSERVED]):
         f = observed_f[k]
-        theta = f[tb.MEAN + 2] - f[tb.OBS_OFFSET + 2]
+        theta = f[tb.MEAN + 2] - f[tb.OFFSET + 2]
         of_observed[k, 0] = f[tb.WEIGHT] * f[tb.INFO + 5]
         of_observed[k, 1], of_observed[k, 2] = math.cos(theta), math.sin(theta)
     return Terms(of_edges, of_observed, known)
@@ -113,7 +113,7 @@ def _translation_terms(head, u):  # type: ignore[no-untyped-def]
     of_observed = np.empty((head[tb.N_OBSERVED], 3))
     for k in range(head[tb.N_OBSERVED]):
         f, v = observed_f[k], observed_i[k, tb.OBS_NODE]
-        x, y = f[tb.OBS_OFFSET], f[tb.OBS_OFFSET + 1]
+        x, y = f[tb.OFFSET], f[tb.OFFSET + 1]
         of_observed[k, 0] = 0.5 * f[tb.WEIGHT] * (f[tb.INFO] + f[tb.INFO + 3])
         of_observed[k, 1] = f[tb.MEAN] - (u[v, 0] * x - u[v, 1] * y)
         of_observed[k, 2] = f[tb.MEAN + 1] - (u[v, 1] * x + u[v, 0] * y)

@@ -167,9 +167,9 @@ def _add_constraints(head, members, rows, terms, front):  # type: ignore[no-unty
     for k in range(rows):
         entry = node_i[members[k], tb.EDGE_LIST]
         while entry >= 0:
-            e, side = entry >> 1, entry & 1
-            other = edge_i[e, tb.END_I if side == 1 else tb.END_J]
-            entry = edge_i[e, tb.NEXT_J if side == 1 else tb.NEXT_I]
+            e, side = entry >> 2, entry & 3
+            other = edge_i[e, 1 - side]     # no edge has a third end: all nodes are poses
+            entry = edge_i[e, tb.NEXT_I + side]
             w = of_edges[e, 0]
             if w <= 0.0 or node_i[other, tb.FRONT] != serial:
                 continue

@@ -12,8 +12,6 @@ a whole iteration. Near the minimum it converges nearly as fast as Gauss-Newton;
 the Jacobians change fast, it does not converge.
 """
 
-import math
-
 from pose_graph_ros.core.compiled.jit import kernel, NUMBER, ROWS
 from pose_graph_ros.core.elimination.assembly import eliminate_clique
 from pose_graph_ros.core.elimination.fronts import backward_rows, forward_rows, solve_rows
@@ -201,83 +199,24 @@ def evaluate(head, right):  # type: ignore[no-untyped-def]
     `right`, shape (N, 3), receives -b: half the gradient of chi2, with negative sign.
     """
     node_f, edge_f, observed_f = tb.node_f(head), tb.edge_f(head), tb.observed_f(head)
-    edge_i, observed_i = tb.edge_i(head), tb.observed_i(head)
     right[:] = 0.0
     chi2 = gradient_sum = cancelled = reach = 0.0
     for e in range(head[tb.N_EDGES]):
-        f = edge_f[e]
-        w = f[tb.WEIGHT]
-        if w > 0.0:
-            i, j = edge_i[e, tb.END_I], edge_i[e, tb.END_J]
-            start, end = node_f[i], node_f[j]
-            if edge_i[e, tb.EDGE_KIND] == factors.BIAS:
-                ex, ey, eth, dx, dy = factors.error_to_bias(f, start, end)
-                gx, gy, gth, energy, terms = _weighted_error(f, ex, ey, eth)
-                chi2 += energy
-                cancelled += terms
-                gradient_sum += abs(gx) + abs(gy)
-                right[i, 0] += gx
-                right[i, 1] += gy
-                right[i, 2] += dx * gy - dy * gx + gth
-                right[j, 0] -= f[tb.FACTOR_T] * gx
-                right[j, 1] -= f[tb.FACTOR_T] * gy
-                right[j, 2] -= f[tb.FACTOR_TH] * gth
-                continue
-            phi = start[tb.POSE + 2] + f[tb.MEAN + 2]
-            c, s = math.cos(phi), math.sin(phi)
-            dx, dy = end[tb.POSE] - start[tb.POSE], end[tb.POSE + 1] - start[tb.POSE + 1]
-            ex, ey = c * dx + s * dy - f[tb.OWN_T], c * dy - s * dx - f[tb.OWN_T + 1]
-            eth = factors.wrap(end[tb.POSE + 2] - start[tb.POSE + 2] - f[tb.MEAN + 2])
-            gx, gy, gth, energy, terms = _weighted_error(f, ex, ey, eth)
+        if edge_f[e, tb.WEIGHT] > 0.0:
+            energy, size, terms = factors.edge_gradient(head, e, right)
             chi2 += energy
+            gradient_sum += size
             cancelled += terms
-            gx, gy = c * gx - s * gy, s * gx + c * gy
-            gradient_sum += abs(gx) + abs(gy)
-            right[i, 0] += gx
-            right[i, 1] += gy
-            right[i, 2] += dx * gy - dy * gx + gth
-            right[j, 0] -= gx
-            right[j, 1] -= gy
-            right[j, 2] -= gth
     for k in range(head[tb.N_OBSERVED]):
-        f = observed_f[k]
-        if f[tb.WEIGHT] > 0.0:
-            v = observed_i[k, tb.OBS_NODE]
-            node = node_f[v]
-            c, s = math.cos(node[tb.POSE + 2]), math.sin(node[tb.POSE + 2])
-            ax = c * f[tb.OBS_OFFSET] - s * f[tb.OBS_OFFSET + 1]
-            ay = s * f[tb.OBS_OFFSET] + c * f[tb.OBS_OFFSET + 1]
-            c, s = math.cos(f[tb.MEAN + 2]), math.sin(f[tb.MEAN + 2])
-            dx, dy = node[tb.POSE] + ax - f[tb.MEAN], node[tb.POSE + 1] + ay - f[tb.MEAN + 1]
-            eth = factors.wrap(node[tb.POSE + 2] + f[tb.OBS_OFFSET + 2] - f[tb.MEAN + 2])
-            gx, gy, gth, energy, terms = _weighted_error(
-                f, c * dx + s * dy, c * dy - s * dx, eth)
+        if observed_f[k, tb.WEIGHT] > 0.0:
+            energy, size, terms = factors.observed_gradient(head, k, right)
             chi2 += energy
+            gradient_sum += size
             cancelled += terms
-            gx, gy = c * gx - s * gy, s * gx + c * gy
-            gradient_sum += abs(gx) + abs(gy)
-            right[v, 0] -= gx
-            right[v, 1] -= gy
-            right[v, 2] -= ax * gy - ay * gx + gth
     for v in range(head[tb.N_NODES]):
         reach = max(reach, abs(node_f[v, tb.POSE]), abs(node_f[v, tb.POSE + 1]))
     return chi2, SUM_ROUNDING * max(chi2, 1.0) + COORDINATE_ROUNDING * (
         reach * gradient_sum + cancelled)
-
-
-@kernel
-def _weighted_error(f, ex, ey, eth):  # type: ignore[no-untyped-def]
-    """
-    Return W e, e^T W e and the sum of its diagonal terms, given a constraint's row and error e.
-
-    The terms cancel each other where W is nearly singular.
-    """
-    i, w = tb.INFO, f[tb.WEIGHT]
-    gx = w * (f[i] * ex + f[i + 1] * ey + f[i + 2] * eth)
-    gy = w * (f[i + 1] * ex + f[i + 3] * ey + f[i + 4] * eth)
-    gth = w * (f[i + 2] * ex + f[i + 4] * ey + f[i + 5] * eth)
-    terms = w * (f[i] * ex * ex + f[i + 3] * ey * ey + f[i + 5] * eth * eth)
-    return gx, gy, gth, ex * gx + ey * gy + eth * gth, terms
 
 
 @kernel(signature=(tb.HEAD, ROWS))
@@ -317,8 +256,8 @@ def settle(head):  # type: ignore[no-untyped-def]
         observed_i[k, tb.OBS_WAITS] = 0
         if observed_f[k, tb.WEIGHT] > 0.0:
             factors.check_observed(head, k)
-            chi2 += observed_f[k, tb.OBS_ENERGY]
-            error2 += observed_f[k, tb.OBS_ERROR2]
+            chi2 += observed_f[k, tb.ENERGY]
+            error2 += observed_f[k, tb.ERROR2]
     scalars[tb.CHI2] = chi2
     head[tb.N_WAITING] = head[tb.N_TURNED] = head[tb.REFINED] = head[tb.LISTED] = 0
     if not 0.0 < scalars[tb.SETTING_BUDGET] < error2:
@@ -330,7 +269,7 @@ def settle(head):  # type: ignore[no-untyped-def]
             waiting[head[tb.N_WAITING]] = e
             head[tb.N_WAITING] += 1
     for k in range(head[tb.N_OBSERVED]):
-        if observed_f[k, tb.OBS_ERROR2] > threshold:
+        if observed_f[k, tb.ERROR2] > threshold:
             observed_i[k, tb.OBS_WAITS] = 1
             waiting[head[tb.N_WAITING]] = -1 - k
             head[tb.N_WAITING] += 1

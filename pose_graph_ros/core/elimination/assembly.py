@@ -7,6 +7,7 @@ from pose_graph_ros.core.compiled.simd import add, copy
 from pose_graph_ros.core.elimination import clique_frames
 from pose_graph_ros.core.elimination.fronts import factorize, LEAST_PIVOT, padded
 from pose_graph_ros.core.graph import factors, tables as tb, transaction_log
+from pose_graph_ros.core.graph.constraints import EdgeKind
 from pose_graph_ros.core.graph.pools import row_start, triangle_size
 
 # Where constraints are stiff in one direction and weak in another, as those of a turn on the spot,
@@ -14,6 +15,9 @@ from pose_graph_ros.core.graph.pools import row_start, triangle_size
 # add in their weakest direction, and, because of rounding, of all that they add.
 LEAST_WEAK_PIVOT = 1e-9
 LEAST_STIFF_PIVOT = 1e-15
+# Edges of this kind and the ones after it have a node that is no pose, so the axes of their errors
+# or unknowns do not turn with a clique.
+FIRST_ANCHORING = int(EdgeKind.BIAS)
 
 
 @kernel
@@ -61,28 +65,28 @@ def _eliminate(head, c, relinearize, by_weakest):  # type: ignore[no-untyped-def
     for k in range(n_all):
         node_i[nodes[k], tb.INDEX] = 3 * k
         node_i[nodes[k], tb.FRONT] = serial
-    any_fixed, anchored = False, 0
+    any_fixed, any_padded, anchored = False, False, 0
     for k in range(n_frontal):
         v = nodes[k]
         entry = node_i[v, tb.EDGE_LIST]
         while entry >= 0:
-            e, side = entry >> 1, entry & 1
-            other = edge_i[e, tb.END_I if side == 1 else tb.END_J]
-            if node_i[other, tb.FRONT] == serial:
-                at = node_i[other, tb.INDEX]
-                # an edge between two frontal nodes is in both lists: added from its start
-                if at >= rows or side == 0:
-                    if relinearize:
-                        transaction_log.log_edge(head, e)
-                        factors.linearize_edge(head, e)
-                    edge_i[e, tb.OWNER] = c
-                    if edge_i[e, tb.EDGE_KIND] == factors.BIAS:
-                        anchored = 1    # its error changes if both ends move together
-                    if side == 0:
-                        factors.add_edge(head, e, 3 * k, at, front, ld)
-                    else:
-                        factors.add_edge(head, e, at, 3 * k, front, ld)
-            entry = edge_i[e, tb.NEXT_J if side == 1 else tb.NEXT_I]
+            e, side = entry >> 2, entry & 3
+            entry = edge_i[e, tb.NEXT_I + side]
+            # an edge between frontal nodes is in all their lists: added from the first of its ends
+            at_i, at_j = _place(head, edge_i[e, tb.END_I]), _place(head, edge_i[e, tb.END_J])
+            if at_i < 0 or at_j < 0 or (side > 0 and at_i < rows):
+                continue
+            at_k, third = -1, edge_i[e, tb.END_K]
+            if third >= 0:
+                at_k = _place(head, third)
+                if at_k < 0 or (side == 2 and at_j < rows):
+                    continue
+            if relinearize:
+                transaction_log.log_edge(head, e)
+                factors.linearize_edge(head, e)
+            edge_i[e, tb.OWNER] = c
+            anchored |= edge_i[e, tb.EDGE_KIND] >= FIRST_ANCHORING
+            factors.add_edge(head, e, at_i, at_j, at_k, front, ld)
         entry = node_i[v, tb.OBSERVED_LIST]
         while entry >= 0:
             anchored = 1
@@ -105,6 +109,9 @@ def _eliminate(head, c, relinearize, by_weakest):  # type: ignore[no-untyped-def
                 front[(3 * k + m + 1) * ld - 1] += more * node_f[v, tb.DELTA + m]
         if node_i[v, tb.FIXED] != 0:
             any_fixed, anchored = True, 1
+        for m in range(node_i[v, tb.DIMENSION], 3):
+            front[(3 * k + m) * (ld + 1)] += 1.0
+            any_padded = True
     child = row[tb.CHILD]
     while child >= 0:
         _extend_add(head, child, front, ld)
@@ -121,6 +128,11 @@ def _eliminate(head, c, relinearize, by_weakest):  # type: ignore[no-untyped-def
     bad = factorize(front, rows, n, ld, least)
     if bad >= 0:
         return nodes[bad // 3]
+    if any_padded:
+        # 0 for the reciprocal of the pivot: the coordinate is 0, without uncertainty
+        for k in range(n_frontal):
+            for m in range(3 * k + node_i[nodes[k], tb.DIMENSION], 3 * k + 3):
+                front[m * (ld + 1)] = 0.0
     # the rows of R, directly followed by the update matrix
     at = row[tb.VALUES]
     for k in range(n):
@@ -138,6 +150,13 @@ def _eliminate(head, c, relinearize, by_weakest):  # type: ignore[no-untyped-def
 
 
 @kernel
+def _place(head, v):  # type: ignore[no-untyped-def]
+    """Return the row of the present front at which the block of a node begins, or -1."""
+    node_i = tb.node_i(head)
+    return node_i[v, tb.INDEX] if node_i[v, tb.FRONT] == head[tb.FRONT_SERIAL] else -1
+
+
+@kernel
 def _lower_bounds(head, v, least):  # type: ignore[no-untyped-def]
     """Lower the bounds of a node's pivots, shape (3,), where its constraints are weak."""
     edge_f, observed_f, node_i = tb.edge_f(head), tb.observed_f(head), tb.node_i(head)
@@ -145,8 +164,8 @@ def _lower_bounds(head, v, least):  # type: ignore[no-untyped-def]
     weak_t = weak_r = 0.0
     entry = node_i[v, tb.EDGE_LIST]
     while entry >= 0:
-        e, side = entry >> 1, entry & 1
-        entry = edge_i[e, tb.NEXT_J if side == 1 else tb.NEXT_I]
+        e = entry >> 2
+        entry = edge_i[e, tb.NEXT_I + (entry & 3)]
         t, r = factors.weakest(edge_f[e])
         weak_t, weak_r = weak_t + t, weak_r + r
     entry = node_i[v, tb.OBSERVED_LIST]

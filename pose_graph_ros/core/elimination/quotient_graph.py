@@ -79,11 +79,12 @@ def structure(head, marked, affected):  # type: ignore[no-untyped-def]
     for k in range(n):
         entry = node_i[affected[k], tb.EDGE_LIST]
         while entry >= 0:
-            e, side = entry >> 1, entry & 1
-            other = edge_i[e, tb.END_I if side == 1 else tb.END_J]
-            if node_i[other, tb.FRONT] == serial:
-                count[k] += 1
-            entry = edge_i[e, tb.NEXT_J if side == 1 else tb.NEXT_I]
+            e, side = entry >> 2, entry & 3
+            for m in range(3):
+                other = edge_i[e, m]
+                if m != side and other >= 0 and node_i[other, tb.FRONT] == serial:
+                    count[k] += 1
+            entry = edge_i[e, tb.NEXT_I + side]
     start = np.empty(n + n_orphans + 1, np.int32)
     start[0] = 0
     for k in range(n):
@@ -116,15 +117,16 @@ def structure(head, marked, affected):  # type: ignore[no-untyped-def]
         entry = node_i[affected[k], tb.EDGE_LIST]
         end = begin_neighbours
         while entry >= 0:
-            e, side = entry >> 1, entry & 1
-            other = edge_i[e, tb.END_I if side == 1 else tb.END_J]
-            if node_i[other, tb.FRONT] == serial:
-                i = node_i[other, tb.INDEX]
-                if last_seen[i] != k:
-                    last_seen[i] = k
-                    adjacency[end] = i
-                    end += 1
-            entry = edge_i[e, tb.NEXT_J if side == 1 else tb.NEXT_I]
+            e, side = entry >> 2, entry & 3
+            for m in range(3):
+                other = edge_i[e, m]
+                if m != side and other >= 0 and node_i[other, tb.FRONT] == serial:
+                    i = node_i[other, tb.INDEX]
+                    if last_seen[i] != k:
+                        last_seen[i] = k
+                        adjacency[end] = i
+                        end += 1
+            entry = edge_i[e, tb.NEXT_I + side]
         # close the gaps left by repeated neighbours
         for m in range(begin, end):
             adjacency[to + m - begin] = adjacency[m]

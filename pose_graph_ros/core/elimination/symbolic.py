@@ -236,8 +236,11 @@ def loose_part(head):  # type: ignore[no-untyped-def]
     part = np.arange(n).astype(np.int32)  # union-find: an earlier node of the same part
     for e in range(head[tb.N_EDGES]):
         if edge_f[e, tb.WEIGHT] > 0.0:
-            i, j = _first_node(part, edge_i[e, tb.END_I]), _first_node(part, edge_i[e, tb.END_J])
-            part[max(i, j)] = min(i, j)
+            i = _first_node(part, edge_i[e, tb.END_I])
+            for m in range(1, 3):
+                if edge_i[e, m] >= 0:
+                    j = _first_node(part, edge_i[e, m])
+                    part[max(i, j)] = i = min(i, j)
     held = np.zeros(n, np.bool_)
     for v in range(n):
         if node_i[v, tb.FIXED] != 0:

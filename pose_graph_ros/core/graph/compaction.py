@@ -47,7 +47,8 @@ def _new_edge_rows(head, nodes):  # type: ignore[no-untyped-def]
     leaves = np.empty(head[tb.N_EDGES], np.int32)
     for e in range(head[tb.N_EDGES]):
         row = edge_i[e]
-        stays = nodes[row[tb.END_I]] >= 0 and nodes[row[tb.END_J]] >= 0
+        stays = (nodes[row[tb.END_I]] >= 0 and nodes[row[tb.END_J]] >= 0
+                 and (row[tb.END_K] < 0 or nodes[row[tb.END_K]] >= 0))
         leaves[e] = 0 if stays and row[tb.EDGE_LEAVES] == 0 else 1
     return _numbered(leaves)
 
@@ -89,8 +90,9 @@ def _rewrite_nodes(head, nodes):  # type: ignore[no-untyped-def]
     """Rewrite the nodes of all constraints that stay."""
     edge_i, observed_i = tb.edge_i(head), tb.observed_i(head)
     for e in range(head[tb.N_EDGES]):
-        edge_i[e, tb.END_I] = nodes[edge_i[e, tb.END_I]]
-        edge_i[e, tb.END_J] = nodes[edge_i[e, tb.END_J]]
+        for side in range(3):
+            if edge_i[e, side] >= 0:
+                edge_i[e, side] = nodes[edge_i[e, side]]
     for k in range(head[tb.N_OBSERVED]):
         observed_i[k, tb.OBS_NODE] = nodes[observed_i[k, tb.OBS_NODE]]
 
@@ -98,7 +100,7 @@ def _rewrite_nodes(head, nodes):  # type: ignore[no-untyped-def]
 @kernel
 def _entry(entry, edges):  # type: ignore[no-untyped-def]
     """Return an entry of the list of a node's edges with the new row of the edge."""
-    return 2 * edges[entry >> 1] + (entry & 1) if entry >= 0 else -1
+    return 4 * edges[entry >> 2] + (entry & 3) if entry >= 0 else -1
 
 
 @kernel
@@ -112,8 +114,9 @@ def _rewrite_lists(head, edges, observed):  # type: ignore[no-untyped-def]
             row[tb.OBSERVED_LIST] = observed[row[tb.OBSERVED_LIST]]
     for e in range(head[tb.N_EDGES]):
         if tb.edge_f(head)[e, tb.WEIGHT] > 0.0:     # others are in no list
-            edge_i[e, tb.NEXT_I] = _entry(edge_i[e, tb.NEXT_I], edges)
-            edge_i[e, tb.NEXT_J] = _entry(edge_i[e, tb.NEXT_J], edges)
+            for side in range(3):
+                if edge_i[e, side] >= 0:
+                    edge_i[e, tb.NEXT_I + side] = _entry(edge_i[e, tb.NEXT_I + side], edges)
     for k in range(head[tb.N_OBSERVED]):
         if tb.observed_f(head)[k, tb.WEIGHT] > 0.0 and observed_i[k, tb.OBS_NEXT] >= 0:
             observed_i[k, tb.OBS_NEXT] = observed[observed_i[k, tb.OBS_NEXT]]

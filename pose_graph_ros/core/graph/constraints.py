@@ -9,12 +9,12 @@ observed node whose information on the heading and whose mean heading are zero, 
 in map axes. A heading is an observed node whose information on the position is zero.
 
 A *bias* is a hidden node that is not a pose but the time-correlated error of a source of
-measurements, in units of its sigma. Edges of the kind `BIAS` lead to it.
+measurements, in units of its sigma. Edges of the kind `BIAS` lead to it. `factor_types` has all
+kinds of edges, with their errors.
 """
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, fields, replace
-from enum import IntEnum
 from operator import attrgetter
 from typing import Annotated, Any, Self, TypeVar
 
@@ -23,38 +23,31 @@ import numpy.typing as npt
 
 from pose_graph_ros.core.exceptions import GraphUpdateError
 from pose_graph_ros.core.geometry.se2 import BoolArray, FloatArray, IntArray
+from pose_graph_ros.core.graph.factor_types import EdgeKind, FACTORS, NodeKind, ObservedKind
 from pose_graph_ros.core.graph.identities import Ids
 from pose_graph_ros.core.saved_columns import Choices
+
+__all__ = [
+    'SEMIDEFINITE_TOLERANCE',
+    'Constraints',
+    'EdgeKind',
+    'EdgeKinds',
+    'Edges',
+    'KindArray',
+    'NodeKind',
+    'ObservedKind',
+    'ObservedKinds',
+    'ObservedNodes',
+    'check',
+    'full',
+    'upper',
+]
 
 KindArray = npt.NDArray[np.uint8]
 
 # How far, with its diagonal scaled to 1, the smallest eigenvalue of an information matrix may be
 # below zero and its triangles may differ, because files print few digits.
 SEMIDEFINITE_TOLERANCE = 1e-5
-
-
-class EdgeKind(IntEnum):
-    """Where an edge comes from."""
-
-    ODOMETRY = 0
-    LOOP_CLOSURE = 1
-    BIAS = 2
-    """
-    Leads to a bias j, from the pose i that was measured with it or from the next bias i; the error
-    is `F x_j + mean - x_i * offset` in map axes, F = diag(f_t, f_t, f_th).
-    """
-
-
-KNOWN_EDGES = (EdgeKind.ODOMETRY, EdgeKind.LOOP_CLOSURE, EdgeKind.BIAS)
-"""Kinds of edges whose error is in `error_functions` and in the kernels; others are refused."""
-
-
-class ObservedKind(IntEnum):
-    """What was measured of an observed node; the error is the same for all kinds."""
-
-    GLOBAL_POSE = 0
-    POSITION = 1
-    HEADING = 2
 
 
 EdgeKinds = Annotated[IntArray, Choices(EdgeKind)]
@@ -90,9 +83,13 @@ class _Table:
 
     def renumbered(self, number: Callable[[IntArray], IntArray]) -> Self:
         """Return the same constraints with other numbers for their nodes, e.g. rows for ids."""
-        return replace(self, **{
-            name: number(getattr(self, name))
-            for name in ('i', 'j', 'node') if hasattr(self, name)})
+        changed = {name: number(getattr(self, name))
+                   for name in ('i', 'j', 'node') if hasattr(self, name)}
+        third: IntArray | None = getattr(self, 'k', None)
+        if third is not None and np.any(third >= 0):
+            changed['k'] = third.copy()
+            changed['k'][third >= 0] = number(third[third >= 0])
+        return replace(self, **changed)
 
 
 Constraints = TypeVar('Constraints', bound=_Table)
@@ -130,6 +127,12 @@ def _weights(weight: npt.ArrayLike | None, size: int) -> FloatArray:
     return ones
 
 
+def _no_nodes(size: int) -> IntArray:
+    none = np.empty(size, dtype=_INT)
+    none.fill(-1)
+    return none
+
+
 @dataclass(frozen=True, slots=True)
 class Edges(_Table):
     """
@@ -139,15 +142,17 @@ class Edges(_Table):
     ----------
     i, j : array_like of int, shape (M,), nodes that the edges start from and lead to
     mean : array_like, shape (M, 3)
-        Measured poses of j in i [m, m, rad]; of edges to a bias those of i in the map.
+        Measured poses of j in i [m, m, rad]; of edges to a bias those of i in the map, of ranges
+        the distance (r, 0, 0).
     information : array_like, shape (M, 3, 3)
         Inverse covariances of the errors (3.48), in the frames of the measured poses; of edges to
-        a bias in map axes.
+        a bias in map axes. It is zero in rows that the error of the kind has not.
     kind : array_like of int, shape (M,), `EdgeKind`
     weight : array_like, shape (M,), optional, factors on the information: 0 removed, default 1
     bias : array_like, shape (M, 4), optional
         Measured offset in i and factors of the bias, `(o_x, o_y, f_t, f_th)` [m, m, m, rad]; used
-        for edges to a bias only.
+        for edges to a bias, of a range (o_x, o_y), of a turn f_th, the duration [s].
+    k : array_like of int, shape (M,), optional, third nodes: of turns the bias; -1, the default
 
     """
 
@@ -158,11 +163,13 @@ class Edges(_Table):
     kind: KindArray
     weight: FloatArray
     bias: FloatArray
+    k: IntArray
 
     def __init__(
         self, i: npt.ArrayLike = (), j: npt.ArrayLike = (), mean: npt.ArrayLike = _NO_ROWS,
         information: npt.ArrayLike = _NO_MATRICES, kind: npt.ArrayLike = (),
         weight: npt.ArrayLike | None = None, bias: npt.ArrayLike | None = None,
+        k: npt.ArrayLike | None = None,
     ) -> None:
         i = _integers(i, _INT)
         _set(self, 'i', i)
@@ -172,6 +179,7 @@ class Edges(_Table):
         _set(self, 'kind', _integers(kind, _KIND))
         _set(self, 'weight', _weights(weight, len(i)))
         _set(self, 'bias', np.zeros((len(i), 4)) if bias is None else _numbers(bias))
+        _set(self, 'k', _no_nodes(len(i)) if k is None else _integers(k, _INT))
 
     def __len__(self) -> int:
         return len(self.i)
@@ -246,22 +254,27 @@ _COLUMNS: dict[type, Any] = {
 _ROW_SHAPES = {'mean': (3,), 'offset': (3,), 'information': (3, 3), 'bias': (4,)}
 
 
-def check(table: Edges | ObservedNodes, is_bias: BoolArray, nodes: Ids | None = None) -> None:
+def check(
+    table: Edges | ObservedNodes, kind: npt.NDArray[Any], dimension: IntArray | None = None,
+    nodes: Ids | None = None,
+) -> None:
     """
     Raise GraphUpdateError for invalid constraints, with the row, what was expected and the value.
 
-    Invalid are wrong shapes, kinds or nodes, negative weights, an edge from a node to itself, an
-    edge to a bias that is not of the kind BIAS or an edge of that kind to a pose, numbers that are
-    not finite, an information matrix that is zero, not symmetric or not positive semidefinite.
+    Invalid are wrong shapes, kinds or nodes, negative weights, an edge from a node to itself, a
+    node of a kind that the kind of edge does not have for this end, numbers that are not finite,
+    numbers in rows that an error has not, an information matrix that is zero, not symmetric or not
+    positive semidefinite.
 
     Parameters
     ----------
     table : Edges or ObservedNodes
-    is_bias : ndarray of bool, shape (N,), which of the hidden nodes are biases, by row
+    kind : ndarray, shape (N,), `NodeKind` of the hidden nodes, by row
+    dimension : ndarray of int, shape (N,), optional, by default 2 for landmarks, 3 for others
     nodes : Ids, optional, of the hidden nodes; by default they are the rows
 
     """
-    name, ids = type(table).__name__, Ids(len(is_bias)) if nodes is None else nodes
+    name, ids = type(table).__name__, Ids(len(kind)) if nodes is None else nodes
     columns = {item.name: getattr(table, item.name) for item in fields(table)}
     for key, column in columns.items():
         expected = (len(table), *_ROW_SHAPES.get(key, ()))
@@ -270,7 +283,8 @@ def check(table: Edges | ObservedNodes, is_bias: BoolArray, nodes: Ids | None = 
                 f'{name}.{key}: expected shape {expected}, got {column.shape}')
     for key, column in columns.items():
         _refuse_rows(~np.isfinite(column), f'{name}.{key} is not finite', column)
-    ends = (table.i, table.j) if isinstance(table, Edges) else (table.node,)
+    ends = ((table.i, table.j, table.k[table.k != -1])
+            if isinstance(table, Edges) else (table.node,))
     for end in ends:
         _refuse_rows((end < 0) | (end >= ids.end),
                      f'{name}: expected a hidden node in 0..{ids.end - 1}', end)
@@ -278,20 +292,40 @@ def check(table: Edges | ObservedNodes, is_bias: BoolArray, nodes: Ids | None = 
         if len(gone) > 0:
             raise GraphUpdateError(
                 f'{name}: hidden node {end[gone[0]]} has left the graph; row {gone[0]}')
-    known = KNOWN_EDGES if isinstance(table, Edges) else tuple(ObservedKind)
+    known = tuple(FACTORS) if isinstance(table, Edges) else tuple(ObservedKind)
     _refuse_rows(~np.isin(table.kind, known),
-                 f'{name}.kind is none of {", ".join(kind.name for kind in known)}', table.kind)
+                 f'{name}.kind is none of {", ".join(each.name for each in known)}', table.kind)
     _refuse_rows(table.weight < 0.0, f'{name}.weight is negative', table.weight)
+    if dimension is None:
+        dimension = np.where(kind == NodeKind.LANDMARK, 2, 3)
     if isinstance(table, Edges):
         _refuse_rows(table.i == table.j, f'{name}: an edge leads from a node to itself', table.i)
-        to_bias = table.kind == EdgeKind.BIAS
-        i_is_bias, j_is_bias = is_bias[ids.rows(table.i)], is_bias[ids.rows(table.j)]
-        _refuse_rows(to_bias & ~j_is_bias,
-                     f'{name}: expected an edge of kind BIAS to lead to a bias', table.j)
-        _refuse_rows(~to_bias & (i_is_bias | j_is_bias),
-                     f'{name}: an edge of another kind than BIAS has a bias for an end',
-                     np.column_stack((table.i, table.j)))
+        _check_ends(table, kind, ids)
+        rows = np.array([np.isin(range(3), factor.rows) for factor in FACTORS.values()])
+        missing = ~rows[table.kind]
+        _refuse_rows(missing & (table.mean != 0.0),
+                     f'{name}.mean: expected 0 in rows that the error has not', table.mean)
+        least = np.where(table.kind == EdgeKind.BIAS, np.minimum(
+            dimension[ids.rows(table.i)], dimension[ids.rows(table.j)]), 3)
+    else:
+        least, missing = dimension[ids.rows(table.node)], np.zeros((len(table), 3), dtype=bool)
+    missing = missing | (np.arange(3) >= least[:, None])
+    diagonal = np.diagonal(table.information, axis1=1, axis2=2)
+    _refuse_rows(missing & (diagonal != 0.0), f'{name}.information: expected 0 in rows that the '
+                 'error or the node has not', diagonal)
     _check_information(f'{name}.information', table.information)
+
+
+def _check_ends(edges: Edges, kind: npt.NDArray[Any], ids: Ids) -> None:
+    """Raise GraphUpdateError if an edge has a node of the wrong kind for an end."""
+    for each, factor in FACTORS.items():
+        rows = edges.kind == each
+        for end, allowed in (('i', factor.i), ('j', factor.j), ('k', factor.k)):
+            node = getattr(edges, end)
+            wrong = rows & (node >= 0) & ~np.isin(kind[ids.rows(node)], allowed)
+            expected = ' or '.join(item.name.lower() for item in allowed) or 'none'
+            _refuse_rows(wrong, f'Edges.{end}: expected an edge of kind {each.name} to have '
+                         f'{expected} for this end', node)
 
 
 def _check_information(name: str, matrix: FloatArray) -> None:

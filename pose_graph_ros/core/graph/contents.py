@@ -14,6 +14,7 @@ from pose_graph_ros.core.graph.constraints import (
     EdgeKind,
     Edges,
     full,
+    NodeKind,
     ObservedNodes,
 )
 from pose_graph_ros.core.graph.error_functions import edge_errors, energies, observed_errors
@@ -26,8 +27,9 @@ from pose_graph_ros.core.graph.graph_update import (
 from pose_graph_ros.core.graph.identities import Ids, known
 from pose_graph_ros.core.graph.tables import Memory
 
-# Columns of edge_f with the column `Edges.bias`.
-_BIAS_COLUMNS = [tb.BIAS_OFFSET, tb.BIAS_OFFSET + 1, tb.FACTOR_T, tb.FACTOR_TH]
+# Columns of edge_f with the column `Edges.bias`, and which of them each kind of edge has.
+_BIAS_COLUMNS = [tb.OFFSET, tb.OFFSET + 1, tb.FACTOR_T, tb.FACTOR_TH]
+_HAS_BIAS = {EdgeKind.BIAS: slice(4), EdgeKind.TURN: slice(3, 4), EdgeKind.RANGE: slice(2)}
 
 
 class GraphContents:
@@ -140,8 +142,23 @@ class GraphContents:
 
     @property
     def is_bias(self) -> BoolArray:
-        """Whether hidden nodes are biases, not poses, shape (N,)."""
-        return self.memory['node_i'][:self.n_nodes, tb.IS_BIAS] != 0
+        """Whether hidden nodes are biases, shape (N,)."""
+        return self.node_kind == NodeKind.BIAS
+
+    @property
+    def is_pose(self) -> BoolArray:
+        """Whether hidden nodes are poses, shape (N,)."""
+        return self.node_kind == NodeKind.POSE
+
+    @property
+    def node_kind(self) -> npt.NDArray[Any]:
+        """`NodeKind` of hidden nodes, shape (N,)."""
+        return self.memory['node_i'][:self.n_nodes, tb.NODE_KIND].copy()
+
+    @property
+    def dimension(self) -> npt.NDArray[Any]:
+        """Numbers of coordinates of hidden nodes, shape (N,), 1 to 3."""
+        return self.memory['node_i'][:self.n_nodes, tb.DIMENSION].copy()
 
     @property
     def edges(self) -> Edges:
@@ -161,11 +178,13 @@ class GraphContents:
         """Return the edges in some rows, with rows for ends."""
         numbers, integers = self.memory['edge_f'][rows], self.memory['edge_i'][rows]
         kind, bias = integers[:, tb.EDGE_KIND], np.zeros((len(integers), 4))
-        to_bias = np.flatnonzero(kind == EdgeKind.BIAS)
-        bias[to_bias] = numbers[to_bias[:, None], _BIAS_COLUMNS]
+        for each, columns in _HAS_BIAS.items():
+            of_kind = np.flatnonzero(kind == each)
+            bias[of_kind, columns] = numbers[of_kind[:, None], _BIAS_COLUMNS[columns]]
         return Edges(
             integers[:, tb.END_I], integers[:, tb.END_J], numbers[:, tb.MEAN:tb.MEAN + 3].copy(),
-            full(numbers[:, tb.INFO:tb.INFO + 6]), kind, numbers[:, tb.WEIGHT].copy(), bias)
+            full(numbers[:, tb.INFO:tb.INFO + 6]), kind, numbers[:, tb.WEIGHT].copy(), bias,
+            integers[:, tb.END_K])
 
     @property
     def observed(self) -> ObservedNodes:
@@ -186,7 +205,7 @@ class GraphContents:
         """Return the observed nodes in some rows, with rows for their nodes."""
         numbers, integers = self.memory['observed_f'][rows], self.memory['observed_i'][rows]
         return ObservedNodes(
-            integers[:, tb.OBS_NODE], numbers[:, tb.OBS_OFFSET:tb.OBS_OFFSET + 3].copy(),
+            integers[:, tb.OBS_NODE], numbers[:, tb.OFFSET:tb.OFFSET + 3].copy(),
             numbers[:, tb.MEAN:tb.MEAN + 3].copy(), full(numbers[:, tb.INFO:tb.INFO + 6]),
             integers[:, tb.OBS_KIND], numbers[:, tb.WEIGHT].copy())
 
@@ -212,10 +231,10 @@ class GraphContents:
         nodes, edges, observed = (
             ids.astype(np.int64) for ids in (self.node_ids, self.edge_ids, self.observed_ids))
         return GraphRows(
-            self.poses.copy(), self.is_bias, self.fixed,
+            self.poses.copy(), self.node_kind, self.fixed,
             Edges(*(column.copy() for column in self.edges.columns)),
             ObservedNodes(*(column.copy() for column in self.observed.columns)),
-            nodes, edges, observed, self.next_ids)
+            nodes, edges, observed, self.next_ids, self.dimension)
 
     def leaving(self) -> GraphUpdate:
         """Return what leaves the graph with the present update; it keeps its rows until then."""

@@ -2,12 +2,15 @@
 # SPDX-License-Identifier: Apache-2.0
 """Checks of the parts of a `GraphUpdate` that are not tables of constraints."""
 
-from collections.abc import Collection, Mapping
+from collections.abc import Collection, Mapping, Sequence
+from typing import Any
 
 import numpy as np
+import numpy.typing as npt
 
 from pose_graph_ros.core.exceptions import GraphUpdateError
 from pose_graph_ros.core.geometry.se2 import FloatArray, IntArray
+from pose_graph_ros.core.graph.constraints import NodeKind
 from pose_graph_ros.core.graph.identities import Ids
 
 
@@ -28,6 +31,37 @@ def checked_poses(name: str, poses: FloatArray) -> FloatArray:
             f'{name}: expected finite poses, shape (N, 3), got shape {array.shape}'
             + ' with numbers that are not finite' * has_shape)
     return array
+
+
+# Kinds and dimensions of some new biases, to save making them.
+_BIASES, _DIMENSIONS = np.full(64, NodeKind.BIAS, np.uint8), np.full(64, 3, np.uint8)
+
+
+def other_nodes(
+    biases: FloatArray, dimensions: Sequence[int], landmarks: FloatArray,
+) -> tuple[npt.NDArray[Any], ...]:
+    """
+    Return values, shape (S + L, 3), kinds and dimensions of new nodes that are no poses.
+
+    Parameters
+    ----------
+    biases, dimensions, landmarks : as in `GraphUpdate`
+
+    """
+    n = len(biases)
+    if len(landmarks) == len(dimensions) == 0 and n <= len(_BIASES):
+        return biases, _BIASES[:n], _DIMENSIONS[:n]
+    biases, points = checked_poses('biases', biases), np.asarray(landmarks, dtype=np.float64)
+    if points.ndim != 2 or points.shape[1] != 2:
+        raise GraphUpdateError(f'landmarks: expected shape (L, 2), got {points.shape}')
+    given = np.asarray(dimensions if len(dimensions) > 0 else np.full(n, 3))
+    if given.shape != (n,) or not np.all(np.isin(given, (1, 2, 3))):
+        raise GraphUpdateError(
+            f'dimensions: expected 1, 2 or 3 for each of {n} biases, got {given.tolist()}')
+    dimension = np.concatenate((given, np.full(len(points), 2))).astype(np.uint8)
+    values = np.concatenate((biases, np.pad(points, ((0, 0), (0, 1)))))
+    kind = np.repeat(np.array((NodeKind.BIAS, NodeKind.LANDMARK), np.uint8), (n, len(points)))
+    return np.where(np.arange(3) < dimension[:, None], values, 0.0), kind, dimension
 
 
 def integers(numbers: Collection[int]) -> IntArray:

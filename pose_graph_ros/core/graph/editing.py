@@ -21,7 +21,14 @@ from pose_graph_ros.core.compiled.jit import (
     NUMBERS,
     ROWS,
 )
-from pose_graph_ros.core.graph import factors, identities, rows, tables as tb, transaction_log
+from pose_graph_ros.core.graph import (
+    factor_types,
+    factors,
+    identities,
+    rows,
+    tables as tb,
+    transaction_log,
+)
 
 # Results of `add_rows`.
 ADDED, NO_ROOM, UNSOUND = range(3)
@@ -38,23 +45,26 @@ def touch(head, v):  # type: ignore[no-untyped-def]
 
 
 @kernel
-def _start_nodes(head, first, first_bias, last):  # type: ignore[no-untyped-def]
-    """Initialise rows of new hidden nodes: the poses before `first_bias`, the biases from it."""
-    node_f, node_i, node_id = tb.node_f(head), tb.node_i(head), tb.node_id(head)
-    for v in range(first, last):
+def _start_nodes(head, first, first_other, kinds, dimensions):  # type: ignore[no-untyped-def]
+    """Initialise rows of new hidden nodes: poses, then from `first_other` on the others."""
+    node_f, node_i = tb.node_f(head), tb.node_i(head)
+    for v in range(first, first_other + len(kinds)):
         f, i = node_f[v], node_i[v]
         factors.refer_to_pose(f)
         f[tb.SCALE_T] = f[tb.SCALE_R] = 0.0
         i[:] = 0
         i[tb.CLIQUE] = i[tb.EDGE_LIST] = i[tb.OBSERVED_LIST] = -1
         i[tb.NODE_LOGGED] = head[tb.UPDATE]
-        i[tb.IS_BIAS] = 1 if v >= first_bias else 0
-        node_id[v] = head[tb.NEXT_NODE]
+        i[tb.DIMENSION] = 3
+        tb.node_id(head)[v] = head[tb.NEXT_NODE]
         head[tb.NEXT_NODE] += 1
+        if v >= first_other:
+            i[tb.NODE_KIND] = kinds[v - first_other]
+            i[tb.DIMENSION] = dimensions[v - first_other]
         touch(head, v)
         head[tb.STRUCTURE] = 1
-    if first_bias > first:
-        head[tb.NEWEST] = first_bias - 1
+    if first_other > first:
+        head[tb.NEWEST] = first_other - 1
 
 
 @kernel
@@ -81,13 +91,14 @@ def scale_by_edge(head, e, weight):  # type: ignore[no-untyped-def]
     f = edge_f[e]
     position = 0.5 * weight * (f[tb.INFO] + f[tb.INFO + 3])
     heading = weight * f[tb.INFO + 5]
-    # for an edge to a bias, OWN_T is BIAS_OFFSET
-    arm2 = f[tb.OWN_T] * f[tb.OWN_T] + f[tb.OWN_T + 1] * f[tb.OWN_T + 1]
+    # of a relative error the length of the mean, of others that of the offset
+    arm2 = f[tb.OWN] * f[tb.OWN] + f[tb.OWN + 1] * f[tb.OWN + 1]
     _add_to_scale(head, edge_i[e, tb.END_I], position, heading + position * arm2)
-    if edge_i[e, tb.EDGE_KIND] == factors.BIAS:
-        position *= f[tb.FACTOR_T] * f[tb.FACTOR_T]
-        heading *= f[tb.FACTOR_TH] * f[tb.FACTOR_TH]
-    _add_to_scale(head, edge_i[e, tb.END_J], position, heading)
+    ft, fth = factor_types.factors_of_end(f, edge_i[e, tb.EDGE_KIND])
+    _add_to_scale(head, edge_i[e, tb.END_J], ft * ft * position, fth * fth * heading)
+    if edge_i[e, tb.END_K] >= 0:
+        rate2 = f[tb.FACTOR_TH] * f[tb.FACTOR_TH]
+        _add_to_scale(head, edge_i[e, tb.END_K], weight * f[tb.INFO + 5] * rate2, 0.0)
 
 
 @kernel
@@ -104,25 +115,30 @@ def scale_by_observed(head, k, weight):  # type: ignore[no-untyped-def]
     observed_f, observed_i = tb.observed_f(head), tb.observed_i(head)
     f = observed_f[k]
     position = 0.5 * weight * (f[tb.INFO] + f[tb.INFO + 3])
-    arm2 = (f[tb.OBS_OFFSET] * f[tb.OBS_OFFSET]
-            + f[tb.OBS_OFFSET + 1] * f[tb.OBS_OFFSET + 1])
+    arm2 = (f[tb.OFFSET] * f[tb.OFFSET]
+            + f[tb.OFFSET + 1] * f[tb.OFFSET + 1])
     _add_to_scale(head, observed_i[k, tb.OBS_NODE], position,
                   weight * f[tb.INFO + 5] + position * arm2)
 
 
 @kernel
-def _have_common_clique(head, a, b):  # type: ignore[no-untyped-def]
-    """Tell whether one of two nodes is in the clique that the other is frontal in."""
-    node_i, clique_i, pool_i = tb.node_i(head), tb.clique_i(head), tb.pool_i(head)
-    for _ in range(2):
-        c = node_i[a, tb.CLIQUE]
+def _have_common_clique(head, e):  # type: ignore[no-untyped-def]
+    """Tell whether a clique that one end of an edge is frontal in has all its ends."""
+    node_i, edge_i = tb.node_i(head), tb.edge_i(head)
+    clique_i, pool_i = tb.clique_i(head), tb.pool_i(head)
+    ends = edge_i[e, tb.END_I:tb.END_K + 1]
+    n_ends = 2 if ends[2] < 0 else 3
+    for k in range(n_ends):
+        c, n = node_i[ends[k], tb.CLIQUE], 0
         if c < 0:
             return False
         row = clique_i[c]
         for m in range(row[tb.NODES], row[tb.NODES] + row[tb.N_FRONTAL] + row[tb.N_SEPARATOR]):
-            if pool_i[m] == b:
-                return True
-        a, b = b, a
+            v = pool_i[m]
+            if v == ends[0] or v == ends[1] or v == ends[2]:
+                n += 1
+        if n == n_ends:
+            return True
     return False
 
 
@@ -130,39 +146,39 @@ def _have_common_clique(head, a, b):  # type: ignore[no-untyped-def]
 def _touch_edge(head, e):  # type: ignore[no-untyped-def]
     """Log and touch the ends of an edge; ask for a new ordering if no clique has both."""
     edge_i = tb.edge_i(head)
-    i, j = edge_i[e, tb.END_I], edge_i[e, tb.END_J]
-    transaction_log.log_node(head, i)
-    transaction_log.log_node(head, j)
-    if head[tb.STRUCTURE] == 0 and not _have_common_clique(head, i, j):
+    if head[tb.STRUCTURE] == 0 and not _have_common_clique(head, e):
         head[tb.STRUCTURE] = 1
-    touch(head, i)
-    touch(head, j)
+    for side in range(3):
+        v = edge_i[e, side]
+        if v >= 0:
+            transaction_log.log_node(head, v)
+            touch(head, v)
 
 
 @kernel
 def _link_edge(head, e):  # type: ignore[no-untyped-def]
-    """Put an edge at the heads of the lists of its ends; the caller has logged all three rows."""
+    """Put an edge at the heads of the lists of its ends; the caller has logged all rows."""
     node_i, edge_i = tb.node_i(head), tb.edge_i(head)
-    row = edge_i[e]
-    i, j = row[tb.END_I], row[tb.END_J]
-    row[tb.NEXT_I], node_i[i, tb.EDGE_LIST] = node_i[i, tb.EDGE_LIST], 2 * e
-    row[tb.NEXT_J], node_i[j, tb.EDGE_LIST] = node_i[j, tb.EDGE_LIST], 2 * e + 1
+    for side in range(3):
+        v = edge_i[e, side]
+        if v >= 0:
+            edge_i[e, tb.NEXT_I + side] = node_i[v, tb.EDGE_LIST]
+            node_i[v, tb.EDGE_LIST] = 4 * e + side
 
 
 @kernel
 def _unlink_edge(head, e, side):  # type: ignore[no-untyped-def]
-    """Take an edge out of the list of its end I (side 0) or J (1), whose row has been logged."""
+    """Take an edge out of the list of one of its ends (I 0, J 1, K 2), whose row is logged."""
     node_i, edge_i = tb.node_i(head), tb.edge_i(head)
-    v = edge_i[e, tb.END_J if side == 1 else tb.END_I]
-    after = edge_i[e, tb.NEXT_J if side == 1 else tb.NEXT_I]
+    v, after = edge_i[e, side], edge_i[e, tb.NEXT_I + side]
     entry = node_i[v, tb.EDGE_LIST]
-    if entry == 2 * e + side:
+    if entry == 4 * e + side:
         node_i[v, tb.EDGE_LIST] = after
         return
     while True:
-        before, column = entry >> 1, tb.NEXT_J if (entry & 1) == 1 else tb.NEXT_I
+        before, column = entry >> 2, tb.NEXT_I + (entry & 3)
         entry = edge_i[before, column]
-        if entry == 2 * e + side:
+        if entry == 4 * e + side:
             transaction_log.log_edge(head, before)
             edge_i[before, column] = after
             return
@@ -205,8 +221,9 @@ def weigh_edge(head, e, weight):  # type: ignore[no-untyped-def]
     scalars[tb.CHI2] -= f[tb.ENERGY]
     f[tb.WEIGHT] = weight
     if weight == 0.0:
-        _unlink_edge(head, e, 0)
-        _unlink_edge(head, e, 1)
+        for side in range(3):
+            if tb.edge_i(head)[e, side] >= 0:
+                _unlink_edge(head, e, side)
         f[tb.ERROR2] = f[tb.ENERGY] = 0.0
         return
     if before == 0.0:
@@ -237,17 +254,17 @@ def weigh_one_observed(head, k, weight):  # type: ignore[no-untyped-def]
     transaction_log.log_node(head, v)
     touch(head, v)
     scale_by_observed(head, k, weight - before)
-    scalars[tb.CHI2] -= f[tb.OBS_ENERGY]
+    scalars[tb.CHI2] -= f[tb.ENERGY]
     f[tb.WEIGHT] = weight
     if weight == 0.0:
         _unlink_observed(head, k)
-        f[tb.OBS_ERROR2] = f[tb.OBS_ENERGY] = 0.0
+        f[tb.ERROR2] = f[tb.ENERGY] = 0.0
         return
     if before == 0.0:
         observed_i[k, tb.OBS_NEXT], node_i[v, tb.OBSERVED_LIST] = node_i[v, tb.OBSERVED_LIST], k
     factors.linearize_observed(head, k)
     factors.check_observed(head, k)
-    scalars[tb.CHI2] += f[tb.OBS_ENERGY]
+    scalars[tb.CHI2] += f[tb.ENERGY]
 
 
 @kernel
@@ -258,10 +275,7 @@ def _start_edges(head, first, last):  # type: ignore[no-untyped-def]
         edge_id[e] = head[tb.NEXT_EDGE]
         head[tb.NEXT_EDGE] += 1
         f, row = edge_f[e], edge_i[e]
-        if row[tb.EDGE_KIND] != factors.BIAS:
-            c, s = math.cos(f[tb.MEAN + 2]), math.sin(f[tb.MEAN + 2])
-            f[tb.OWN_T] = c * f[tb.MEAN] + s * f[tb.MEAN + 1]
-            f[tb.OWN_T + 1] = c * f[tb.MEAN + 1] - s * f[tb.MEAN]
+        factor_types.prepare(f, row[tb.EDGE_KIND])
         f[tb.ERROR2] = f[tb.ENERGY] = 0.0
         row[tb.EDGE_CHECKED] = row[tb.EDGE_WAITS] = row[tb.EDGE_LEAVES] = 0
         row[tb.EDGE_LOGGED] = head[tb.UPDATE]
@@ -278,7 +292,7 @@ def _start_observed(head, first, last):  # type: ignore[no-untyped-def]
         observed_id[k] = head[tb.NEXT_OBSERVED]
         head[tb.NEXT_OBSERVED] += 1
         f, row = observed_f[k], observed_i[k]
-        f[tb.OBS_ERROR2] = f[tb.OBS_ENERGY] = 0.0
+        f[tb.ERROR2] = f[tb.ENERGY] = 0.0
         row[tb.OBS_WAITS] = row[tb.OBS_LEAVES] = 0
         row[tb.OBS_LOGGED] = head[tb.UPDATE]
         weight, f[tb.WEIGHT] = f[tb.WEIGHT], 0.0
@@ -340,11 +354,11 @@ def _lengths_agree(n, mean, information, kind, weight):  # type: ignore[no-untyp
 
 
 @kernel(signature=(
-    tb.HEAD, ROWS, ROWS, INTEGERS, INTEGERS, ROWS, MATRICES, BYTES, NUMBERS, ROWS, INTEGERS,
-    ROWS, ROWS, MATRICES, BYTES, NUMBERS, FLAG))
+    tb.HEAD, ROWS, ROWS, BYTES, BYTES, INTEGERS, INTEGERS, ROWS, MATRICES, BYTES, NUMBERS, ROWS,
+    INTEGERS, INTEGERS, ROWS, ROWS, MATRICES, BYTES, NUMBERS, FLAG))
 def add_rows(  # type: ignore[no-untyped-def]
-    head, hidden, biases, i, j, mean, information, kind, weight, bias, node, offset,
-    observed_mean, observed_information, observed_kind, observed_weight, checked,
+    head, hidden, others, kinds, dimensions, i, j, mean, information, kind, weight, bias, k,
+    node, offset, observed_mean, observed_information, observed_kind, observed_weight, checked,
 ):
     """
     Return ADDED after adding hidden nodes, edges and observed nodes, all of them, or why none.
@@ -354,19 +368,22 @@ def add_rows(  # type: ignore[no-untyped-def]
 
     Parameters
     ----------
-    hidden, biases : ndarray, shapes (N, 3) and (S, 3), poses of new nodes, values of new biases
-    i, j, mean, information, kind, weight, bias : ndarray, columns of `Edges`
+    hidden : ndarray, shape (N, 3), poses of new nodes
+    others, kinds, dimensions : ndarray, shapes (S, 3), (S,) and (S,)
+        Values of new nodes that are no poses, their `NodeKind` and dimensions.
+    i, j, mean, information, kind, weight, bias, k : ndarray, columns of `Edges`
     node, offset, observed_mean, observed_information, observed_kind, observed_weight : ndarray
         Columns of `ObservedNodes`.
     checked : bool, whether `constraints.check` has accepted the rows
 
     """
     first = head[tb.N_NODES]
-    first_bias = first + len(hidden)
-    n_nodes = first_bias + len(biases)
+    first_other = first + len(hidden)
+    n_nodes = first_other + len(others)
     n_edges = head[tb.N_EDGES] + len(i)
     n_observed = head[tb.N_OBSERVED] + len(node)
-    if (hidden.shape[1] != 3 or biases.shape[1] != 3 or len(j) != len(i)
+    if (hidden.shape[1] != 3 or others.shape[1] != 3 or len(kinds) != len(others)
+            or len(dimensions) != len(others) or len(j) != len(i) or len(k) != len(i)
             or not _lengths_agree(len(i), mean, information, kind, weight)
             or bias.shape != (len(i), 4)
             or offset.shape != (len(node), 3)
@@ -378,16 +395,16 @@ def add_rows(  # type: ignore[no-untyped-def]
         return NO_ROOM
     # rows behind the ends are not part of the graph yet
     valid = rows.write_nodes(head, first, hidden)
-    valid = rows.write_nodes(head, first_bias, biases) and valid
-    valid = rows.write_edges(head, n_nodes, first_bias, i, j, mean, information, kind, weight,
-                             bias) and valid
+    valid = rows.write_nodes(head, first_other, others) and valid
+    valid = rows.write_edges(head, n_nodes, first_other, kinds, dimensions, i, j, mean,
+                             information, kind, weight, bias, k) and valid
     valid = rows.write_all_observed(
-        head, n_nodes, node, offset, observed_mean, observed_information, observed_kind,
-        observed_weight) and valid
+        head, n_nodes, first_other, kinds, dimensions, node, offset, observed_mean,
+        observed_information, observed_kind, observed_weight) and valid
     if not valid and not checked:
         return UNSOUND
     head[tb.N_NODES] = n_nodes
-    _start_nodes(head, first, first_bias, n_nodes)
+    _start_nodes(head, first, first_other, kinds, dimensions)
     first, head[tb.N_EDGES] = head[tb.N_EDGES], n_edges
     _start_edges(head, first, n_edges)
     first, head[tb.N_OBSERVED] = head[tb.N_OBSERVED], n_observed
@@ -423,4 +440,4 @@ def restart(head):  # type: ignore[no-untyped-def]
         if observed_f[k, tb.WEIGHT] > 0.0:
             factors.linearize_observed(head, k)
             factors.check_observed(head, k)
-            scalars[tb.CHI2] += observed_f[k, tb.OBS_ENERGY]
+            scalars[tb.CHI2] += observed_f[k, tb.ENERGY]

@@ -1,35 +1,23 @@
 # Copyright 2026 The pose_graph_ros authors
 # SPDX-License-Identifier: Apache-2.0
 """
-Errors of constraints, vectorised.
-
-Numbers in parentheses are equations of C. Merfels, "Sensor fusion for localization of automated
-vehicles", section 3.4.6. Symbols: x_i = (t_i, th_i) a hidden node, z = (t_z, th_z) a measured
-pose, R_i and R_z their rotations (3.47). A node is updated by adding dx in map axes, its theta
-wrapped.
-
-Edge from i to j: the prediction (3.46) is `h = (R_i^T (t_j - t_i), th_j - th_i)`, the error (3.48)
-
-    e = (R_z^T (R_i^T (t_j - t_i) - t_z), wrap(th_j - th_i - th_z))
-
-in the frame of the measured pose. Observed node with offset o = (t_o, th_o) from its hidden node i
-(the identity gives (3.51) and (3.52) as they stand in the source):
-
-    e = (R_z^T (t_i + R_i t_o - t_z), wrap(th_i + th_o - th_z))
-
-Edge to a bias m_j, in map axes, with an offset t_o from node i and factors f_t, f_th of the bias:
-
-    e = (f_t m_t + t_z - (t_i + R_i t_o), wrap(f_th m_th + th_z - th_i))
+Errors of constraints at given poses: `factor_types` for tables that need not be in a graph.
 
 The energy of a constraint is `e^T information e`, without a factor 1/2; chi2 is the sum of all
-energies. The compiled kernels in `factors` have the same errors, with their Jacobians.
+energies.
 """
 
-import numpy as np
+from typing import Any
 
-from pose_graph_ros.core.geometry import se2
+import numpy as np
+import numpy.typing as npt
+
+from pose_graph_ros.core.compiled.jit import BYTES, INTEGERS, kernel, ROWS
 from pose_graph_ros.core.geometry.se2 import FloatArray
-from pose_graph_ros.core.graph.constraints import EdgeKind, Edges, ObservedNodes
+from pose_graph_ros.core.graph import tables as tb
+from pose_graph_ros.core.graph.constraints import Edges, ObservedNodes
+from pose_graph_ros.core.graph.factor_types import OBSERVED, prepare, wrap
+from pose_graph_ros.core.graph.factors import model
 
 
 def edge_errors(poses: FloatArray, edges: Edges) -> FloatArray:
@@ -44,17 +32,9 @@ def edge_errors(poses: FloatArray, edges: Edges) -> FloatArray:
     edges : Edges
 
     """
-    start, end, mean = poses[edges.i], poses[edges.j], edges.mean
-    moved = _unrotate(start[:, 2], end[:, :2] - start[:, :2])
-    translation = _unrotate(mean[:, 2], moved - mean[:, :2])
-    theta = se2.wrap(end[:, 2] - start[:, 2] - mean[:, 2])
-    error = np.column_stack((translation, theta))
-    rows = np.flatnonzero(edges.kind == EdgeKind.BIAS)
-    if len(rows) > 0:
-        bias = edges.bias[rows]
-        error[rows] = bias[:, [2, 2, 3]] * end[rows] + mean[rows] - start[rows]
-        error[rows, :2] -= _unrotate(-start[rows, 2], bias[:, :2])
-        error[rows, 2] = se2.wrap(error[rows, 2])
+    error = np.empty((len(edges), 3))
+    _edge_errors(*map(_writable, (
+        poses, edges.i, edges.j, edges.k, edges.mean, edges.kind, edges.bias)), error)
     return error
 
 
@@ -70,11 +50,52 @@ def observed_errors(poses: FloatArray, observed: ObservedNodes) -> FloatArray:
     observed : ObservedNodes
 
     """
-    pose, mean = poses[observed.node], observed.mean
-    predicted = se2.transform(pose, observed.offset[:, :2])
-    translation = _unrotate(mean[:, 2], predicted - mean[:, :2])
-    theta = se2.wrap(pose[:, 2] + observed.offset[:, 2] - mean[:, 2])
-    return np.column_stack((translation, theta))
+    error = np.empty((len(observed), 3))
+    _observed_errors(*map(_writable, (
+        poses, observed.node, observed.offset, observed.mean)), error)
+    return error
+
+
+def _writable(column: npt.NDArray[Any]) -> npt.NDArray[Any]:
+    """Return an array as kernels take it."""
+    return np.require(column, requirements=('C', 'W'))
+
+
+@kernel
+def write_data(f, kind, mean, bias):  # type: ignore[no-untyped-def]
+    """
+    Write what the error of an edge depends on into a row as of `edge_f`.
+
+    Parameters
+    ----------
+    f, kind : ndarray and int
+    mean, bias : ndarray, values of the columns of `Edges`
+
+    """
+    f[tb.MEAN], f[tb.MEAN + 1], f[tb.MEAN + 2] = mean[0], mean[1], mean[2]
+    f[tb.OFFSET], f[tb.OFFSET + 1] = bias[0], bias[1]
+    f[tb.FACTOR_T], f[tb.FACTOR_TH] = bias[2], bias[3]
+    prepare(f, kind)
+
+
+@kernel(signature=(ROWS, INTEGERS, INTEGERS, INTEGERS, ROWS, BYTES, ROWS, ROWS), allocates=True)
+def _edge_errors(poses, i, j, k, mean, kind, bias, error):  # type: ignore[no-untyped-def]
+    f = np.empty(tb.EDGE_F)
+    for e in range(len(i)):
+        write_data(f, kind[e], mean[e], bias[e])
+        third = bias[e, 3] * poses[k[e], 0] if k[e] >= 0 else 0.0
+        error[e, 0], error[e, 1], error[e, 2], _, _, _, _ = model(
+            f, kind[e], poses[i[e]], poses[j[e]], third)
+
+
+@kernel(signature=(ROWS, INTEGERS, ROWS, ROWS, ROWS), allocates=True)
+def _observed_errors(poses, node, offset, mean, error):  # type: ignore[no-untyped-def]
+    f = np.empty(tb.OBS_F)
+    for k in range(len(node)):
+        for m in range(3):
+            f[tb.MEAN + m], f[tb.OFFSET + m] = mean[k, m], offset[k, m]
+        x, y, th, _, _, _, _ = model(f, OBSERVED, poses[node[k]], poses[node[k]], 0.0)
+        error[k, 0], error[k, 1], error[k, 2] = -x, -y, wrap(-th)
 
 
 def energies(error: FloatArray, information: FloatArray) -> FloatArray:
@@ -88,10 +109,3 @@ def energies(error: FloatArray, information: FloatArray) -> FloatArray:
 
     """
     return np.einsum('mi,mij,mj->m', error, information, error)
-
-
-def _unrotate(theta: FloatArray, vector: FloatArray) -> FloatArray:
-    """Return R(theta)^T v for each row."""
-    c, s = np.cos(theta), np.sin(theta)
-    x, y = vector[:, 0], vector[:, 1]
-    return np.column_stack((c * x + s * y, c * y - s * x))

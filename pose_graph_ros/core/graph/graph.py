@@ -12,13 +12,14 @@ from pose_graph_ros.core.geometry import se2
 from pose_graph_ros.core.geometry.se2 import FloatArray, IntArray
 from pose_graph_ros.core.graph import editing, removal, tables as tb, transaction_log
 from pose_graph_ros.core.graph.compaction import compact
-from pose_graph_ros.core.graph.constraints import check
+from pose_graph_ros.core.graph.constraints import check, NodeKind
 from pose_graph_ros.core.graph.contents import GraphContents
 from pose_graph_ros.core.graph.edit_checks import (
     check_ids,
     check_weights,
     checked_poses,
     integers,
+    other_nodes,
     values,
 )
 from pose_graph_ros.core.graph.graph_update import (
@@ -83,7 +84,8 @@ class Graph(GraphContents):
         edits = any(map(len, update[FIRST_EDIT:]))
         if edits:
             self._check_edits(update)
-        columns, checked = (update.hidden, update.biases, *update.edges.columns,
+        others = other_nodes(update.biases, update.dimensions, update.landmarks)
+        columns, checked = (update.hidden, *others, *update.edges.columns,
                             *update.observed.columns), False
         try:
             code = editing.add_rows(self.memory.head, *columns, checked)
@@ -92,17 +94,18 @@ class Graph(GraphContents):
         while code != editing.ADDED:
             if code == editing.NO_ROOM:
                 self.ensure(
-                    self.n_nodes + len(update.hidden) + len(update.biases),
+                    self.n_nodes + len(update.hidden) + len(others[0]),
                     self.n_edges + len(update.edges), self.n_observed + len(update.observed))
             else:
-                columns, checked = self._checked_columns(update), True
+                columns, checked = self._checked_columns(update, others), True
             code = editing.add_rows(self.memory.head, *columns, checked)
         if edits:
             self._edit(update)
 
     def _check_edits(self, update: GraphUpdate) -> None:
         """Raise GraphUpdateError for unknown ids or invalid weights; new rows may be edited."""
-        nodes = self._nodes.extended(len(update.hidden) + len(update.biases))
+        nodes = self._nodes.extended(
+            len(update.hidden) + len(update.biases) + len(update.landmarks))
         edges = self._edges.extended(len(update.edges))
         observed = self._observed.extended(len(update.observed))
         for part in ('fix', 'free', 'remove_nodes'):
@@ -142,21 +145,24 @@ class Graph(GraphContents):
             return NOTHING_LEFT
         return Left(*(ids.astype(np.int64) for ids in compact(self.memory.head)))
 
-    def _checked_columns(self, update: GraphUpdate) -> tuple[npt.NDArray[Any], ...]:
+    def _checked_columns(
+        self, update: GraphUpdate, others: tuple[npt.NDArray[Any], ...],
+    ) -> tuple[npt.NDArray[Any], ...]:
         """Return new rows as arrays for the kernel; raise GraphUpdateError if one is invalid."""
-        hidden, biases = (
-            checked_poses(name, getattr(update, name)) for name in ('hidden', 'biases'))
+        hidden = checked_poses('hidden', update.hidden)
+        others = (checked_poses('biases', others[0]), *others[1:])
         edges, observed = update.edges, update.observed
-        is_bias = np.concatenate((
-            self.is_bias, np.zeros(len(hidden), dtype=bool), np.ones(len(biases), dtype=bool)))
-        nodes = self._nodes.extended(len(hidden) + len(biases))
+        kind, dimension = (np.concatenate((present, np.full(len(hidden), usual), new))
+                           for present, usual, new in ((self.node_kind, 0, others[1]),
+                                                       (self.dimension, 3, others[2])))
+        nodes = self._nodes.extended(len(hidden) + len(others[0]))
         for table in (edges, observed):
             if len(table) > 0:
-                check(table, is_bias, nodes)
+                check(table, kind, dimension, nodes)
         edges = edges if len(edges) > 0 else NO_EDGES
         observed = observed if len(observed) > 0 else NOTHING_OBSERVED
         return tuple(np.array(column, order='C')
-                     for column in (hidden, biases, *edges.columns, *observed.columns))
+                     for column in (hidden, *others, *edges.columns, *observed.columns))
 
     def ensure(self, n_nodes: int, n_edges: int, n_observed: int) -> None:
         """
@@ -216,10 +222,12 @@ class Graph(GraphContents):
         Raises GraphUpdateError if they are not, or a row is invalid.
         """
         self._append('node', GraphUpdate(hidden=rows.poses), rows.node_ids, rows.next_ids.node)
-        is_bias, memory = rows.is_bias, self.memory
-        begin = self.n_nodes - len(is_bias)
-        memory['node_i'][begin:self.n_nodes, tb.IS_BIAS] = is_bias
-        poses = np.flatnonzero(~self.is_bias)
+        memory, begin = self.memory, self.n_nodes - len(rows.poses)
+        new = memory['node_i'][begin:self.n_nodes]
+        new[:, tb.NODE_KIND] = rows.node_kind
+        new[:, tb.DIMENSION] = rows.dimension if rows.dimension is not None else np.where(
+            rows.node_kind == NodeKind.LANDMARK, 2, 3)
+        poses = np.flatnonzero(self.is_pose)
         memory.head[tb.NEWEST] = poses[-1] if len(poses) > 0 else -1
         self._append('edge', GraphUpdate(edges=rows.edges), rows.edge_ids, rows.next_ids.edge)
         self._append('observed', GraphUpdate(observed=rows.observed), rows.observed_ids,

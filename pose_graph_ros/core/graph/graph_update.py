@@ -4,15 +4,17 @@
 
 from collections.abc import Mapping, Sequence
 from types import MappingProxyType
-from typing import Final, NamedTuple, Self
+from typing import Any, Final, NamedTuple, Self
 
 import numpy as np
+import numpy.typing as npt
 
 from pose_graph_ros.core.geometry.se2 import BoolArray, FloatArray, IntArray
-from pose_graph_ros.core.graph.constraints import Edges, ObservedNodes
+from pose_graph_ros.core.graph.constraints import Edges, NodeKind, ObservedNodes
 
 # Empty parts of updates.
 NO_POSES: Final[FloatArray] = np.empty((0, 3))
+NO_POINTS: Final[FloatArray] = np.empty((0, 2))
 NO_EDGES: Final = Edges()
 NOTHING_OBSERVED: Final = ObservedNodes()
 NO_WEIGHTS: Final[Mapping[int, float]] = MappingProxyType({})
@@ -36,6 +38,10 @@ class GraphUpdate(NamedTuple):
     Initial values of new biases, shape (S, 3) [sigma, sigma, rad]: hidden nodes that are numbered
     after those of `hidden`.
     """
+    dimensions: Sequence[int] = ()
+    """Numbers of coordinates of the new biases, 3 if not given; the others are and stay 0."""
+    landmarks: FloatArray = NO_POINTS
+    """Initial positions of new landmarks in the map, shape (L, 2) [m], numbered after biases."""
     fix: Sequence[int] = ()
     """Hidden nodes that keep their pose from now on (the gauge)."""
     free: Sequence[int] = ()
@@ -104,7 +110,8 @@ class GraphRows(NamedTuple):
 
     poses: FloatArray
     """Estimates of all hidden nodes, biases included, shape (N, 3) [m, m, rad]."""
-    is_bias: BoolArray
+    node_kind: npt.NDArray[Any]
+    """`NodeKind` of the hidden nodes, shape (N,)."""
     fixed: BoolArray
     edges: Edges
     """Their ends are ids."""
@@ -116,6 +123,18 @@ class GraphRows(NamedTuple):
     observed_ids: IntArray
     next_ids: NextIds
     """Ids of the next new rows; at least 1 more than the last."""
+    dimension: IntArray | None = None
+    """Numbers of coordinates of the hidden nodes; by default those usual for their kinds."""
+
+    @property
+    def is_bias(self) -> BoolArray:
+        """Whether hidden nodes are biases, shape (N,)."""
+        return np.asarray(self.node_kind == NodeKind.BIAS)
+
+    @property
+    def is_pose(self) -> BoolArray:
+        """Whether hidden nodes are poses, shape (N,)."""
+        return np.asarray(self.node_kind == NodeKind.POSE)
 
     def since(self, first: NextIds) -> 'GraphRows':
         """Return the rows that are new since the next ids were these."""
@@ -123,9 +142,10 @@ class GraphRows(NamedTuple):
             slice(int(np.searchsorted(ids, begin)), None) for ids, begin in zip(
                 (self.node_ids, self.edge_ids, self.observed_ids), first, strict=True))
         return GraphRows(
-            self.poses[nodes], self.is_bias[nodes], self.fixed[nodes], self.edges.rows(edges),
+            self.poses[nodes], self.node_kind[nodes], self.fixed[nodes], self.edges.rows(edges),
             self.observed.rows(observed), self.node_ids[nodes], self.edge_ids[edges],
-            self.observed_ids[observed], self.next_ids)
+            self.observed_ids[observed], self.next_ids,
+            None if self.dimension is None else self.dimension[nodes])
 
     def with_edges(self, edges: Edges) -> Self:
         """Return the same rows with other edges, which get the ids 0, 1 and so on."""

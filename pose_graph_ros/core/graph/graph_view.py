@@ -22,8 +22,8 @@ from pose_graph_ros.core.graph.graph import Graph
 
 # Columns of the tables: diagonal of the information, offset or arm with the measured position.
 DIAGONAL = [tb.INFO, tb.INFO + 3, tb.INFO + 5]
-_OFFSET_AND_MEAN = [tb.OBS_OFFSET, tb.OBS_OFFSET + 1, tb.MEAN, tb.MEAN + 1]
-_ARM_AND_MEAN = [tb.BIAS_OFFSET, tb.BIAS_OFFSET + 1, tb.MEAN, tb.MEAN + 1]
+_OFFSET_AND_MEAN = [tb.OFFSET, tb.OFFSET + 1, tb.MEAN, tb.MEAN + 1]
+_ARM_AND_MEAN = [tb.OFFSET, tb.OFFSET + 1, tb.MEAN, tb.MEAN + 1]
 
 
 @dataclass(frozen=True, slots=True)
@@ -97,7 +97,7 @@ def view(graph: Graph, drawn: DrawnRows = ALL_BELIEVED) -> GraphView | None:
     """
     if graph.n_nodes == 0:
         return None
-    positions, is_bias = graph.poses[:, :2].copy(), graph.is_bias
+    positions, is_bias = graph.poses[:, :2].copy(), ~graph.is_pose
     tables = constraint_tables(graph)
     edges, observed = tables
     sigmas = edges.sigmas

@@ -58,7 +58,7 @@ def _forget_newest(head):  # type: ignore[no-untyped-def]
     """Let the newest pose be the last one that does not leave."""
     node_i = tb.node_i(head)
     v = head[tb.NEWEST]
-    while v >= 0 and (node_i[v, tb.NODE_LEAVES] != 0 or node_i[v, tb.IS_BIAS] != 0):
+    while v >= 0 and (node_i[v, tb.NODE_LEAVES] != 0 or node_i[v, tb.NODE_KIND] != 0):
         v -= 1
     head[tb.NEWEST] = v
 
@@ -80,7 +80,7 @@ def remove_nodes(head, nodes):  # type: ignore[no-untyped-def]
             continue
         transaction_log.log_node(head, v)
         while node_i[v, tb.EDGE_LIST] >= 0:
-            weigh_edge(head, node_i[v, tb.EDGE_LIST] >> 1, 0.0)
+            weigh_edge(head, node_i[v, tb.EDGE_LIST] >> 2, 0.0)
         while node_i[v, tb.OBSERVED_LIST] >= 0:
             weigh_one_observed(head, node_i[v, tb.OBSERVED_LIST], 0.0)
         _touch_cliques_with(head, v)

@@ -9,14 +9,21 @@ A row is *valid* if it passes the quick checks in here. Rows that do not are che
 
 import math
 
+import numpy as np
+
 from pose_graph_ros.core.compiled.jit import kernel
 from pose_graph_ros.core.graph import factors, identities, tables as tb
-from pose_graph_ros.core.graph.constraints import KNOWN_EDGES, ObservedKind
+from pose_graph_ros.core.graph.factor_types import BIAS, FACTORS, NodeKind, ObservedKind
 
 # Tolerance of the symmetry and the eigenvalues of an information matrix whose diagonal is scaled
 # to 1; a tenth of that in `constraints.check`.
 _TOLERANCE = 1e-6
-_EDGE_KINDS = tuple(map(int, KNOWN_EDGES))
+# By kind of edges: bits of the kinds of nodes (1 << kind) that its ends may be, END_K also none,
+# and of the rows that its error has.
+_NO_NODE = len(NodeKind)
+_ENDS = np.array([[sum(1 << kind for kind in kinds) for kinds in (factor.i, factor.j, (
+    *factor.k, _NO_NODE))] for factor in FACTORS.values()])
+_ROWS = np.array([sum(1 << row for row in factor.rows) for factor in FACTORS.values()])
 _OBSERVED_KINDS = tuple(map(int, ObservedKind))
 
 
@@ -76,7 +83,7 @@ def write_edge(head, e, i, j, mean, information, kind, weight):  # type: ignore[
     """
     edge_f, edge_i = tb.edge_f(head), tb.edge_i(head)
     f, row = edge_f[e], edge_i[e]
-    row[tb.END_I], row[tb.END_J], row[tb.EDGE_KIND] = i, j, kind
+    row[tb.END_I], row[tb.END_J], row[tb.END_K], row[tb.EDGE_KIND] = i, j, -1, kind
     f[tb.WEIGHT] = weight
     valid = _copy_pose(f, tb.MEAN, mean) and _is_finite(weight) and weight >= 0.0 and i != j
     return _pack_information(f, information) and valid
@@ -101,7 +108,7 @@ def write_observed(  # type: ignore[no-untyped-def]
     row[tb.OBS_NODE], row[tb.OBS_KIND] = node, kind
     f[tb.WEIGHT] = weight
     valid = _copy_pose(f, tb.MEAN, mean) and _is_finite(weight) and weight >= 0.0
-    valid = _copy_pose(f, tb.OBS_OFFSET, offset) and valid
+    valid = _copy_pose(f, tb.OFFSET, offset) and valid
     return _pack_information(f, information) and valid
 
 
@@ -127,16 +134,37 @@ def write_nodes(head, first, poses):  # type: ignore[no-untyped-def]
 
 
 @kernel
-def _is_bias(head, v, first_bias):  # type: ignore[no-untyped-def]
-    """Tell whether a node is a bias; new biases are the rows from `first_bias` on."""
+def _node(head, v, others):  # type: ignore[no-untyped-def]
+    """
+    Return kind and dimension of a node, _NO_NODE and 0 for -1.
+
+    `others` are the first of the new nodes that are no poses, their kinds and dimensions.
+    """
+    first, kinds, dimensions = others
+    if v < 0:
+        return _NO_NODE, 0
     if v < head[tb.N_NODES]:
-        return tb.node_i(head)[v, tb.IS_BIAS] != 0
-    return v >= first_bias
+        row = tb.node_i(head)[v]
+        return row[tb.NODE_KIND], row[tb.DIMENSION]
+    if v < first:
+        return 0, 3
+    return kinds[v - first], dimensions[v - first]
+
+
+@kernel
+def _has_rows_only(f, rows, of_mean):  # type: ignore[no-untyped-def]
+    """Tell whether information, and the mean if asked for, are zero but in some rows (bits)."""
+    for m in range(3):
+        if (rows >> m) & 1 == 0 and (
+                f[tb.INFO + (0, 3, 5)[m]] != 0.0 or (of_mean and f[tb.MEAN + m] != 0.0)):
+            return False
+    return True
 
 
 @kernel
 def write_edges(  # type: ignore[no-untyped-def]
-    head, n_nodes, first_bias, i, j, mean, information, kind, weight, bias,
+    head, n_nodes, first_other, kinds, dimensions, i, j, mean, information, kind, weight, bias,
+    third,
 ):
     """
     Return whether new edges are all valid after writing them behind the last row.
@@ -144,48 +172,64 @@ def write_edges(  # type: ignore[no-untyped-def]
     Parameters
     ----------
     n_nodes : int, number of hidden nodes, with the new ones
-    first_bias : int, first row of the new biases
-    i, j, mean, information, kind, weight, bias : ndarray, columns of `Edges`
+    first_other : int, first row of the new nodes that are no poses
+    kinds, dimensions : ndarray, `NodeKind` of these and numbers of coordinates
+    i, j, mean, information, kind, weight, bias, third : ndarray, columns of `Edges`
 
     """
-    edge_f = tb.edge_f(head)
+    edge_f, edge_i = tb.edge_f(head), tb.edge_i(head)
     valid = True
     for k in range(len(i)):
         e = head[tb.N_EDGES] + k
-        a, b = identities.node_row(head, i[k]), identities.node_row(head, j[k])
-        inside = 0 <= a < n_nodes and 0 <= b < n_nodes and kind[k] in _EDGE_KINDS
+        a, b, c = identities.node_row(head, i[k]), identities.node_row(head, j[k]), -1
+        if third[k] != -1:
+            c = identities.node_row(head, third[k])
+            valid = valid and c >= 0
         valid = write_edge(
-            head, e, a, b, mean[k], information[k], kind[k], weight[k]) and inside and valid
-        if kind[k] == factors.BIAS:
-            f = edge_f[e]
-            f[tb.BIAS_OFFSET], f[tb.BIAS_OFFSET + 1] = bias[k, 0], bias[k, 1]
-            f[tb.FACTOR_T], f[tb.FACTOR_TH] = bias[k, 2], bias[k, 3]
-            for m in range(4):
-                valid = _is_finite(bias[k, m]) and valid
-            valid = valid and _is_bias(head, b, first_bias)
-        elif valid:
-            valid = not (_is_bias(head, a, first_bias) or _is_bias(head, b, first_bias))
+            head, e, a, b, mean[k], information[k], kind[k], weight[k]) and valid
+        f = edge_f[e]
+        edge_i[e, tb.END_K] = c
+        f[tb.OFFSET], f[tb.OFFSET + 1] = bias[k, 0], bias[k, 1]
+        f[tb.FACTOR_T], f[tb.FACTOR_TH] = bias[k, 2], bias[k, 3]
+        for m in range(4):
+            valid = _is_finite(bias[k, m]) and valid
+        valid = (valid and 0 <= a < n_nodes and 0 <= b < n_nodes and c < n_nodes
+                 and kind[k] < len(_ROWS))
+        if valid:
+            others = first_other, kinds, dimensions
+            ends = _node(head, a, others), _node(head, b, others), _node(head, c, others)
+            for m in range(3):
+                valid = valid and (_ENDS[kind[k], m] >> ends[m][0]) & 1 == 1
+            if kind[k] == BIAS:     # of the rows that both nodes have
+                valid = valid and _has_rows_only(
+                    f, (1 << min(ends[0][1], ends[1][1])) - 1, False)
+            elif kind[k] > BIAS:
+                valid = valid and _has_rows_only(f, _ROWS[kind[k]], True)
     return valid
 
 
 @kernel
 def write_all_observed(  # type: ignore[no-untyped-def]
-    head, n_nodes, node, offset, mean, information, kind, weight,
+    head, n_nodes, first_other, kinds, dimensions, node, offset, mean, information, kind, weight,
 ):
     """
     Return whether new observed nodes are all valid after writing them behind the last row.
 
     Parameters
     ----------
-    n_nodes : int, number of hidden nodes, with the new ones
+    n_nodes, first_other, kinds, dimensions : int or ndarray, as for `write_edges`
     node, offset, mean, information, kind, weight : ndarray, columns of `ObservedNodes`
 
     """
     valid = True
     for k in range(len(node)):
+        row = head[tb.N_OBSERVED] + k
         v = identities.node_row(head, node[k])
-        inside = 0 <= v < n_nodes and kind[k] in _OBSERVED_KINDS
-        if not (write_observed(head, head[tb.N_OBSERVED] + k, v, offset[k], mean[k],
-                               information[k], kind[k], weight[k]) and inside):
-            valid = False
+        valid = write_observed(head, row, v, offset[k], mean[k], information[k], kind[k],
+                               weight[k]) and valid
+        valid = valid and 0 <= v < n_nodes and kind[k] in _OBSERVED_KINDS
+        if valid:
+            dimension = _node(head, v, (first_other, kinds, dimensions))[1]
+            valid = dimension == 3 or _has_rows_only(
+                tb.observed_f(head)[row], (1 << dimension) - 1, False)
     return valid

@@ -48,8 +48,8 @@ HEAD = INTEGERS     # the type of the head, in signatures of kernels
 POSE, DELTA, SEEN, CHECKED_TURN, SCALE_T, SCALE_R, REF, NODE_F = 0, 3, 6, 9, 10, 11, 12, 15
 # node_i
 #   CLIQUE: row of the clique that the node is frontal in
-#   EDGE_LIST: head of the list of its edges with a weight above 0; an entry is 2 * edge + side
-#       (0: END_I, 1: END_J)
+#   EDGE_LIST: head of the list of its edges with a weight above 0; an entry is 4 * edge + side
+#       (0: END_I, 1: END_J, 2: END_K)
 #   OBSERVED_LIST: head of the list of its observed nodes with a weight above 0
 #   FIXED: 1 if the node keeps its pose
 #   TOUCHED: 1 if the node is in the table `touched`
@@ -58,33 +58,33 @@ POSE, DELTA, SEEN, CHECKED_TURN, SCALE_T, SCALE_R, REF, NODE_F = 0, 3, 6, 9, 10,
 #   CHANGED: stamp (ITERATION) of the last move by more than alpha sigmas
 #   NODE_LOGGED, SOLUTION_LOGGED: stamps (UPDATE) of the last log of the row, and of the columns
 #       before SCALE_T alone
-#   IS_BIAS: 1 for a bias, 0 for a pose
+#   NODE_KIND, DIMENSION: `NodeKind`, and number of coordinates (1 to 3); those behind stay 0
 #   NODE_LEAVES: 1 if `compaction` takes the node out after the update; it is in no list by then
 (CLIQUE, EDGE_LIST, OBSERVED_LIST, FIXED, TOUCHED, INDEX, FRONT, CHANGED, NODE_LOGGED,
- SOLUTION_LOGGED, IS_BIAS, NODE_LEAVES, NODE_I) = range(13)
+ SOLUTION_LOGGED, NODE_KIND, DIMENSION, NODE_LEAVES, NODE_I) = range(14)
 
 # edge_f; th is the DELTA of a heading, and "linearized" means at the last linearization.
 #   MEAN (3): measured pose of j in i [m, m, rad]
 #   INFO (6): information xx, xy, xt, yy, yt, tt [1/m^2, 1/(m rad), 1/rad^2]
 #   WEIGHT: factor on the information, 0 for a removed edge
-#   OWN_T (2): translation of the mean in its own axes, R_z^T t_z [m]
-#   LIN_D (2): linearized t_j - t_i [m]
-#   LIN_COS, LIN_SIN: of the linearized direction of the measured frame, th_i + th_z
+#   OWN (2): translation of the mean in its own axes, R_z^T t_z [m], or the column OFFSET
+#   OFFSET: measured position in the frame of i [m], where an error has one
+#   FACTOR_T, FACTOR_TH: factors of a bias that is the end j; FACTOR_TH: of the third node
+#   DIRECTION (2): of a range, linearized; shares the columns of the factors
+#   LIN_COS, LIN_SIN: of the linearized direction of the measured frame, th_i + th_z, or of th_i
+#   LIN_ARM (2): linearized arm of the Jacobian [m]
+#   LIN_H (2): linear error of the position without the nodes' differences, in map axes [m]
 #   LIN_TH: linearized th of i [rad]
-#   LIN_K: heading error minus (th_j - th_i), linearized [rad]
+#   LIN_K: linearized heading error without th of the nodes [rad]
 #   ERROR2: squared linearization error, weighted [sigma^2]
 #   ENERGY: e^T information e, weighted [sigma^2]
-(MEAN, INFO, WEIGHT, OWN_T, LIN_D, LIN_COS, LIN_SIN, LIN_TH, LIN_K, ERROR2, ENERGY, EDGE_F) = (
-    0, 3, 9, 10, 12, 14, 15, 16, 17, 18, 19, 20)
-# Columns of edge_f that an edge to a bias uses otherwise; its error lies in map axes, so it has no
-# direction to keep.
-#   BIAS_OFFSET (2): measured position in the frame of i [m]
-#   BIAS_ARM (2): linearized R_i BIAS_OFFSET, in map axes [m]
-#   FACTOR_T, FACTOR_TH: factors of the bias [m, rad]
-BIAS_OFFSET, BIAS_ARM, FACTOR_T, FACTOR_TH = OWN_T, LIN_D, LIN_COS, LIN_SIN
+(MEAN, INFO, WEIGHT, OWN, FACTOR_T, FACTOR_TH, LIN_COS, LIN_SIN, LIN_ARM, LIN_H, LIN_TH, LIN_K,
+ ERROR2, ENERGY, EDGE_F) = 0, 3, 9, 10, 12, 13, 14, 15, 16, 18, 20, 21, 22, 23, 24
+OFFSET, DIRECTION = OWN, FACTOR_T
 # edge_i
 #   END_I, END_J: nodes that the edge starts from and leads to
-#   NEXT_I, NEXT_J: next entries of the edge lists of END_I and END_J
+#   END_K: third node, or -1
+#   NEXT_I, NEXT_J, NEXT_K: next entries of the edge lists of END_I, END_J and END_K
 #   EDGE_KIND: `EdgeKind`
 #   EDGE_CHECKED: stamp (ITERATION) of the last check of the linearization
 #   EDGE_WAITS: 1 if the edge is in the table `waiting`
@@ -92,15 +92,12 @@ BIAS_OFFSET, BIAS_ARM, FACTOR_T, FACTOR_TH = OWN_T, LIN_D, LIN_COS, LIN_SIN
 #       and EDGE_WAITS alone
 #   OWNER: row of the clique that the edge was assembled in
 #   EDGE_LEAVES: 1 if `compaction` takes the edge out, as it does all edges of nodes that leave
-(END_I, END_J, NEXT_I, NEXT_J, EDGE_KIND, EDGE_CHECKED, EDGE_WAITS, EDGE_LOGGED, ENERGY_LOGGED,
- OWNER, EDGE_LEAVES, EDGE_I) = range(12)
+(END_I, END_J, END_K, NEXT_I, NEXT_J, NEXT_K, EDGE_KIND, EDGE_CHECKED, EDGE_WAITS, EDGE_LOGGED,
+ ENERGY_LOGGED, OWNER, EDGE_LEAVES, EDGE_I) = range(14)
 
-# observed_f; MEAN, INFO and WEIGHT as for edges, the mean being the observed pose in the map.
-#   OBS_OFFSET (3): pose of the observed frame in the hidden node [m, m, rad]
-#   OBS_TH: linearized th of the hidden node [rad]
-#   OBS_K: heading error minus th, linearized [rad]
-#   OBS_ERROR2, OBS_ENERGY: as ERROR2 and ENERGY [sigma^2]
-OBS_OFFSET, OBS_TH, OBS_K, OBS_ERROR2, OBS_ENERGY, OBS_F = 10, 13, 14, 15, 16, 17
+# observed_f has the columns of edge_f, with the observed pose in the map for a mean, and
+#   OFFSET (3): pose of the observed frame in the hidden node [m, m, rad]
+OBS_F = EDGE_F
 # observed_i
 #   OBS_NODE: hidden node that is observed
 #   OBS_NEXT: next entry of its list of observed nodes
@@ -119,7 +116,8 @@ OBS_NODE, OBS_NEXT, OBS_KIND, OBS_WAITS, OBS_LOGGED, OBS_LEAVES, OBS_I = range(7
 #   BUILT: stamp (ITERATION) of the last elimination or solution
 #   BORN, VALUES_BORN, CLIQUE_LOGGED: stamps (UPDATE) of taking the row, of taking the values, and
 #       of the last log of the row
-#   ANCHORED: 1 if a node at or below it is fixed, observed or has an edge to a bias
+#   ANCHORED: 1 if a node at or below it is fixed, observed or has an edge to a node that is no
+#       pose
 (PARENT, CHILD, SIBLING, N_FRONTAL, N_SEPARATOR, NODES, VALUES, MARKED, BUILT, BORN, VALUES_BORN,
  CLIQUE_LOGGED, ANCHORED, CLIQUE_I) = range(14)
 # clique_f; see `clique_frames`.

@@ -74,7 +74,7 @@ class SavedGraph:
         rows, nodes = self.rows, self.nodes
         for table in (rows.edges, rows.observed):
             if len(table) > 0:
-                check_table(table, rows.is_bias)
+                check_table(table, rows.node_kind, rows.dimension)
         sizes = {'nodes': len(rows.poses), 'edges': len(rows.edges),
                  'observed': len(rows.observed)}
         _require(len(nodes.rows) > 0, 'nodes: expected at least one')
@@ -82,7 +82,7 @@ class SavedGraph:
         _increasing('nodes.stamps_ns', nodes.stamps_ns)
         _increasing('nodes.rows', nodes.rows)
         _inside('nodes.rows', nodes.rows, sizes['nodes'])
-        _require(np.array_equal(np.flatnonzero(~rows.is_bias), nodes.rows),
+        _require(np.array_equal(np.flatnonzero(rows.is_pose), nodes.rows),
                  'nodes.rows: expected all hidden nodes of the graph that are no biases')
         self._check_odometry()
         if self.datum is not None:

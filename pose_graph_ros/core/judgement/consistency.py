@@ -224,7 +224,7 @@ def _first(graph: Graph) -> IntArray:
     ends = graph.memory['edge_i'][:graph.n_edges]
     odometry = ends[ends[:, tb.EDGE_KIND] == EdgeKind.ODOMETRY]
     if len(odometry) == 0:
-        return np.flatnonzero(~graph.is_bias)[:1]
+        return np.flatnonzero(graph.is_pose)[:1]
     # a node before it may have no odometry any more, as all nodes in between have left
     return odometry[np.argmin(odometry[:, tb.END_J])][[tb.END_I]].copy()
 

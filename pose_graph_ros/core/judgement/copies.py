@@ -38,7 +38,7 @@ def in_rows(graph: Graph, edges: Edges) -> Edges:
     edges : Edges
 
     """
-    return Edges(graph.node_rows(edges.i), graph.node_rows(edges.j), *edges.columns[2:])
+    return edges.renumbered(graph.node_rows)
 
 
 def weights_in_rows(graph: Graph, weights: Mapping[int, float]) -> dict[int, float]:

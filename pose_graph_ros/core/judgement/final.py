@@ -89,5 +89,5 @@ def _copy(graph: Graph, closures: IntArray) -> Graph:
     for column, values in zip(
             columns, (own.i, own.j, own.mean, own.information), strict=True):
         column[closures] = values
-    copy.fill(rows._replace(edges=Edges(*columns, edges.kind, edges.weight, edges.bias)))
+    copy.fill(rows._replace(edges=Edges(*columns, edges.kind, edges.weight, edges.bias, edges.k)))
     return copy

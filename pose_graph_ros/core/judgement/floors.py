@@ -7,12 +7,14 @@ A closure is turned to lead from the earlier to the later node before its varian
 that it does not matter in which direction it was measured.
 """
 
+from dataclasses import replace
+
 import numpy as np
 
 from pose_graph_ros.core.config import CLOSURE_FLOORS
 from pose_graph_ros.core.geometry import se2
 from pose_graph_ros.core.geometry.se2 import FloatArray
-from pose_graph_ros.core.graph.constraints import Edges
+from pose_graph_ros.core.graph.constraints import EdgeKind, Edges
 
 FLOORS = np.array(CLOSURE_FLOORS)
 # Added to an information, relative to its largest entry, before it is inverted.
@@ -39,12 +41,12 @@ def floored(edges: Edges, sigmas: FloatArray = FLOORS) -> Edges:
     # (C + D)^-1 = I (1 + D I)^-1 with D the diagonal of what is missing
     softer = information @ np.linalg.inv(np.eye(3) + missing[:, :, None] * information)
     softer = 0.5 * (softer + softer.transpose(0, 2, 1))
-    return Edges(edges.i, edges.j, edges.mean, softer, edges.kind, edges.weight, edges.bias)
+    return replace(edges, information=softer)
 
 
 def forward(edges: Edges) -> Edges:
     """Return the same edges, each leading from the smaller row to the larger one."""
-    back = np.flatnonzero(edges.i > edges.j)
+    back = np.flatnonzero((edges.i > edges.j) & (edges.kind <= EdgeKind.LOOP_CLOSURE))
     if len(back) == 0:
         return edges
     i, j = edges.i.copy(), edges.j.copy()
@@ -54,4 +56,4 @@ def forward(edges: Edges) -> Edges:
     mean[back] = se2.inverse(edges.mean[back])
     adjoint = se2.adjoint(mean[back])
     information[back] = adjoint.transpose(0, 2, 1) @ information[back] @ adjoint
-    return Edges(i, j, mean, information, edges.kind, edges.weight, edges.bias)
+    return replace(edges, i=i, j=j, mean=mean, information=information)

@@ -18,7 +18,7 @@ import numpy as np
 from pose_graph_ros.core.batch.optimizer import Status
 from pose_graph_ros.core.config import BackendConfig, Robust
 from pose_graph_ros.core.geometry.se2 import FloatArray, IntArray
-from pose_graph_ros.core.graph.constraints import EdgeKind, Edges
+from pose_graph_ros.core.graph.constraints import EdgeKind
 from pose_graph_ros.core.graph.graph import GraphUpdate
 from pose_graph_ros.core.graph.graph_view import DrawnRows
 from pose_graph_ros.core.graph.incidence import constraints_on
@@ -313,5 +313,4 @@ def _weighed(change: GraphUpdate, numbers: IntArray, weights: FloatArray) -> Gra
     edges = change.edges
     every = edges.weight.copy()
     every[numbers] = weights
-    return change._replace(edges=Edges(
-        edges.i, edges.j, edges.mean, edges.information, edges.kind, every, edges.bias))
+    return change._replace(edges=replace(edges, weight=every))

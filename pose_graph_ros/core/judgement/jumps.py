@@ -246,7 +246,7 @@ def rows_with_motion(
     odometry, at, motion, sigmas : as in `with_motion`
 
     """
-    row, edges, poses, moved = int(odometry.rows[at]), rows.edges, rows.poses, ~rows.is_bias
+    row, edges, poses, moved = int(odometry.rows[at]), rows.edges, rows.poses, rows.is_pose
     edges.mean[row] = motion
     edges.information[row] = floored(edges.rows(np.array([row])), sigmas).information[0]
     k, l = odometry.nodes[[at, at + 1]]     # noqa: E741  as above

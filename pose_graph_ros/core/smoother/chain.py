@@ -13,7 +13,14 @@ import math
 
 from pose_graph_ros.core.compiled.jit import kernel, NUMBER, NUMBERS, ROWS
 from pose_graph_ros.core.elimination.fronts import LEAST_PIVOT
-from pose_graph_ros.core.graph import factors, pools, rows, tables as tb, transaction_log
+from pose_graph_ros.core.graph import (
+    factor_types,
+    factors,
+    pools,
+    rows,
+    tables as tb,
+    transaction_log,
+)
 from pose_graph_ros.core.graph.editing import scale_by_edge
 
 # Return codes of `extend`.
@@ -37,7 +44,7 @@ def _write_node(head, v, last, mean):  # type: ignore[no-untyped-def]
     f[tb.SCALE_T] = f[tb.SCALE_R] = 0.0
     i[:] = 0
     i[tb.CLIQUE] = i[tb.EDGE_LIST] = i[tb.OBSERVED_LIST] = -1
-    i[tb.NODE_LOGGED] = head[tb.UPDATE]
+    i[tb.NODE_LOGGED], i[tb.DIMENSION] = head[tb.UPDATE], 3
     tb.node_id(head)[v] = head[tb.NEXT_NODE]
 
 
@@ -136,8 +143,7 @@ def extend(head, mean, information, weight):  # type: ignore[no-untyped-def]
     transaction_log.begin(head)
     _write_node(head, v, last, mean)
     f = edge_f[e]
-    cos, sin = math.cos(mean[2]), math.sin(mean[2])
-    f[tb.OWN_T], f[tb.OWN_T + 1] = cos * mean[0] + sin * mean[1], cos * mean[1] - sin * mean[0]
+    factor_types.prepare(f, 0)
     tb.edge_id(head)[e] = head[tb.NEXT_EDGE]
     edge_i[e, tb.EDGE_CHECKED] = edge_i[e, tb.EDGE_WAITS] = edge_i[e, tb.EDGE_LEAVES] = 0
     edge_i[e, tb.OWNER] = c
@@ -148,7 +154,7 @@ def extend(head, mean, information, weight):  # type: ignore[no-untyped-def]
     front, least = work_f[:42], work_f[42:45]
     front[:] = 0.0
     _root_equations(head, last, old[tb.VALUES], front, 7)
-    factors.add_edge(head, e, 0, 3, front, 7)
+    factors.add_edge(head, e, 0, 3, -1, front, 7)
     scale_t, scale_r = node_f[last, tb.SCALE_T], node_f[last, tb.SCALE_R]
     scale_by_edge(head, e, 1.0)
     _set_least_pivots(head, last, least)
@@ -183,8 +189,8 @@ def extend(head, mean, information, weight):  # type: ignore[no-untyped-def]
     pool_i[old[tb.NODES]], pool_i[old[tb.NODES] + 1] = last, v
     _copy_rows(front, 7, 0, 6, old[tb.VALUES], pool_f)
     node_i[v, tb.CLIQUE] = r
-    edge_i[e, tb.NEXT_I], node_i[last, tb.EDGE_LIST] = node_i[last, tb.EDGE_LIST], 2 * e
-    edge_i[e, tb.NEXT_J], node_i[v, tb.EDGE_LIST] = -1, 2 * e + 1
+    edge_i[e, tb.NEXT_I], node_i[last, tb.EDGE_LIST] = node_i[last, tb.EDGE_LIST], 4 * e
+    edge_i[e, tb.NEXT_J], node_i[v, tb.EDGE_LIST] = -1, 4 * e + 1
     head[tb.N_NODES], head[tb.N_EDGES], head[tb.NEWEST] = v + 1, e + 1, v
     head[tb.NEXT_NODE] += 1
     head[tb.NEXT_EDGE] += 1

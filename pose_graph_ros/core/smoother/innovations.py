@@ -27,8 +27,9 @@ from pose_graph_ros.core.compiled.jit import (
 )
 from pose_graph_ros.core.elimination import clique_frames
 from pose_graph_ros.core.geometry.se2 import FloatArray, IntArray
-from pose_graph_ros.core.graph import factors, tables as tb
+from pose_graph_ros.core.graph import factor_types, factors, tables as tb
 from pose_graph_ros.core.graph.constraints import Edges
+from pose_graph_ros.core.graph.error_functions import write_data
 from pose_graph_ros.core.graph.pools import row_start
 from pose_graph_ros.core.smoother.covariances import cleared, pass_up
 
@@ -61,7 +62,7 @@ def at_estimate(head: IntArray, edges: Edges) -> Innovations:
     Parameters
     ----------
     head : ndarray of int, of the memory of a graph all of whose edits have been solved for
-    edges : Edges
+    edges : Edges, without third nodes
 
     """
     result = Innovations(np.empty((len(edges), 3)), np.zeros((len(edges), 3, 3)))
@@ -82,11 +83,11 @@ def of_edges(head, i, j, mean, kind, bias, error, out):  # type: ignore[no-untyp
 
     """
     node_f, node_i, clique_i = tb.node_f(head), tb.node_i(head), tb.clique_i(head)
-    start_j, end_j = np.empty((3, 3)), np.empty((3, 3))
+    f, start_j, end_j = np.empty(tb.EDGE_F), np.empty((3, 3)), np.empty((3, 3))
     first, second, spare = np.empty((3, 96)), np.empty((3, 96)), np.empty((3, 96))
     for k in range(len(i)):
-        _edge_jacobians(
-            node_f[i[k]], node_f[j[k]], mean[k], kind[k], bias[k], error[k], start_j, end_j)
+        write_data(f, kind[k], mean[k], bias[k])
+        _edge_jacobians(f, kind[k], node_f[i[k]], node_f[j[k]], error[k], start_j, end_j)
         a, b = node_i[i[k], tb.CLIQUE], node_i[j[k], tb.CLIQUE]
         common = _lowest_common(clique_i, a, b)
         first, spare, at_a = _begin(head, i[k], start_j, common, first, spare, out[k])
@@ -101,48 +102,26 @@ def of_edges(head, i, j, mean, kind, bias, error, out):  # type: ignore[no-untyp
 
 
 @kernel
-def _edge_jacobians(  # type: ignore[no-untyped-def]
-    start, end, mean, kind, bias, error, start_j, end_j,
-):
+def _edge_jacobians(f, kind, start, end, error, start_j, end_j):  # type: ignore[no-untyped-def]
     """
     Write the error of an edge and its Jacobians, in map axes.
 
     Parameters
     ----------
+    f, kind : ndarray and int, row of the edge as in edge_f
     start, end : ndarray, rows of its nodes in node_f
-    mean, kind, bias : ndarray or int, values of the columns of `Edges`
     error, start_j, end_j : ndarray, shapes (3,), (3, 3) and (3, 3), output
 
     """
-    dx, dy = end[tb.POSE] - start[tb.POSE], end[tb.POSE + 1] - start[tb.POSE + 1]
+    error[0], error[1], error[2], c, s, ax, ay = factors.model(f, kind, start, end, 0.0)
+    ft, fth = factor_types.factors_of_end(f, kind)
     start_j[:] = 0.0
     end_j[:] = 0.0
+    start_j[0, 0], start_j[0, 1], start_j[0, 2] = -c, -s, c * ay - s * ax
+    start_j[1, 0], start_j[1, 1], start_j[1, 2] = s, -c, -s * ay - c * ax
     start_j[2, 2] = -1.0
-    if kind == factors.BIAS:
-        c, s = math.cos(start[tb.POSE + 2]), math.sin(start[tb.POSE + 2])
-        ax, ay = c * bias[0] - s * bias[1], s * bias[0] + c * bias[1]
-        error[0] = bias[2] * end[tb.POSE] + mean[0] - start[tb.POSE] - ax
-        error[1] = bias[2] * end[tb.POSE + 1] + mean[1] - start[tb.POSE + 1] - ay
-        error[2] = factors.wrap(bias[3] * end[tb.POSE + 2] + mean[2] - start[tb.POSE + 2])
-        start_j[0, 0] = start_j[1, 1] = -1.0
-        start_j[0, 2], start_j[1, 2] = ay, -ax
-        end_j[0, 0] = end_j[1, 1] = bias[2]
-        end_j[2, 2] = bias[3]
-        return
-    phi = start[tb.POSE + 2] + mean[2]
-    c, s = math.cos(phi), math.sin(phi)
-    qx, qy = c * dx + s * dy, c * dy - s * dx
-    c_z, s_z = math.cos(mean[2]), math.sin(mean[2])
-    error[0] = qx - (c_z * mean[0] + s_z * mean[1])
-    error[1] = qy - (c_z * mean[1] - s_z * mean[0])
-    error[2] = factors.wrap(end[tb.POSE + 2] - start[tb.POSE + 2] - mean[2])
-    end_j[0, 0] = end_j[1, 1] = c
-    end_j[0, 1], end_j[1, 0] = s, -s
-    end_j[2, 2] = 1.0
-    for m in range(2):
-        for n in range(2):
-            start_j[m, n] = -end_j[m, n]
-    start_j[0, 2], start_j[1, 2] = qy, -qx
+    end_j[0, 0], end_j[0, 1], end_j[1, 0], end_j[1, 1] = ft * c, ft * s, -ft * s, ft * c
+    end_j[2, 2] = fth
 
 
 @kernel

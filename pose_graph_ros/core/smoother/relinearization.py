@@ -51,11 +51,11 @@ def _check_observed(head, k):  # type: ignore[no-untyped-def]
     observed_f, scalars, observed_i = tb.observed_f(head), tb.scalars(head), tb.observed_i(head)
     transaction_log.log_observed(head, k)
     f = observed_f[k]
-    scalars[tb.CHI2] -= f[tb.OBS_ENERGY]
+    scalars[tb.CHI2] -= f[tb.ENERGY]
     factors.check_observed(head, k)
-    scalars[tb.CHI2] += f[tb.OBS_ENERGY]
-    scalars[tb.ERROR2_SUM] += f[tb.OBS_ERROR2]
-    if (f[tb.OBS_ERROR2] > factors.LEAST_FRACTION * scalars[tb.SETTING_SHARE]
+    scalars[tb.CHI2] += f[tb.ENERGY]
+    scalars[tb.ERROR2_SUM] += f[tb.ERROR2]
+    if (f[tb.ERROR2] > factors.LEAST_FRACTION * scalars[tb.SETTING_SHARE]
             and observed_i[k, tb.OBS_WAITS] == 0):
         observed_i[k, tb.OBS_WAITS] = 1
         _append_waiting(head, -1 - k)
@@ -74,11 +74,11 @@ def _check(head):  # type: ignore[no-untyped-def]
         v = checks[n]
         entry = node_i[v, tb.EDGE_LIST]
         while entry >= 0:
-            e, side = entry >> 1, entry & 1
+            e, side = entry >> 2, entry & 3
             if edge_i[e, tb.EDGE_CHECKED] != iteration:
                 edge_i[e, tb.EDGE_CHECKED] = iteration
                 _check_edge(head, e)
-            entry = edge_i[e, tb.NEXT_J if side == 1 else tb.NEXT_I]
+            entry = edge_i[e, tb.NEXT_I + side]
         k = node_i[v, tb.OBSERVED_LIST]
         while k >= 0:
             _check_observed(head, k)
@@ -121,7 +121,7 @@ def _error2(head, entry):  # type: ignore[no-untyped-def]
     edge_f, observed_f = tb.edge_f(head), tb.observed_f(head)
     if entry >= 0:
         return edge_f[entry, tb.ERROR2]
-    return observed_f[-1 - entry, tb.OBS_ERROR2]
+    return observed_f[-1 - entry, tb.ERROR2]
 
 
 @kernel
@@ -160,8 +160,9 @@ def _relinearize_worst(head, allowed):  # type: ignore[no-untyped-def]
             if worst:
                 head[tb.N_RELINEARIZED] += 1
                 factors.linearize_edge(head, entry)
-                _touch(head, edge_i[entry, tb.END_I])
-                _touch(head, edge_i[entry, tb.END_J])
+                for side in range(3):
+                    if edge_i[entry, side] >= 0:
+                        _touch(head, edge_i[entry, side])
         else:
             k = -1 - entry
             transaction_log.log_observed(head, k)

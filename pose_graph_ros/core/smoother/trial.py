@@ -90,7 +90,7 @@ class Trial:
         That is so if the poses of the graph were set since, as an alignment with the map does, or
         if all poses that it began with have left the graph.
         """
-        poses = self.graph.node_ids[~self.graph.is_bias]
+        poses = self.graph.node_ids[self.graph.is_pose]
         return self._graph.n_moves != self._moves or not np.any(self._graph.node_rows(poses) >= 0)
 
     def catch_up(self) -> None:
@@ -150,11 +150,11 @@ def continued(graph: Graph, poses: FloatArray, ids: IntArray | None = None) -> F
 
     """
     rows = np.arange(len(poses)) if ids is None else graph.node_rows(ids)
-    moved, is_bias = graph.poses.copy(), graph.is_bias
+    moved, is_pose = graph.poses.copy(), graph.is_pose
     n = int(np.max(rows)) + 1
-    last = int(rows[(rows >= 0) & ~is_bias[rows]][-1])
+    last = int(rows[(rows >= 0) & is_pose[rows]][-1])
     moved[rows[rows >= 0]] = poses[rows >= 0]
-    newer = n + np.flatnonzero(~is_bias[n:])
+    newer = n + np.flatnonzero(is_pose[n:])
     moved[newer] = se2.compose(
         moved[last], se2.between(graph.poses[last], graph.poses[newer]))
     return moved

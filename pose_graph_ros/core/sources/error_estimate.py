@@ -198,7 +198,7 @@ def _odometry(
 
     With `begin`, the id of a node that is still there, that is the first of them.
     """
-    at, rows = np.cumsum(~graph.is_bias) - 1, graph.node_rows(nodes)
+    at, rows = np.cumsum(graph.is_pose) - 1, graph.node_rows(nodes)
     if begin is not None:
         rows = np.append(graph.node_rows(begin), rows)
         rows = np.maximum(rows, rows[0])

@@ -90,7 +90,7 @@ def crowd(graph: Graph, config: ThinningConfig) -> Crowd:
     config : ThinningConfig
 
     """
-    rows = np.flatnonzero(~graph.is_bias)[:-config.newest]
+    rows = np.flatnonzero(graph.is_pose)[:-config.newest]
     fixed = graph.fixed
     preferred = np.where(fixed, 2, informed(graph))
     found = crowded(graph.poses[rows], preferred[rows], config)

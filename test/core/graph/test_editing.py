@@ -39,14 +39,14 @@ def chi2(graph: Graph) -> float:
 
 
 def edges_of(graph: Graph, node: int) -> list[int]:
-    """Return the edges in the list of a node; bit 0 of an entry is the end of the edge."""
+    """Return the edges in the list of a node; the two low bits are the end of the edge."""
     edge_i, found = graph.memory['edge_i'], []
     entry = int(graph.memory['node_i'][node, tb.EDGE_LIST])
     while entry >= 0:
-        edge, side = entry >> 1, entry & 1
-        assert edge_i[edge, tb.END_J if side == 1 else tb.END_I] == node
+        edge, side = entry >> 2, entry & 3
+        assert edge_i[edge, side] == node
         found.append(edge)
-        entry = int(edge_i[edge, tb.NEXT_J if side == 1 else tb.NEXT_I])
+        entry = int(edge_i[edge, tb.NEXT_I + side])
     return found
 
 
@@ -164,7 +164,8 @@ def test_a_weight_of_zero_removes_a_constraint_and_another_brings_it_back() -> N
 
 def columns(edges: Edges) -> tuple[np.ndarray, ...]:
     none = Graph().observed
-    return (np.empty((0, 3)), np.empty((0, 3)), *edges.columns,
+    no_bytes = np.empty(0, np.uint8)
+    return (np.empty((0, 3)), np.empty((0, 3)), no_bytes, no_bytes, *edges.columns,
             *(np.ascontiguousarray(column) for column in (
                 none.node.astype(np.int64), none.offset, none.mean, none.information,
                 none.kind.astype(np.uint8), none.weight)))

@@ -1,0 +1,184 @@
+# Copyright 2026 The pose_graph_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""
+The types of constraints (factors), each defined here and nowhere else.
+
+`FACTORS` says which nodes a kind of edge has for ends, which rows its error has, and its tag in
+g2o files. `error` has the errors with their Jacobians; `factors` derives from it what solvers
+need. Numbers in parentheses are equations of C. Merfels, "Sensor fusion for localization of
+automated vehicles", section 3.4.6. A node is x = (t, th), its theta wrapped; R_i and R_z are the
+rotations (3.47) of node i and of the measured pose z = (t_z, th_z), o an offset in node i. With
+F = diag(f_t, f_t, f_th) and `d = f_t t_j - t_i` the errors are
+
+    odometry, loop closure (3.48)    e = (R_z^T (R_i^T d - t_z), wrap(th_j - th_i - th_z)), F = 1
+    bias j of a measurement at i     e = (d + t_z - R_i o, wrap(f_th th_j - th_i + th_z))
+    turn (integrated yaw rate)       e_th = wrap(th_j - th_i - th_z + f_th b), b the bias k [rad/s]
+    point (landmark j seen from i)   e_t = R_i^T d - t_z
+    range (landmark j, antenna o)    e_x = |d - R_i o| - r
+    observed node (3.52), F = 0      e = -(R_z^T (t_i + R_i o - t_z), wrap(th_i + th_o - th_z))
+
+A row that a type has not is given no information: a point is an edge without a heading, a turn one
+without a position. All of them are, turned into map axes by the rotation R of their *frame*,
+
+    R e_t' = d - S a dth_i + constant,    e_th' = f_th dth_j - dth_i + f_th b + constant
+
+for small changes, S = ((0, -1), (1, 0)). Frame and *arm* a are all that a type says of its
+Jacobians. Of the heading of i only the rotation by th_i enters, which is given as (c, s).
+"""
+
+from enum import IntEnum
+import math
+from typing import NamedTuple
+
+from pose_graph_ros.core.compiled.jit import kernel
+from pose_graph_ros.core.graph import tables as tb
+
+
+class NodeKind(IntEnum):
+    """What a hidden node is."""
+
+    POSE = 0
+    BIAS = 1
+    """Time-correlated error of a source of measurements, of dimension 1 to 3."""
+    LANDMARK = 2
+    """A point in the map, of dimension 2."""
+
+
+class EdgeKind(IntEnum):
+    """Where an edge comes from."""
+
+    ODOMETRY = 0
+    LOOP_CLOSURE = 1
+    BIAS = 2
+    """
+    Leads to a bias j, from the pose i that was measured with it or from the next bias i; the error
+    is `F x_j + mean - x_i * offset` in map axes, F = diag(f_t, f_t, f_th).
+    """
+    TURN = 3
+    """Change of the heading, as from a gyro, whose bias is the third node if there is one."""
+    POINT = 4
+    """Position of landmark j in the frame of i."""
+    PRIOR = 5
+    """What marginalisation leaves of edges between poses; the error is that of odometry."""
+    RANGE = 6
+    """Distance of landmark j from a point of the robot i."""
+
+
+class ObservedKind(IntEnum):
+    """What was measured of an observed node; the error is the same for all kinds."""
+
+    GLOBAL_POSE = 0
+    POSITION = 1
+    HEADING = 2
+    PRIOR = 3
+    """What marginalisation leaves."""
+
+
+class FactorType(NamedTuple):
+    """What `constraints.check`, files and pictures need to know of a kind of edges."""
+
+    name: str
+    i: tuple[NodeKind, ...]
+    """Kinds of nodes that the edge may start from."""
+    j: tuple[NodeKind, ...]
+    k: tuple[NodeKind, ...] = ()
+    """Kinds of the third node, which may be missing."""
+    rows: tuple[int, ...] = (0, 1, 2)
+    """Rows that the error has; mean and information are zero in the others."""
+    tag: str = ''
+    """
+    Tag in g2o files, followed by i, j and, of the rows that it has, mean and upper triangle of the
+    information.
+    """
+
+
+_POSE, _BIAS, _LANDMARK = (NodeKind.POSE,), (NodeKind.BIAS,), (NodeKind.LANDMARK,)
+FACTORS = {
+    EdgeKind.ODOMETRY: FactorType('odometry', _POSE, _POSE, tag='EDGE_SE2'),
+    EdgeKind.LOOP_CLOSURE: FactorType('loop closure', _POSE, _POSE, tag='EDGE_SE2'),
+    EdgeKind.BIAS: FactorType('bias', (*_POSE, *_BIAS), _BIAS),
+    EdgeKind.TURN: FactorType('turn', _POSE, _POSE, _BIAS, rows=(2,)),
+    EdgeKind.POINT: FactorType('point', _POSE, _LANDMARK, rows=(0, 1), tag='EDGE_SE2_XY'),
+    EdgeKind.PRIOR: FactorType('prior', _POSE, _POSE, tag='EDGE_SE2'),
+    EdgeKind.RANGE: FactorType('range', _POSE, _LANDMARK, rows=(0,), tag='EDGE_RANGE_SE2_XY'),
+}
+
+# Numbers of the definitions: kinds of edges, then observed nodes.
+BIAS, TURN, RANGE = int(EdgeKind.BIAS), int(EdgeKind.TURN), int(EdgeKind.RANGE)
+OBSERVED = len(EdgeKind)
+
+
+@kernel
+def wrap(angle):  # type: ignore[no-untyped-def]
+    """Return the angle in [-pi, pi), as `se2.wrap` does."""
+    if -math.pi <= angle < math.pi:
+        return angle
+    wrapped = (angle + math.pi) % (2.0 * math.pi) - math.pi
+    return wrapped if wrapped < math.pi else -math.pi
+
+
+@kernel
+def is_relative(kind):  # type: ignore[no-untyped-def]
+    """Tell whether an error lies in the frame of the pose that was measured from node i."""
+    return kind < BIAS or BIAS < kind < RANGE
+
+
+@kernel
+def prepare(f, kind):  # type: ignore[no-untyped-def]
+    """Set what a row of `edge_f` needs of its mean: `R_z^T t_z`."""
+    if is_relative(kind):
+        c, s = math.cos(f[tb.MEAN + 2]), math.sin(f[tb.MEAN + 2])
+        f[tb.OWN] = c * f[tb.MEAN] + s * f[tb.MEAN + 1]
+        f[tb.OWN + 1] = c * f[tb.MEAN + 1] - s * f[tb.MEAN]
+
+
+@kernel
+def angle(f, kind):  # type: ignore[no-untyped-def]
+    """Return the angle that (c, s) are turned by against the heading of i [rad]."""
+    return f[tb.MEAN + 2] if is_relative(kind) else 0.0
+
+
+@kernel
+def factors_of_end(f, kind):  # type: ignore[no-untyped-def]
+    """Return f_t and f_th of node j."""
+    if kind == BIAS:
+        return f[tb.FACTOR_T], f[tb.FACTOR_TH]
+    return (1.0, 1.0) if kind < OBSERVED else (0.0, 0.0)
+
+
+@kernel
+def heading_offset(f, kind):  # type: ignore[no-untyped-def]
+    """Return the constant part of the heading's error [rad]."""
+    if kind == BIAS:
+        return f[tb.MEAN + 2]
+    return -f[tb.MEAN + 2] if kind < OBSERVED else f[tb.MEAN + 2] - f[tb.OFFSET + 2]
+
+
+@kernel
+def error(f, kind, dx, dy, c, s):  # type: ignore[no-untyped-def]
+    """
+    Return the error e_t, cosine and sine of its frame, and its arm a.
+
+    Parameters
+    ----------
+    f : ndarray, row of the constraint
+    kind : int, `EdgeKind` or OBSERVED
+    dx, dy : float, `f_t t_j - t_i` [m]
+    c, s : float, cosine and sine of the heading of i plus `angle`
+
+    """
+    if is_relative(kind):
+        return (c * dx + s * dy - f[tb.OWN], c * dy - s * dx - f[tb.OWN + 1], c, s, dx, dy)
+    ox, oy = f[tb.OFFSET], f[tb.OFFSET + 1]
+    ax, ay = c * ox - s * oy, s * ox + c * oy
+    if kind == RANGE:
+        vx, vy = dx - ax, dy - ay
+        length = math.sqrt(vx * vx + vy * vy)
+        if length == 0.0:
+            return -f[tb.MEAN], 0.0, 1.0, 0.0, ax, ay
+        return length - f[tb.MEAN], 0.0, vx / length, vy / length, ax, ay
+    ex, ey = dx + f[tb.MEAN] - ax, dy + f[tb.MEAN + 1] - ay
+    if kind == BIAS or f[tb.MEAN + 2] == 0.0:
+        return ex, ey, 1.0, 0.0, ax, ay
+    c, s = math.cos(f[tb.MEAN + 2]), math.sin(f[tb.MEAN + 2])
+    return c * ex + s * ey, c * ey - s * ex, c, s, ax, ay
