@@ -16,8 +16,8 @@ from pose_graph_ros.core.compiled.jit import BYTES, INTEGERS, kernel, ROWS
 from pose_graph_ros.core.geometry.se2 import FloatArray
 from pose_graph_ros.core.graph import tables as tb
 from pose_graph_ros.core.graph.constraints import Edges, ObservedNodes
-from pose_graph_ros.core.graph.factor_types import OBSERVED, prepare, wrap
-from pose_graph_ros.core.graph.factors import model
+from pose_graph_ros.core.graph.factor_types import OBSERVED, prepare
+from pose_graph_ros.core.graph.factors import model, wrap
 
 
 def edge_errors(poses: FloatArray, edges: Edges) -> FloatArray:
@@ -56,7 +56,7 @@ def observed_errors(poses: FloatArray, observed: ObservedNodes) -> FloatArray:
     return error
 
 
-def _writable(column: npt.NDArray[Any]) -> npt.NDArray[Any]:
+def _writable(column: Any) -> npt.NDArray[Any]:
     """Return an array as kernels take it."""
     return np.require(column, requirements=('C', 'W'))
 

@@ -109,15 +109,6 @@ OBSERVED = len(EdgeKind)
 
 
 @kernel
-def wrap(angle):  # type: ignore[no-untyped-def]
-    """Return the angle in [-pi, pi), as `se2.wrap` does."""
-    if -math.pi <= angle < math.pi:
-        return angle
-    wrapped = (angle + math.pi) % (2.0 * math.pi) - math.pi
-    return wrapped if wrapped < math.pi else -math.pi
-
-
-@kernel
 def is_relative(kind):  # type: ignore[no-untyped-def]
     """Tell whether an error lies in the frame of the pose that was measured from node i."""
     return kind < BIAS or BIAS < kind < RANGE

@@ -38,7 +38,6 @@ from pose_graph_ros.core.graph.factor_types import (
     is_relative,
     OBSERVED,
     RANGE,
-    wrap,
 )
 
 # Smallest squared linearization error for which a constraint is linearized again, as a fraction of
@@ -47,6 +46,15 @@ LEAST_FRACTION = 0.01
 # Squared relative change of the arm of a Jacobian above which it is added to the squared
 # linearization error whatever the energy.
 MUCH_LONGER = 1e-4
+
+
+@kernel
+def wrap(angle):  # type: ignore[no-untyped-def]
+    """Return the angle in [-pi, pi), as `se2.wrap` does."""
+    if -math.pi <= angle < math.pi:
+        return angle
+    wrapped = (angle + math.pi) % (2.0 * math.pi) - math.pi
+    return wrapped if wrapped < math.pi else -math.pi
 
 
 @kernel

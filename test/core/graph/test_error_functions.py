@@ -148,7 +148,7 @@ def test_angles_are_wrapped_once_and_at_the_end() -> None:
 
 
 @pytest.mark.parametrize(
-    'kind', (EdgeKind.ODOMETRY, EdgeKind.LOOP_CLOSURE, EdgeKind.BIAS, EdgeKind.PRIOR))
+    'kind', [EdgeKind.ODOMETRY, EdgeKind.LOOP_CLOSURE, EdgeKind.BIAS, EdgeKind.PRIOR])
 def test_an_edge_of_any_kind_has_the_same_error_in_arrays_and_kernels(kind: EdgeKind) -> None:
     rng, graph = np.random.default_rng(4), Graph()
     poses, to_bias = random_poses(rng, 2), kind is EdgeKind.BIAS

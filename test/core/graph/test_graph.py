@@ -93,13 +93,15 @@ BAD_UPDATES = {
         lambda: edge(information=[np.zeros((3, 3))]), r'Edges\.information.*row 0'),
     'edge_kind_missing': (lambda: edge(kind=()), r'Edges\.kind.*\(1,\).*\(0,\)'),
     'edge_kind_unknown': (
-        lambda: edge(kind=[len(EdgeKind)]), 'kind is none of ODOMETRY, LOOP_CLOSURE, BIAS, .*; row 0'),
+        lambda: edge(kind=[len(EdgeKind)]),
+        'kind is none of ODOMETRY, LOOP_CLOSURE, BIAS, .*; row 0'),
     'observed_kind_unknown': (
         lambda: observed(kind=[255]), 'kind is none of GLOBAL_POSE, .*; row 0: 255'),
     'edge_to_a_pose_as_a_bias': (
         lambda: edge(kind=[EdgeKind.BIAS]), r'Edges\.j: .*kind BIAS to have bias .*; row 0: 1'),
     'edge_to_a_bias_of_another_kind': (
-        lambda: edge(j=[7])._replace(biases=np.zeros((1, 3))), r'Edges\.j: .* to have pose .*row 0: 7'),
+        lambda: edge(j=[7])._replace(biases=np.zeros((1, 3))),
+        r'Edges\.j: .* to have pose .*row 0: 7'),
     'edge_bias_shape': (
         lambda: edge_to_bias([[1.0, 1.0]]), r'Edges\.bias.*\(1, 4\).*\(1, 2\)'),
     'edge_bias_inf': (
