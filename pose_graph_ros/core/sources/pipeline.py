@@ -196,7 +196,8 @@ class MeasurementPipeline:
         if not aligned:
             needed += [each.measurement.stamp_ns for each in self.queue.observed
                        if not isinstance(each.measurement, HeadingOnly)]
-        return min(needed, default=None)
+        begin_ns = self._nodes.last_frozen_ns
+        return min((stamp_ns for stamp_ns in needed if stamp_ns >= begin_ns), default=None)
 
     def _stamps_of(self, measurement: Measurement) -> Iterator[int]:
         """Yield the stamps that a measurement is attached at, as far as they are known [ns]."""

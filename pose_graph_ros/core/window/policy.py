@@ -41,7 +41,7 @@ def n_leaving(config: WindowConfig, table: NodeTable, needed_ns: int | None = No
     leaving = min(_beyond(config, table, 1.0), n_kept - LEAST_NODES)
     if leaving > 0 and needed_ns is not None:
         at = int(np.searchsorted(table.stamps_ns, needed_ns, side='right')) - 1 - table.n_frozen
-        if at < leaving:
+        if 0 <= at < leaving:
             leaving = max(at, min(_beyond(config, table, LONGEST_HOLD), leaving))
     return max(leaving, 0)
 
