@@ -8,7 +8,7 @@ from pose_graph_ros.core.geometry.se2 import IntArray
 from pose_graph_ros.core.graph import tables as tb
 from pose_graph_ros.core.graph.graph import Graph
 
-_ENDS = [tb.END_I, tb.END_J]
+_ENDS = [tb.END_I, tb.END_J, tb.END_K]
 
 
 def constraints_on(graph: Graph, nodes: IntArray) -> tuple[IntArray, IntArray]:
@@ -21,7 +21,7 @@ def constraints_on(graph: Graph, nodes: IntArray) -> tuple[IntArray, IntArray]:
     nodes : ndarray of int, ids of hidden nodes that are in it
 
     """
-    chosen = np.zeros(graph.n_nodes, dtype=bool)
+    chosen = np.zeros(graph.n_nodes + 1, dtype=bool)    # the last one is for no third end, -1
     chosen[graph.node_rows(nodes)] = True
     edges, observed = graph.memory['edge_i'], graph.memory['observed_i']
     on_edges = np.any(chosen[edges[:graph.n_edges, _ENDS]], axis=1)
