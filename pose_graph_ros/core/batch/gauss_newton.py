@@ -15,7 +15,7 @@ the Jacobians change fast, it does not converge.
 from pose_graph_ros.core.compiled.jit import kernel, NUMBER, ROWS
 from pose_graph_ros.core.elimination.assembly import eliminate_clique
 from pose_graph_ros.core.elimination.fronts import backward_rows, forward_rows, solve_rows
-from pose_graph_ros.core.graph import factors, tables as tb
+from pose_graph_ros.core.graph import factors, normal_equations, tables as tb
 
 # Relative rounding error of a sum of many numbers, and of a coordinate.
 SUM_ROUNDING = 1e-12
@@ -203,13 +203,13 @@ def evaluate(head, right):  # type: ignore[no-untyped-def]
     chi2 = gradient_sum = cancelled = reach = 0.0
     for e in range(head[tb.N_EDGES]):
         if edge_f[e, tb.WEIGHT] > 0.0:
-            energy, size, terms = factors.edge_gradient(head, e, right)
+            energy, size, terms = normal_equations.edge_gradient(head, e, right)
             chi2 += energy
             gradient_sum += size
             cancelled += terms
     for k in range(head[tb.N_OBSERVED]):
         if observed_f[k, tb.WEIGHT] > 0.0:
-            energy, size, terms = factors.observed_gradient(head, k, right)
+            energy, size, terms = normal_equations.observed_gradient(head, k, right)
             chi2 += energy
             gradient_sum += size
             cancelled += terms

@@ -6,7 +6,7 @@ from pose_graph_ros.core.compiled.jit import kernel
 from pose_graph_ros.core.compiled.simd import add, copy
 from pose_graph_ros.core.elimination import clique_frames
 from pose_graph_ros.core.elimination.fronts import factorize, LEAST_PIVOT, padded
-from pose_graph_ros.core.graph import factors, tables as tb, transaction_log
+from pose_graph_ros.core.graph import factors, normal_equations, tables as tb, transaction_log
 from pose_graph_ros.core.graph.constraints import EdgeKind
 from pose_graph_ros.core.graph.pools import row_start, triangle_size
 
@@ -86,14 +86,14 @@ def _eliminate(head, c, relinearize, by_weakest):  # type: ignore[no-untyped-def
                 factors.linearize_edge(head, e)
             edge_i[e, tb.OWNER] = c
             anchored |= edge_i[e, tb.EDGE_KIND] >= FIRST_ANCHORING
-            factors.add_edge(head, e, at_i, at_j, at_k, front, ld)
+            normal_equations.add_edge(head, e, at_i, at_j, at_k, front, ld)
         entry = node_i[v, tb.OBSERVED_LIST]
         while entry >= 0:
             anchored = 1
             if relinearize:
                 transaction_log.log_observed(head, entry)
                 factors.linearize_observed(head, entry)
-            factors.add_observed(head, entry, 3 * k, front, ld)
+            normal_equations.add_observed(head, entry, 3 * k, front, ld)
             entry = observed_i[entry, tb.OBS_NEXT]
         scale_t = node_f[v, tb.SCALE_T] * node_f[v, tb.SCALE_T]
         scale_r = node_f[v, tb.SCALE_R] * node_f[v, tb.SCALE_R]
@@ -166,11 +166,11 @@ def _lower_bounds(head, v, least):  # type: ignore[no-untyped-def]
     while entry >= 0:
         e = entry >> 2
         entry = edge_i[e, tb.NEXT_I + (entry & 3)]
-        t, r = factors.weakest(edge_f[e])
+        t, r = normal_equations.weakest(edge_f[e])
         weak_t, weak_r = weak_t + t, weak_r + r
     entry = node_i[v, tb.OBSERVED_LIST]
     while entry >= 0:
-        t, r = factors.weakest(observed_f[entry])
+        t, r = normal_equations.weakest(observed_f[entry])
         weak_t, weak_r = weak_t + t, weak_r + r
         entry = observed_i[entry, tb.OBS_NEXT]
     for m in range(3):

@@ -108,8 +108,16 @@ def _linearize(f, kind, start, end, pose_k, delta_k):  # type: ignore[no-untyped
 
 
 @kernel
-def _frame(f, kind):  # type: ignore[no-untyped-def]
-    """Return cosine and sine of the frame at the linearization."""
+def frame(f, kind):  # type: ignore[no-untyped-def]
+    """
+    Return cosine and sine of the frame at the linearization.
+
+    Parameters
+    ----------
+    f : ndarray, row of the constraint
+    kind : int, `EdgeKind` or OBSERVED
+
+    """
     if is_relative(kind):
         return f[tb.LIN_COS], f[tb.LIN_SIN]
     if kind == RANGE:
@@ -143,7 +151,7 @@ def _check(f, kind, start, end, delta_k, phi):  # type: ignore[no-untyped-def]
     ex, ey, to_x, to_y, ax, ay = error(f, kind, dx, dy, c, s)
     lx, ly, _, _, _, _ = error(f, kind, dx, dy, c_bar, s_bar)
     # S a_bar turn, in the axes of the error
-    frame_c, frame_s = _frame(f, kind)
+    frame_c, frame_s = frame(f, kind)
     bx, by = f[tb.LIN_ARM], f[tb.LIN_ARM + 1]
     gx, gy = frame_c * bx + frame_s * by, frame_c * by - frame_s * bx
     rx, ry = ex - lx - gy * turn, ey - ly + gx * turn
@@ -176,8 +184,16 @@ def _check(f, kind, start, end, delta_k, phi):  # type: ignore[no-untyped-def]
 
 
 @kernel
-def _third(head, e, column):  # type: ignore[no-untyped-def]
-    """Return the factor of the third node times the first of its numbers at POSE or DELTA."""
+def third(head, e, column):  # type: ignore[no-untyped-def]
+    """
+    Return the factor of the third node of an edge times one of its numbers, 0 without one.
+
+    Parameters
+    ----------
+    e : int
+    column : int, POSE or DELTA
+
+    """
     k = tb.edge_i(head)[e, tb.END_K]
     return tb.edge_f(head)[e, tb.FACTOR_TH] * tb.node_f(head)[k, column] if k >= 0 else 0.0
 
@@ -187,7 +203,7 @@ def linearize_edge(head, e):  # type: ignore[no-untyped-def]
     """Linearize an edge at the present estimate; the caller has logged its row."""
     node_f, row = tb.node_f(head), tb.edge_i(head)[e]
     _linearize(tb.edge_f(head)[e], row[tb.EDGE_KIND], node_f[row[tb.END_I]],
-               node_f[row[tb.END_J]], _third(head, e, tb.POSE), _third(head, e, tb.DELTA))
+               node_f[row[tb.END_J]], third(head, e, tb.POSE), third(head, e, tb.DELTA))
 
 
 @kernel
@@ -203,7 +219,7 @@ def check_edge(head, e, phi):  # type: ignore[no-untyped-def]
     """
     node_f, row = tb.node_f(head), tb.edge_i(head)[e]
     _check(tb.edge_f(head)[e], row[tb.EDGE_KIND], node_f[row[tb.END_I]], node_f[row[tb.END_J]],
-           _third(head, e, tb.DELTA), phi)
+           third(head, e, tb.DELTA), phi)
 
 
 @kernel
@@ -228,213 +244,6 @@ def _form(f, x, y, th):  # type: ignore[no-untyped-def]
             + y * (f[i + 3] * y + 2.0 * f[i + 4] * th) + th * f[i + 5] * th)
 
 
-@kernel
-def weakest(f):  # type: ignore[no-untyped-def]
-    """
-    Return the weighted information of a constraint in its weakest direction and on its heading.
-
-    The first is the smaller eigenvalue of the information on the position, the second that on the
-    heading if the position is unknown; both are lower bounds, to rounding.
-    """
-    i, w = tb.INFO, f[tb.WEIGHT]
-    xx, xy, xt, yy, yt, tt = f[i], f[i + 1], f[i + 2], f[i + 3], f[i + 4], f[i + 5]
-    trace, determinant = xx + yy, xx * yy - xy * xy
-    if not determinant > 0.0:
-        return 0.0, 0.0
-    joint = (yy * xt * xt - 2.0 * xy * xt * yt + xx * yt * yt) / determinant
-    return w * determinant / trace, w * max(tt - joint, 0.0)
-
-
-@kernel
-def _turned(f, c, s):  # type: ignore[no-untyped-def]
-    """Return the weighted information, rotated by the angle with cosine c and sine s."""
-    i, w = tb.INFO, f[tb.WEIGHT]
-    xx, xy, xt, yy, yt, tt = f[i], f[i + 1], f[i + 2], f[i + 3], f[i + 4], f[i + 5]
-    cc, ss, cs = c * c, s * s, c * s
-    return (w * (cc * xx - 2.0 * cs * xy + ss * yy), w * (cs * (xx - yy) + (cc - ss) * xy),
-            w * (c * xt - s * yt), w * (ss * xx + 2.0 * cs * xy + cc * yy),
-            w * (s * xt + c * yt), w * tt)
-
-
-@kernel
-def _add(f, kind, start, end, a, b, k, front, ld):  # type: ignore[no-untyped-def]
-    """Add a constraint to a front; parameters as for `add_edge`, rows as for `model`."""
-    c, s = _frame(f, kind)
-    xx, xy, xt, yy, yt, tt = _turned(f, c, s)
-    ft, fth = factors_of_end(f, kind)
-    px, py = -f[tb.LIN_ARM + 1], f[tb.LIN_ARM]  # S a
-    hx = f[tb.LIN_H] + (ft * end[tb.REF] - start[tb.REF])
-    hy = f[tb.LIN_H + 1] + (ft * end[tb.REF + 1] - start[tb.REF + 1])
-    hth = f[tb.LIN_K]
-    # W T: the third column is W (S a, 1)
-    wx, wy, wt = xx * px + xy * py + xt, xy * px + yy * py + yt, xt * px + yt * py + tt
-    gx = xx * hx + xy * hy + xt * hth
-    gy = xy * hx + yy * hy + yt * hth
-    gth = xt * hx + yt * hy + tt * hth
-    # block ii is T^T W T
-    r = a * ld + a
-    front[r] += xx
-    front[r + 1] += xy
-    front[r + 2] += wx
-    front[r + ld + 1] += yy
-    front[r + ld + 2] += wy
-    front[r + 2 * ld + 2] += px * wx + py * wy + wt
-    right = ld - 1
-    front[a * ld + right] += gx
-    front[(a + 1) * ld + right] += gy
-    front[(a + 2) * ld + right] += px * gx + py * gy + gth
-    if b < 0:
-        return
-    front[b * ld + right] -= ft * gx
-    front[(b + 1) * ld + right] -= ft * gy
-    front[(b + 2) * ld + right] -= fth * gth
-    if k >= 0:
-        _add_third(front, ld, (a, b, k), f[tb.FACTOR_TH], (xt, yt, wt), (xt, yt, tt), gth)
-    # from here on with the columns of j multiplied by F
-    xx, xy, xt, yy, yt = ft * xx, ft * xy, fth * xt, ft * yy, fth * yt
-    wx, wy, wt = ft * wx, ft * wy, fth * wt
-    r = b * ld + b
-    front[r] += ft * xx
-    front[r + 1] += ft * xy
-    front[r + 2] += ft * xt
-    front[r + ld + 1] += ft * yy
-    front[r + ld + 2] += ft * yt
-    front[r + 2 * ld + 2] += fth * fth * tt
-    # block ij is -T^T W F, block ji its transpose
-    if a < b:
-        r = a * ld + b
-        front[r] -= xx
-        front[r + 1] -= xy
-        front[r + 2] -= xt
-        front[r + ld] -= xy
-        front[r + ld + 1] -= yy
-        front[r + ld + 2] -= yt
-        front[r + 2 * ld] -= wx
-        front[r + 2 * ld + 1] -= wy
-        front[r + 2 * ld + 2] -= wt
-    else:
-        r = b * ld + a
-        front[r] -= xx
-        front[r + 1] -= xy
-        front[r + 2] -= wx
-        front[r + ld] -= xy
-        front[r + ld + 1] -= yy
-        front[r + ld + 2] -= wy
-        front[r + 2 * ld] -= xt
-        front[r + 2 * ld + 1] -= yt
-        front[r + 2 * ld + 2] -= wt
-
-
-@kernel
-def _add_third(front, ld, at, factor, of_i, of_j, gth):  # type: ignore[no-untyped-def]
-    """Add the blocks of a third node, whose first coordinate enters the heading's error."""
-    a, b, k = at
-    front[k * ld + k] += factor * factor * of_j[2]
-    front[(k + 1) * ld - 1] -= factor * gth
-    for m in range(3):
-        for row, value in ((a + m, -of_i[m]), (b + m, of_j[m])):
-            front[min(row, k) * ld + max(row, k)] += factor * value
-
-
-@kernel
-def add_edge(head, e, a, b, k, front, ld):  # type: ignore[no-untyped-def]
-    """
-    Add an edge to a front.
-
-    Parameters
-    ----------
-    e : int
-    a, b, k : int, rows of the front at which the blocks of its ends i, j and k begin; k may be -1
-    front, ld : ndarray, int
-        Upper triangle, stored by rows of `ld` numbers, the last of which is the right-hand side.
-
-    """
-    node_f, row = tb.node_f(head), tb.edge_i(head)[e]
-    _add(tb.edge_f(head)[e], row[tb.EDGE_KIND], node_f[row[tb.END_I]], node_f[row[tb.END_J]],
-         a, b, k, front, ld)
-
-
-@kernel
-def add_observed(head, k, a, front, ld):  # type: ignore[no-untyped-def]
-    """
-    Add an observed node to a front.
-
-    Parameters
-    ----------
-    k : int
-    a : int, row of the front at which the block of its hidden node begins
-    front, ld : ndarray, int, as for `add_edge`
-
-    """
-    node = tb.node_f(head)[tb.observed_i(head)[k, tb.OBS_NODE]]
-    _add(tb.observed_f(head)[k], OBSERVED, node, node, a, -1, -1, front, ld)
-
-
-@kernel
-def _gradient(f, kind, nodes, node_f, third, right):  # type: ignore[no-untyped-def]
-    """
-    Add -b of a constraint to `right`, shape (N, 3); return its energy and two sums of magnitudes.
-
-    These are of the gradient's coordinates of a position, and of the diagonal terms of the
-    energy, which cancel each other where W is nearly singular.
-    """
-    v, j = nodes
-    ex, ey, eth, c, s, ax, ay = model(f, kind, node_f[v], node_f[j], third)
-    i, w = tb.INFO, f[tb.WEIGHT]
-    gx = w * (f[i] * ex + f[i + 1] * ey + f[i + 2] * eth)
-    gy = w * (f[i + 1] * ex + f[i + 3] * ey + f[i + 4] * eth)
-    gth = w * (f[i + 2] * ex + f[i + 4] * ey + f[i + 5] * eth)
-    energy = ex * gx + ey * gy + eth * gth
-    terms = w * (f[i] * ex * ex + f[i + 3] * ey * ey + f[i + 5] * eth * eth)
-    gx, gy = c * gx - s * gy, s * gx + c * gy
-    right[v, 0] += gx
-    right[v, 1] += gy
-    right[v, 2] += ax * gy - ay * gx + gth
-    if kind < OBSERVED:
-        ft, fth = factors_of_end(f, kind)
-        right[j, 0] -= ft * gx
-        right[j, 1] -= ft * gy
-        right[j, 2] -= fth * gth
-    return energy, abs(gx) + abs(gy), terms, gth
-
-
-@kernel
-def edge_gradient(head, e, right):  # type: ignore[no-untyped-def]
-    """
-    Add -b of an edge to `right`, shape (N, 3); return its energy and the sums of `_gradient`.
-
-    Parameters
-    ----------
-    e : int
-    right : ndarray
-
-    """
-    f, row = tb.edge_f(head)[e], tb.edge_i(head)[e]
-    energy, total, terms, gth = _gradient(
-        f, row[tb.EDGE_KIND], (row[tb.END_I], row[tb.END_J]), tb.node_f(head),
-        _third(head, e, tb.POSE), right)
-    if row[tb.END_K] >= 0:
-        right[row[tb.END_K], 0] -= f[tb.FACTOR_TH] * gth
-    return energy, total, terms
-
-
-@kernel
-def observed_gradient(head, k, right):  # type: ignore[no-untyped-def]
-    """
-    Add -b of an observed node to `right`, as `edge_gradient` does.
-
-    Parameters
-    ----------
-    k : int
-    right : ndarray
-
-    """
-    v = tb.observed_i(head)[k, tb.OBS_NODE]
-    energy, total, terms, _ = _gradient(
-        tb.observed_f(head)[k], OBSERVED, (v, v), tb.node_f(head), 0.0, right)
-    return energy, total, terms
-
-
 @kernel(signature=(tb.HEAD, NUMBERS, NUMBERS))
 def energies(head, edges, observed):  # type: ignore[no-untyped-def]
     """
@@ -451,7 +260,7 @@ def energies(head, edges, observed):  # type: ignore[no-untyped-def]
         row = edge_i[e]
         ex, ey, eth, _, _, _, _ = model(
             edge_f[e], row[tb.EDGE_KIND], node_f[row[tb.END_I]], node_f[row[tb.END_J]],
-            _third(head, e, tb.POSE))
+            third(head, e, tb.POSE))
         edges[e] = _form(edge_f[e], ex, ey, eth)
     for k in range(head[tb.N_OBSERVED]):
         node = node_f[observed_i[k, tb.OBS_NODE]]

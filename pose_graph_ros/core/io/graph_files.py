@@ -241,7 +241,8 @@ def _graph_rows(rows: SavedRows, text: str) -> GraphRows:
         raise ValueError('expected the hidden nodes that are no biases as vertices, in order')
     poses[~is_bias] = vertices[:, 1:]
     _fill(poses, rows.biases, rows.bias_values, 'biases')
-    return GraphRows(poses, is_bias.astype(np.int32), fixed, _edges(rows, _numbers(lines, 'EDGE_SE2')),
+    return GraphRows(poses, is_bias.astype(np.int32), fixed,
+                     _edges(rows, _numbers(lines, 'EDGE_SE2')),
                      _observed(rows, lines), np.arange(n), np.arange(len(rows.edge_kind)),
                      np.arange(len(rows.observed_kind)),
                      NextIds(n, len(rows.edge_kind), len(rows.observed_kind)),

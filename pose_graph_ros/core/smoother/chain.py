@@ -16,6 +16,7 @@ from pose_graph_ros.core.elimination.fronts import LEAST_PIVOT
 from pose_graph_ros.core.graph import (
     factor_types,
     factors,
+    normal_equations,
     pools,
     rows,
     tables as tb,
@@ -154,7 +155,7 @@ def extend(head, mean, information, weight):  # type: ignore[no-untyped-def]
     front, least = work_f[:42], work_f[42:45]
     front[:] = 0.0
     _root_equations(head, last, old[tb.VALUES], front, 7)
-    factors.add_edge(head, e, 0, 3, -1, front, 7)
+    normal_equations.add_edge(head, e, 0, 3, -1, front, 7)
     scale_t, scale_r = node_f[last, tb.SCALE_T], node_f[last, tb.SCALE_R]
     scale_by_edge(head, e, 1.0)
     _set_least_pivots(head, last, least)

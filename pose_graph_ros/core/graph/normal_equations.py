@@ -1,0 +1,220 @@
+# Copyright 2026 The pose_graph_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""
+What constraints add to the normal equations: to the front of a clique, or to a gradient.
+
+Symbols are those of `factors`. With G = (0, 0, f_th) the column of a third node, an edge adds the
+blocks of `J^T W J` and `-J^T W h`, with J = (-T, F, G) in map axes.
+"""
+
+from pose_graph_ros.core.compiled.jit import kernel
+from pose_graph_ros.core.graph import tables as tb
+from pose_graph_ros.core.graph.factor_types import factors_of_end, OBSERVED
+from pose_graph_ros.core.graph.factors import frame, model, third
+
+
+@kernel
+def weakest(f):  # type: ignore[no-untyped-def]
+    """
+    Return the weighted information of a constraint in its weakest direction and on its heading.
+
+    The first is the smaller eigenvalue of the information on the position, the second that on the
+    heading if the position is unknown; both are lower bounds, to rounding.
+    """
+    i, w = tb.INFO, f[tb.WEIGHT]
+    xx, xy, xt, yy, yt, tt = f[i], f[i + 1], f[i + 2], f[i + 3], f[i + 4], f[i + 5]
+    trace, determinant = xx + yy, xx * yy - xy * xy
+    if not determinant > 0.0:
+        return 0.0, 0.0
+    joint = (yy * xt * xt - 2.0 * xy * xt * yt + xx * yt * yt) / determinant
+    return w * determinant / trace, w * max(tt - joint, 0.0)
+
+
+@kernel
+def _turned(f, c, s):  # type: ignore[no-untyped-def]
+    """Return the weighted information, rotated by the angle with cosine c and sine s."""
+    i, w = tb.INFO, f[tb.WEIGHT]
+    xx, xy, xt, yy, yt, tt = f[i], f[i + 1], f[i + 2], f[i + 3], f[i + 4], f[i + 5]
+    cc, ss, cs = c * c, s * s, c * s
+    return (w * (cc * xx - 2.0 * cs * xy + ss * yy), w * (cs * (xx - yy) + (cc - ss) * xy),
+            w * (c * xt - s * yt), w * (ss * xx + 2.0 * cs * xy + cc * yy),
+            w * (s * xt + c * yt), w * tt)
+
+
+@kernel
+def _add(f, kind, start, end, a, b, k, front, ld):  # type: ignore[no-untyped-def]
+    """Add a constraint to a front; parameters as for `add_edge`, rows as for `model`."""
+    c, s = frame(f, kind)
+    xx, xy, xt, yy, yt, tt = _turned(f, c, s)
+    ft, fth = factors_of_end(f, kind)
+    px, py = -f[tb.LIN_ARM + 1], f[tb.LIN_ARM]  # S a
+    hx = f[tb.LIN_H] + (ft * end[tb.REF] - start[tb.REF])
+    hy = f[tb.LIN_H + 1] + (ft * end[tb.REF + 1] - start[tb.REF + 1])
+    hth = f[tb.LIN_K]
+    # W T: the third column is W (S a, 1)
+    wx, wy, wt = xx * px + xy * py + xt, xy * px + yy * py + yt, xt * px + yt * py + tt
+    gx = xx * hx + xy * hy + xt * hth
+    gy = xy * hx + yy * hy + yt * hth
+    gth = xt * hx + yt * hy + tt * hth
+    # block ii is T^T W T
+    r = a * ld + a
+    front[r] += xx
+    front[r + 1] += xy
+    front[r + 2] += wx
+    front[r + ld + 1] += yy
+    front[r + ld + 2] += wy
+    front[r + 2 * ld + 2] += px * wx + py * wy + wt
+    right = ld - 1
+    front[a * ld + right] += gx
+    front[(a + 1) * ld + right] += gy
+    front[(a + 2) * ld + right] += px * gx + py * gy + gth
+    if b < 0:
+        return
+    front[b * ld + right] -= ft * gx
+    front[(b + 1) * ld + right] -= ft * gy
+    front[(b + 2) * ld + right] -= fth * gth
+    if k >= 0:
+        _add_third(front, ld, (a, b, k), f[tb.FACTOR_TH], (xt, yt, wt), (xt, yt, tt), gth)
+    # from here on with the columns of j multiplied by F
+    xx, xy, xt, yy, yt = ft * xx, ft * xy, fth * xt, ft * yy, fth * yt
+    wx, wy, wt = ft * wx, ft * wy, fth * wt
+    r = b * ld + b
+    front[r] += ft * xx
+    front[r + 1] += ft * xy
+    front[r + 2] += ft * xt
+    front[r + ld + 1] += ft * yy
+    front[r + ld + 2] += ft * yt
+    front[r + 2 * ld + 2] += fth * fth * tt
+    # block ij is -T^T W F, block ji its transpose
+    if a < b:
+        r = a * ld + b
+        front[r] -= xx
+        front[r + 1] -= xy
+        front[r + 2] -= xt
+        front[r + ld] -= xy
+        front[r + ld + 1] -= yy
+        front[r + ld + 2] -= yt
+        front[r + 2 * ld] -= wx
+        front[r + 2 * ld + 1] -= wy
+        front[r + 2 * ld + 2] -= wt
+    else:
+        r = b * ld + a
+        front[r] -= xx
+        front[r + 1] -= xy
+        front[r + 2] -= wx
+        front[r + ld] -= xy
+        front[r + ld + 1] -= yy
+        front[r + ld + 2] -= wy
+        front[r + 2 * ld] -= xt
+        front[r + 2 * ld + 1] -= yt
+        front[r + 2 * ld + 2] -= wt
+
+
+@kernel
+def _add_third(front, ld, at, factor, of_i, of_j, gth):  # type: ignore[no-untyped-def]
+    """Add the blocks of a third node, whose first coordinate enters the heading's error."""
+    a, b, k = at
+    front[k * ld + k] += factor * factor * of_j[2]
+    front[(k + 1) * ld - 1] -= factor * gth
+    for m in range(3):
+        for row, value in ((a + m, -of_i[m]), (b + m, of_j[m])):
+            front[min(row, k) * ld + max(row, k)] += factor * value
+
+
+@kernel
+def add_edge(head, e, a, b, k, front, ld):  # type: ignore[no-untyped-def]
+    """
+    Add an edge to a front.
+
+    Parameters
+    ----------
+    e : int
+    a, b, k : int, rows of the front at which the blocks of its ends i, j and k begin; k may be -1
+    front, ld : ndarray, int
+        Upper triangle, stored by rows of `ld` numbers, the last of which is the right-hand side.
+
+    """
+    node_f, row = tb.node_f(head), tb.edge_i(head)[e]
+    _add(tb.edge_f(head)[e], row[tb.EDGE_KIND], node_f[row[tb.END_I]], node_f[row[tb.END_J]],
+         a, b, k, front, ld)
+
+
+@kernel
+def add_observed(head, k, a, front, ld):  # type: ignore[no-untyped-def]
+    """
+    Add an observed node to a front.
+
+    Parameters
+    ----------
+    k : int
+    a : int, row of the front at which the block of its hidden node begins
+    front, ld : ndarray, int, as for `add_edge`
+
+    """
+    node = tb.node_f(head)[tb.observed_i(head)[k, tb.OBS_NODE]]
+    _add(tb.observed_f(head)[k], OBSERVED, node, node, a, -1, -1, front, ld)
+
+
+@kernel
+def _gradient(f, kind, nodes, node_f, third, right):  # type: ignore[no-untyped-def]
+    """
+    Add -b of a constraint to `right`, shape (N, 3); return its energy and two sums of magnitudes.
+
+    These are of the gradient's coordinates of a position, and of the diagonal terms of the
+    energy, which cancel each other where W is nearly singular.
+    """
+    v, j = nodes
+    ex, ey, eth, c, s, ax, ay = model(f, kind, node_f[v], node_f[j], third)
+    i, w = tb.INFO, f[tb.WEIGHT]
+    gx = w * (f[i] * ex + f[i + 1] * ey + f[i + 2] * eth)
+    gy = w * (f[i + 1] * ex + f[i + 3] * ey + f[i + 4] * eth)
+    gth = w * (f[i + 2] * ex + f[i + 4] * ey + f[i + 5] * eth)
+    energy = ex * gx + ey * gy + eth * gth
+    terms = w * (f[i] * ex * ex + f[i + 3] * ey * ey + f[i + 5] * eth * eth)
+    gx, gy = c * gx - s * gy, s * gx + c * gy
+    right[v, 0] += gx
+    right[v, 1] += gy
+    right[v, 2] += ax * gy - ay * gx + gth
+    if kind < OBSERVED:
+        ft, fth = factors_of_end(f, kind)
+        right[j, 0] -= ft * gx
+        right[j, 1] -= ft * gy
+        right[j, 2] -= fth * gth
+    return energy, abs(gx) + abs(gy), terms, gth
+
+
+@kernel
+def edge_gradient(head, e, right):  # type: ignore[no-untyped-def]
+    """
+    Add -b of an edge to `right`, shape (N, 3); return its energy and the sums of `_gradient`.
+
+    Parameters
+    ----------
+    e : int
+    right : ndarray
+
+    """
+    f, row = tb.edge_f(head)[e], tb.edge_i(head)[e]
+    energy, total, terms, gth = _gradient(
+        f, row[tb.EDGE_KIND], (row[tb.END_I], row[tb.END_J]), tb.node_f(head),
+        third(head, e, tb.POSE), right)
+    if row[tb.END_K] >= 0:
+        right[row[tb.END_K], 0] -= f[tb.FACTOR_TH] * gth
+    return energy, total, terms
+
+
+@kernel
+def observed_gradient(head, k, right):  # type: ignore[no-untyped-def]
+    """
+    Add -b of an observed node to `right`, as `edge_gradient` does.
+
+    Parameters
+    ----------
+    k : int
+    right : ndarray
+
+    """
+    v = tb.observed_i(head)[k, tb.OBS_NODE]
+    energy, total, terms, _ = _gradient(
+        tb.observed_f(head)[k], OBSERVED, (v, v), tb.node_f(head), 0.0, right)
+    return energy, total, terms
