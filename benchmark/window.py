@@ -37,7 +37,7 @@ SECTIONS: dict[str, Callable[[argparse.Namespace], Section]] = {
         hours=chosen.hours or (0.4 if chosen.quick else None), cases=chosen.case,
         folder=chosen.out),
     'samples': lambda chosen: window_samples.section(
-        chosen.samples or ([100_000] if chosen.quick else [1_000_000, 10_000_000]))}
+        chosen.samples or ([100_000] if chosen.quick else [1_000_000, 10_000_000]), chosen.bags)}
 ROWS = ('consistency',)
 """Sections of which rows that are not made again are kept."""
 
@@ -57,6 +57,9 @@ def main(arguments: list[str]) -> int:
                         help='day: length of the drives (default: 24 hours, unlimited ones 2)')
     parser.add_argument('--samples', type=int, metavar='N', action='append',
                         help='samples of odometry (default: a million and ten million)')
+    parser.add_argument('--bags', type=Path, metavar='DIR',
+                        help='samples: keep the bags there, and use them again (default: they '
+                        'are removed)')
     parser.add_argument('--case', action='append', default=[], metavar='TEXT',
                         help='consistency, day: only what has one of these in its name; other '
                         'rows of the page stay')
@@ -78,9 +81,9 @@ def main(arguments: list[str]) -> int:
 
 
 def _shown(arguments: list[str]) -> list[str]:
-    """Return the arguments with a name for the folder, which is another elsewhere."""
-    return ['OUT' if k > 0 and arguments[k - 1] == '--out' else argument
-            for k, argument in enumerate(arguments)]
+    """Return the arguments with names for folders, which are others elsewhere."""
+    return [arguments[k - 1][2:].upper() if k > 0 and arguments[k - 1] in ('--out', '--bags')
+            else argument for k, argument in enumerate(arguments)]
 
 
 if __name__ == '__main__':

@@ -140,8 +140,16 @@ def replay(bag: Path, out: Path, *arguments: str) -> tuple[float, float, FloatAr
     return time.monotonic() - begin, usage.ru_maxrss * 1.024e-3, np.array(curve)
 
 
-def section(samples: list[int]) -> Section:
-    """Replay bags with these numbers of messages of odometry."""
+def section(samples: list[int], bags: Path | None = None) -> Section:
+    """
+    Replay bags of several lengths.
+
+    Parameters
+    ----------
+    samples : list of int, numbers of messages of odometry
+    bags : Path, optional, folder where the bags are kept, and used again; else they are removed
+
+    """
     found = Section(
         'A replay of very many samples',
         f'`pose-graph replay` of a bag with odometry at {RATE:.0f} Hz, fixes at '
@@ -152,9 +160,10 @@ def section(samples: list[int]) -> Section:
                        'largest memory MB'))
     for n in samples:
         with tempfile.TemporaryDirectory() as scratch:
-            bag, out = Path(scratch, 'bag'), Path(scratch, 'out')
-            say(f'  writing {n} samples')
-            write_bag(bag, n)
+            bag, out = Path(bags or scratch, f'{n}_samples'), Path(scratch, 'out')
+            if not bag.exists():
+                say(f'  writing {n} samples')
+                write_bag(bag, n)
             size = sum(file.stat().st_size for file in bag.iterdir()) * 1e-6
             say('  replaying')
             seconds, memory, curve = replay(bag, out, '-p', f'window:={float(WINDOW)}')
