@@ -50,7 +50,7 @@ class Ours:
 
     lag: int
     """[nodes]; `NEVER` for the whole graph."""
-    every: int = 1
+    every: int = 20
     """Nodes that are let go at a time."""
 
     @property
@@ -58,7 +58,7 @@ class Ours:
         """As the tables have it."""
         if self.lag == NEVER:
             return f'{ours.NAME}, unlimited'
-        return ours.NAME if self.every == 1 else f'{ours.NAME}, {self.every} at a time'
+        return f'{ours.NAME}, one at a time' if self.every == 1 else ours.NAME
 
     def __call__(self, world: World, plan: Plan) -> LagRun:
         """Run the smoother over a world; RuntimeError if a step fails."""
