@@ -15,7 +15,7 @@ import numpy as np
 
 from benchmark import ours
 from benchmark.runs import Plan, quiet
-from benchmark.worlds import World
+from benchmark.worlds import chain, laps, World
 from pose_graph_ros.core.batch.optimizer import Status
 from pose_graph_ros.core.geometry.se2 import FloatArray, IntArray
 from pose_graph_ros.core.smoother.incremental import IncrementalSmoother
@@ -42,6 +42,13 @@ class LagRun:
     def cut(self, steps: int) -> None:
         """Keep the first steps only."""
         self.seconds, self.newest = self.seconds[:steps], self.newest[:steps]
+
+
+def warm_up() -> None:
+    """Let nodes go in small worlds, so that nothing is compiled while times are taken."""
+    for world in (chain(100), laps(120, 60)):
+        for every in (1, 20):
+            Ours(50, every)(world, Plan())
 
 
 @dataclass(frozen=True, slots=True)

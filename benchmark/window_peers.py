@@ -11,7 +11,7 @@ from benchmark import excess
 from benchmark.metrics import ACCURACY, Metric, RATIO
 from benchmark.runs import MICROSECOND, Plan, sample_steps
 from benchmark.section import say, Section, Table
-from benchmark.window_lag import LagRun, NEVER, Ours
+from benchmark.window_lag import LagRun, NEVER, Ours, warm_up
 from benchmark.worlds import chain, laps, World
 from pose_graph_ros.core.batch import optimizer
 from pose_graph_ros.core.geometry import se2
@@ -134,6 +134,7 @@ def section(*, quick: bool, repeats: int, limit: float) -> Section:
     times, wrong = Table('Time of a step [us]', TIMES), Table('Errors', ERRORS)
     found.tables = [times, wrong]
     chosen = tools(quick=quick)
+    warm_up()
     for world in worlds(n):
         say(f'  {world.name}')
         plan = Plan(sample_steps(n, EVERY), limit)
