@@ -166,7 +166,7 @@ def section(samples: list[int], bags: Path | None = None) -> Section:
                 write_bag(bag, n)
             size = sum(file.stat().st_size for file in bag.iterdir()) * 1e-6
             say('  replaying')
-            seconds, memory, curve = replay(bag, out, '-p', f'window:={float(WINDOW)}')
+            seconds, memory, curve = replay(bag, out, '-p', f'window.seconds:={float(WINDOW)}')
             summary = json.loads((out / 'summary.json').read_text(encoding='utf-8'))
         table.add(str(n), f'{n / RATE / 3600.0:.1f}', f'{size:.0f}', f'{seconds:.0f}',
                   f'{1e6 * seconds / n:.0f}', str(summary['hidden_nodes']), f'{memory:.0f}')
