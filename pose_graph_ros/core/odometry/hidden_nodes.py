@@ -139,8 +139,7 @@ class HiddenNodes:
 
     def poses(self, graph: Graph) -> FloatArray:
         """Return the poses of all hidden nodes, shape (N, 3): frozen ones, then the graph's."""
-        kept = graph.poses_of(self.ids[self.n_frozen:])
-        return kept if self.n_frozen == 0 else np.concatenate((self.table.frozen, kept))
+        return self.table.poses(graph.poses[graph.node_rows(self.ids[self.n_frozen:])])
 
     @property
     def last_frozen_ns(self) -> int:
@@ -367,14 +366,15 @@ class HiddenNodes:
         """
         Return the last hidden node before a stamp and the motion from there to the stamp.
 
-        If that node has left the graph, it is the next one, and the motion leads back. The motion
+        If that node has left the graph, it is the one that stands for it, or the next one, from
+        which the motion leads back. The motion
         is that of the source that was the primary one then, so the result does not depend on later
         samples; None if that source does not cover the node and the stamp. The stamp is not before
         the first node or `last_frozen_ns`, and not after `covered_ns` [ns].
         """
         node = int(np.searchsorted(self.stamps_ns, stamp_ns, side='right')) - 1
         node = max(node, self.n_frozen)
-        node_ns, node_id = int(self.stamps_ns[node]), int(self.ids[node])
+        node_ns = int(self.stamps_ns[node])
         stream = self.streams[self.primary_at(max(stamp_ns, node_ns))]
         if not (stream.timeline.covers(node_ns) and stream.timeline.covers(stamp_ns)):
             return None
@@ -383,7 +383,7 @@ class HiddenNodes:
         if stamp_ns < node_ns:
             adjoint = se2.adjoint(mean)
             mean, noise = se2.inverse(mean), adjoint @ noise @ adjoint.T
-        return Attachment(node_id, mean, noise)
+        return self.table.attachment(node, mean, noise)
 
     def forget(self, poses: FloatArray) -> None:
         """

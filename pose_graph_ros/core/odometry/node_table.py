@@ -9,6 +9,8 @@ import numpy as np
 from pose_graph_ros.core.compiled.growing_array import GrowingArray
 from pose_graph_ros.core.geometry import se2
 from pose_graph_ros.core.geometry.se2 import FloatArray, IntArray
+from pose_graph_ros.core.odometry.motion import Attachment
+from pose_graph_ros.core.odometry.thinned_nodes import ThinnedNodes
 
 
 class NodeTable:
@@ -17,7 +19,8 @@ class NodeTable:
 
     The first `n_frozen` of them have left the graph: their poses do not change any more, but for
     motions of the whole map, and a node takes 40 bytes. The number of a node, such as 42 of x42,
-    is its index among all of them, and never changes.
+    is its index among all of them, and never changes. Of the others, too, some may have left
+    (`thinned`); their poses move with those of other nodes.
     """
 
     def __init__(self) -> None:
@@ -26,6 +29,8 @@ class NodeTable:
         self._frozen = GrowingArray((3,), np.float64)
         self._odometry = GrowingArray((3,), np.float64)
         self._travelled = GrowingArray((), np.float64)
+        self.thinned = ThinnedNodes()
+        """Nodes that have left although older ones stay; by number."""
 
     def __len__(self) -> int:
         return len(self._stamps)
@@ -85,6 +90,54 @@ class NodeTable:
         self._frozen.append(poses)
         self._odometry.drop_first(len(poses))
         self._travelled.drop_first(len(poses))
+        self.thinned.drop_before(self.n_frozen)
+
+    def poses(self, present: FloatArray) -> FloatArray:
+        """
+        Return the poses of all nodes in the map, shape (N, 3) [m, m, rad].
+
+        Those of the nodes from `n_frozen` on are given, shape (N - F, 3), and overwritten where a
+        node has left.
+        """
+        thinned, first = self.thinned, self.n_frozen
+        if len(thinned) > 0:
+            present[thinned.numbers - first] = se2.compose(
+                present[thinned.anchors - first], thinned.relative)
+        return present if first == 0 else np.concatenate((self.frozen, present))
+
+    def attachment(self, number: int, mean: FloatArray, noise: FloatArray) -> Attachment:
+        """
+        Return the attachment of a motion from a node, or from the one that stands for it.
+
+        Parameters
+        ----------
+        number : int, of the node
+        mean : ndarray, shape (3,), the motion [m, m, rad]
+        noise : ndarray, shape (3, 3), its covariance, in the frame at its end
+
+        """
+        place = self.thinned.place(number)
+        if place is None:
+            return Attachment(int(self.ids[number]), mean, noise)
+        adjoint = se2.adjoint(se2.inverse(mean))
+        return Attachment(int(self.ids[place.anchor]), se2.compose(place.mean, mean),
+                          adjoint @ place.noise @ adjoint.T + noise)
+
+    def thin(
+        self, ids: IntArray, anchors: IntArray, relative: FloatArray, noise: FloatArray,
+    ) -> None:
+        """
+        Let nodes leave, each with its place relative to a node that stays.
+
+        Parameters
+        ----------
+        ids, anchors : ndarray of int, shape (L,), of nodes that leave and of those that stay
+        relative : ndarray, shape (L, 3), poses in the anchors [m, m, rad]
+        noise : ndarray, shape (L, 3, 3), covariances of these, in the frames of the nodes
+
+        """
+        self.thinned.add(
+            np.searchsorted(self.ids, ids), np.searchsorted(self.ids, anchors), relative, noise)
 
     def move_frozen(self, T: FloatArray) -> None:
         """Move the frozen poses by a rigid motion of the map, shape (3,) [m, m, rad]."""

@@ -70,7 +70,7 @@ def attach_reference(nodes: HiddenNodes, closure: LoopClosure) -> Attachment | A
         return rejected('unknown_node', f'there is no hidden node {node}')
     if node < nodes.n_frozen:
         return _before_window(int(nodes.stamps_ns[node]), nodes)
-    return Attachment(int(nodes.ids[node]), np.zeros(3), np.zeros((3, 3)))
+    return nodes.table.attachment(node, np.zeros(3), np.zeros((3, 3)))
 
 
 def absolute_constraint(measurement: Absolute, attachment: Attachment) -> ObservedNodes:
