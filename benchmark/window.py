@@ -22,6 +22,7 @@ from benchmark import (
     ours,
     report,
     window_consistency,
+    window_hall,
     window_memory,
     window_peers,
     window_samples,
@@ -36,6 +37,8 @@ SECTIONS: dict[str, Callable[[argparse.Namespace], Section]] = {
     'day': lambda chosen: window_memory.section(
         hours=chosen.hours or (0.4 if chosen.quick else None), cases=chosen.case,
         folder=chosen.out),
+    'hall': lambda chosen: window_hall.section(
+        quick=chosen.quick, seeds=chosen.seeds, folder=chosen.out),
     'samples': lambda chosen: window_samples.section(
         chosen.samples or ([100_000] if chosen.quick else [1_000_000, 10_000_000]), chosen.bags)}
 ROWS = ('consistency',)
@@ -52,7 +55,8 @@ def main(arguments: list[str]) -> int:
                         help='peers: runs of each tool over each world (default %(default)s)')
     parser.add_argument('--limit', type=float, default=60.0, metavar='S',
                         help='peers: cut a run after so many seconds (default: %(default)s)')
-    parser.add_argument('--seeds', type=int, metavar='N', help='consistency: drives of each kind')
+    parser.add_argument('--seeds', type=int, metavar='N',
+                        help='consistency, hall: drives of each kind')
     parser.add_argument('--hours', type=float, metavar='H',
                         help='day: length of the drives (default: 24 hours, unlimited ones 2)')
     parser.add_argument('--samples', type=int, metavar='N', action='append',

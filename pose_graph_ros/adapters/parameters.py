@@ -10,6 +10,7 @@ generated from them. Defaults come from `core.config`. This module imports no RO
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
 from enum import Enum
+import math
 import re
 import sys
 from typing import Any
@@ -57,7 +58,7 @@ def _values(choices: type[Enum]) -> tuple[str, ...]:
 _BACKEND, _ODOMETRY = config.BackendConfig(), config.OdometrySource()
 _MEASUREMENT, _COVARIANCE = config.MeasurementSource(), config.CovariancePolicy()
 _NODES, _ALIGNMENT, _NOISE = _BACKEND.nodes, _BACKEND.alignment, _ODOMETRY.noise
-_WINDOW = _BACKEND.window
+_WINDOW, _THINNING = _BACKEND.window, _BACKEND.thinning
 
 PARAMETERS: tuple[Parameter, ...] = (
     Parameter('sources', list(DEFAULT_SOURCES), '', 'Names of the sources of measurements; the '
@@ -126,6 +127,18 @@ PARAMETERS: tuple[Parameter, ...] = (
     Parameter('window.prior', _WINDOW.prior.value, '', 'What stays of those that leave: `dense`, '
               'one constraint of all their neighbours, or `sparse`, a few constraints of pairs '
               'of them, which are cheaper and less certain.', choices=_values(config.Prior)),
+    Parameter('thinning.cell', _THINNING.cell, 'm', 'Where a place is driven again and again, few '
+              'hidden nodes stay in the graph: the oldest ones, and rather those with fixes or '
+              'loop closures, in each square cell with sides of this length. The others leave it '
+              'once their positions relative to those are certain. If 0, all stay. Twice the '
+              'distance between hidden nodes is a good value.', 0.0, 1000.0),
+    Parameter('thinning.angle', _THINNING.angle, 'rad', 'Hidden nodes of one cell are only left '
+              'out for others whose heading is in the same sector of this size.', 0.01,
+              2.0 * math.pi),
+    Parameter('thinning.poses', float(_THINNING.poses), '', 'Number of hidden nodes that stay in '
+              'a sector of a cell.', 1.0, 1000.0),
+    Parameter('thinning.newest', float(_THINNING.newest), '', 'Number of newest hidden nodes that '
+              'stay in any case.', 2.0, 1e6),
     Parameter('alignment.sigma_heading', _ALIGNMENT.sigma_heading, 'rad', 'The map is aligned '
               'with the odometry from positions alone once the standard deviation of the angle '
               'between them is at most this.', 1e-3, 1.0),
@@ -244,8 +257,9 @@ OF_SOURCES = frozenset(parameter.name for parameter in SOURCE_PARAMETERS)
 # Names of sources are prefixes of parameters and of counts in the diagnostics.
 _NAME = re.compile(r'[A-Za-z][A-Za-z0-9_]*')
 _TOPIC = re.compile(r'(~?/)?[A-Za-z_][A-Za-z0-9_]*(/[A-Za-z_][A-Za-z0-9_]*)*')
-_TAKEN = {'solver', 'worker', 'received', 'alignment', 'window', 'qos_overrides', 'use_sim_time',
-          'start_type_description_service'} | {parameter.name for parameter in PARAMETERS}
+_TAKEN = {'solver', 'worker', 'received', 'alignment', 'window', 'thinning', 'qos_overrides',
+          'use_sim_time', 'start_type_description_service'} | {
+              parameter.name for parameter in PARAMETERS}
 
 
 def type_parameter(source: str) -> Parameter:

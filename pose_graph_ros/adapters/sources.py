@@ -116,7 +116,11 @@ def backend_config(values: Mapping[str, Any]) -> config.BackendConfig:
         odometry_patience=values['odometry_patience'],
         window=config.WindowConfig(
             seconds=values['window.seconds'], metres=values['window.metres'],
-            nodes=math.ceil(values['window.nodes']), prior=config.Prior(values['window.prior'])))
+            nodes=math.ceil(values['window.nodes']), prior=config.Prior(values['window.prior'])),
+        thinning=config.ThinningConfig(
+            cell=values['thinning.cell'], angle=values['thinning.angle'],
+            poses=math.ceil(values['thinning.poses']),
+            newest=math.ceil(values['thinning.newest'])))
 
 
 def _odometry_source(own: Mapping[str, Any]) -> config.OdometrySource:

@@ -43,6 +43,7 @@ from pose_graph_ros.core.sources.constraint_queue import Queue, QueuedEdge
 from pose_graph_ros.core.sources.factor_builder import FactorBuilder
 from pose_graph_ros.core.sources.pipeline import MeasurementPipeline
 from pose_graph_ros.core.sources.source_report import SourceReport
+from pose_graph_ros.core.thinner import Thinner
 from pose_graph_ros.core.transaction import Transaction
 
 # Number of edges of a graph up to which an update may change the weights of all odometry.
@@ -88,6 +89,7 @@ class PoseGraphBackend:
         self._pipeline = MeasurementPipeline(self._nodes, self._config)
         self._quarantine = Queue()
         self._alignment = AlignmentMonitor(self._config)
+        self._thinner = Thinner(self._smoother, self._tuner, self._parts())
         self._settled, self._chi2 = True, 0.0
 
     def configure(self, config: BackendConfig) -> None:
@@ -280,6 +282,7 @@ class PoseGraphBackend:
         """
         report, untried = self._update()
         self._pipeline.queue = untried.joined(self._pipeline.queue)
+        self._thinner.step(self._config.thinning)
         return report
 
     def _update(self) -> tuple[UpdateReport, Queue]:

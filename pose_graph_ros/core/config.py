@@ -389,6 +389,8 @@ class BackendConfig:
     """Silence of the primary odometry source after which another one replaces it [s]."""
     window: WindowConfig = field(default_factory=WindowConfig)
     """What the graph keeps; the rest leaves it, and what it told stays as a prior."""
+    thinning: ThinningConfig = field(default_factory=ThinningConfig)
+    """Which hidden nodes leave where a place is driven often."""
 
     def __post_init__(self) -> None:
         require(self, 'odometry_patience', positive=True)

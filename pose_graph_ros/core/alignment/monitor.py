@@ -166,7 +166,7 @@ class AlignmentMonitor:
         table = ObservedNodes(np.searchsorted(ids, table.node), *table.columns[1:])
         rows = graph.node_rows(ids)
         found = estimator.recheck(
-            graph.poses[rows], nodes.odometry, table, self._config.alignment,
+            nodes.poses(graph)[nodes.n_frozen:], nodes.odometry, table, self._config.alignment,
             self._noise(nodes.primary), correlation=self._correlation(self._evidence),
             sigma=self.sigma)
         if self._next_recheck > LAST_RECHECK:
@@ -176,6 +176,8 @@ class AlignmentMonitor:
         self.sigma = found.sigma
         moved = se2.compose(found.T_map_graph, nodes.odometry)
         # what is no hidden node of the path any more keeps its place beside the oldest one
+        kept = rows >= 0
+        moved, rows = moved[kept], rows[kept]
         poses = se2.compose(moved[0], se2.between(graph.poses[rows[0]], graph.poses))
         poses[graph.is_bias] = 0.0
         poses[rows] = moved

@@ -63,7 +63,7 @@ class _Candidates(NamedTuple):
 
 def sparsify(
     nodes: IntArray, poses: FloatArray, information: FloatArray, vector: FloatArray, *,
-    anchored: bool, n_extra: int = 0, kind: EdgeKind = EdgeKind.ODOMETRY,
+    anchored: bool, n_extra: int = 0,
 ) -> SparsePrior:
     """
     Return edges and observed nodes that approximate a prior and tell no more than it.
@@ -79,7 +79,6 @@ def sparsify(
     anchored : bool, whether the prior tells of the map; if not, its null space is that of motions
         of all poses as one body
     n_extra : int, number of edges beyond the tree
-    kind : EdgeKind, of the new edges
 
     """
     basis, free = _basis(poses, information, anchored)
@@ -102,7 +101,7 @@ def sparsify(
     displaced = poses, delta.reshape(-1, 3)
     edges = _edges(*displaced, (i[is_edge], j[is_edge]), in_map[is_edge])
     seen = _observed(*displaced, j[~is_edge], in_map[~is_edge])
-    kinds = np.full(len(edges), kind, dtype=np.uint8)
+    kinds = np.full(len(edges), EdgeKind.PRIOR, dtype=np.uint8)
     return SparsePrior(
         replace(edges, i=nodes[edges.i], j=nodes[edges.j], kind=kinds),
         replace(seen, node=nodes[seen.node]), distance)
@@ -253,7 +252,7 @@ def _observed(
     mean = se2.wrapped(poses[node] + delta[node])
     return ObservedNodes(
         node, mean=mean, information=_turned(in_map, mean[:, 2]),
-        kind=np.full(len(node), ObservedKind.GLOBAL_POSE, dtype=np.uint8))
+        kind=np.full(len(node), ObservedKind.PRIOR, dtype=np.uint8))
 
 
 def _turned(information: FloatArray, theta: FloatArray) -> FloatArray:

@@ -14,17 +14,32 @@ Nodes leave in groups of connected ones. The prior of a group becomes a tree of 
 nodes taken into it, so that the number of edges stays in proportion to the number of nodes.
 """
 
-from typing import NamedTuple
+from collections.abc import Collection, Iterator
+from typing import NamedTuple, Self
 
 import numpy as np
 import numpy.typing as npt
 
+from pose_graph_ros.core.batch.optimizer import Status
 from pose_graph_ros.core.config import ThinningConfig
 from pose_graph_ros.core.geometry import se2
 from pose_graph_ros.core.geometry.se2 import BoolArray, FloatArray, IntArray
 from pose_graph_ros.core.graph.constraints import EdgeKind
 from pose_graph_ros.core.graph.graph import Graph
+from pose_graph_ros.core.graph.graph_update import Left
+from pose_graph_ros.core.smoother.incremental import IncrementalSmoother
+from pose_graph_ros.core.window.sparse_removal import (
+    can_leave,
+    leaving,
+    sparse_removal,
+    with_fewer_edges,
+)
 
+# Nodes leave whenever so many new ones have been made; so many are looked at each time.
+EVERY, MOST_AT_ONCE = 10, 40
+# Edges of the kind PRIOR for each pose, above which some of them are replaced by fewer ones, and
+# how often in one step.
+MOST_EDGES, MOST_REPLACED = 2.5, 3
 # A group has at most this many nodes, and about this many neighbours in all.
 MOST_IN_GROUP, MOST_NEIGHBOURS = 10, 12
 
@@ -98,6 +113,137 @@ def crowd(graph: Graph, config: ThinningConfig) -> Crowd:
     free = ~fixed[leaving]
     ids = graph.node_ids
     return Crowd(ids[leaving[free]], ids[anchors[free]])
+
+
+class Places(NamedTuple):
+    """Nodes that leave, ascending, with their places relative to nodes that stay."""
+
+    nodes: IntArray
+    """Ids, shape (L,)."""
+    anchors: IntArray
+    """Ids, shape (L,)."""
+    relative: FloatArray
+    """Poses in the anchors, shape (L, 3) [m, m, rad]."""
+    noise: FloatArray
+    """Covariances of these, in the frames of the nodes, shape (L, 3, 3)."""
+
+    def rows(self, index: BoolArray) -> Self:
+        """Return the places of some of the nodes."""
+        return type(self)(self.nodes[index], self.anchors[index], self.relative[index],
+                          self.noise[index])
+
+
+class Thinning:
+    """Decides now and then which nodes leave; see the module."""
+
+    def __init__(self) -> None:
+        self._newest, self._next = -EVERY, 0
+
+    def places(
+        self, smoother: IncrementalSmoother, config: ThinningConfig, keep: Collection[int] = (),
+    ) -> Places | None:
+        """
+        Return the nodes that leave now; None most times.
+
+        Parameters
+        ----------
+        smoother : IncrementalSmoother, without edits that wait
+        config : ThinningConfig
+        keep : collection of int, ids of nodes that do not leave
+
+        """
+        newest = smoother.graph.newest_pose
+        if config.cell == 0.0 or newest < self._newest + EVERY:
+            return None
+        self._newest = newest
+        found = crowd(smoother.graph, config)
+        found = Crowd(*(ids[~np.isin(found.leaving, list(keep))] for ids in found))
+        # those that are not sure enough to leave must not keep others from being looked at
+        order = np.argsort(found.leaving < self._next, kind='stable')[:MOST_AT_ONCE]
+        if len(order) == 0:
+            return None
+        self._next = int(found.leaving[order[-1]]) + 1
+        chosen = Crowd(*(ids[np.sort(order)] for ids in found))
+        places = certain(smoother, chosen, config)
+        return places if len(places.nodes) > 0 else None
+
+
+def groups(graph: Graph, places: Places) -> Iterator[Places]:
+    """
+    Yield connected groups of nodes; each must leave the graph before the next is asked for.
+
+    Parameters
+    ----------
+    graph : Graph
+    places : Places, all nodes that leave
+
+    """
+    while len(places.nodes) > 0:
+        edges = graph.edges
+        used = edges.weight > 0.0
+        members = group(places.nodes, np.column_stack((edges.i[used], edges.j[used])))
+        inside = np.isin(places.nodes, members)
+        if can_leave(graph, members):
+            yield places.rows(inside)
+        places = places.rows(~inside)
+
+
+def remove(smoother: IncrementalSmoother, nodes: IntArray) -> Left | None:
+    """
+    Return what has left the graph with a group of nodes, or None if the solver has failed.
+
+    Parameters
+    ----------
+    smoother : IncrementalSmoother
+    nodes : ndarray of int, ids, one of `groups`
+
+    """
+    update = sparse_removal(smoother.graph, nodes)
+    gone = leaving(smoother.graph, update)
+    return None if smoother.update(update).status is Status.FAILED else gone
+
+
+def simplify(smoother: IncrementalSmoother) -> Iterator[Left]:
+    """Replace some edges between poses by fewer ones where there are many; yield what leaves."""
+    for _ in range(MOST_REPLACED):
+        update = with_fewer_edges(smoother.graph, MOST_EDGES)
+        if update is None:
+            return
+        gone = leaving(smoother.graph, update)
+        if smoother.update(update).status is Status.FAILED:
+            return
+        yield gone
+
+
+def certain(smoother: IncrementalSmoother, found: Crowd, config: ThinningConfig) -> Places:
+    """
+    Return those nodes that leave which are in one cell with their anchors for sure.
+
+    The standard deviation of the position relative to the anchor is at most half of a cell, that
+    of the heading half of a sector. So what odometry alone brings together is not thinned.
+
+    Parameters
+    ----------
+    smoother : IncrementalSmoother, without edits that wait
+    found : Crowd, with ids
+    config : ThinningConfig
+
+    """
+    graph = smoother.graph
+    start, end = graph.poses_of(found.anchors), graph.poses_of(found.leaving)
+    noise = np.empty((len(start), 3, 3))
+    for k, (anchor, node) in enumerate(zip(*map(np.ndarray.tolist, found[::-1]), strict=True)):
+        # from both poses in map axes to the frame of the node
+        jacobian = np.hstack((-np.eye(3), np.eye(3)))
+        jacobian[:2, 2] = end[k, 1] - start[k, 1], start[k, 0] - end[k, 0]
+        axes = np.eye(3)
+        axes[:2, :2] = se2.rotation(end[k, 2]).T
+        jacobian = axes @ jacobian
+        noise[k] = jacobian @ smoother.joint_covariance(anchor, node) @ jacobian.T
+    sure = (np.linalg.eigvalsh(noise[:, :2, :2])[:, -1] <= (0.5 * config.cell)**2) & (
+        noise[:, 2, 2] <= (0.5 * config.angle)**2)
+    return Places(found.leaving[sure], found.anchors[sure],
+                  se2.between(start[sure], end[sure]), noise[sure])
 
 
 def informed(graph: Graph) -> BoolArray:

@@ -1,0 +1,67 @@
+# Copyright 2026 The pose_graph_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""The back end in a place that is driven often, with `thinning.cell`."""
+
+import numpy as np
+
+from pose_graph_ros.core.backend import PoseGraphBackend
+from pose_graph_ros.core.config import BackendConfig, MeasurementSource, Robust, ThinningConfig
+from pose_graph_ros.core.geometry import se2
+from pose_graph_ros.core.geometry.se2 import FloatArray
+from pose_graph_ros.core.measurements import AnswerStatus, LoopClosure, OdometrySample
+
+PER_LAP, LAPS = 40, 6
+SIGMA = np.array((0.02, 0.02, 0.005))
+
+
+def stamp(k: int) -> int:
+    return (k + 1) * 1_000_000_000
+
+
+def driven(config: BackendConfig) -> tuple[PoseGraphBackend, FloatArray]:
+    """Return a back end after laps on a circle, a closure each fifth node, and the true poses."""
+    rng, backend = np.random.default_rng(3), PoseGraphBackend(config)
+    angle = 2.0 * np.pi / PER_LAP * np.arange(PER_LAP * LAPS)
+    truth = se2.wrapped(np.column_stack((6.0 * np.cos(angle), 6.0 * np.sin(angle), angle)))
+    pose = truth[0]
+    for k, true in enumerate(truth):
+        if k > 0:
+            pose = se2.compose(pose, se2.compose(
+                se2.between(truth[k - 1], true), SIGMA * rng.standard_normal(3)))
+        backend.add_odometry(OdometrySample(stamp(k), pose))
+        if k > PER_LAP and k % 5 == 0:
+            # half of the closures name a node, half a time
+            other = k - PER_LAP * int(rng.integers(1, k // PER_LAP + 1))
+            named = {'reference_node': other} if k % 2 == 0 else {'reference_ns': stamp(other)}
+            answer = backend.add_measurement(LoopClosure(
+                stamp(k), pose=se2.compose(
+                    se2.between(truth[other], true), SIGMA * rng.standard_normal(3)),
+                covariance=np.diag(SIGMA**2), **named), 'loop')
+            assert answer.status is not AnswerStatus.REJECTED
+        if k % 3 == 0:
+            backend.update()
+    backend.update()
+    return backend, truth
+
+
+def settings(cell: float) -> BackendConfig:
+    return BackendConfig(
+        measurements={'loop': MeasurementSource(robust=Robust.NONE)},
+        thinning=ThinningConfig(cell=cell, newest=15))
+
+
+def test_the_graph_does_not_grow_and_the_path_is_whole() -> None:
+    whole, truth = driven(settings(0.0))
+    thinned, _ = driven(settings(2.0))
+    n = len(truth) - 1      # the last sample waits for those that might come before it
+    assert whole.graph.n_nodes == n
+    assert thinned.graph.n_nodes < 2 * PER_LAP
+    paths = []
+    for backend in (whole, thinned):
+        estimate = backend.estimate()
+        assert estimate is not None
+        assert estimate.trajectory is not None
+        assert estimate.n_hidden == n
+        paths.append(estimate.trajectory.poses[:n])
+        assert np.max(np.hypot(*(paths[-1] - truth[:n])[:, :2].T)) < 0.5
+    assert np.sqrt(np.mean((paths[1] - paths[0])[:, :2]**2)) < 0.1
