@@ -23,7 +23,7 @@ from pose_graph_ros.core.config import CLOSURE_FLOORS, SolverConfig
 from pose_graph_ros.core.elimination import symbolic
 from pose_graph_ros.core.geometry.se2 import FloatArray, IntArray
 from pose_graph_ros.core.graph.constraints import ObservedKind, ObservedNodes
-from pose_graph_ros.core.graph.error_functions import edge_errors, energies as energies_of
+from pose_graph_ros.core.graph.error_functions import energies as energies_of
 from pose_graph_ros.core.graph.graph import Graph, GraphUpdate
 from pose_graph_ros.core.io.g2o import EDGE2_ORDERS, GraphFile, read_g2o, write_g2o
 
@@ -120,7 +120,7 @@ def _doubt(file: GraphFile, sigma: Sequence[float]) -> IntArray:
         graph.apply(GraphUpdate(weigh_edges=dict.fromkeys(
             beliefs.closures[beliefs.believed].tolist(), beliefs.scale**-2.0)))
     edges = graph.edges_at(doubted)
-    errors = edge_errors(graph.poses, edges)
+    errors = graph.edge_errors(edges)
     squares = energies_of(errors, edges.information)
     for k in np.argsort(-squares, kind='stable')[:N_LARGEST]:
         x, y, theta = errors[k]

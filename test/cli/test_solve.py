@@ -299,8 +299,7 @@ def test_closures_join_what_odometry_does_not(
     gone = np.flatnonzero((graph.edges.i == cut) & (graph.edges.j == cut + 1))
     path, out = tmp_path / 'parts.g2o', tmp_path / 'out.g2o'
     rows, parts = graph.rows(), Graph()
-    parts.fill(rows._replace(edges=rows.edges.rows(
-        np.setdiff1d(np.arange(len(rows.edges)), gone))))
+    parts.fill(rows.with_edges(rows.edges.rows(np.setdiff1d(np.arange(len(rows.edges)), gone))))
     write_g2o(parts, path)
     assert main(['solve', str(path), '--robust', '-o', str(out)]) == 0
     printed = capsys.readouterr().out

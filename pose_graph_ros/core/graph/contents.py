@@ -58,18 +58,18 @@ class GraphContents:
 
     @property
     def node_ids(self) -> IntArray:
-        """Ids of all hidden nodes, ascending, shape (N,), a read-only view."""
-        return self._read_only('node_id', self.n_nodes)
+        """Ids of all hidden nodes, ascending, shape (N,), a copy."""
+        return np.asarray(self._nodes.by_row(), dtype=np.int64)
 
     @property
     def edge_ids(self) -> IntArray:
-        """Ids of all edges, ascending, shape (M,), a read-only view."""
-        return self._read_only('edge_id', self.n_edges)
+        """Ids of all edges, ascending, shape (M,), a copy."""
+        return np.asarray(self._edges.by_row(), dtype=np.int64)
 
     @property
     def observed_ids(self) -> IntArray:
-        """Ids of all observed nodes, ascending, shape (K,), a read-only view."""
-        return self._read_only('observed_id', self.n_observed)
+        """Ids of all observed nodes, ascending, shape (K,), a copy."""
+        return np.asarray(self._observed.by_row(), dtype=np.int64)
 
     @property
     def next_ids(self) -> NextIds:
@@ -90,15 +90,16 @@ class GraphContents:
 
     @property
     def _nodes(self) -> Ids:
-        return Ids.of(self.next_ids.node, self.node_ids)
+        return Ids.of(self.next_ids.node, self.memory['node_id'][:self.n_nodes])
 
     @property
     def _edges(self) -> Ids:
-        return Ids.of(self.next_ids.edge, self.edge_ids)
+        return Ids.of(self.next_ids.edge, self.memory['edge_id'][:self.n_edges])
 
     @property
     def _observed(self) -> Ids:
-        return Ids.of(self.next_ids.observed, self.observed_ids)
+        return Ids.of(
+            self.next_ids.observed, self.memory['observed_id'][:self.n_observed])
 
     def _read_only(self, name: str, rows: int) -> npt.NDArray[Any]:
         """Return the rows of a table in use."""
@@ -228,13 +229,11 @@ class GraphContents:
 
     def rows(self) -> GraphRows:
         """Return a copy of all rows."""
-        nodes, edges, observed = (
-            ids.astype(np.int64) for ids in (self.node_ids, self.edge_ids, self.observed_ids))
         return GraphRows(
             self.poses.copy(), self.node_kind, self.fixed,
             Edges(*(column.copy() for column in self.edges.columns)),
             ObservedNodes(*(column.copy() for column in self.observed.columns)),
-            nodes, edges, observed, self.next_ids, self.dimension)
+            self.node_ids, self.edge_ids, self.observed_ids, self.next_ids, self.dimension)
 
     def leaving(self) -> GraphUpdate:
         """Return what leaves the graph with the present update; it keeps its rows until then."""

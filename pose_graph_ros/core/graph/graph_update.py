@@ -136,6 +136,10 @@ class GraphRows(NamedTuple):
         """Whether hidden nodes are poses, shape (N,)."""
         return np.asarray(self.node_kind == NodeKind.POSE)
 
+    def rows_of(self, ids: IntArray) -> IntArray:
+        """Return the rows of nodes that are in the graph, given their ids."""
+        return np.asarray(np.searchsorted(self.node_ids, ids), dtype=np.int64)
+
     def since(self, first: NextIds) -> 'GraphRows':
         """Return the rows that are new since the next ids were these."""
         nodes, edges, observed = (

@@ -43,7 +43,7 @@ NO_LINES = Lines(np.empty((0, 2, 2)), np.empty(0))
 
 
 class DrawnRows(NamedTuple):
-    """Rows of constraints that are drawn in another way, as they are not simply believed."""
+    """Ids of constraints that are drawn in another way, as they are not simply believed."""
 
     weak: Sequence[int] = ()
     """Edges between poses in the estimate that little speaks for."""
@@ -92,7 +92,7 @@ def view(graph: Graph, drawn: DrawnRows = ALL_BELIEVED) -> GraphView | None:
     Parameters
     ----------
     graph : Graph
-    drawn : DrawnRows, rows of what is not simply believed
+    drawn : DrawnRows, ids of what is not simply believed; those that have left are ignored
 
     """
     if graph.n_nodes == 0:
@@ -108,7 +108,11 @@ def view(graph: Graph, drawn: DrawnRows = ALL_BELIEVED) -> GraphView | None:
                      sigmas[rows])
 
     in_graph, kinds = edges.weights > 0.0, edges.integers[:, tb.EDGE_KIND]
-    in_graph[[*drawn.weak, *drawn.doubted]] = False
+    weak, waiting, doubted, unused_edges, unused_observed = (
+        rows[rows >= 0] for part, rows_of in zip(
+            drawn, (graph.edge_rows,) * 4 + (graph.observed_rows,), strict=True)
+        for rows in (rows_of(np.array(part, dtype=np.int64)),))
+    in_graph[weak] = in_graph[doubted] = False
     # a measurement with a time-correlated error is an edge to a bias
     biased = np.flatnonzero(
         (kinds == EdgeKind.BIAS) & edges.tells_position & ~is_bias[edges.integers[:, tb.END_I]])
@@ -118,20 +122,15 @@ def view(graph: Graph, drawn: DrawnRows = ALL_BELIEVED) -> GraphView | None:
         nodes=positions.take(np.flatnonzero(~is_bias), axis=0),
         odometry=lines(np.flatnonzero(in_graph & (kinds == EdgeKind.ODOMETRY))),
         loop_closures=lines(np.flatnonzero(in_graph & (kinds == EdgeKind.LOOP_CLOSURE))),
-        observed=_measured(graph, tables, biased, seen), weak=lines(_rows(drawn.weak)),
-        waiting=lines(_rows(drawn.waiting)), doubted=lines(_rows(drawn.doubted)),
-        unused=_measured(graph, tables, _positions_in(edges, drawn.unused_edges),
-                         _positions_in(observed, drawn.unused_observed)))
+        observed=_measured(graph, tables, biased, seen), weak=lines(weak),
+        waiting=lines(waiting), doubted=lines(doubted),
+        unused=_measured(graph, tables, _positions_in(edges, unused_edges),
+                         _positions_in(observed, unused_observed)))
 
 
-def _rows(rows: Sequence[int]) -> IntArray:
-    return np.array(rows, dtype=np.int64)
-
-
-def _positions_in(table: 'ConstraintTable', rows: Sequence[int]) -> IntArray:
+def _positions_in(table: 'ConstraintTable', rows: IntArray) -> IntArray:
     """Return those rows of a table that measure positions."""
-    found = _rows(rows)
-    return found[table.numbers[found, tb.INFO] > 0.0]
+    return rows[table.numbers[rows, tb.INFO] > 0.0]
 
 
 def _measured(

@@ -339,7 +339,7 @@ def write_g2o(graph: Graph, path: Path, ids: IntArray | None = None) -> None:
     ----------
     graph : Graph
     path : Path
-    ids : ndarray, shape (N,), optional, id of each hidden node; by default its row in the graph
+    ids : ndarray, shape (N,), optional, number of each hidden node; by default its id
 
     """
     path.write_text(g2o_text(graph.rows(), ids), encoding='ascii')
@@ -352,11 +352,12 @@ def g2o_text(rows: GraphRows, ids: IntArray | None = None) -> str:
     Parameters
     ----------
     rows : GraphRows
-    ids : ndarray, shape (N,), optional, id of each hidden node; by default its row in the graph
+    ids : ndarray, shape (N,), optional, number of each hidden node; by default its id
 
     """
-    ids = np.arange(len(rows.poses)) if ids is None else ids
-    edges, observed, is_pose = rows.edges, rows.observed, ~rows.is_bias
+    ids = rows.node_ids if ids is None else ids
+    edges, observed = rows.edges.renumbered(rows.rows_of), rows.observed.renumbered(rows.rows_of)
+    is_pose = ~rows.is_bias
     used = _is_used(observed, edges)
     lines = []
     if not np.all(is_pose):

@@ -43,7 +43,7 @@ from pose_graph_ros.core.io.tum import tum_text
 from pose_graph_ros.core.saved_columns import Integers, Numbers, Rows3, Rows4, Rows6
 
 FORMAT = 'pose_graph_ros graph'
-VERSION = 3
+VERSION = 4
 
 SUFFIXES = ('.g2o', '.json', '.tum')
 _OPENING, _MIDDLE = b'{\n"sha256": "', b'",\n'
@@ -58,9 +58,9 @@ class SavedRows:
     """What the g2o file lacks of the rows of a graph."""
 
     fixed: Integers
-    """Rows of the fixed hidden nodes."""
+    """Ids of the fixed hidden nodes."""
     biases: Integers
-    """Rows of the hidden nodes that are biases; all others are vertices of the g2o file."""
+    """Ids of the hidden nodes that are biases; all others are vertices of the g2o file."""
     bias_values: Rows3
     edge_kind: EdgeKinds
     """Of all edges. Those of kind `bias` are given here, others in the g2o file."""
@@ -79,6 +79,12 @@ class SavedRows:
     bias_observed_offset: Rows3
     bias_observed_mean: Rows3
     bias_observed_information: Rows6
+    node_ids: Integers | None = None
+    """Ids of all hidden nodes, in order; None where they are 0, 1 and so on, without a gap."""
+    edge_ids: Integers | None = None
+    observed_ids: Integers | None = None
+    next_ids: NextIds | None = None
+    """Ids of the next new rows; None where they follow on the last ones."""
 
 
 def graph_paths(path: Path) -> tuple[Path, Path, Path]:
@@ -106,7 +112,7 @@ def write_graph(saved: SavedGraph, path: Path) -> tuple[Path, Path, Path]:
     paths = graph_paths(path)
     g2o = g2o_text(saved.rows).encode('ascii')
     nodes = saved.nodes
-    tum = tum_text(Trajectory(nodes.stamps_ns, saved.rows.poses[nodes.rows])).encode('ascii')
+    tum = tum_text(Trajectory(nodes.stamps_ns, saved.path)).encode('ascii')
     members = {
         'format': FORMAT, 'version': VERSION, 'created_by': f'pose_graph_ros {__version__}',
         'g2o_sha256': hashlib.sha256(g2o).hexdigest(), 'graph': encoded(_saved_rows(saved.rows)),
@@ -206,47 +212,53 @@ def _checked_members(path: Path, content: bytes) -> dict[str, Any]:
     except (ValueError, RecursionError) as error:
         raise FileFormatError(f'{path}: expected JSON ({error})') from error
     version = members.pop('version', None)
-    if members.pop('format', None) != FORMAT or version not in (1, 2, VERSION):
+    if members.pop('format', None) != FORMAT or version not in range(1, VERSION + 1):
         raise FileFormatError(
             f'{path}: expected a {FORMAT} of version 1 to {VERSION}, created by pose_graph_ros; '
             f'this one is of version {version!r}, created by {members.get("created_by")!r}')
     members = with_names(members) if version == 1 else dict(members)
-    return with_judgement(members) if version < VERSION else members
+    return with_judgement(members) if version < 3 else members
 
 
 def _saved_rows(rows: GraphRows) -> SavedRows:
     edges = rows.edges.rows(rows.edges.kind == EdgeKind.BIAS)
-    on_bias = np.flatnonzero(rows.is_bias[rows.observed.node])
-    observed, biases = rows.observed.rows(on_bias), np.flatnonzero(rows.is_bias)
+    on_bias = np.flatnonzero(np.isin(rows.observed.node, rows.node_ids[rows.is_bias]))
+    observed = rows.observed.rows(on_bias)
+    node_ids, edge_ids, observed_ids = (
+        None if len(ids) == end else ids for ids, end in zip(
+            (rows.node_ids, rows.edge_ids, rows.observed_ids), rows.next_ids, strict=True))
     return SavedRows(
-        np.flatnonzero(rows.fixed), biases, rows.poses[biases],
+        rows.node_ids[rows.fixed], rows.node_ids[rows.is_bias], rows.poses[rows.is_bias],
         rows.edges.kind.astype(np.int64), rows.edges.weight, edges.i, edges.j, edges.mean,
         upper(edges.information), edges.bias, rows.observed.kind.astype(np.int64),
         rows.observed.weight, on_bias, observed.node, observed.offset, observed.mean,
-        upper(observed.information))
+        upper(observed.information), node_ids, edge_ids, observed_ids, rows.next_ids)
 
 
 def _graph_rows(rows: SavedRows, text: str) -> GraphRows:
     """Return the rows of a graph from both files; raise ValueError if they do not fit together."""
     lines = [line.removeprefix(NOT_USED) for line in text.split('\n')]
     vertices = _numbers(lines, 'VERTEX_SE2')
-    n = len(vertices) + len(rows.biases)
-    is_bias, fixed = np.zeros(n, dtype=bool), np.zeros(n, dtype=bool)
-    poses = np.zeros((n, 3))
+    n = len(vertices) + len(rows.biases), len(rows.edge_kind), len(rows.observed_kind)
+    node_ids, edge_ids, observed_ids = (
+        np.arange(size) if ids is None else ids for size, ids in zip(
+            n, (rows.node_ids, rows.edge_ids, rows.observed_ids), strict=True))
+    if (len(node_ids), len(edge_ids), len(observed_ids)) != n:
+        raise ValueError(f'graph: expected {n} ids of nodes, edges and observed nodes')
     for name, chosen in (('fixed', rows.fixed), ('biases', rows.biases)):
-        if np.any((chosen < 0) | (chosen >= n)):
-            raise ValueError(f'graph.{name}: expected hidden nodes in 0..{n - 1}')
-    fixed[rows.fixed] = is_bias[rows.biases] = True
-    if not np.array_equal(vertices[:, 0], np.flatnonzero(~is_bias)):
+        if not np.all(np.isin(chosen, node_ids)):
+            raise ValueError(f'graph.{name}: expected hidden nodes')
+    is_bias, fixed = np.isin(node_ids, rows.biases), np.isin(node_ids, rows.fixed)
+    if not np.array_equal(vertices[:, 0], node_ids[~is_bias]):
         raise ValueError('expected the hidden nodes that are no biases as vertices, in order')
+    poses = np.zeros((len(node_ids), 3))
     poses[~is_bias] = vertices[:, 1:]
-    _fill(poses, rows.biases, rows.bias_values, 'biases')
-    return GraphRows(poses, is_bias.astype(np.int32), fixed,
-                     _edges(rows, _numbers(lines, 'EDGE_SE2')),
-                     _observed(rows, lines), np.arange(n), np.arange(len(rows.edge_kind)),
-                     np.arange(len(rows.observed_kind)),
-                     NextIds(n, len(rows.edge_kind), len(rows.observed_kind)),
-                     np.full(n, 3, dtype=np.int32))
+    _fill(poses, np.flatnonzero(is_bias), rows.bias_values, 'biases')
+    next_ids = NextIds(*n) if rows.next_ids is None else rows.next_ids
+    return GraphRows(
+        poses, is_bias.astype(np.int32), fixed, _edges(rows, _numbers(lines, 'EDGE_SE2')),
+        _observed(rows, lines), node_ids, edge_ids, observed_ids, next_ids,
+        np.full(n[0], 3, dtype=np.int32))
 
 
 def _edges(rows: SavedRows, numbers: FloatArray) -> Edges:

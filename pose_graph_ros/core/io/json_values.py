@@ -12,7 +12,7 @@ from collections.abc import Mapping
 from dataclasses import fields, is_dataclass, MISSING
 import math
 from types import UnionType
-from typing import Annotated, Any, get_args, get_origin, get_type_hints
+from typing import Annotated, Any, get_args, get_origin, get_type_hints, Union
 
 import numpy as np
 import numpy.typing as npt
@@ -70,7 +70,7 @@ def decoded(kind: Any, plain: Any, where: str) -> Any:
     if origin is Annotated:
         read = _chosen if isinstance(arguments[1], Choices) else _array
         return read(arguments[1], plain, where)
-    if origin is UnionType:     # of something and None
+    if origin in (UnionType, Union):     # of something and None
         return None if plain is None else decoded(arguments[0], plain, where)
     if origin is tuple:
         _expect(isinstance(plain, list), where, 'a list', plain)

@@ -17,9 +17,10 @@ import numpy.typing as npt
 from pose_graph_ros.core.alignment.monitor import AlignmentState, SavedAlignment
 from pose_graph_ros.core.config import Loss
 from pose_graph_ros.core.geometry.geodesy import distances, MapOrigin, TangentPlane
-from pose_graph_ros.core.geometry.se2 import IntArray, wrap
-from pose_graph_ros.core.graph.constraints import check as check_table, EdgeKind
+from pose_graph_ros.core.geometry.se2 import FloatArray, IntArray, wrap
+from pose_graph_ros.core.graph.constraints import check as check_table, EdgeKind, KindArray
 from pose_graph_ros.core.graph.graph import GraphRows
+from pose_graph_ros.core.graph.identities import Ids
 from pose_graph_ros.core.graph.reweighting import SavedLosses
 from pose_graph_ros.core.judgement.closure_states import SavedClosures
 from pose_graph_ros.core.judgement.fix_states import SavedFixes
@@ -65,6 +66,12 @@ class SavedGraph:
     datum: MapOrigin | None
     """Datum of the map, if it has one."""
 
+    @property
+    def path(self) -> FloatArray:
+        """Poses of all nodes that are no biases, those that have left included, shape (H, 3)."""
+        frozen, nodes = self.nodes.frozen, self.nodes.rows
+        return np.concatenate((frozen, self.rows.poses[self.rows.rows_of(nodes[len(frozen):])]))
+
     def check(self) -> None:
         """
         Raise ValueError unless all sizes, indices and stamps are consistent; it names the place.
@@ -74,25 +81,28 @@ class SavedGraph:
         rows, nodes = self.rows, self.nodes
         for table in (rows.edges, rows.observed):
             if len(table) > 0:
-                check_table(table, rows.node_kind, rows.dimension)
-        sizes = {'nodes': len(rows.poses), 'edges': len(rows.edges),
-                 'observed': len(rows.observed)}
+                check_table(table, rows.node_kind, rows.dimension,
+                            Ids.of(rows.next_ids.node, rows.node_ids))
+        ids = {'nodes': rows.node_ids, 'edges': rows.edge_ids, 'observed': rows.observed_ids}
+        for (name, present), end in zip(ids.items(), rows.next_ids, strict=True):
+            _increasing(f'graph.{name}', np.concatenate(([-1], present, [end])))
         _require(len(nodes.rows) > 0, 'nodes: expected at least one')
         _same_length('nodes', nodes, 'stamps_ns', 'rows', 'odometry')
         _increasing('nodes.stamps_ns', nodes.stamps_ns)
         _increasing('nodes.rows', nodes.rows)
-        _inside('nodes.rows', nodes.rows, sizes['nodes'])
-        _require(np.array_equal(np.flatnonzero(rows.is_pose), nodes.rows),
+        poses = rows.node_ids[rows.is_pose]
+        _require(np.isin(poses, nodes.rows),
                  'nodes.rows: expected all hidden nodes of the graph that are no biases')
+        _in_graph('nodes.rows', nodes.rows[len(nodes.frozen):], poses)
         self._check_odometry()
         if self.datum is not None:
             TangentPlane(*self.datum)   # raises if it is no point on the Earth
         for name, source in self.sources.items():
-            self._check_source(f'sources.{name}', source, sizes)
+            self._check_source(f'sources.{name}', source, ids)
         for name, losses in (('edges', self.edge_losses), ('observed', self.observed_losses)):
             where = f'{name} losses'
             _same_length(where, losses, 'rows', 'losses', 'thresholds', 'shares')
-            _inside(where, losses.rows, sizes[name])
+            _in_graph(where, losses.rows, ids[name])
             _increasing(where, losses.rows)
             _inside(where, losses.losses, len(Loss))
             _require(np.all(losses.thresholds > 0.0) and losses.cursor >= 0,
@@ -105,9 +115,9 @@ class SavedGraph:
         _require(np.isin(alignment.node, nodes.rows), 'alignment.node: expected hidden nodes')
         _require(alignment.state in STATES, f'alignment.state: expected one of {STATES}')
         _require(alignment.next_verdict > 0, 'alignment.next_verdict: expected a positive number')
-        self._check_judgement(self.judgement.closures, sizes['edges'])
-        self._check_fixes(self.judgement.fixes, sizes)
-        self._check_doubts(self.judgement.odometry, sizes)
+        self._check_judgement(self.judgement.closures)
+        self._check_fixes(self.judgement.fixes, ids)
+        self._check_doubts(self.judgement.odometry)
         for name, edges in (('waiting', self.waiting), ('set_aside', self.set_aside)):
             _same_length(name, edges, 'sources', 'i', 'j', 'mean', 'information', 'kind',
                          'stamps_ns')
@@ -141,66 +151,73 @@ class SavedGraph:
         _require(covered[0] <= nodes.base_ns <= covered[-1],
                  'nodes.base_ns: expected an instant that the primary odometry covers')
 
-    def _check_judgement(self, closures: SavedClosures, n_edges: int) -> None:
+    def _check_judgement(self, closures: SavedClosures) -> None:
         where = 'judgement.closures'
         _same_length(where, closures, 'rows', 'source', 'stamps_ns', 'state', 'since_ns',
                      'decision', 'distance')
         _same_length(where, closures, 'sources', 'scales')
-        _inside(where, closures.rows, n_edges)
+        _in_graph(where, closures.rows, self.rows.edge_ids)
         _inside(where, closures.source, len(closures.sources))
         _inside(where, closures.state, len(State))
         _inside(where, closures.decision, len(Decision))
-        _require(self.rows.edges.kind[closures.rows] == EdgeKind.LOOP_CLOSURE,
+        _require(self._kinds(closures.rows) == EdgeKind.LOOP_CLOSURE,
                  f'{where}: expected rows of loop closures')
         _require(closures.scales > 0.0, f'{where}: expected positive scales')
 
-    def _check_fixes(self, fixes: SavedFixes, sizes: Mapping[str, int]) -> None:
+    def _check_fixes(self, fixes: SavedFixes, ids: Mapping[str, IntArray]) -> None:
         where = 'judgement.fixes'
         _same_length(where, fixes, 'rows', 'edges', 'source', 'stamps_ns', 'believed', 'since_ns',
                      'decision', 'observed', 'distance')
-        _inside(where, fixes.observed + 1, sizes['observed'] + 1)
+        _in_graph(where, fixes.observed[fixes.observed != -1], ids['observed'])
         _same_length(where, fixes, 'loosened', 'weights')
         _inside(where, fixes.edges, 2)
         _inside(where, fixes.believed, 2)
         for kind, table in enumerate(('observed', 'edges')):
-            _inside(where, fixes.rows[fixes.edges == kind], sizes[table])
+            _in_graph(where, fixes.rows[fixes.edges == kind], ids[table])
         _inside(where, fixes.source, len(fixes.sources))
         _inside(where, fixes.decision, len(Decision))
-        _inside(where, fixes.loosened, sizes['edges'])
+        _in_graph(where, fixes.loosened, ids['edges'])
         _require(fixes.weights > 0.0, f'{where}: expected positive weights')
 
-    def _check_doubts(self, odometry: SavedOdometry, sizes: Mapping[str, int]) -> None:
+    def _check_doubts(self, odometry: SavedOdometry) -> None:
         where = 'judgement.odometry'
         _same_length(where, odometry, 'rows', 'ends', 'weights', 'since_ns')
-        _inside(where, odometry.rows, sizes['edges'])
-        _require(self.rows.edges.kind[odometry.rows] == EdgeKind.ODOMETRY,
+        _in_graph(where, odometry.rows, self.rows.edge_ids)
+        _require(self._kinds(odometry.rows) == EdgeKind.ODOMETRY,
                  f'{where}: expected rows of odometry')
         _require(np.isin(odometry.ends, self.nodes.rows), f'{where}: expected hidden nodes')
         _require(odometry.weights > 0.0, f'{where}: expected positive weights')
 
-    def _check_source(self, where: str, source: SavedSource, sizes: Mapping[str, int]) -> None:
+    def _check_source(
+        self, where: str, source: SavedSource, ids: Mapping[str, IntArray],
+    ) -> None:
         _same_length(where, source, 'seen_ns', 'seen_references')
         _require(np.diff(source.seen_ns) >= 0, f'{where}.seen_ns: must not decrease')
         _require(source.n_otherwise >= 0, f'{where}.n_otherwise: expected a count')
-        _inside(f'{where}.ties', source.ties, sizes['edges'])
+        _in_graph(f'{where}.ties', source.ties, ids['edges'])
         constraints = source.rows[:, 1]
         as_edges = source.bins is not None and source.errors is None
-        _inside(f'{where}.rows', constraints, sizes['edges' if as_edges else 'observed'])
+        _in_graph(f'{where}.rows', constraints, ids['edges' if as_edges else 'observed'])
         self._check_errors(where, source)
         if source.bins is None:
             return
         bins, rows = source.bins, self.rows
         held = constraints if as_edges else source.edges
-        _inside(f'{where}.edges', held, sizes['edges'])
-        _require(rows.edges.kind[held] == EdgeKind.BIAS,
+        _in_graph(f'{where}.edges', held, ids['edges'])
+        _require(self._kinds(held) == EdgeKind.BIAS,
                  f'{where}: expected edges to biases')
         _same_length(f'{where}.bins', bins, 'numbers', 'rows', 'ties')
         _increasing(f'{where}.bins.numbers', bins.numbers)
-        _inside(f'{where}.bins.rows', bins.rows, sizes['nodes'])
-        _inside(f'{where}.bins.ties', bins.ties[:1], sizes['observed'])
-        _inside(f'{where}.bins.ties', bins.ties[1:], sizes['edges'])
-        _require(bins.width_ns > 0 and np.all(rows.is_bias[bins.rows]),
+        _in_graph(f'{where}.bins.rows', bins.rows, ids['nodes'])
+        _in_graph(f'{where}.bins.ties', bins.ties[:1], ids['observed'])
+        _in_graph(f'{where}.bins.ties', bins.ties[1:], ids['edges'])
+        _require(bins.width_ns > 0 and np.all(
+            rows.is_bias[rows.rows_of(bins.rows)]),
                  f'{where}.bins: expected biases, and a width')
+
+    def _kinds(self, edges: IntArray) -> KindArray:
+        """Return the kinds of edges that are in the graph, by id."""
+        return self.rows.edges.kind[np.searchsorted(self.rows.edge_ids, edges)]
 
     def _check_errors(self, where: str, source: SavedSource) -> None:
         """Check what was estimated of the errors of a source."""
@@ -268,7 +285,7 @@ def _distance_to(saved: SavedGraph, fix: MapOrigin) -> float:
     least = float(distances(fix, saved.datum.latitude, saved.datum.longitude)[0])
     if saved.alignment.state != AlignmentState.ALIGNED.value:
         return least  # the nodes are not in the map
-    points = TangentPlane(*saved.datum).to_geodetic(saved.rows.poses[saved.nodes.rows, :2])
+    points = TangentPlane(*saved.datum).to_geodetic(saved.path[:, :2])
     return min(least, float(np.min(distances(fix, points[:, 0], points[:, 1]))))
 
 
@@ -284,6 +301,11 @@ def _same_length(where: str, value: Any, *names: str) -> None:
 
 def _increasing(where: str, numbers: IntArray) -> None:
     _require(numbers[1:] > numbers[:-1], f'{where}: expected increasing numbers')
+
+
+def _in_graph(where: str, ids: IntArray, present: IntArray) -> None:
+    missing = ids[~np.isin(ids, present)]
+    _require(len(missing) == 0, f'{where}: {missing[:1]} is not in the graph')
 
 
 def _inside(where: str, numbers: IntArray, size: int) -> None:

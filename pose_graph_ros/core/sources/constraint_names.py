@@ -59,7 +59,7 @@ def largest(
     for row in rows.tolist():
         edge = row < graph.n_edges
         number, table = (row, tables[0]) if edge else (row - graph.n_edges, tables[1])
-        names = _names(number, table, nodes, factors, edge=edge)
+        names = _names(number, table, graph, nodes, factors, edge=edge)
         named.append(ConstraintEnergy(float(energies[row]), float(table.energies[number]),
                                       int(table.freedom[number]), *names))
     return named
@@ -83,15 +83,18 @@ def queued(queue: Queue, nodes: HiddenNodes) -> list[str]:
 
 
 def _names(
-    row: int, table: ConstraintTable, nodes: HiddenNodes, factors: FactorBuilder, *, edge: bool,
+    row: int, table: ConstraintTable, graph: Graph, nodes: HiddenNodes, factors: FactorBuilder, *,
+    edge: bool,
 ) -> tuple[str, str, str]:
     """Return source, kind and name of a constraint, given its row in the graph."""
-    integers, origin = table.integers[row], factors.origin(row, edge=edge)
+    number = int((graph.edge_ids if edge else graph.observed_ids)[row])
+    integers, origin = table.integers[row], factors.origin(number, edge=edge)
     if not edge or integers[tb.EDGE_KIND] == EdgeKind.BIAS:
-        node = int(integers[tb.END_I if edge else tb.OBS_NODE])
+        node = int(graph.node_ids[integers[tb.END_I if edge else tb.OBS_NODE]])
         return _measurement_name(origin, node, table.numbers[row], nodes, factors)
     kind = EdgeKind(int(integers[tb.EDGE_KIND]))
-    i, j = np.searchsorted(nodes.ids, integers[[tb.END_I, tb.END_J]]).tolist()
+    ends = graph.node_ids[integers[[tb.END_I, tb.END_J]]]
+    i, j = np.searchsorted(nodes.ids, ends).tolist()
     source = '' if origin is None else origin.source
     if origin is None and kind == EdgeKind.ODOMETRY:
         source = nodes.primary_at(int(nodes.stamps_ns[j]))
@@ -106,7 +109,7 @@ def _measurement_name(
     """
     Return source, kind and name of a constraint that was made from a measurement in the map.
 
-    `node` is the row of its hidden node in the graph, `numbers` its row of the constraint table. A
+    `node` is the id of its hidden node, `numbers` its row of the constraint table. A
     constraint on a bias alone comes from no measurement and is named after the bias.
     """
     number = int(np.searchsorted(nodes.ids, node))

@@ -78,7 +78,7 @@ def test_other_programs_read_the_graph_and_the_path(tmp_path: Path) -> None:
     np.testing.assert_array_equal(path.stamps_ns, saved.nodes.stamps_ns)
     np.testing.assert_array_equal(path.poses[:, :2], rows.poses[saved.nodes.rows, :2])
     members = json.loads(side.read_text(encoding='ascii'))
-    assert members['version'] == 3
+    assert members['version'] == 4
     assert members['datum'] == {
         'latitude': 48.1, 'longitude': 11.6, 'altitude': 500.0, 'yaw': 0.25}
     assert members['nodes']['stamps_ns'] == saved.nodes.stamps_ns.tolist()
@@ -216,10 +216,10 @@ def test_another_version_is_refused_and_says_who_wrote_it(tmp_path: Path) -> Non
     assert_same_value(read_graph(side), small_graph())  # the layout of the text does not matter
 
     def renew(members: dict[str, Any]) -> None:
-        members['version'], members['created_by'] = 4, 'pose_graph_ros 9.9'
+        members['version'], members['created_by'] = 5, 'pose_graph_ros 9.9'
 
     rewrite(side, renew)
-    with pytest.raises(FileFormatError, match=r'version 1 to 3, .*version 4, .*9\.9'):
+    with pytest.raises(FileFormatError, match=r'version 1 to 4, .*version 5, .*9\.9'):
         read_graph(side)
 
 
@@ -268,7 +268,7 @@ def test_losses_and_kinds_are_saved_by_their_names(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(('place', 'value', 'expected'), [
-    (('graph', 'fixed'), [-1], r'graph\.fixed: expected hidden nodes in 0'),
+    (('graph', 'fixed'), [-1], r'graph\.fixed: expected hidden nodes'),
     (('graph', 'biases'), [10**6], r'graph\.biases: expected hidden nodes in 0'),
     (('graph', 'biases'), [0], 'no biases as vertices'),
     (('graph', 'observed_on_bias'), [-1], r'graph\.observed_on_bias: expected numbers in 0'),

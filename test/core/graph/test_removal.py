@@ -1,0 +1,180 @@
+# Copyright 2026 The pose_graph_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""What leaves a graph leaves no trace in its tables, and its id never comes back."""
+
+from collections.abc import Callable
+
+from hypothesis import given, settings, strategies as st
+import numpy as np
+import pytest
+from random_graphs import random_edges, random_graph, random_observed, random_poses, snapshot
+from slow_smoother import differences, state
+
+from pose_graph_ros.core.exceptions import GraphUpdateError
+from pose_graph_ros.core.graph import tables as tb
+from pose_graph_ros.core.graph.graph import Graph, GraphUpdate
+
+seeds = st.integers(0, 2**32 - 1)
+
+
+def graph_of(seed: int) -> Graph:
+    """Return a graph with biases, some constraints of which have the weight 0."""
+    graph, rng = random_graph(seed, n_nodes=9, n_biases=3), np.random.default_rng(seed)
+    graph.apply(GraphUpdate(
+        remove_edges=rng.choice(graph.n_edges, 4, replace=False).tolist(),
+        remove_observed=rng.choice(graph.n_observed, 2, replace=False).tolist(), fix=(2,)))
+    return graph
+
+
+def leaving(graph: Graph, rng: np.random.Generator) -> GraphUpdate:
+    nodes, edges, observed = (
+        rng.choice(ids, min(len(ids), int(rng.integers(0, 4))), replace=False).tolist()
+        for ids in (graph.node_ids, graph.edge_ids, graph.observed_ids))
+    return GraphUpdate(remove_nodes=nodes, drop_edges=edges, drop_observed=observed)
+
+
+def listed(graph: Graph) -> list[tuple[list[int], list[int]]]:
+    """Return the ids of the edges and the observed nodes in the lists of each node, sorted."""
+    memory, found = graph.memory, []
+    for row in memory['node_i'][:graph.n_nodes]:
+        edges, observed = [], []
+        entry, k = int(row[tb.EDGE_LIST]), int(row[tb.OBSERVED_LIST])
+        while entry >= 0:
+            edges.append(int(graph.edge_ids[entry >> 1]))
+            entry = int(memory['edge_i'][entry >> 1, tb.NEXT_J if entry & 1 else tb.NEXT_I])
+        while k >= 0:
+            observed.append(int(graph.observed_ids[k]))
+            k = int(memory['observed_i'][k, tb.OBS_NEXT])
+        found.append((sorted(edges), sorted(observed)))
+    return found
+
+
+@given(seeds)
+@settings(max_examples=60)
+def test_the_graph_is_the_one_that_what_is_left_would_make(seed: int) -> None:
+    graph, rng = graph_of(seed), np.random.default_rng(seed)
+    for _ in range(3):
+        before, update = graph.rows(), leaving(graph, rng)
+        graph.apply(update)
+        stays = ~np.isin(before.node_ids, update.remove_nodes)
+        nodes = before.node_ids[stays]
+        edges = (np.isin(before.edges.i, nodes) & np.isin(before.edges.j, nodes)
+                 & ~np.isin(before.edge_ids, update.drop_edges))
+        observed = (np.isin(before.observed.node, nodes)
+                    & ~np.isin(before.observed_ids, update.drop_observed))
+        assert graph.node_ids.tolist() == nodes.tolist()
+        assert graph.edge_ids.tolist() == before.edge_ids[edges].tolist()
+        assert graph.observed_ids.tolist() == before.observed_ids[observed].tolist()
+        assert graph.next_ids == before.next_ids
+        for table, rows in ((graph.edges, before.edges.rows(edges)),
+                            (graph.observed, before.observed.rows(observed))):
+            for column, expected in zip(table.columns, rows.columns, strict=True):
+                np.testing.assert_array_equal(column, expected)
+        anew = Graph()
+        anew.fill(before._replace(
+            poses=before.poses[stays], is_bias=before.is_bias[stays], fixed=before.fixed[stays],
+            edges=before.edges.rows(edges), observed=before.observed.rows(observed),
+            node_ids=nodes, edge_ids=before.edge_ids[edges],
+            observed_ids=before.observed_ids[observed]))
+        assert snapshot(graph) == snapshot(anew)
+        assert listed(graph) == listed(anew)
+        assert graph.newest_pose == anew.newest_pose
+        assert sorted(graph.node_ids[graph.memory['touched'][:graph.memory.head[
+            tb.N_TOUCHED]]].tolist()) == nodes.tolist()
+        if len(nodes) > 0:
+            scale = [g.memory['node_f'][:g.n_nodes, tb.SCALE_T:tb.SCALE_R + 1]
+                     for g in (graph, anew)]
+            np.testing.assert_allclose(*scale, rtol=1e-6, atol=1e-5)
+        assert graph.energies().chi2 == pytest.approx(anew.energies().chi2, rel=1e-12)
+
+
+@given(seeds)
+@settings(max_examples=25)
+def test_new_rows_go_on_with_the_ids_and_find_the_nodes(seed: int) -> None:
+    graph, rng = graph_of(seed), np.random.default_rng(seed)
+    graph.apply(leaving(graph, rng)._replace(remove_nodes=[1, 11], drop_edges=[0]))
+    left, first = graph.node_ids[~graph.is_bias].tolist(), graph.next_ids
+    i, j = rng.choice(left, 2, replace=False).tolist()
+    edges = random_edges(rng, [i, first.node], [first.node + 1, j])
+    observed = random_observed(rng, [first.node, i])
+    graph.apply(GraphUpdate(hidden=random_poses(rng, 2), edges=edges, observed=observed))
+    assert graph.node_ids[-2:].tolist() == [12, 13] == [first.node, first.node + 1]
+    assert graph.next_ids == (first.node + 2, first.edge + 2, first.observed + 2)
+    found = graph.edges_at([first.edge, first.edge + 1])
+    assert (found.i.tolist(), found.j.tolist()) == (edges.i.tolist(), edges.j.tolist())
+    assert graph.observed_at([first.observed, first.observed + 1]).node.tolist() == [12, i]
+    poses = dict(zip(graph.node_ids.tolist(), graph.poses, strict=True))
+    np.testing.assert_array_equal(graph.poses_of([j, 12]), [poses[j], poses[12]])
+    assert graph.node_rows([1, 11, 99, -1]).tolist() == [-1] * 4
+    assert graph.edge_rows(0) == -1
+
+
+GONE: dict[str, tuple[Callable[[], GraphUpdate], str]] = {
+    'fix': (lambda: GraphUpdate(fix=[3]), 'fix: hidden node 3 has left the graph'),
+    'free': (lambda: GraphUpdate(free=[2, 3]), 'free: hidden node 3 has left the graph'),
+    'remove': (lambda: GraphUpdate(remove_nodes=[3]), 'remove_nodes: hidden node 3 has left'),
+    'edge': (lambda: GraphUpdate(weigh_edges={0: 1.0}), 'weigh_edges: edge 0 has left the graph'),
+    'drop': (lambda: GraphUpdate(drop_edges=[0]), 'drop_edges: edge 0 has left the graph'),
+    'observed': (lambda: GraphUpdate(remove_observed=[1]),
+                 'remove_observed: observed node 1 has left the graph'),
+    'end': (lambda: GraphUpdate(edges=random_edges(np.random.default_rng(0), [2, 4], [4, 3])),
+            'Edges: hidden node 3 has left the graph; row 1'),
+    'observation': (lambda: GraphUpdate(observed=random_observed(np.random.default_rng(0), [3])),
+                    'ObservedNodes: hidden node 3 has left the graph; row 0'),
+}
+
+
+@pytest.mark.parametrize('name', GONE)
+def test_an_id_that_has_left_is_refused_by_name(name: str) -> None:
+    make, message = GONE[name]
+    graph = random_graph(4, n_nodes=7)
+    graph.apply(GraphUpdate(remove_nodes=[3], drop_edges=[0], drop_observed=[1]))
+    before = state(graph)
+    with pytest.raises(GraphUpdateError, match=message):
+        graph.apply(make())
+    assert differences(before, state(graph)) == []
+
+
+def test_within_an_update_rows_stay_and_a_rollback_brings_all_back() -> None:
+    graph = graph_of(5)
+    before = state(graph)
+    graph.begin()
+    graph.apply(GraphUpdate(remove_nodes=[0, 8, 10], drop_edges=[3], drop_observed=[0]))
+    assert graph.n_nodes == 12
+    assert graph.newest_pose == 7
+    assert graph.leaving() == GraphUpdate(
+        remove_nodes=[0, 8, 10], drop_edges=[3], drop_observed=[0])
+    graph.rollback()
+    assert differences(before, state(graph)) == []
+    assert graph.leaving() == GraphUpdate(remove_nodes=[], drop_edges=[], drop_observed=[])
+    graph.begin()
+    edges = graph.edges
+    graph.apply(GraphUpdate(remove_nodes=[0, 8]))
+    left = graph.commit()
+    assert left.nodes.tolist() == [0, 8]
+    assert left.edges.tolist() == np.flatnonzero(
+        np.isin(edges.i, [0, 8]) | np.isin(edges.j, [0, 8])).tolist()
+
+
+def test_a_graph_can_be_emptied_and_goes_on() -> None:
+    graph = random_graph(6, n_biases=2)
+    graph.apply(GraphUpdate(remove_nodes=range(9)))
+    assert (graph.n_nodes, graph.n_edges, graph.n_observed, graph.newest_pose) == (0, 0, 0, -1)
+    assert graph.node_rows([0, 8]).tolist() == [-1, -1]
+    graph.apply(GraphUpdate(hidden=np.zeros((1, 3))))
+    assert (graph.node_ids.tolist(), graph.newest_pose) == ([9], 9)
+
+
+def test_rows_are_filled_with_their_ids_which_must_ascend() -> None:
+    graph = graph_of(7)
+    first = graph.rows()
+    graph.apply(GraphUpdate(remove_nodes=[1, 11], drop_edges=[4]))
+    copy = Graph()
+    copy.fill(graph.rows())
+    assert (snapshot(copy), copy.next_ids) == (snapshot(graph), graph.next_ids)
+    assert copy.node_ids.tolist() == graph.node_ids.tolist()
+    graph.apply(GraphUpdate(hidden=np.ones((2, 3)), fix=[13]))
+    copy.fill(graph.rows().since(first.next_ids))
+    assert snapshot(copy) == snapshot(graph)
+    with pytest.raises(GraphUpdateError, match='node: expected ascending ids from 14 on'):
+        copy.fill(graph.rows())
