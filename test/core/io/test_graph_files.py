@@ -4,6 +4,7 @@
 
 from collections.abc import Callable
 import copy
+from dataclasses import replace
 import functools
 import hashlib
 import json
@@ -15,7 +16,14 @@ from typing import Any
 from hypothesis import given, settings, strategies as st
 import numpy as np
 import pytest
-from saved_graphs import assert_same_value, CORRELATED, feed_all, LINE_ODOMETRY, straight_line
+from saved_graphs import (
+    assert_same_value,
+    CORRELATED,
+    feed_all,
+    LINE_ODOMETRY,
+    line_sample,
+    straight_line,
+)
 from test_delay_invariance import DRIVES
 from tum_files import read_tum
 
@@ -24,6 +32,7 @@ from pose_graph_ros.core.config import Loss
 from pose_graph_ros.core.exceptions import FileFormatError, FileWriteError
 from pose_graph_ros.core.geometry.geodesy import MapOrigin
 from pose_graph_ros.core.graph.constraints import EdgeKind, ObservedKind
+from pose_graph_ros.core.graph.graph import NextIds
 from pose_graph_ros.core.io import atomic_files, old_versions
 from pose_graph_ros.core.io.g2o import read_g2o
 from pose_graph_ros.core.io.graph_files import graph_paths, read_datum, read_graph, write_graph
@@ -269,7 +278,7 @@ def test_losses_and_kinds_are_saved_by_their_names(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize(('place', 'value', 'expected'), [
     (('graph', 'fixed'), [-1], r'graph\.fixed: expected hidden nodes'),
-    (('graph', 'biases'), [10**6], r'graph\.biases: expected hidden nodes in 0'),
+    (('graph', 'biases'), [10**6], r'graph\.biases: expected hidden nodes'),
     (('graph', 'biases'), [0], 'no biases as vertices'),
     (('graph', 'observed_on_bias'), [-1], r'graph\.observed_on_bias: expected numbers in 0'),
     (('graph', 'observed_on_bias'), [], r'expected \d+ observed nodes, got \d+'),
@@ -385,3 +394,27 @@ def test_a_loaded_graph_can_be_used_with_other_settings(tmp_path: Path) -> None:
     backend = PoseGraphBackend.restored(LINE_ODOMETRY, read_graph(tmp_path / 'map'))
     assert backend.estimate() is not None
     backend.optimize()
+
+
+def test_ids_with_gaps_come_back_and_are_those_of_the_g2o_file(tmp_path: Path) -> None:
+    saved = small_graph()
+    rows, nodes = saved.rows, saved.nodes
+    with_gaps = replace(
+        saved, nodes=replace(nodes, rows=2 * nodes.rows + 5), rows=rows._replace(
+            edges=rows.edges.renumbered(lambda ids: 2 * ids + 5),
+            node_ids=2 * rows.node_ids + 5, edge_ids=3 * rows.edge_ids,
+            next_ids=NextIds(1000, 1000, 7)),
+        edge_losses=replace(saved.edge_losses, rows=3 * saved.edge_losses.rows))
+    g2o, side, _ = write_graph(with_gaps, tmp_path / 'gaps')
+    assert_same_value(read_graph(side), with_gaps)
+    assert g2o.read_text().startswith('VERTEX_SE2 5 ')
+    backend = PoseGraphBackend.restored(LINE_ODOMETRY, read_graph(side))
+    backend.add_odometry(line_sample(13.0), 'odom')
+    backend.finish()
+    backend.update()
+    assert backend.graph.node_ids[:2].tolist() == [5, 7]
+    assert backend.graph.node_ids[-1] >= 1000
+    rewrite(side, lambda members: members['graph'].update(
+        node_ids=members['graph']['node_ids'][:-1] + [6]))
+    with pytest.raises(FileFormatError, match='expected the hidden nodes'):
+        read_graph(side)
