@@ -415,6 +415,6 @@ def test_ids_with_gaps_come_back_and_are_those_of_the_g2o_file(tmp_path: Path) -
     assert backend.graph.node_ids[:2].tolist() == [5, 7]
     assert backend.graph.node_ids[-1] >= 1000
     rewrite(side, lambda members: members['graph'].update(
-        node_ids=members['graph']['node_ids'][:-1] + [6]))
+        node_ids=[*members['graph']['node_ids'][:-1], 6]))
     with pytest.raises(FileFormatError, match='expected the hidden nodes'):
         read_graph(side)
