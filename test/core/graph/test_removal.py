@@ -40,8 +40,8 @@ def listed(graph: Graph) -> list[tuple[list[int], list[int]]]:
         edges, observed = [], []
         entry, k = int(row[tb.EDGE_LIST]), int(row[tb.OBSERVED_LIST])
         while entry >= 0:
-            edges.append(int(graph.edge_ids[entry >> 1]))
-            entry = int(memory['edge_i'][entry >> 1, tb.NEXT_J if entry & 1 else tb.NEXT_I])
+            edges.append(int(graph.edge_ids[entry >> 2]))
+            entry = int(memory['edge_i'][entry >> 2, tb.NEXT_I + (entry & 3)])
         while k >= 0:
             observed.append(int(graph.observed_ids[k]))
             k = int(memory['observed_i'][k, tb.OBS_NEXT])
@@ -72,7 +72,8 @@ def test_the_graph_is_the_one_that_what_is_left_would_make(seed: int) -> None:
                 np.testing.assert_array_equal(column, expected)
         anew = Graph()
         anew.fill(before._replace(
-            poses=before.poses[stays], is_bias=before.is_bias[stays], fixed=before.fixed[stays],
+            poses=before.poses[stays], node_kind=before.node_kind[stays],
+            dimension=before.dimension[stays], fixed=before.fixed[stays],
             edges=before.edges.rows(edges), observed=before.observed.rows(observed),
             node_ids=nodes, edge_ids=before.edge_ids[edges],
             observed_ids=before.observed_ids[observed]))
