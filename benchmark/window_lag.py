@@ -48,7 +48,7 @@ def warm_up() -> None:
     """Let nodes go in small worlds, so that nothing is compiled while times are taken."""
     for world in (chain(100), laps(120, 60)):
         for every in (1, 20):
-            Ours(50, every)(world, Plan())
+            Ours(70, every)(world, Plan())
 
 
 @dataclass(frozen=True, slots=True)
