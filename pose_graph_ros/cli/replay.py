@@ -37,7 +37,8 @@ from pose_graph_ros.core.batch.optimizer import Status
 from pose_graph_ros.core.estimate import UpdateReport
 from pose_graph_ros.core.geometry.geodesy import MapOrigin
 from pose_graph_ros.core.geometry.trajectory import Trajectory
-from pose_graph_ros.core.io.g2o import EDGE2_ORDERS, write_g2o
+from pose_graph_ros.core.io.g2o import EDGE2_ORDERS
+from pose_graph_ros.core.io.g2o_writing import write_g2o
 from pose_graph_ros.core.judgement.texts import states_by_stamps
 from pose_graph_ros.core.judgement.verdicts import State, Verdict
 from pose_graph_ros.core.measurements import Answer, LoopClosure, Measurement, OdometrySample

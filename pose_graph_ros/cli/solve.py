@@ -25,7 +25,8 @@ from pose_graph_ros.core.geometry.se2 import FloatArray, IntArray
 from pose_graph_ros.core.graph.constraints import ObservedKind, ObservedNodes
 from pose_graph_ros.core.graph.error_functions import energies as energies_of
 from pose_graph_ros.core.graph.graph import Graph, GraphUpdate
-from pose_graph_ros.core.io.g2o import EDGE2_ORDERS, GraphFile, read_g2o, write_g2o
+from pose_graph_ros.core.io.g2o import EDGE2_ORDERS, GraphFile, read_g2o
+from pose_graph_ros.core.io.g2o_writing import write_g2o
 
 N_LARGEST = 5  # number of edges, of observed nodes, and of names, that are printed
 N_TAGS = 10  # number of warnings of tags
@@ -173,9 +174,10 @@ def _solve(graph: Graph, optimize: Callable[[Graph, SolverConfig], BatchResult])
     copy.fill(graph.rows())
     typical = np.concatenate([np.einsum('mii->mi', table.weighted_information).ravel()
                               for table in (graph.edges, graph.observed)])
-    weak = WEAK * np.median(typical[typical > 0.0]) * np.eye(3)
+    weak = WEAK * np.median(typical[typical > 0.0]) * (
+        np.eye(3) * (np.arange(3) < graph.dimension[:, None, None]))
     copy.apply(GraphUpdate(observed=ObservedNodes(
-        np.arange(n), None, graph.poses.copy(), np.tile(weak, (n, 1, 1)),
+        np.arange(n), None, graph.poses.copy(), weak,
         [ObservedKind.GLOBAL_POSE] * n)))
     other = optimize(copy, CONFIG)
     if other.status is Status.FAILED:

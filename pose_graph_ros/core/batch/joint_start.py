@@ -80,7 +80,9 @@ def unit_headings(graph: Graph) -> FloatArray:
 
 def _problem(graph: Graph) -> _Problem:
     n, is_bias, fixed = graph.n_nodes, graph.is_bias, graph.fixed
+    is_pose, loose = graph.is_pose, ~graph.is_pose
     edges, observed = _of_poses(graph.edges_by_row, graph.observed_by_row, is_bias)
+    loose[edges.j[edges.kind == EdgeKind.POINT]] = False    # landmarks that are seen
     edge_rows, observed_rows = np.arange(len(edges)), np.arange(len(observed))
     root_t = np.sqrt(_isotropic(edges.weighted_information))
     root_u = np.sqrt(edges.weighted_information[:, 2, 2])
@@ -105,7 +107,7 @@ def _problem(graph: Graph) -> _Problem:
         np.zeros(2 * len(edges)), seen_t * _complex(observed.mean),
         seen_u * np.exp(1j * (observed.mean[:, 2] - observed.offset[:, 2]))))
     known = np.concatenate((_complex(graph.poses), np.exp(1j * graph.poses[:, 2])))
-    return _Problem(matrix, right, known, np.tile(fixed | is_bias, 2))
+    return _Problem(matrix, right, known, np.concatenate((fixed | loose, fixed | ~is_pose)))
 
 
 def _pulled(
@@ -125,6 +127,7 @@ def _poses(graph: Graph, v: ComplexArray) -> FloatArray:
     theta = np.where(graph.fixed, graph.poses[:, 2], se2.wrap(np.angle(v[n:])))
     poses = np.column_stack((v[:n].real, v[:n].imag, theta))
     poses[graph.is_bias & ~graph.fixed] = 0.0
+    poses[~graph.is_pose, 2] = 0.0
     return poses
 
 
@@ -146,7 +149,7 @@ def _of_poses(
         observed = ObservedNodes.joined([observed, ObservedNodes(
             measured.i, offset, measured.mean, information,
             [ObservedKind.GLOBAL_POSE] * len(measured))])
-    return edges.rows(~to_bias), observed
+    return edges.rows(~to_bias & (edges.kind != EdgeKind.RANGE)), observed
 
 
 def _complex(pose: FloatArray) -> ComplexArray:

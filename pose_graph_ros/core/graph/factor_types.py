@@ -116,7 +116,15 @@ def is_relative(kind):  # type: ignore[no-untyped-def]
 
 @kernel
 def prepare(f, kind):  # type: ignore[no-untyped-def]
-    """Set what a row of `edge_f` needs of its mean: `R_z^T t_z`."""
+    """
+    Set what a row of `edge_f` needs of its mean: `R_z^T t_z`.
+
+    Parameters
+    ----------
+    f : ndarray, row of the constraint
+    kind : int, `EdgeKind` or OBSERVED
+
+    """
     if is_relative(kind):
         c, s = math.cos(f[tb.MEAN + 2]), math.sin(f[tb.MEAN + 2])
         f[tb.OWN] = c * f[tb.MEAN] + s * f[tb.MEAN + 1]
@@ -125,13 +133,29 @@ def prepare(f, kind):  # type: ignore[no-untyped-def]
 
 @kernel
 def angle(f, kind):  # type: ignore[no-untyped-def]
-    """Return the angle that (c, s) are turned by against the heading of i [rad]."""
+    """
+    Return the angle that (c, s) are turned by against the heading of i [rad].
+
+    Parameters
+    ----------
+    f : ndarray, row of the constraint
+    kind : int, `EdgeKind` or OBSERVED
+
+    """
     return f[tb.MEAN + 2] if is_relative(kind) else 0.0
 
 
 @kernel
 def factors_of_end(f, kind):  # type: ignore[no-untyped-def]
-    """Return f_t and f_th of node j."""
+    """
+    Return f_t and f_th of node j.
+
+    Parameters
+    ----------
+    f : ndarray, row of the constraint
+    kind : int, `EdgeKind` or OBSERVED
+
+    """
     if kind == BIAS:
         return f[tb.FACTOR_T], f[tb.FACTOR_TH]
     return (1.0, 1.0) if kind < OBSERVED else (0.0, 0.0)
@@ -139,7 +163,15 @@ def factors_of_end(f, kind):  # type: ignore[no-untyped-def]
 
 @kernel
 def heading_offset(f, kind):  # type: ignore[no-untyped-def]
-    """Return the constant part of the heading's error [rad]."""
+    """
+    Return the constant part of the heading's error [rad].
+
+    Parameters
+    ----------
+    f : ndarray, row of the constraint
+    kind : int, `EdgeKind` or OBSERVED
+
+    """
     if kind == BIAS:
         return f[tb.MEAN + 2]
     return -f[tb.MEAN + 2] if kind < OBSERVED else f[tb.MEAN + 2] - f[tb.OFFSET + 2]

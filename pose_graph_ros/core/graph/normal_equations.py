@@ -186,7 +186,7 @@ def _gradient(f, kind, nodes, node_f, third, right):  # type: ignore[no-untyped-
 @kernel
 def edge_gradient(head, e, right):  # type: ignore[no-untyped-def]
     """
-    Add -b of an edge to `right`, shape (N, 3); return its energy and the sums of `_gradient`.
+    Return the energy of an edge and the sums of `_gradient` after adding -b to `right`, (N, 3).
 
     Parameters
     ----------
@@ -206,7 +206,7 @@ def edge_gradient(head, e, right):  # type: ignore[no-untyped-def]
 @kernel
 def observed_gradient(head, k, right):  # type: ignore[no-untyped-def]
     """
-    Add -b of an observed node to `right`, as `edge_gradient` does.
+    Return energy and sums of an observed node after adding -b to `right`, as `edge_gradient`.
 
     Parameters
     ----------

@@ -8,6 +8,9 @@ Tags that are read and written, one per line:
     VERTEX_SE2 id x y theta
     FIX id ...
     EDGE_SE2 i j x y theta I11 I12 I13 I22 I23 I33
+    VERTEX_XY id x y                                        a landmark
+    EDGE_SE2_XY i j x y I11 I12 I22                         landmark j in the frame of i
+    EDGE_RANGE_SE2_XY i j distance I11                      distance of landmark j from i
     EDGE_PRIOR_SE2 id x y theta I11 I12 I13 I22 I23 I33     a global pose
     EDGE_PRIOR_SE2_XY id x y I11 I12 I22                    a position
     OBSERVED_SE2_OFFSET id ox oy otheta x y theta I11 I12 I13 I22 I23 I33
@@ -15,10 +18,11 @@ Tags that are read and written, one per line:
 The last tag is specific to this project, because g2o has no tag for an observed node with an
 offset; other programs skip it with a warning.
 
-Biases and the constraints on them have no tag. They are left out, and a comment gives their
-number; a measurement with a correlated error is written as if its error were white. Constraints
-with weight 0, such as doubted loop closures, are written as comments, `# not used EDGE_SE2 ...`,
-so that other programs read the graph without them. Other weights are not written: the information
+Biases and the constraints on them have no tag, nor has a range from another point than the origin
+of the robot. They are left out, and a comment gives their number; a measurement with a correlated
+error is written as if its error were white. Constraints with weight 0, such as doubted loop
+closures, are written as comments, `# not used EDGE_SE2 ...`, so that other programs read the graph
+without them. Other weights are not written: the information
 is that of the measurement.
 
 A file keeps neither the order of observed nodes with different tags nor the kind of an edge. An
@@ -33,9 +37,9 @@ another one of iSAM's for `EDGE2`.
 A loop closure with a switch, `EDGE_SE2_SWITCHABLE i j switch x y theta I11 ...`, is read as an
 edge; its switch, `VERTEX_SWITCH` and `EDGE_SWITCH_PRIOR`, is not needed.
 
-Lines with any other tag are skipped and counted: landmarks and their measurements, parameters of
-sensors, constraints in space. So are the lines `EQUIV i j` of TORO: they allow it to merge two
-nodes that an edge of the file connects, and add nothing to that edge.
+Lines with any other tag are skipped and counted: parameters of sensors, constraints in space. So
+are the lines `EQUIV i j` of TORO: they allow it to merge two nodes that an edge of the file
+connects, and add nothing to that edge.
 """
 
 from dataclasses import dataclass
@@ -50,14 +54,13 @@ from pose_graph_ros.core.geometry.se2 import BoolArray, FloatArray, IntArray
 from pose_graph_ros.core.graph.constraints import (
     EdgeKind,
     Edges,
+    NodeKind,
     ObservedKind,
     ObservedNodes,
-    upper,
 )
-from pose_graph_ros.core.graph.graph import Graph, GraphRows, GraphUpdate
+from pose_graph_ros.core.graph.factor_types import FACTORS
+from pose_graph_ros.core.graph.graph import Graph, GraphRows, GraphUpdate, NextIds
 
-NOT_USED = '# not used '
-"""Begin of the line of a constraint with weight 0."""
 SWITCHES = ('VERTEX_SWITCH', 'EDGE_SWITCH_PRIOR')
 # Formats of EDGE2.
 EDGE2_ORDERS = ('toro', 'isam')
@@ -78,7 +81,12 @@ LAYOUT = {
     'EDGE_PRIOR_SE2': (1, 9),
     'EDGE_PRIOR_SE2_XY': (1, 5),
     'OBSERVED_SE2_OFFSET': (1, 12),
+    'VERTEX_XY': (1, 2),
+    'EDGE_SE2_XY': (2, 5),
+    'EDGE_RANGE_SE2_XY': (2, 2),
 }
+# Kinds of edges to landmarks.
+_TO_LANDMARKS = (EdgeKind.POINT, EdgeKind.RANGE)
 
 
 @dataclass(frozen=True, slots=True)
@@ -197,6 +205,10 @@ def _build(
     path: Path, rows: dict[str, _Rows], fixes: _Rows, edge2_order: str | None,
 ) -> tuple[Graph, IntArray, bool]:
     vertices = _joined(rows['VERTEX_SE2'], rows['VERTEX2'], rows['VERTEX'])
+    points = rows['VERTEX_XY']
+    vertices.ids += points.ids
+    vertices.numbers += [[*position, 0.0] for position in points.numbers]
+    vertices.lines += points.lines
     ids = np.unique(np.concatenate([_ids(table).ravel() for table in rows.values()]))
     given, first = np.unique(_ids(vertices).ravel(), return_index=True)
     if len(given) < len(vertices.lines):
@@ -204,22 +216,35 @@ def _build(
         raise FileFormatError(f'{path}:{vertices.lines[again]}: vertex '
                               f'{vertices.ids[again][0]} is in the file twice')
 
+    is_landmark = np.isin(ids, np.concatenate(
+        (_ids(points)[:, 0], *(_ids(rows[FACTORS[kind].tag])[:, 1] for kind in _TO_LANDMARKS))))
+    kind = np.where(is_landmark, NodeKind.LANDMARK, NodeKind.POSE)
     edges = _edges(rows, ids, edge2_order)
     observed = _observed(rows, ids)
     poses, known = np.zeros((len(ids), 3)), np.isin(ids, given)
     poses[known] = _numbers(vertices, 3)[first]
     if not np.all(known):
         _compose_missing(poses, known, edges)
+        poses[is_landmark, 2] = 0.0
     fixed = _fixed(path, fixes, ids)
     if len(fixed) == 0 and len(observed) == 0:
-        fixed = [0]
-    graph = Graph()
+        fixed = [int(np.argmin(is_landmark))]
     try:
-        graph.apply(GraphUpdate(hidden=poses))
+        graph = _graph(poses, kind)
         graph.apply(GraphUpdate(edges=edges, observed=observed, fix=fixed))
     except GraphUpdateError as error:
-        raise FileFormatError(f'{_refused_line(path, rows, ids, edge2_order)}: {error}') from error
+        raise FileFormatError(
+            f'{_refused_line(path, rows, ids, edge2_order, kind)}: {error}') from error
     return graph, ids, bool(len(given) == len(ids))
+
+
+def _graph(poses: FloatArray, kind: IntArray) -> Graph:
+    """Return a graph of hidden nodes without constraints."""
+    graph, n = Graph(), len(poses)
+    graph.fill(GraphRows(
+        poses, kind, np.zeros(n, dtype=bool), Edges(), ObservedNodes(), np.arange(n),
+        np.empty(0, np.int64), np.empty(0, np.int64), NextIds(n, 0, 0)))
+    return graph
 
 
 def _joined(*tables: _Rows) -> _Rows:
@@ -249,6 +274,15 @@ def _edges(rows: dict[str, _Rows], ids: IntArray, edge2_order: str | None) -> Ed
         i, j = np.searchsorted(ids, ends).T
         parts.append(Edges(
             i, j, se2.wrapped(numbers[:, :3]), _information(numbers[:, 3:], order), kind))
+    for each in _TO_LANDMARKS:
+        tag, size = FACTORS[each].tag, len(FACTORS[each].rows)
+        numbers, ends = _numbers(rows[tag], LAYOUT[tag][1]), _ids(rows[tag])
+        mean, information = np.zeros((len(ends), 3)), np.zeros((len(ends), 3, 3))
+        mean[:, :size] = numbers[:, :size]
+        for column, (row, col) in enumerate(zip(*np.triu_indices(size), strict=True), size):
+            information[:, row, col] = information[:, col, row] = numbers[:, column]
+        i, j = np.searchsorted(ids, ends).T
+        parts.append(Edges(i, j, mean, information, np.full(len(ends), each)))
     return Edges.joined(parts)
 
 
@@ -284,9 +318,12 @@ def _observed(rows: dict[str, _Rows], ids: IntArray) -> ObservedNodes:
 def _compose_missing(poses: FloatArray, known: BoolArray, edges: Edges) -> None:
     """Set the poses of the nodes that are not known by composing edges, breadth-first."""
     neighbours: dict[int, list[tuple[int, FloatArray]]] = {}
-    for i, j, mean in zip(edges.i.tolist(), edges.j.tolist(), edges.mean, strict=True):
+    placing = edges.rows(edges.kind != EdgeKind.RANGE)
+    for i, j, mean, kind in zip(placing.i.tolist(), placing.j.tolist(), placing.mean,
+                                placing.kind.tolist(), strict=True):
         neighbours.setdefault(i, []).append((j, mean))
-        neighbours.setdefault(j, []).append((i, se2.inverse(mean)))
+        if kind != EdgeKind.POINT:
+            neighbours.setdefault(j, []).append((i, se2.inverse(mean)))
     known = known.copy()
     for start in (*np.flatnonzero(known).tolist(), *range(len(known))):
         known[start] = True
@@ -313,7 +350,7 @@ def _fixed(path: Path, fixes: _Rows, ids: IntArray) -> list[int]:
 
 
 def _refused_line(
-    path: Path, rows: dict[str, _Rows], ids: IntArray, edge2_order: str | None,
+    path: Path, rows: dict[str, _Rows], ids: IntArray, edge2_order: str | None, kind: IntArray,
 ) -> str:
     """Return file and number of the first line whose row the graph refuses, tried one by one."""
     lines = [(line, tag, k) for tag, table in rows.items() if not tag.startswith('VERTEX')
@@ -321,105 +358,10 @@ def _refused_line(
     for line, tag, k in sorted(lines):
         single = {name: _Rows(table.n_ids) for name, table in rows.items()}
         single[tag].ids, single[tag].numbers = [rows[tag].ids[k]], [rows[tag].numbers[k]]
-        graph = Graph()
-        graph.apply(GraphUpdate(hidden=np.zeros((len(ids), 3))))
+        graph = _graph(np.zeros((len(ids), 3)), kind)
         try:
             graph.apply(GraphUpdate(edges=_edges(single, ids, edge2_order),
                                     observed=_observed(single, ids)))
         except GraphUpdateError:
             return f'{path}:{line}'
     return str(path)
-
-
-def write_g2o(graph: Graph, path: Path, ids: IntArray | None = None) -> None:
-    """
-    Write a graph so that its numbers read back bit for bit.
-
-    Parameters
-    ----------
-    graph : Graph
-    path : Path
-    ids : ndarray, shape (N,), optional, number of each hidden node; by default its id
-
-    """
-    path.write_text(g2o_text(graph.rows(), ids), encoding='ascii')
-
-
-def g2o_text(rows: GraphRows, ids: IntArray | None = None) -> str:
-    """
-    Return the text of a g2o file: vertices, FIX, edges and observed nodes, each in their order.
-
-    Parameters
-    ----------
-    rows : GraphRows
-    ids : ndarray, shape (N,), optional, number of each hidden node; by default its id
-
-    """
-    ids = rows.node_ids if ids is None else ids
-    edges, observed = rows.edges.renumbered(rows.rows_of), rows.observed.renumbered(rows.rows_of)
-    is_pose = ~rows.is_bias
-    used = _is_used(observed, edges)
-    lines = []
-    if not np.all(is_pose):
-        used = used[is_pose[observed.node]]
-        edges = edges.rows(edges.kind != EdgeKind.BIAS)
-        observed = observed.rows(is_pose[observed.node])
-        lines.append(f'# left out: {np.sum(~is_pose)} biases, {len(rows.edges) - len(edges)} '
-                     f'edges to them and {len(rows.observed) - len(observed)} observed ones')
-    lines += [f'VERTEX_SE2 {name} {numbers}' for name, numbers in zip(
-        ids[is_pose].tolist(), _texts(rows.poses[is_pose]), strict=True)]
-    lines += [f'FIX {name}' for name in ids[rows.fixed & is_pose].tolist()]
-    lines += [*_edge_lines(edges, ids), *_observed_lines(observed, ids, used)]
-    return '\n'.join(lines) + '\n'
-
-
-def _is_used(observed: ObservedNodes, edges: Edges) -> BoolArray:
-    """
-    Return which measurements are used, shape (K,).
-
-    One with a correlated error has weight 0; an edge from its node to a bias holds it instead.
-    """
-    to_bias = edges.rows((edges.kind == EdgeKind.BIAS) & (edges.weight > 0.0))
-    held = set(zip(to_bias.i.tolist(), *to_bias.mean[:, :2].T.tolist(), strict=True))
-    used = observed.weight > 0.0
-    for k in np.flatnonzero(~used).tolist() if len(held) > 0 else ():
-        used[k] = (int(observed.node[k]), *observed.mean[k, :2].tolist()) in held
-    return np.asarray(used)
-
-
-def _edge_lines(edges: Edges, ids: IntArray) -> list[str]:
-    return [f'{begin}EDGE_SE2 {i} {j} {numbers}' for begin, i, j, numbers in zip(
-        _begins(edges.weight > 0.0), ids[edges.i].tolist(), ids[edges.j].tolist(),
-        _texts(np.hstack((edges.mean, upper(edges.information)))), strict=True)]
-
-
-def _observed_lines(
-    observed: ObservedNodes, ids: IntArray, used: BoolArray,
-) -> list[str]:
-    triangles = upper(observed.information)
-    moved = np.any(observed.offset != 0.0, axis=1)
-    placed = np.all(observed.information[:, 2] == 0.0, axis=1) & (observed.mean[:, 2] == 0.0)
-    tags = np.where(moved, 'OBSERVED_SE2_OFFSET',
-                    np.where(placed, 'EDGE_PRIOR_SE2_XY', 'EDGE_PRIOR_SE2'))
-    numbers = {
-        'OBSERVED_SE2_OFFSET': (observed.offset, observed.mean, triangles),
-        'EDGE_PRIOR_SE2': (observed.mean, triangles),
-        'EDGE_PRIOR_SE2_XY': (observed.mean[:, :2], triangles[:, (0, 1, 3)]),
-    }
-    lines = np.empty(len(observed), dtype=object)
-    for tag, columns in numbers.items():
-        rows = np.flatnonzero(tags == tag)
-        lines[rows] = [f'{begin}{tag} {name} {text}' for begin, name, text in zip(
-            _begins(used[rows]), ids[observed.node[rows]].tolist(),
-            _texts(np.hstack(columns)[rows]), strict=True)]
-    return list(lines)
-
-
-def _begins(used: BoolArray) -> list[str]:
-    """Return what the lines of constraints begin with, given which are used, shape (M,)."""
-    return ['' if each else NOT_USED for each in used.tolist()]
-
-
-def _texts(rows: FloatArray) -> list[str]:
-    """Return the numbers of each row with the digits needed to read them back bit for bit."""
-    return [' '.join(map(repr, row)) for row in rows.tolist()]

@@ -35,7 +35,8 @@ from pose_graph_ros.core.graph.constraints import (
 )
 from pose_graph_ros.core.graph.graph import GraphRows, NextIds
 from pose_graph_ros.core.io.atomic_files import write_files
-from pose_graph_ros.core.io.g2o import g2o_text, LAYOUT, NOT_USED
+from pose_graph_ros.core.io.g2o import LAYOUT
+from pose_graph_ros.core.io.g2o_writing import g2o_text, NOT_USED
 from pose_graph_ros.core.io.json_values import annotations, decoded, encoded
 from pose_graph_ros.core.io.old_versions import with_judgement, with_names
 from pose_graph_ros.core.io.saved_graph import SavedGraph

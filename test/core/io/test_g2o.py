@@ -10,11 +10,14 @@ import numpy as np
 import pytest
 from random_graphs import random_edges, random_information, random_poses, snapshot
 
+from pose_graph_ros.core.batch import optimizer
+from pose_graph_ros.core.config import SolverConfig
 from pose_graph_ros.core.exceptions import FileFormatError
 from pose_graph_ros.core.geometry import se2
 from pose_graph_ros.core.graph.constraints import EdgeKind, Edges, ObservedKind, ObservedNodes
 from pose_graph_ros.core.graph.graph import Graph, GraphUpdate
-from pose_graph_ros.core.io.g2o import GraphFile, read_g2o, write_g2o
+from pose_graph_ros.core.io.g2o import GraphFile, read_g2o
+from pose_graph_ros.core.io.g2o_writing import write_g2o
 
 seeds = st.integers(0, 2**32 - 1)
 IDENTITY = '1 0 0 1 0 1'
@@ -259,11 +262,11 @@ def test_the_other_tags_of_toro_and_isam_are_read(folder: Path) -> None:
 
 
 def test_lines_with_other_tags_are_skipped_and_counted(folder: Path) -> None:
-    foreign = ('EQUIV 0 1', 'EQUIV 1 0', 'VERTEX_XY 77 1 2', 'EDGE_SE2_XY 0 77 1 2 1 0 1',
+    foreign = ('EQUIV 0 1', 'EQUIV 1 0', 'VERTEX_TAG 77 1 2', 'EDGE_SE2_TAG 0 77 1 2 1 0 1',
                'PARAMS_SE2OFFSET 0 0 0 0', 'FIX 77', 'VERTEX_SE3 5 0 0 0', 'edge_se2 x')
     plain, file = read(folder, GOOD), read(folder, '\n'.join((*foreign, GOOD)))
     assert plain.skipped == {}
-    assert file.skipped == {'EQUIV': 2, 'VERTEX_XY': 1, 'EDGE_SE2_XY': 1, 'PARAMS_SE2OFFSET': 1,
+    assert file.skipped == {'EQUIV': 2, 'VERTEX_TAG': 1, 'EDGE_SE2_TAG': 1, 'PARAMS_SE2OFFSET': 1,
                             'VERTEX_SE3': 1, 'edge_se2': 1}
     assert snapshot(file.graph) == snapshot(plain.graph)
 
@@ -374,3 +377,34 @@ def test_reading_one_file_does_not_change_the_next(folder: Path) -> None:
     first = snapshot(read(folder, GOOD).graph)
     read(folder, f'EDGE_SE2 7 9 1 0 0 {IDENTITY}')
     assert snapshot(read(folder, GOOD).graph) == first
+
+
+def test_landmarks_are_read_solved_and_written_again(tmp_path: Path) -> None:
+    truth = np.array([[0.0, 0.0, 0.0], [2.0, 0.0, 0.5], [3.5, 1.0, 1.2]])
+    point, far = np.array([2.0, 3.0]), np.array([5.0, -1.0])
+    lines = ['VERTEX_SE2 0 0 0 0', 'VERTEX_SE2 2 2.3 0.2 0.4', 'VERTEX_SE2 5 3.2 1.1 1.3',
+             'VERTEX_XY 4 4.6 -0.7', 'FIX 0']
+    for k, name in enumerate((0, 2, 5)):
+        if k > 0:
+            motion = ' '.join(map(repr, se2.between(truth[k - 1], truth[k]).tolist()))
+            lines.append(f'EDGE_SE2 {(0, 2)[k - 1]} {name} {motion} 50 0 0 50 0 200')
+        x, y = se2.transform(se2.inverse(truth[k]), point).tolist()
+        lines.append(f'EDGE_SE2_XY {name} 3 {x!r} {y!r} 20 1 30')
+        distance = float(np.hypot(*(far - truth[k, :2])))
+        lines.append(f'EDGE_RANGE_SE2_XY {name} 4 {distance!r} 100')
+    path, again = tmp_path / 'landmarks.g2o', tmp_path / 'again.g2o'
+    path.write_text('\n'.join(lines))
+    file = read_g2o(path)
+    graph = file.graph
+    assert (file.skipped, file.has_start) == ({}, False)
+    assert graph.node_kind.tolist() == [0, 0, 2, 2, 0]
+    for optimize in (optimizer.optimize, optimizer.optimize_from_linear_start):
+        result = optimize(graph, SolverConfig())
+        assert result.chi2 == pytest.approx(0.0, abs=1e-12)
+        np.testing.assert_allclose(graph.poses[graph.is_pose], truth, atol=1e-6)
+        np.testing.assert_allclose(graph.poses[~graph.is_pose, :2], [point, far], atol=1e-6)
+    write_g2o(graph, again, file.ids)
+    copy = read_g2o(again)
+    np.testing.assert_array_equal(copy.graph.poses, graph.poses)
+    assert again.read_text().count('_XY') == 8
+    assert copy.graph.energies().chi2 == graph.energies().chi2

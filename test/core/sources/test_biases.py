@@ -30,7 +30,8 @@ from pose_graph_ros.core.geometry.se2 import FloatArray
 from pose_graph_ros.core.graph import error_functions, factors, tables as tb
 from pose_graph_ros.core.graph.constraints import EdgeKind, Edges, ObservedKind, ObservedNodes
 from pose_graph_ros.core.graph.graph import Graph, GraphUpdate
-from pose_graph_ros.core.io.g2o import read_g2o, write_g2o
+from pose_graph_ros.core.io.g2o import read_g2o
+from pose_graph_ros.core.io.g2o_writing import write_g2o
 from pose_graph_ros.core.smoother import batch_fallback
 from pose_graph_ros.core.smoother.incremental import IncrementalSmoother
 

@@ -1,0 +1,123 @@
+# Copyright 2026 The pose_graph_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""Writing of graphs in the g2o text format; `g2o` has the tags, and what is left out."""
+
+from pathlib import Path
+
+import numpy as np
+
+from pose_graph_ros.core.geometry.se2 import BoolArray, FloatArray, IntArray
+from pose_graph_ros.core.graph.constraints import EdgeKind, Edges, ObservedNodes, upper
+from pose_graph_ros.core.graph.factor_types import FACTORS
+from pose_graph_ros.core.graph.graph import Graph, GraphRows
+
+NOT_USED = '# not used '
+"""Begin of the line of a constraint with weight 0."""
+# Row and column of each number of an upper triangle.
+_UPPER = ((0, 0), (0, 1), (0, 2), (1, 1), (1, 2), (2, 2))
+
+
+def write_g2o(graph: Graph, path: Path, ids: IntArray | None = None) -> None:
+    """
+    Write a graph so that its numbers read back bit for bit.
+
+    Parameters
+    ----------
+    graph : Graph
+    path : Path
+    ids : ndarray, shape (N,), optional, number of each hidden node; by default its id
+
+    """
+    path.write_text(g2o_text(graph.rows(), ids), encoding='ascii')
+
+
+def g2o_text(rows: GraphRows, ids: IntArray | None = None) -> str:
+    """
+    Return the text of a g2o file: vertices, FIX, edges and observed nodes, each in their order.
+
+    Parameters
+    ----------
+    rows : GraphRows
+    ids : ndarray, shape (N,), optional, number of each hidden node; by default its id
+
+    """
+    ids = rows.node_ids if ids is None else ids
+    edges, observed = rows.edges.renumbered(rows.rows_of), rows.observed.renumbered(rows.rows_of)
+    is_pose = rows.is_pose
+    used = _is_used(observed, edges)
+    lines = []
+    if not np.all(is_pose):
+        used = used[~rows.is_bias[observed.node]]
+        edges = edges.rows(np.isin(edges.kind, [kind for kind in FACTORS if FACTORS[kind].tag])
+                           & ((edges.kind != EdgeKind.RANGE) | ~np.any(edges.bias, axis=1)))
+        observed = observed.rows(~rows.is_bias[observed.node])
+    if len(edges) < len(rows.edges) or np.any(rows.is_bias):
+        lines.append(f'# left out: {np.sum(rows.is_bias)} biases, {len(rows.edges) - len(edges)} '
+                     f'edges to them and {len(rows.observed) - len(observed)} observed ones')
+    lines += [f'VERTEX_SE2 {name} {numbers}' for name, numbers in zip(
+        ids[is_pose].tolist(), _texts(rows.poses[is_pose]), strict=True)]
+    is_landmark = ~is_pose & ~rows.is_bias
+    lines += [f'VERTEX_XY {name} {numbers}' for name, numbers in zip(
+        ids[is_landmark].tolist(), _texts(rows.poses[is_landmark, :2]), strict=True)]
+    lines += [f'FIX {name}' for name in ids[rows.fixed & ~rows.is_bias].tolist()]
+    lines += [*_edge_lines(edges, ids), *_observed_lines(observed, ids, used)]
+    return '\n'.join(lines) + '\n'
+
+
+def _is_used(observed: ObservedNodes, edges: Edges) -> BoolArray:
+    """
+    Return which measurements are used, shape (K,).
+
+    One with a correlated error has weight 0; an edge from its node to a bias holds it instead.
+    """
+    to_bias = edges.rows((edges.kind == EdgeKind.BIAS) & (edges.weight > 0.0))
+    held = set(zip(to_bias.i.tolist(), *to_bias.mean[:, :2].T.tolist(), strict=True))
+    used = observed.weight > 0.0
+    for k in np.flatnonzero(~used).tolist() if len(held) > 0 else ():
+        used[k] = (int(observed.node[k]), *observed.mean[k, :2].tolist()) in held
+    return np.asarray(used)
+
+
+def _edge_lines(edges: Edges, ids: IntArray) -> list[str]:
+    lines, triangles = np.empty(len(edges), dtype=object), upper(edges.information)
+    for kind, factor in FACTORS.items():
+        chosen = np.flatnonzero(edges.kind == kind)
+        measured = [column for column, pair in enumerate(_UPPER) if set(pair) <= set(factor.rows)]
+        some = edges.rows(chosen)
+        lines[chosen] = [f'{begin}{factor.tag} {i} {j} {numbers}' for begin, i, j, numbers in zip(
+            _begins(some.weight > 0.0), ids[some.i].tolist(), ids[some.j].tolist(),
+            _texts(np.hstack((some.mean[:, list(factor.rows)], triangles[chosen][:, measured]))),
+            strict=True)]
+    return list(lines)
+
+
+def _observed_lines(
+    observed: ObservedNodes, ids: IntArray, used: BoolArray,
+) -> list[str]:
+    triangles = upper(observed.information)
+    moved = np.any(observed.offset != 0.0, axis=1)
+    placed = np.all(observed.information[:, 2] == 0.0, axis=1) & (observed.mean[:, 2] == 0.0)
+    tags = np.where(moved, 'OBSERVED_SE2_OFFSET',
+                    np.where(placed, 'EDGE_PRIOR_SE2_XY', 'EDGE_PRIOR_SE2'))
+    numbers = {
+        'OBSERVED_SE2_OFFSET': (observed.offset, observed.mean, triangles),
+        'EDGE_PRIOR_SE2': (observed.mean, triangles),
+        'EDGE_PRIOR_SE2_XY': (observed.mean[:, :2], triangles[:, (0, 1, 3)]),
+    }
+    lines = np.empty(len(observed), dtype=object)
+    for tag, columns in numbers.items():
+        rows = np.flatnonzero(tags == tag)
+        lines[rows] = [f'{begin}{tag} {name} {text}' for begin, name, text in zip(
+            _begins(used[rows]), ids[observed.node[rows]].tolist(),
+            _texts(np.hstack(columns)[rows]), strict=True)]
+    return list(lines)
+
+
+def _begins(used: BoolArray) -> list[str]:
+    """Return what the lines of constraints begin with, given which are used, shape (M,)."""
+    return ['' if each else NOT_USED for each in used.tolist()]
+
+
+def _texts(rows: FloatArray) -> list[str]:
+    """Return the numbers of each row with the digits needed to read them back bit for bit."""
+    return [' '.join(map(repr, row)) for row in rows.tolist()]
