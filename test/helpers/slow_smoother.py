@@ -20,6 +20,7 @@ from pose_graph_ros.core.geometry.se2 import FloatArray
 from pose_graph_ros.core.graph import error_functions, tables as tb
 from pose_graph_ros.core.graph.constraints import EdgeKind, Edges, ObservedKind, ObservedNodes
 from pose_graph_ros.core.graph.graph import Graph, GraphUpdate
+from pose_graph_ros.core.graph.priors import packed
 
 # Settings with which every update ends at the minimum.
 EXACT = SmootherConfig(alpha=0.0, budget=1e-20, budget_share=1e-22, max_iterations=60)
@@ -456,8 +457,8 @@ def cliques(graph: Graph) -> dict[int, Clique]:
     memory, found = graph.memory, {}
     for c, row in enumerate(memory['clique_i'][:memory.head[tb.N_CLIQUES]]):
         n_frontal, n_separator = int(row[tb.N_FRONTAL]), int(row[tb.N_SEPARATOR])
-        if n_frontal == 0:
-            continue
+        if n_frontal <= 0:
+            continue    # a prior, or an unused row
         nodes = memory['pool_i'][row[tb.NODES]:][:n_frontal + n_separator].tolist()
         rows, rest = 3 * n_frontal, 3 * n_separator
         values = memory['pool_f'][row[tb.VALUES]:]
@@ -494,6 +495,8 @@ def state(graph: Graph) -> dict[str, bytes]:
         np.array([row, c.parent, -1, *c.children, -1, *c.frontal, -1, *c.separator]).tobytes()
         + c.R.tobytes() + c.rhs.tobytes() + c.update.tobytes()
         for row, c in cliques(graph).items())
+    parts['priors'] = b''.join(
+        prior.nodes.tobytes() + packed(prior).tobytes() for prior in graph.priors)
     parts['newest'] = memory.head[tb.NEWEST].tobytes()
     parts['next'] = memory.head[tb.NEXT_NODE:tb.N_LEAVING + 1].tobytes()
     parts['structure'] = bytes([int(memory.head[tb.STRUCTURE]) != 0])

@@ -38,7 +38,7 @@ def chordal(graph: Graph, cliques: symbolic.Cliques) -> FloatArray:
     Return initial poses, shape (N, 3), from the constraints and the poses of fixed nodes alone.
 
     Raises LinearSolveError if headings or positions are not determined, for example if only
-    positions are observed, or if the graph has nodes that are no poses.
+    positions are observed, or if the graph has priors or nodes that are no poses.
 
     Parameters
     ----------
@@ -49,6 +49,8 @@ def chordal(graph: Graph, cliques: symbolic.Cliques) -> FloatArray:
     head = graph.memory.head
     if _n_others(head) > 0:
         raise LinearSolveError('chordal start: a bias or a landmark has no heading')
+    if head[tb.N_PRIORS] > 0:
+        raise LinearSolveError('chordal start: a prior has no term for a heading alone')
     u, bad = complex_system.solve(head, cliques, _rotation_terms(head))
     length = np.hypot(u[:, 0], u[:, 1])
     if bad >= 0:

@@ -15,7 +15,7 @@ the Jacobians change fast, it does not converge.
 from pose_graph_ros.core.compiled.jit import kernel, NUMBER, ROWS
 from pose_graph_ros.core.elimination.assembly import eliminate_clique
 from pose_graph_ros.core.elimination.fronts import backward_rows, forward_rows, solve_rows
-from pose_graph_ros.core.graph import factors, normal_equations, tables as tb
+from pose_graph_ros.core.graph import factors, normal_equations, prior_rows, tables as tb
 
 # Relative rounding error of a sum of many numbers, and of a coordinate.
 SUM_ROUNDING = 1e-12
@@ -85,7 +85,7 @@ def eliminate(head, damping):  # type: ignore[no-untyped-def]
     scalars = tb.scalars(head)
     scalars[tb.DAMPING] = damping
     bad = -1
-    for c in range(head[tb.N_CLIQUES]):
+    for c in range(head[tb.N_PRIORS], head[tb.N_CLIQUES]):  # `symbolic.plant` puts priors first
         bad = eliminate_clique(head, c, False)
         if bad >= 0:
             head[tb.BAD_NODE] = bad
@@ -108,7 +108,7 @@ def gauss_newton_step(head):  # type: ignore[no-untyped-def]
     node_f, pool_f, work_f = tb.node_f(head), tb.pool_f(head), tb.work_f(head)
     node_i, clique_i, pool_i = tb.node_i(head), tb.clique_i(head), tb.pool_i(head)
     largest = 0.0
-    for c in range(head[tb.N_CLIQUES] - 1, -1, -1):
+    for c in range(head[tb.N_CLIQUES] - 1, head[tb.N_PRIORS] - 1, -1):
         row = clique_i[c]
         n_frontal, n_all = row[tb.N_FRONTAL], row[tb.N_FRONTAL] + row[tb.N_SEPARATOR]
         nodes = pool_i[row[tb.NODES]:row[tb.NODES] + n_all]
@@ -141,8 +141,8 @@ def chord_step(head, right):  # type: ignore[no-untyped-def]
     """
     node_f, pool_f, work_f = tb.node_f(head), tb.pool_f(head), tb.work_f(head)
     node_i, clique_i, pool_i = tb.node_i(head), tb.clique_i(head), tb.pool_i(head)
-    n_cliques = head[tb.N_CLIQUES]
-    for c in range(n_cliques):
+    n_priors, n_cliques = head[tb.N_PRIORS], head[tb.N_CLIQUES]
+    for c in range(n_priors, n_cliques):
         row = clique_i[c]
         n_frontal, n_all = row[tb.N_FRONTAL], row[tb.N_FRONTAL] + row[tb.N_SEPARATOR]
         nodes = pool_i[row[tb.NODES]:row[tb.NODES] + n_all]
@@ -159,7 +159,7 @@ def chord_step(head, right):  # type: ignore[no-untyped-def]
             for m in range(3):
                 right[v, m] = x[3 * k + m]
     largest = 0.0
-    for c in range(n_cliques - 1, -1, -1):
+    for c in range(n_cliques - 1, n_priors - 1, -1):
         row = clique_i[c]
         n_frontal, n_all = row[tb.N_FRONTAL], row[tb.N_FRONTAL] + row[tb.N_SEPARATOR]
         nodes = pool_i[row[tb.NODES]:row[tb.NODES] + n_all]
@@ -213,10 +213,40 @@ def evaluate(head, right):  # type: ignore[no-untyped-def]
             chi2 += energy
             gradient_sum += size
             cancelled += terms
+    energy, size, terms = _add_priors(head, right)
+    chi2 += energy
+    gradient_sum += size
+    cancelled += terms
     for v in range(head[tb.N_NODES]):
         reach = max(reach, abs(node_f[v, tb.POSE]), abs(node_f[v, tb.POSE + 1]))
     return chi2, SUM_ROUNDING * max(chi2, 1.0) + COORDINATE_ROUNDING * (
         reach * gradient_sum + cancelled)
+
+
+@kernel
+def _add_priors(head, right):  # type: ignore[no-untyped-def]
+    """
+    Add the priors to -b, shape (N, 3).
+
+    Return their energies, the sum of the magnitudes of their gradients by a position, and that of
+    the terms that cancel each other in their energies.
+    """
+    clique_i, pool_i, work = tb.clique_i(head), tb.pool_i(head), tb.work_f(head)
+    energies = gradients = cancelled = 0.0
+    for c in range(head[tb.N_CLIQUES] if head[tb.N_PRIORS] > 0 else 0):
+        if not prior_rows.is_prior(head, c):
+            continue
+        row = clique_i[c]
+        n = row[tb.N_SEPARATOR]
+        energies += prior_rows.gradient(head, c, work)
+        d, g = work[:3 * n], work[3 * n:6 * n]
+        for k in range(n):
+            v = pool_i[row[tb.NODES] + k]
+            gradients += abs(g[3 * k]) + abs(g[3 * k + 1])
+            for m in range(3):
+                right[v, m] -= g[3 * k + m]
+                cancelled += abs(d[3 * k + m] * g[3 * k + m])
+    return energies, gradients, cancelled
 
 
 @kernel(signature=(tb.HEAD, ROWS))
@@ -259,6 +289,7 @@ def settle(head):  # type: ignore[no-untyped-def]
             chi2 += observed_f[k, tb.ENERGY]
             error2 += observed_f[k, tb.ERROR2]
     scalars[tb.CHI2] = chi2
+    prior_rows.add_energies(head)
     head[tb.N_WAITING] = head[tb.N_TURNED] = head[tb.REFINED] = head[tb.LISTED] = 0
     if not 0.0 < scalars[tb.SETTING_BUDGET] < error2:
         return

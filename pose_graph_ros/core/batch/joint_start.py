@@ -19,9 +19,10 @@ import scipy.sparse.linalg
 
 from pose_graph_ros.core.exceptions import LinearSolveError
 from pose_graph_ros.core.geometry import se2
-from pose_graph_ros.core.geometry.se2 import BoolArray, ComplexArray, FloatArray
+from pose_graph_ros.core.geometry.se2 import BoolArray, ComplexArray, FloatArray, IntArray
 from pose_graph_ros.core.graph.constraints import EdgeKind, Edges, ObservedKind, ObservedNodes
 from pose_graph_ros.core.graph.graph import Graph
+from pose_graph_ros.core.graph.priors import Prior
 
 # The headings of `unit_headings` are pulled to length 1 with these fractions of their information,
 # so many times with each.
@@ -51,7 +52,8 @@ def joint(graph: Graph) -> FloatArray:
     Gauss-Newton from the drifted poses does not find that solution.
 
     Biases start at zero. A measurement with a bias is treated as an observed node whose variance
-    includes that of the bias. Raises LinearSolveError if the poses are not determined.
+    includes that of the bias, a prior as observed nodes or edges at its references. Raises
+    LinearSolveError if the poses are not determined.
     """
     problem = _problem(graph)
     return _poses(graph, _solver(problem)(problem.right))
@@ -83,6 +85,9 @@ def _problem(graph: Graph) -> _Problem:
     is_pose, loose = graph.is_pose, ~graph.is_pose
     edges, observed = _of_poses(graph.edges_by_row, graph.observed_by_row, is_bias)
     loose[edges.j[edges.kind == EdgeKind.POINT]] = False    # landmarks that are seen
+    for prior in graph.priors:
+        more = _approximated(prior, graph.node_rows(prior.nodes), is_pose)
+        edges, observed = Edges.joined([edges, more[0]]), ObservedNodes.joined([observed, more[1]])
     edge_rows, observed_rows = np.arange(len(edges)), np.arange(len(observed))
     root_t = np.sqrt(_isotropic(edges.weighted_information))
     root_u = np.sqrt(edges.weighted_information[:, 2, 2])
@@ -150,6 +155,36 @@ def _of_poses(
             measured.i, offset, measured.mean, information,
             [ObservedKind.GLOBAL_POSE] * len(measured))])
     return edges.rows(~to_bias & (edges.kind != EdgeKind.RANGE)), observed
+
+
+def _approximated(
+    prior: Prior, rows: IntArray, is_pose: BoolArray,
+) -> tuple[Edges, ObservedNodes]:
+    """
+    Return constraints at the reference poses of a prior, which suffice to start from.
+
+    Parameters
+    ----------
+    prior : Prior
+    rows : ndarray of int, shape (k,), its nodes
+    is_pose : ndarray of bool, shape (N,), which nodes are poses
+
+    """
+    poses = np.flatnonzero(is_pose[rows])
+    blocks = prior.information.reshape(len(rows), 3, -1, 3)[poses, :, poses]
+    information = np.zeros_like(blocks)
+    information[:, 0, 0] = information[:, 1, 1] = _isotropic(blocks)
+    information[:, 2, 2] = blocks[:, 2, 2]
+    says = np.any(information, axis=(1, 2))
+    poses, information = poses[says], information[says]
+    nodes, reference = rows[poses], prior.reference[poses]
+    if prior.anchored:
+        return Edges(), ObservedNodes(
+            nodes, None, reference, information, [ObservedKind.GLOBAL_POSE] * len(nodes))
+    first, others = nodes[:1].repeat(len(nodes) - 1), nodes[1:]
+    mean = se2.between(reference[:1], reference[1:])
+    return Edges(first, others, mean, information[1:],
+                 [EdgeKind.ODOMETRY] * len(others)), ObservedNodes()
 
 
 def _complex(pose: FloatArray) -> ComplexArray:

@@ -208,7 +208,7 @@ def optimize_from_two_starts(graph: Graph, config: SolverConfig, solve: Solve) -
     """
     before = graph.poses.copy()
     result = solve(graph, config)
-    if len(graph.observed) == 0:
+    if not _is_observed(graph):
         return result
     poses = graph.poses.copy()
     try:
@@ -223,6 +223,11 @@ def optimize_from_two_starts(graph: Graph, config: SolverConfig, solve: Solve) -
     return other
 
 
+def _is_observed(graph: Graph) -> bool:
+    """Tell whether the graph has an observed node, or a prior in their place."""
+    return len(graph.observed) > 0 or any(prior.anchored for prior in graph.priors)
+
+
 def _start(graph: Graph, start: Start, cliques: symbolic.Cliques) -> FloatArray:
     """
     Return the poses of a start, shape (N, 3), or raise LinearSolveError if there are none.
@@ -234,7 +239,7 @@ def _start(graph: Graph, start: Start, cliques: symbolic.Cliques) -> FloatArray:
     if start is Start.PRESENT:
         return graph.poses.copy()
     if start is Start.JOINT:
-        if len(graph.observed) == 0:
+        if not _is_observed(graph):
             raise LinearSolveError('joint start: no node is observed')
         return _joint(graph)
     from pose_graph_ros.core.batch.joint_start import unit_headings  # noqa: PLC0415
@@ -274,8 +279,10 @@ def _analysed(graph: Graph) -> symbolic.Cliques:
     """Return the cliques of the whole graph, with memory allocated for them."""
     memory = graph.memory
     analysis = symbolic.analyse(memory.head)
-    memory.ensure('pool_f', analysis.need_f)
-    memory.ensure('pool_i', analysis.need_i)
+    keep_f, keep_i = (
+        memory.head[tb.POOL_F_END:tb.POOL_I_END + 1] if memory.head[tb.N_PRIORS] > 0 else (0, 0))
+    memory.ensure('pool_f', max(analysis.need_f, int(keep_f)), keep=int(keep_f))
+    memory.ensure('pool_i', max(analysis.need_i, int(keep_i)), keep=int(keep_i))
     memory.ensure('work_f', analysis.largest)
     return analysis.cliques
 

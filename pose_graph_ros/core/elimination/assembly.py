@@ -4,9 +4,15 @@
 
 from pose_graph_ros.core.compiled.jit import kernel
 from pose_graph_ros.core.compiled.simd import add, copy
-from pose_graph_ros.core.elimination import clique_frames
+from pose_graph_ros.core.elimination import clique_frames, prior_model
 from pose_graph_ros.core.elimination.fronts import factorize, LEAST_PIVOT, padded
-from pose_graph_ros.core.graph import factors, normal_equations, tables as tb, transaction_log
+from pose_graph_ros.core.graph import (
+    factors,
+    normal_equations,
+    prior_rows,
+    tables as tb,
+    transaction_log,
+)
 from pose_graph_ros.core.graph.constraints import EdgeKind
 from pose_graph_ros.core.graph.pools import row_start, triangle_size
 
@@ -18,6 +24,7 @@ LEAST_STIFF_PIVOT = 1e-15
 # Edges of this kind and the ones after it have a node that is no pose, so the axes of their errors
 # or unknowns do not turn with a clique.
 FIRST_ANCHORING = int(EdgeKind.BIAS)
+PRIOR = int(EdgeKind.PRIOR)     # between poses as well
 
 
 @kernel
@@ -85,7 +92,8 @@ def _eliminate(head, c, relinearize, by_weakest):  # type: ignore[no-untyped-def
                 transaction_log.log_edge(head, e)
                 factors.linearize_edge(head, e)
             edge_i[e, tb.OWNER] = c
-            anchored |= edge_i[e, tb.EDGE_KIND] >= FIRST_ANCHORING
+            kind = edge_i[e, tb.EDGE_KIND]
+            anchored |= kind >= FIRST_ANCHORING and kind != PRIOR
             normal_equations.add_edge(head, e, at_i, at_j, at_k, front, ld)
         entry = node_i[v, tb.OBSERVED_LIST]
         while entry >= 0:
@@ -161,6 +169,7 @@ def _lower_bounds(head, v, least):  # type: ignore[no-untyped-def]
     """Lower the bounds of a node's pivots, shape (3,), where its constraints are weak."""
     edge_f, observed_f, node_i = tb.edge_f(head), tb.observed_f(head), tb.node_i(head)
     edge_i, observed_i = tb.edge_i(head), tb.observed_i(head)
+    clique_i = tb.clique_i(head)
     weak_t = weak_r = 0.0
     entry = node_i[v, tb.EDGE_LIST]
     while entry >= 0:
@@ -173,6 +182,12 @@ def _lower_bounds(head, v, least):  # type: ignore[no-untyped-def]
         t, r = normal_equations.weakest(observed_f[entry])
         weak_t, weak_r = weak_t + t, weak_r + r
         entry = observed_i[entry, tb.OBS_NEXT]
+    c = clique_i[node_i[v, tb.CLIQUE], tb.CHILD]
+    while c >= 0:
+        if clique_i[c, tb.N_FRONTAL] == 0:
+            t, r = prior_rows.weakest(head, c, v)
+            weak_t, weak_r = weak_t + t, weak_r + r
+        c = clique_i[c, tb.SIBLING]
     for m in range(3):
         weak = LEAST_WEAK_PIVOT * (weak_t if m < 2 else weak_r)
         if weak > 0.0:
@@ -196,7 +211,11 @@ def _extend_add(head, child, front, ld):  # type: ignore[no-untyped-def]
     if phi != clique_f[child, tb.TURN_SEEN]:
         transaction_log.log_clique(head, child)
     clique_f[child, tb.TURN_SEEN] = phi
-    if phi != 0.0:
+    if n_frontal == 0:
+        linear = work_f[len(front) + len(front) // ld:]
+        prior_model.linearize(head, child, phi, linear, linear[triangle_size(size, size):])
+        update = linear
+    elif phi != 0.0:
         turned = work_f[len(front) + len(front) // ld:]
         clique_frames.turned_update(update, n_separator, nodes, node_f, phi, turned)
         update = turned
@@ -270,6 +289,6 @@ def _substitute_fixed(head, v, at, front, n, ld):  # type: ignore[no-untyped-def
 
 @kernel
 def work_size(n_nodes):  # type: ignore[no-untyped-def]
-    """Return the size of the work space for a front of n nodes and a turned update matrix."""
+    """Return the size of the work space for a front of n nodes and a child's update matrix."""
     n = 3 * n_nodes
-    return n * padded(n) + n + triangle_size(n, n)
+    return n * padded(n) + n + triangle_size(n, n) + 5 * n

@@ -29,7 +29,7 @@ units of the squared linearization error of a constraint.
 import math
 
 from pose_graph_ros.core.compiled.jit import kernel
-from pose_graph_ros.core.graph import tables as tb
+from pose_graph_ros.core.graph import prior_rows, tables as tb
 from pose_graph_ros.core.graph.pools import row_start, triangle_size
 
 # Angles of a frame below this are set to zero [rad].
@@ -54,7 +54,10 @@ def present_turn(head, c):  # type: ignore[no-untyped-def]
     clique_i, clique_f = tb.clique_i(head), tb.clique_f(head)
     if clique_i[c, tb.ANCHORED] != 0:
         return 0.0
-    phi = mean_turn(head, c) - clique_f[c, tb.TURN_ZERO]
+    if clique_i[c, tb.N_FRONTAL] == 0:
+        phi = prior_rows.mean_turn(head, c)
+    else:
+        phi = mean_turn(head, c) - clique_f[c, tb.TURN_ZERO]
     return phi if abs(phi) > LEAST_TURN else 0.0
 
 
@@ -136,8 +139,30 @@ def turned_update(update, n, nodes, node_f, phi, to):  # type: ignore[no-untyped
                 u0 -= update[r0 + q] * mx + update[r0 + q + 1] * my - update[r0 + q + 2] * phi
                 u1 -= update[r1 + q] * mx + update[r1 + q + 1] * my - update[r1 + q + 2] * phi
                 u2 -= update[r2 + q] * mx + update[r2 + q + 1] * my - update[r2 + q + 2] * phi
-        to[r0 + size], to[r1 + size] = cos * u0 - sin * u1, sin * u0 + cos * u1
-        to[r2 + size] = u2
+        to[r0 + size], to[r1 + size], to[r2 + size] = u0, u1, u2
+    rotated_triangle(update, n, cos, sin, to)
+
+
+@kernel
+def rotated_triangle(update, n, cos, sin, to):  # type: ignore[no-untyped-def]
+    """
+    Rotate the axes of an update matrix, and of a right-hand side in place.
+
+    Parameters
+    ----------
+    update : ndarray, flat, 3n columns, laid out by `pools.row_start`
+    n : int, number of nodes
+    cos, sin : float, of the angle of the present axes in the new ones
+    to : ndarray, flat, laid out as `update` or `update` itself
+        Receives the matrix, and has the right-hand side.
+
+    """
+    size = 3 * n
+    for a in range(n):
+        r0, r1, r2 = (row_start(3 * a, size), row_start(3 * a + 1, size),
+                      row_start(3 * a + 2, size))
+        x, y = to[r0 + size], to[r1 + size]
+        to[r0 + size], to[r1 + size] = cos * x - sin * y, sin * x + cos * y
         q = 3 * a
         xx, xy, yy = update[r0 + q], update[r0 + q + 1], update[r1 + q + 1]
         xt, yt = update[r0 + q + 2], update[r1 + q + 2]

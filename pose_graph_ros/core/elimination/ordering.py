@@ -5,10 +5,11 @@ Fill-reducing order of elimination by approximate minimum degree.
 
 The quotient graph is that of P. Amestoy, T. Davis, I. Duff, "An approximate minimum degree
 ordering algorithm", SIAM J. Matrix Anal. Appl. 17 (1996). An eliminated node becomes an *element*,
-the set of nodes that it connects, and absorbs the elements that it was a member of. There are two
-extensions. The separators of unchanged subtrees (*orphans*) are elements from the start. The last
-nodes of the list can be eliminated last, in their order, so that the newest nodes stay near the
-root of the tree, where the next nodes are attached.
+the set of nodes that it connects, and absorbs the elements that it was a member of. There are
+three extensions. The separators of unchanged subtrees (*orphans*) are elements from the start. The
+last nodes of the list can be eliminated last, in their order, so that the newest nodes stay near
+the root of the tree, where the next nodes are attached. The first nodes can be eliminated before
+all others, in any order among themselves: nodes that are about to leave the graph.
 
 The elements are the cliques, so the ordering yields the symbolic factorisation as well.
 """
@@ -58,14 +59,15 @@ def _put(i, member, nodes, end):  # type: ignore[no-untyped-def]
     return end
 
 
-@kernel(signature=(INTEGER, INTEGER, INTEGER, INDICES, INDICES), allocates=True)
-def minimum_degree(n, n_elements, n_last, start, adjacency):  # type: ignore[no-untyped-def]
+@kernel(signature=(INTEGER, INTEGER, INTEGER, INTEGER, INDICES, INDICES), allocates=True)
+def minimum_degree(n, n_elements, n_before, n_last, start, adjacency):  # type: ignore[no-untyped-def]
     """
     Order n nodes and return the cliques of the elimination, children before parents.
 
     Parameters
     ----------
     n, n_elements : int, nodes are 0 to n - 1, elements from the start n to n + n_elements - 1
+    n_before : int, number of nodes, the first of the list, that are eliminated before all others
     n_last : int, number of nodes, the last of the list, that are eliminated last, in their order
     start : ndarray of int32, shape (n + n_elements + 1,), where each list begins in `adjacency`
     adjacency : ndarray of int32
@@ -109,7 +111,7 @@ def minimum_degree(n, n_elements, n_last, start, adjacency):  # type: ignore[no-
     bucket_next = np.full(n, -1, np.int32)
     code = np.zeros(n, np.int32)
 
-    n_first = n - n_last
+    n_first = n_before if n_before > 0 else n - n_last
     for i in range(total):
         begin[i] = start[i]
         length[i] = start[i + 1] - start[i]
@@ -136,8 +138,14 @@ def minimum_degree(n, n_elements, n_last, start, adjacency):  # type: ignore[no-
     smallest = 0
     flag = np.int64(1)
     eliminated = 0
-    next_last = n_first
+    next_last = n - n_last
     while eliminated < n:
+        if eliminated == n_first and n_first < n - n_last:  # the nodes before all others are done
+            n_first = n - n_last
+            for i in range(n_before, n_first):
+                degree[i] = max(min(degree[i], n - eliminated - 1), 0)
+                _insert(i, degree[i], first, after, before)
+            smallest = 0
         # 1. the pivot
         if eliminated < n_first:
             while first[smallest] < 0:
@@ -208,13 +216,14 @@ def minimum_degree(n, n_elements, n_last, start, adjacency):  # type: ignore[no-
             for m in range(begin[i], begin[i] + n_in[i]):
                 e = iw[m]
                 if size[e] > 0:
-                    if outside[e] > flag:
+                    if outside[e] > flag or p < n_before:
                         d += outside[e] - flag
                         iw[to] = e
                         to += 1
                         h += e
                     else:
-                        # aggressive absorption: all its nodes are in the new element
+                        # aggressive absorption: all its nodes are in the new element, but not of
+                        # a node before all others, as what is below such a node leaves with it
                         size[e] = 0
                         if e < n:
                             parent[clique_of[e]] = n_cliques
@@ -228,7 +237,7 @@ def minimum_degree(n, n_elements, n_last, start, adjacency):  # type: ignore[no-
                     iw[to] = j
                     to += 1
                     h += j
-            if d == 0 and i < n_first:
+            if d == 0 and i < n_first and (p >= n_before or first_node == begin[i]):
                 # mass elimination: all its neighbours are in the new element
                 nodes_end = _put(i, member, nodes, nodes_end)
                 eliminated += weight[i]

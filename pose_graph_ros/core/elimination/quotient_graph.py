@@ -39,17 +39,19 @@ def newest_last(affected, newest):  # type: ignore[no-untyped-def]
 
 
 @kernel(allocates=True)
-def structure(head, marked, affected):  # type: ignore[no-untyped-def]
+def structure(head, marked, loose, affected):  # type: ignore[no-untyped-def]
     """
     Return the orphans, and the quotient graph of the affected nodes with them as elements.
 
-    Orphans are children of marked cliques that are not marked themselves. The graph is given as
-    `start` and `adjacency` of `ordering.minimum_degree`; node k is `affected[k]`.
+    Orphans are children of marked cliques that are not marked themselves, then the loose priors.
+    The graph is given as `start` and `adjacency` of `ordering.minimum_degree`; node k is
+    `affected[k]`.
 
     Parameters
     ----------
     marked : ndarray of int32
         Cliques that are to be replaced, with FRONT_SERIAL of the head in their column MARKED.
+    loose : ndarray of int32, further orphans
     affected : ndarray of int32, nodes to be ordered
 
     """
@@ -62,20 +64,32 @@ def structure(head, marked, affected):  # type: ignore[no-untyped-def]
         node_i[affected[k], tb.INDEX] = k
         node_i[affected[k], tb.FRONT] = serial
     stamp = serial - 1
-    # count the orphans, and an upper bound of the entries in the list of each node
-    n_orphans = 0
-    count = np.zeros(n + 1, np.int32)
+    # the orphans, and an upper bound of the entries in the list of each node
+    n_orphans = len(loose)
     for k in range(len(marked)):
         c = clique_i[marked[k], tb.CHILD]
         while c >= 0:
             if clique_i[c, tb.MARKED] != stamp:
                 n_orphans += 1
-                row = clique_i[c]
-                begin = row[tb.NODES] + row[tb.N_FRONTAL]
-                for m in range(begin, begin + row[tb.N_SEPARATOR]):
-                    count[node_i[pool_i[m], tb.INDEX]] += 1
             c = clique_i[c, tb.SIBLING]
     orphans = np.empty(n_orphans, np.int32)
+    n_orphans = 0
+    for k in range(len(marked)):
+        c = clique_i[marked[k], tb.CHILD]
+        while c >= 0:
+            if clique_i[c, tb.MARKED] != stamp:
+                orphans[n_orphans] = c
+                n_orphans += 1
+            c = clique_i[c, tb.SIBLING]
+    for k in range(len(loose)):
+        orphans[n_orphans + k] = loose[k]
+    n_orphans = len(orphans)
+    count = np.zeros(n + 1, np.int32)
+    for k in range(n_orphans):
+        row = clique_i[orphans[k]]
+        begin = row[tb.NODES] + row[tb.N_FRONTAL]
+        for m in range(begin, begin + row[tb.N_SEPARATOR]):
+            count[node_i[pool_i[m], tb.INDEX]] += 1
     for k in range(n):
         entry = node_i[affected[k], tb.EDGE_LIST]
         while entry >= 0:
@@ -92,23 +106,16 @@ def structure(head, marked, affected):  # type: ignore[no-untyped-def]
     position = start[:n].copy()
     adjacency = np.empty(2 * start[n] + 16, np.int32)
     end = start[n]
-    n_orphans = 0
-    for k in range(len(marked)):
-        c = clique_i[marked[k], tb.CHILD]
-        while c >= 0:
-            if clique_i[c, tb.MARKED] != stamp:
-                orphans[n_orphans] = c
-                row = clique_i[c]
-                begin = row[tb.NODES] + row[tb.N_FRONTAL]
-                for m in range(begin, begin + row[tb.N_SEPARATOR]):
-                    i = node_i[pool_i[m], tb.INDEX]
-                    adjacency[end] = i
-                    end += 1
-                    adjacency[position[i]] = n + n_orphans
-                    position[i] += 1
-                n_orphans += 1
-                start[n + n_orphans] = end
-            c = clique_i[c, tb.SIBLING]
+    for k in range(n_orphans):
+        row = clique_i[orphans[k]]
+        begin = row[tb.NODES] + row[tb.N_FRONTAL]
+        for m in range(begin, begin + row[tb.N_SEPARATOR]):
+            i = node_i[pool_i[m], tb.INDEX]
+            adjacency[end] = i
+            end += 1
+            adjacency[position[i]] = n + k
+            position[i] += 1
+        start[n + k + 1] = end
     # add each neighbour once
     last_seen = np.full(n, -1, np.int32)
     to = 0
@@ -142,7 +149,7 @@ def structure(head, marked, affected):  # type: ignore[no-untyped-def]
 
 @kernel(allocates=True)
 def amalgamate(  # type: ignore[no-untyped-def]
-    n_cliques, n_frontal, offset, parent, most_zeros, most_frontal,
+    n_cliques, n_frontal, offset, parent, n_apart, most_zeros, most_frontal,
 ):
     """
     Return into which clique to merge each: a parent where that stores few explicit zero blocks.
@@ -153,6 +160,7 @@ def amalgamate(  # type: ignore[no-untyped-def]
     Parameters
     ----------
     n_cliques, n_frontal, offset, parent : as returned by `ordering.minimum_degree`
+    n_apart : int, number of the first cliques, none of which is merged with one of the others
     most_zeros, most_frontal : int, limits of the zero blocks and frontal nodes of a merged clique
 
     """
@@ -161,7 +169,7 @@ def amalgamate(  # type: ignore[no-untyped-def]
     zeros = np.zeros(n_cliques, np.int32)
     for k in range(n_cliques - 1):
         q = parent[k]
-        if q < 0 or q == n_cliques - 1:
+        if q < 0 or q == n_cliques - 1 or k < n_apart <= q:
             continue
         separator = offset[k + 1] - offset[k] - n_frontal[k]
         width = frontal[q] + offset[q + 1] - offset[q] - n_frontal[q]

@@ -19,7 +19,7 @@ from pose_graph_ros.core.compiled.jit import INDICES, INTEGER, INTEGERS, kernel
 from pose_graph_ros.core.elimination.assembly import work_size
 from pose_graph_ros.core.elimination.ordering import minimum_degree
 from pose_graph_ros.core.elimination.quotient_graph import amalgamate, newest_last, structure
-from pose_graph_ros.core.graph import pools, tables as tb, transaction_log
+from pose_graph_ros.core.graph import pools, prior_rows, tables as tb, transaction_log
 
 # Limits of amalgamation: explicit zero blocks and frontal nodes of a merged clique. They differ
 # from those of the incremental smoother, as every clique is eliminated in every iteration here.
@@ -62,14 +62,17 @@ def analyse(head: tb.IntHead) -> Analysis:
     order = np.arange(int(head[tb.N_NODES])).astype(np.int32)
     n_last = newest_last(order, int(head[tb.NEWEST]))
     start, adjacency = _adjacency(head, order)
-    cliques = _amalgamated(order, minimum_degree(len(order), 0, n_last, start, adjacency))
-    return Analysis(cliques, *_required_memory(cliques))
+    n_priors = len(start) - 1 - len(order)
+    cliques = _amalgamated(order, minimum_degree(
+        len(order), n_priors, 0, n_last, start, adjacency))
+    return Analysis(cliques, *_required_memory(head, cliques))
 
 
 @kernel(signature=(tb.HEAD, INDICES), allocates=True)
 def _adjacency(head, order):  # type: ignore[no-untyped-def]
-    """Return the lists of neighbours of all nodes, in this order, for `minimum_degree`."""
-    _, start, adjacency = structure(head, np.empty(0, np.int32), order)
+    """Return the lists of neighbours of all nodes, in this order, and of the priors' nodes."""
+    _, start, adjacency = structure(
+        head, np.empty(0, np.int32), prior_rows.all_priors(head), order)
     return start, adjacency
 
 
@@ -80,7 +83,7 @@ def _amalgamated(order, eliminated):  # type: ignore[no-untyped-def]
     for m in range(offset[n_raw]):
         raw_nodes[m] = order[raw_nodes[m]]
     into, _ = amalgamate(
-        n_raw, raw_frontal, offset, raw_parent, RELAXED_ZEROS, RELAXED_FRONTAL)
+        n_raw, raw_frontal, offset, raw_parent, 0, RELAXED_ZEROS, RELAXED_FRONTAL)
     raw_order = _postorder(n_raw, into, raw_parent)
     n_cliques = len(raw_order)
     place = np.full(n_raw, -1, np.int32)
@@ -113,10 +116,21 @@ def _amalgamated(order, eliminated):  # type: ignore[no-untyped-def]
     return cliques
 
 
-@kernel(signature=(CLIQUES,), allocates=True)
-def _required_memory(cliques):  # type: ignore[no-untyped-def]
-    """Return the memory of the cliques in both pools, and the work space of the largest front."""
+@kernel(signature=(tb.HEAD, CLIQUES), allocates=True)
+def _required_memory(head, cliques):  # type: ignore[no-untyped-def]
+    """
+    Return what cliques and priors need in both pools, and the work space of the largest front.
+
+    Parameters
+    ----------
+    cliques : Cliques
+
+    """
     need_f, need_i, largest = np.int64(0), np.int64(0), np.int64(0)
+    for c in prior_rows.all_priors(head):
+        n_separator = np.int64(tb.clique_i(head)[c, tb.N_SEPARATOR])
+        need_f += pools.rounded(pools.n_values(0, n_separator))
+        need_i += pools.rounded(n_separator)
     for k in range(len(cliques.n_frontal)):
         n_all = np.int64(cliques.first[k + 1] - cliques.first[k])
         n_frontal = np.int64(cliques.n_frontal[k])
@@ -194,16 +208,15 @@ def plant(head, cliques):  # type: ignore[no-untyped-def]
     """
     Replace all cliques in the tables by those of a symbolic factorisation, without values.
 
-    The pools must have been enlarged by what `Analysis` requires. Clique k is stored in row k, so
-    that the order of the rows is that of the elimination. No node is touched afterwards, and the
-    log of the update is empty: a rollback is not possible.
+    The pools must have been enlarged by what `Analysis` requires. The rows are in the order of the
+    elimination, behind those of the priors. No node is touched afterwards, and the log of the
+    update is empty: a rollback is not possible.
     """
     node_i, clique_i, pool_i = tb.node_i(head), tb.clique_i(head), tb.pool_i(head)
     touched = tb.touched(head)
     first, n_frontal = cliques.first, cliques.n_frontal
-    head[tb.N_CLIQUES] = head[tb.POOL_F_END] = head[tb.POOL_I_END] = 0
-    head[tb.FREE_CLIQUE] = -1
-    head[tb.FREE_F:] = -1
+    prior_rows.remove_cliques(head)
+    n_priors = head[tb.N_CLIQUES]
     for s in range(head[tb.N_TOUCHED]):
         node_i[touched[s], tb.TOUCHED] = 0
     head[tb.N_TOUCHED] = head[tb.STRUCTURE] = 0
@@ -216,17 +229,28 @@ def plant(head, cliques):  # type: ignore[no-untyped-def]
         for m in range(first[k], first[k] + n_frontal[k]):
             node_i[cliques.nodes[m], tb.CLIQUE] = c
     for k in range(len(n_frontal)):
-        q = cliques.parent[k]
-        if q >= 0:
-            clique_i[k, tb.PARENT] = q
-            clique_i[k, tb.SIBLING], clique_i[q, tb.CHILD] = clique_i[q, tb.CHILD], k
+        if cliques.parent[k] >= 0:
+            _attach(head, n_priors + cliques.parent[k], n_priors + k)
+    for c in range(n_priors):   # to the clique of the node that is eliminated first
+        parent = head[tb.N_CLIQUES]
+        for m in range(clique_i[c, tb.NODES], clique_i[c, tb.NODES] + clique_i[c, tb.N_SEPARATOR]):
+            parent = min(parent, node_i[pool_i[m], tb.CLIQUE])
+        _attach(head, parent, c)
+    head[tb.LOOSE] = -1
     head[tb.LOG_F_END] = head[tb.LOG_I_END] = head[tb.N_FREED] = 0
+
+
+@kernel
+def _attach(head, parent, child):  # type: ignore[no-untyped-def]
+    clique_i = tb.clique_i(head)
+    clique_i[child, tb.PARENT] = parent
+    clique_i[child, tb.SIBLING], clique_i[parent, tb.CHILD] = clique_i[parent, tb.CHILD], child
 
 
 @kernel(signature=(tb.HEAD,), allocates=True)
 def loose_part(head):  # type: ignore[no-untyped-def]
     """
-    Find the parts of the graph that contain no fixed and no observed node.
+    Find the parts of the graph that contain no fixed and no observed node, nor an anchored prior.
 
     Return the first hidden node in such a part, or -1, and the number of nodes in all of them.
     """
@@ -241,7 +265,16 @@ def loose_part(head):  # type: ignore[no-untyped-def]
                 if edge_i[e, m] >= 0:
                     j = _first_node(part, edge_i[e, m])
                     part[max(i, j)] = i = min(i, j)
+    clique_i, pool_i, priors = tb.clique_i(head), tb.pool_i(head), prior_rows.all_priors(head)
+    for c in priors:
+        begin = clique_i[c, tb.NODES]
+        for m in range(begin + 1, begin + clique_i[c, tb.N_SEPARATOR]):
+            i, j = _first_node(part, pool_i[begin]), _first_node(part, pool_i[m])
+            part[max(i, j)] = min(i, j)
     held = np.zeros(n, np.bool_)
+    for c in priors:
+        if clique_i[c, tb.ANCHORED] != 0:
+            held[_first_node(part, pool_i[clique_i[c, tb.NODES]])] = True
     for v in range(n):
         if node_i[v, tb.FIXED] != 0:
             held[_first_node(part, v)] = True

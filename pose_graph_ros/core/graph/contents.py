@@ -25,6 +25,8 @@ from pose_graph_ros.core.graph.graph_update import (
     NextIds,
 )
 from pose_graph_ros.core.graph.identities import Ids, known
+from pose_graph_ros.core.graph.prior_edits import priors_of
+from pose_graph_ros.core.graph.priors import model, Prior
 from pose_graph_ros.core.graph.tables import Memory
 
 # Columns of edge_f with the column `Edges.bias`, and which of them each kind of edge has.
@@ -233,7 +235,13 @@ class GraphContents:
             self.poses.copy(), self.node_kind, self.fixed,
             Edges(*(column.copy() for column in self.edges.columns)),
             ObservedNodes(*(column.copy() for column in self.observed.columns)),
-            self.node_ids, self.edge_ids, self.observed_ids, self.next_ids, self.dimension)
+            self.node_ids, self.edge_ids, self.observed_ids, self.next_ids, self.dimension,
+            self.priors)
+
+    @property
+    def priors(self) -> tuple[Prior, ...]:
+        """All dense priors."""
+        return priors_of(self.memory, self.node_ids)
 
     def leaving(self) -> GraphUpdate:
         """Return what leaves the graph with the present update; it keeps its rows until then."""
@@ -250,7 +258,9 @@ class GraphContents:
         edges, observed = self.edges_by_row, self.observed_by_row
         return Energies(
             energies(edge_errors(poses, edges), edges.weighted_information),
-            energies(observed_errors(poses, observed), observed.weighted_information))
+            energies(observed_errors(poses, observed), observed.weighted_information),
+            np.array([model(prior, poses[self.node_rows(prior.nodes)]).energy
+                      for prior in self.priors]))
 
     def edge_errors(self, edges: Edges, poses: FloatArray | None = None) -> FloatArray:
         """

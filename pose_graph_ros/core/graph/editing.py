@@ -25,6 +25,7 @@ from pose_graph_ros.core.graph import (
     factor_types,
     factors,
     identities,
+    prior_rows,
     rows,
     tables as tb,
     transaction_log,
@@ -68,8 +69,16 @@ def _start_nodes(head, first, first_other, kinds, dimensions):  # type: ignore[n
 
 
 @kernel
-def _add_to_scale(head, v, position, heading):  # type: ignore[no-untyped-def]
-    """Add information on position and heading to the squared diagonal scales of a node."""
+def add_to_scale(head, v, position, heading):  # type: ignore[no-untyped-def]
+    """
+    Add information to the squared diagonal scales of a node.
+
+    Parameters
+    ----------
+    v : int, node
+    position, heading : float, information, or the change of it [1/m^2, 1/rad^2]
+
+    """
     node_f = tb.node_f(head)
     f = node_f[v]
     f[tb.SCALE_T] = math.sqrt(max(f[tb.SCALE_T] * f[tb.SCALE_T] + position, 0.0))
@@ -93,12 +102,12 @@ def scale_by_edge(head, e, weight):  # type: ignore[no-untyped-def]
     heading = weight * f[tb.INFO + 5]
     # of a relative error the length of the mean, of others that of the offset
     arm2 = f[tb.OWN] * f[tb.OWN] + f[tb.OWN + 1] * f[tb.OWN + 1]
-    _add_to_scale(head, edge_i[e, tb.END_I], position, heading + position * arm2)
+    add_to_scale(head, edge_i[e, tb.END_I], position, heading + position * arm2)
     ft, fth = factor_types.factors_of_end(f, edge_i[e, tb.EDGE_KIND])
-    _add_to_scale(head, edge_i[e, tb.END_J], ft * ft * position, fth * fth * heading)
+    add_to_scale(head, edge_i[e, tb.END_J], ft * ft * position, fth * fth * heading)
     if edge_i[e, tb.END_K] >= 0:
         rate2 = f[tb.FACTOR_TH] * f[tb.FACTOR_TH]
-        _add_to_scale(head, edge_i[e, tb.END_K], weight * f[tb.INFO + 5] * rate2, 0.0)
+        add_to_scale(head, edge_i[e, tb.END_K], weight * f[tb.INFO + 5] * rate2, 0.0)
 
 
 @kernel
@@ -117,7 +126,7 @@ def scale_by_observed(head, k, weight):  # type: ignore[no-untyped-def]
     position = 0.5 * weight * (f[tb.INFO] + f[tb.INFO + 3])
     arm2 = (f[tb.OFFSET] * f[tb.OFFSET]
             + f[tb.OFFSET + 1] * f[tb.OFFSET + 1])
-    _add_to_scale(head, observed_i[k, tb.OBS_NODE], position,
+    add_to_scale(head, observed_i[k, tb.OBS_NODE], position,
                   weight * f[tb.INFO + 5] + position * arm2)
 
 
@@ -167,8 +176,16 @@ def _link_edge(head, e):  # type: ignore[no-untyped-def]
 
 
 @kernel
-def _unlink_edge(head, e, side):  # type: ignore[no-untyped-def]
-    """Take an edge out of the list of one of its ends (I 0, J 1, K 2), whose row is logged."""
+def unlink_edge(head, e, side):  # type: ignore[no-untyped-def]
+    """
+    Take an edge out of the list of one of its ends, whose row has been logged.
+
+    Parameters
+    ----------
+    e : int, edge
+    side : int, 0 for its end I, 1 for J, 2 for K
+
+    """
     node_i, edge_i = tb.node_i(head), tb.edge_i(head)
     v, after = edge_i[e, side], edge_i[e, tb.NEXT_I + side]
     entry = node_i[v, tb.EDGE_LIST]
@@ -223,7 +240,7 @@ def weigh_edge(head, e, weight):  # type: ignore[no-untyped-def]
     if weight == 0.0:
         for side in range(3):
             if tb.edge_i(head)[e, side] >= 0:
-                _unlink_edge(head, e, side)
+                unlink_edge(head, e, side)
         f[tb.ERROR2] = f[tb.ENERGY] = 0.0
         return
     if before == 0.0:
@@ -390,7 +407,7 @@ def add_rows(  # type: ignore[no-untyped-def]
             or not _lengths_agree(len(node), observed_mean, observed_information, observed_kind,
                                   observed_weight)):
         return UNSOUND
-    if (n_nodes > head[tb.NODE_ROOM] or n_edges > head[tb.EDGE_ROOM]
+    if (n_nodes + head[tb.N_PRIORS] > head[tb.NODE_ROOM] or n_edges > head[tb.EDGE_ROOM]
             or n_observed > head[tb.OBSERVED_ROOM]):
         return NO_ROOM
     # rows behind the ends are not part of the graph yet
@@ -412,16 +429,14 @@ def add_rows(  # type: ignore[no-untyped-def]
     return ADDED
 
 
-@kernel(signature=(tb.HEAD,))
+@kernel(signature=(tb.HEAD,), allocates=True)
 def restart(head):  # type: ignore[no-untyped-def]
-    """Remove all cliques, linearize all constraints at the present poses and touch all nodes."""
+    """Remove all cliques but the priors, linearize all constraints anew and touch all nodes."""
     node_f, edge_f, observed_f = tb.node_f(head), tb.edge_f(head), tb.observed_f(head)
     scalars, node_i, edge_i = tb.scalars(head), tb.node_i(head), tb.edge_i(head)
     observed_i = tb.observed_i(head)
-    head[tb.N_CLIQUES] = head[tb.POOL_F_END] = head[tb.POOL_I_END] = 0
-    head[tb.FREE_CLIQUE] = -1
-    head[tb.FREE_F:] = -1
-    head[tb.N_FREED] = head[tb.N_TOUCHED] = head[tb.N_WAITING] = 0
+    prior_rows.remove_cliques(head)
+    head[tb.N_TOUCHED] = head[tb.N_WAITING] = 0
     scalars[tb.CHI2] = 0.0
     head[tb.STRUCTURE] = 1
     for v in range(head[tb.N_NODES]):
@@ -441,3 +456,4 @@ def restart(head):  # type: ignore[no-untyped-def]
             factors.linearize_observed(head, k)
             factors.check_observed(head, k)
             scalars[tb.CHI2] += observed_f[k, tb.ENERGY]
+    prior_rows.add_energies(head)

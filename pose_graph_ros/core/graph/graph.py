@@ -35,6 +35,8 @@ from pose_graph_ros.core.graph.graph_update import (
     NOTHING_LEFT,
     NOTHING_OBSERVED,
 )
+from pose_graph_ros.core.graph.prior_edits import add_priors
+from pose_graph_ros.core.graph.priors import check_priors
 
 __all__ = [
     'NOTHING_OBSERVED',
@@ -117,6 +119,9 @@ class Graph(GraphContents):
                 check_ids(part, getattr(update, part), what, known_ids)
         check_weights('weigh_edges', update.weigh_edges, 'edge', edges)
         check_weights('weigh_observed', update.weigh_observed, 'observed node', observed)
+        check_priors(update.priors, update.remove_nodes)
+        for n, prior in enumerate(update.priors):
+            check_ids(f'priors[{n}].nodes', prior.nodes, 'hidden node', nodes)
 
     def _edit(self, update: GraphUpdate) -> None:
         """Apply the edits of existing rows, which have been checked."""
@@ -136,6 +141,10 @@ class Graph(GraphContents):
                             (removal.remove_nodes, update.remove_nodes)):
             if len(ids) > 0:
                 remove(head, integers(ids))
+        if len(update.priors) > 0:
+            self.ensure(self.n_nodes + len(update.priors), self.n_edges, self.n_observed)
+            add_priors(self.memory, update.priors, [
+                self.node_rows(prior.nodes) for prior in update.priors])
         if head[tb.LOG_I_END] == 0:     # not within an update
             self._compact()
 
@@ -174,6 +183,7 @@ class Graph(GraphContents):
 
         """
         memory, head = self.memory, self.memory.head
+        n_nodes += int(head[tb.N_PRIORS])   # of which there is as much space as of nodes
         if (n_nodes <= head[tb.NODE_ROOM] and n_edges <= head[tb.EDGE_ROOM]
                 and n_observed <= head[tb.OBSERVED_ROOM]):
             return
@@ -232,7 +242,8 @@ class Graph(GraphContents):
         self._append('edge', GraphUpdate(edges=rows.edges), rows.edge_ids, rows.next_ids.edge)
         self._append('observed', GraphUpdate(observed=rows.observed), rows.observed_ids,
                      rows.next_ids.observed)
-        self.apply(GraphUpdate(fix=self.node_ids[begin:][rows.fixed].tolist()))
+        self.apply(GraphUpdate(
+            fix=self.node_ids[begin:][rows.fixed].tolist(), priors=rows.priors))
 
     def _append(
         self, name: str, update: GraphUpdate, ids: IntArray, next_id: int,

@@ -11,6 +11,7 @@ import numpy.typing as npt
 
 from pose_graph_ros.core.geometry.se2 import BoolArray, FloatArray, IntArray
 from pose_graph_ros.core.graph.constraints import Edges, NodeKind, ObservedNodes
+from pose_graph_ros.core.graph.priors import Prior
 
 # Empty parts of updates.
 NO_POSES: Final[FloatArray] = np.empty((0, 3))
@@ -66,6 +67,8 @@ class GraphUpdate(NamedTuple):
     """Edges that leave the graph for good."""
     drop_observed: Sequence[int] = ()
     """Observed nodes that leave the graph for good."""
+    priors: Sequence[Prior] = ()
+    """New dense priors, possibly on the new nodes."""
 
 
 class Left(NamedTuple):
@@ -90,11 +93,13 @@ class Energies(NamedTuple):
     """Shape (M,)."""
     observed: FloatArray
     """Shape (K,)."""
+    priors: FloatArray
+    """Of the dense priors."""
 
     @property
     def chi2(self) -> float:
         """Sum of the energies, without a factor 1/2."""
-        return float(np.sum(self.edges) + np.sum(self.observed))
+        return float(np.sum(self.edges) + np.sum(self.observed) + np.sum(self.priors))
 
 
 class NextIds(NamedTuple):
@@ -125,6 +130,8 @@ class GraphRows(NamedTuple):
     """Ids of the next new rows; at least 1 more than the last."""
     dimension: IntArray | None = None
     """Numbers of coordinates of the hidden nodes; by default those usual for their kinds."""
+    priors: Sequence[Prior] = ()
+    """All dense priors, by ids."""
 
     @property
     def is_bias(self) -> BoolArray:

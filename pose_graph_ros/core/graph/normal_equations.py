@@ -22,12 +22,25 @@ def weakest(f):  # type: ignore[no-untyped-def]
     heading if the position is unknown; both are lower bounds, to rounding.
     """
     i, w = tb.INFO, f[tb.WEIGHT]
-    xx, xy, xt, yy, yt, tt = f[i], f[i + 1], f[i + 2], f[i + 3], f[i + 4], f[i + 5]
+    position, heading = weakest_of(f[i], f[i + 1], f[i + 2], f[i + 3], f[i + 4], f[i + 5])
+    return w * position, w * heading
+
+
+@kernel
+def weakest_of(xx, xy, xt, yy, yt, tt):  # type: ignore[no-untyped-def]
+    """
+    Return what `weakest` does, of an information matrix.
+
+    Parameters
+    ----------
+    xx, xy, xt, yy, yt, tt : float, its upper triangle
+
+    """
     trace, determinant = xx + yy, xx * yy - xy * xy
     if not determinant > 0.0:
         return 0.0, 0.0
     joint = (yy * xt * xt - 2.0 * xy * xt * yt + xx * yt * yt) / determinant
-    return w * determinant / trace, w * max(tt - joint, 0.0)
+    return determinant / trace, max(tt - joint, 0.0)
 
 
 @kernel

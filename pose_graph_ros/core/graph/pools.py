@@ -130,10 +130,13 @@ def n_values(n_frontal, n_separator):  # type: ignore[no-untyped-def]
     """
     Return how many numbers a clique holds: rows of R, then the update matrix.
 
+    A prior, with no frontal node, has more (see `prior_rows`).
+
     Parameters
     ----------
     n_frontal, n_separator : int, numbers of nodes
 
     """
     rows, rest = 3 * n_frontal, 3 * n_separator
-    return triangle_size(rows, rows + rest) + triangle_size(rest, rest)
+    more = 3 * rest + 1 if n_frontal == 0 else 0
+    return triangle_size(rows, rows + rest) + triangle_size(rest, rest) + more

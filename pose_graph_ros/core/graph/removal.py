@@ -9,7 +9,7 @@ out.
 """
 
 from pose_graph_ros.core.compiled.jit import INTEGERS, kernel
-from pose_graph_ros.core.graph import identities, tables as tb, transaction_log
+from pose_graph_ros.core.graph import identities, prior_edits, tables as tb, transaction_log
 from pose_graph_ros.core.graph.editing import touch, weigh_edge, weigh_one_observed
 
 
@@ -76,6 +76,7 @@ def remove_nodes(head, nodes):  # type: ignore[no-untyped-def]
     node_i = tb.node_i(head)
     for node in nodes:
         v = identities.node_row(head, node)
+        prior_edits.remove_of_node(head, v)
         if node_i[v, tb.NODE_LEAVES] != 0:
             continue
         transaction_log.log_node(head, v)

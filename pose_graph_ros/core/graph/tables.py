@@ -108,9 +108,10 @@ OBS_NODE, OBS_NEXT, OBS_KIND, OBS_WAITS, OBS_LOGGED, OBS_LEAVES, OBS_I = range(7
 # clique_i
 #   PARENT, CHILD, SIBLING: rows of the parent, the first child and the next child of the parent;
 #       in an unused row SIBLING is the next unused one
-#   N_FRONTAL, N_SEPARATOR: numbers of frontal and separator nodes, both 0 in an unused row
+#   N_FRONTAL, N_SEPARATOR: numbers of frontal nodes (0 for a prior, -1 in an unused row) and
+#       separator nodes
 #   NODES: index in pool_i of its nodes, frontal ones first
-#   VALUES: index in pool_f of its rows of R, with the update matrix behind them
+#   VALUES: index in pool_f of its rows of R, with the update matrix behind them; see `prior_rows`
 #   MARKED: stamp (FRONT_SERIAL) of the last marking for elimination; while marked cliques are
 #       eliminated, the number of marked children that are left
 #   BUILT: stamp (ITERATION) of the last elimination or solution
@@ -129,7 +130,8 @@ OBS_NODE, OBS_NEXT, OBS_KIND, OBS_WAITS, OBS_LOGGED, OBS_LEAVES, OBS_I = range(7
 #   SLIP_SCALE: diagonal scale of the update matrix: the estimate of SLIP_ERROR2 is
 #       SLIP_SCALE * turn^4 plus a term in turn^2 [sigma^2/rad^4]
 #   DRIFT: upper bound of how far the separator has deformed since the clique was solved [sigma]
-TURN_SEEN, TURN_ZERO, SLIP_ERROR2, SLIP_SCALE, DRIFT, CLIQUE_F = range(6)
+#   PRIOR_ENERGY: of a prior, its energy [sigma^2]
+TURN_SEEN, TURN_ZERO, SLIP_ERROR2, SLIP_SCALE, DRIFT, PRIOR_ENERGY, CLIQUE_F = range(7)
 TURN = SLIP_ERROR2
 
 # Tables by name, with their numbers of columns. Those with one column are 1-D:
@@ -174,12 +176,13 @@ NAMES: Final = (*FLOAT_TABLES, *INT_TABLES)
 #   NEXT_NODE, NEXT_EDGE, NEXT_OBSERVED: ids of the next new rows
 #   N_LEAVING: number of rows that `compaction` takes out after the update, without those that
 #       leave because of the node that they are on
+#   N_PRIORS, LOOSE: number of priors, and the first of those without a parent (SIBLING: the next)
 (N_NODES, N_EDGES, N_OBSERVED, N_CLIQUES, FREE_CLIQUE, POOL_F_END, POOL_I_END, N_TOUCHED, N_FREED,
  N_WAITING, LOG_F_END, LOG_I_END, UPDATE, ITERATION, FRONT_SERIAL, STRUCTURE, NEED_F,
  NEED_I, NEED_WORK, BAD_NODE, N_RELINEARIZED, N_ELIMINATED, N_VISITED, N_ITERATIONS, N_ROOTS,
  N_CHECKS, N_CHANGED, N_TURNED, NODE_ROOM, EDGE_ROOM, OBSERVED_ROOM, NEWEST, SINCE, REFINED,
- LISTED, ROUND, INTERRUPT, NEXT_NODE, NEXT_EDGE, NEXT_OBSERVED, N_LEAVING, COUNTERS_END) = range(
-     2 * len(NAMES), 2 * len(NAMES) + 42)
+ LISTED, ROUND, INTERRUPT, NEXT_NODE, NEXT_EDGE, NEXT_OBSERVED, N_LEAVING, N_PRIORS, LOOSE,
+ COUNTERS_END) = range(2 * len(NAMES), 2 * len(NAMES) + 44)
 # Sizes of the blocks of the pools: exact up to 64 numbers, then in steps of an eighth.
 SIZES: Final = [*range(65)]
 while SIZES[-1] < 2**31:
@@ -297,7 +300,7 @@ class Memory:
 
     def __init__(self) -> None:
         self.head: IntHead = np.zeros(HEAD_SIZE, dtype=np.int64)
-        self.head[FREE_CLIQUE] = self.head[NEWEST] = -1
+        self.head[FREE_CLIQUE] = self.head[NEWEST] = self.head[LOOSE] = -1
         self.head[FREE_F:] = -1
         self._tables: dict[str, npt.NDArray[Any]] = {}
         for name in NAMES:

@@ -21,7 +21,7 @@ _INTEGERS = (tb.NODE_I, tb.EDGE_I, tb.OBS_I, tb.CLIQUE_I, 0, 0, 1)
 # Counters in the first entry.
 STARTED_WITH = (
     tb.N_NODES, tb.N_EDGES, tb.N_OBSERVED, tb.STRUCTURE, tb.N_TOUCHED, tb.N_WAITING, tb.NEWEST,
-    tb.NEXT_NODE, tb.NEXT_EDGE, tb.NEXT_OBSERVED, tb.N_LEAVING)
+    tb.NEXT_NODE, tb.NEXT_EDGE, tb.NEXT_OBSERVED, tb.N_LEAVING, tb.N_PRIORS, tb.LOOSE)
 
 
 @kernel
@@ -125,6 +125,8 @@ def take_clique(head, n_frontal, n_separator):  # type: ignore[no-untyped-def]
     row = clique_i[c]
     row[tb.PARENT] = row[tb.CHILD] = row[tb.SIBLING] = -1
     row[tb.N_FRONTAL], row[tb.N_SEPARATOR] = n_frontal, n_separator
+    if n_frontal == 0:
+        head[tb.N_PRIORS] += 1
     row[tb.NODES] = pools.take_nodes(head, n_frontal + n_separator)
     row[tb.VALUES] = pools.take_values(head, pools.n_values(n_frontal, n_separator))
     row[tb.MARKED] = row[tb.ANCHORED] = 0
@@ -138,13 +140,15 @@ def take_clique(head, n_frontal, n_separator):  # type: ignore[no-untyped-def]
 
 
 @kernel
-def _give_clique(head, c):  # type: ignore[no-untyped-def]
+def give_clique(head, c):  # type: ignore[no-untyped-def]
     """Give the row of a clique and its memory back."""
     clique_i = tb.clique_i(head)
     row = clique_i[c]
     pools.give_nodes(head, row[tb.NODES], row[tb.N_FRONTAL] + row[tb.N_SEPARATOR])
     pools.give_values(head, row[tb.VALUES], pools.n_values(row[tb.N_FRONTAL], row[tb.N_SEPARATOR]))
-    row[tb.N_FRONTAL] = row[tb.N_SEPARATOR] = 0
+    if row[tb.N_FRONTAL] == 0:
+        head[tb.N_PRIORS] -= 1
+    row[tb.N_FRONTAL], row[tb.N_SEPARATOR] = -1, 0
     row[tb.SIBLING] = head[tb.FREE_CLIQUE]
     head[tb.FREE_CLIQUE] = c
 
@@ -154,7 +158,7 @@ def drop_clique(head, c):  # type: ignore[no-untyped-def]
     """Give a clique back: at once if this update has made it, else on commit."""
     clique_i = tb.clique_i(head)
     if clique_i[c, tb.BORN] == head[tb.UPDATE]:
-        _give_clique(head, c)
+        give_clique(head, c)
     else:
         _give_on_commit(head, c, -1)
 
@@ -233,11 +237,21 @@ def commit(head):  # type: ignore[no-untyped-def]
     for k in range(0, head[tb.N_FREED], 2):
         c, values = freed[k], freed[k + 1]
         if values < 0:
-            _give_clique(head, c)
+            give_clique(head, c)
         else:
             row = clique_i[c]
             pools.give_values(head, values, pools.n_values(row[tb.N_FRONTAL], row[tb.N_SEPARATOR]))
     head[tb.N_FREED] = head[tb.LOG_F_END] = head[tb.LOG_I_END] = 0
+
+
+@kernel
+def _restore_linearization(head, c):  # type: ignore[no-untyped-def]
+    """Restore where a prior was linearized before the update; see `prior_rows`."""
+    pool_f, row = tb.pool_f(head), tb.clique_i(head)[c]
+    n = 3 * row[tb.N_SEPARATOR]
+    at = row[tb.VALUES] + pools.n_values(0, row[tb.N_SEPARATOR]) - 2 * n
+    for k in range(at, at + n):
+        pool_f[k] = pool_f[k + n]
 
 
 @kernel(signature=(tb.HEAD,))
@@ -256,9 +270,8 @@ def rollback(head):  # type: ignore[no-untyped-def]
             break
         end_i -= 2
         if code == TAKEN_CLIQUE:
-            # else the same update has given it back
-            if clique_i[row, tb.N_FRONTAL] + clique_i[row, tb.N_SEPARATOR] > 0:
-                _give_clique(head, row)
+            if clique_i[row, tb.N_FRONTAL] >= 0:  # else the same update has given it back
+                give_clique(head, row)
         elif code == SOLUTION:
             end_f -= tb.SCALE_T
             for k in range(tb.SCALE_T):
@@ -271,6 +284,9 @@ def rollback(head):  # type: ignore[no-untyped-def]
         elif code == CLIQUE:
             end_i -= tb.CLIQUE_I
             values = clique_i[row, tb.VALUES]
+            if clique_i[row, tb.N_FRONTAL] == 0 and (
+                    clique_i[row, tb.VALUES_BORN] == head[tb.UPDATE]):
+                _restore_linearization(head, row)
             if values != log_i[end_i + tb.VALUES]:
                 pools.give_values(head, values, pools.n_values(
                     clique_i[row, tb.N_FRONTAL], clique_i[row, tb.N_SEPARATOR]))

@@ -17,7 +17,7 @@ from pose_graph_ros.core.compiled.jit import kernel
 from pose_graph_ros.core.compiled.simd import fetch
 from pose_graph_ros.core.elimination import clique_frames
 from pose_graph_ros.core.elimination.fronts import solve_rows
-from pose_graph_ros.core.graph import factors, tables as tb, transaction_log
+from pose_graph_ros.core.graph import factors, prior_rows, tables as tb, transaction_log
 from pose_graph_ros.core.graph.pools import triangle_size
 from pose_graph_ros.core.smoother.rigid_propagation import propagate, rigid_motion
 
@@ -205,6 +205,14 @@ def back_substitute(head):  # type: ignore[no-untyped-def]
             # the first child to be solved for comes next, the others go on the stack
             child, c = clique_i[c, tb.CHILD], -1
             while child >= 0:
+                if clique_i[child, tb.N_FRONTAL] == 0:
+                    transaction_log.log_clique(head, child)
+                    prior_rows.update_energy(head, child)
+                    if clique_i[child, tb.ANCHORED] == 0:
+                        work_i[2 * head[tb.NODE_ROOM] + head[tb.N_TURNED]] = child
+                        head[tb.N_TURNED] += 1
+                    child = clique_i[child, tb.SIBLING]
+                    continue
                 if drift > 0.0:
                     transaction_log.log_clique(head, child)
                     clique_f[child, tb.DRIFT] += drift

@@ -125,7 +125,7 @@ def extend(head, mean, information, weight):  # type: ignore[no-untyped-def]
     pool_f, work_f, node_i = tb.pool_f(head), tb.work_f(head), tb.node_i(head)
     edge_i, clique_i, pool_i = tb.edge_i(head), tb.clique_i(head), tb.pool_i(head)
     v, e = head[tb.N_NODES], head[tb.N_EDGES]
-    if (v >= head[tb.NODE_ROOM] or e >= head[tb.EDGE_ROOM]
+    if (v + head[tb.N_PRIORS] >= head[tb.NODE_ROOM] or e >= head[tb.EDGE_ROOM]
             or head[tb.POOL_F_END] + _PAIR + _ROOT > len(pool_f)
             or head[tb.POOL_I_END] + 3 > len(pool_i) or len(work_f) < 256):
         return NO_ROOM

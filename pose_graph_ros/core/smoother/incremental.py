@@ -2,7 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """The incremental smoother; `docs/solver.md` describes the method."""
 
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -19,6 +19,7 @@ from pose_graph_ros.core.smoother import (
     batch_fallback,
     chain,
     covariances,
+    forgetting,
     innovations,
     refinement,
     step,
@@ -57,9 +58,24 @@ class Refinement(NamedTuple):
     """Largest change of a coordinate of a position [m]."""
 
 
+class Forgotten(NamedTuple):
+    """What `IncrementalSmoother.forget` has taken out of the graph."""
+
+    nodes: IntArray
+    """Ids of the hidden nodes, ascending, shape (N,)."""
+    poses: FloatArray
+    """Their last estimates, shape (N, 3) [m, m, rad]."""
+    edges: IntArray
+    """Ids of all edges that ended at them."""
+    observed: IntArray
+    """Ids of all observed nodes on them."""
+
+
 DIVERGED = 'the iterations diverge'
 """Reason of an update that has failed because it must not fall back to the batch optimiser."""
 
+# Attempts to order leaving nodes first: a step may touch further ones that wait to be linearized.
+_ATTEMPTS = 4
 _NOT_REFINED = Refinement(finished=True, moved=0.0)
 _EXTENDED_RESULT = UpdateResult(Status.CONVERGED, '', 0, 1, 1, 1)
 
@@ -245,6 +261,56 @@ class IncrementalSmoother:
             hidden=se2.compose(self.graph.poses_of(last), mean)[None],
             edges=Edges([last], [node], mean[None], information[None], [EdgeKind.ODOMETRY],
                         [weight])))
+
+    def forget(self, nodes: Collection[int]) -> Forgotten:
+        """
+        Take nodes out of the graph; what their constraints say about the others becomes priors.
+
+        The result is that of `marginalize`, linear where the tree is, with a prior for each
+        connected part of the nodes. If these are whole subtrees, as the oldest nodes of a chain
+        are, nothing is eliminated, and neither the estimate nor any covariance changes; else they
+        are ordered first, in a step like that of an update. Raises GraphUpdateError, with the
+        graph as before, for a node that is not in the graph, for the newest pose, and if that step
+        fails; ValueError as `refine` does.
+
+        Parameters
+        ----------
+        nodes : collection of int, ids of hidden nodes
+
+        """
+        self._eliminated()
+        graph = self.graph
+        ids = np.unique(np.fromiter(nodes, np.int64, len(nodes)))
+        rows = graph.node_rows(ids)
+        if np.any(rows < 0):
+            raise GraphUpdateError(f'forget: no hidden node has id {ids[np.argmin(rows)]}')
+        if graph.newest_pose in ids:
+            raise GraphUpdateError(f'forget: {graph.newest_pose} is the newest pose')
+        self._order_first(rows)
+        poses = graph.poses[rows]
+        code = forgetting.MORE_MEMORY
+        while code == forgetting.MORE_MEMORY:
+            code = forgetting.drop(self._memory.head, rows)
+            if code == forgetting.MORE_MEMORY:
+                self._make_room(*self._memory.head[tb.NEED_F:tb.NEED_WORK + 1].tolist())
+        left = graph.commit()
+        return Forgotten(left.nodes, poses, left.edges, left.observed)
+
+    def _order_first(self, rows: IntArray) -> None:
+        """Make whole subtrees of nodes, by row, or raise GraphUpdateError."""
+        for _ in range(_ATTEMPTS):
+            self.graph.begin()
+            try:
+                if not forgetting.touch_mixed(self._memory.head, rows):
+                    self.graph.rollback()
+                    return
+                result = self._step(step.FIRST, fall_back=False)
+            except BaseException:
+                self.graph.rollback()
+                raise
+            if result.status is Status.FAILED:
+                raise GraphUpdateError(f'forget: {result.reason}')
+        raise GraphUpdateError('forget: the nodes cannot be ordered first')
 
     def newest_covariance(self) -> FloatArray:
         """Return the covariance of the newest pose in map axes, shape (3, 3)."""

@@ -12,7 +12,7 @@ next iteration (M. Kaess et al., "iSAM2", IJRR 2012, here with whitened errors).
 import math
 
 from pose_graph_ros.core.compiled.jit import kernel
-from pose_graph_ros.core.elimination import clique_frames
+from pose_graph_ros.core.elimination import clique_frames, prior_model
 from pose_graph_ros.core.graph import factors, tables as tb, transaction_log
 from pose_graph_ros.core.graph.editing import touch
 from pose_graph_ros.core.smoother.back_substitution import back_substitute
@@ -89,12 +89,16 @@ def _check(head):  # type: ignore[no-untyped-def]
 def _check_turned(head):  # type: ignore[no-untyped-def]
     """Add the errors of the listed turned frames to the sum, and keep the large ones listed."""
     scalars, clique_f, work_i = tb.scalars(head), tb.clique_f(head), tb.work_i(head)
+    clique_i = tb.clique_i(head)
     turned = work_i[2 * head[tb.NODE_ROOM]:]
     kept = 0
     for k in range(head[tb.N_TURNED]):
         c = turned[k]
-        slip = clique_frames.frame_slip(head, c)
-        error2 = clique_frames.interface_error2(head, c, slip, tb.work_f(head))
+        if clique_i[c, tb.N_FRONTAL] == 0:
+            error2 = prior_model.linearization_error2(head, c, tb.work_f(head))
+        else:
+            slip = clique_frames.frame_slip(head, c)
+            error2 = clique_frames.interface_error2(head, c, slip, tb.work_f(head))
         scalars[tb.ERROR2_SUM] += error2
         if error2 > factors.LEAST_FRACTION * scalars[tb.SETTING_SHARE]:
             clique_f[c, tb.SLIP_ERROR2] = error2

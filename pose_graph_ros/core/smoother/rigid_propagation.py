@@ -117,7 +117,8 @@ def propagate(head, c, motion, stack, depth):  # type: ignore[no-untyped-def]
         moved += row[tb.N_FRONTAL]
         child = row[tb.CHILD]
         while child >= 0:
-            stack[depth] = child
-            depth += 1
+            if clique_i[child, tb.N_FRONTAL] > 0:
+                stack[depth] = child
+                depth += 1
             child = clique_i[child, tb.SIBLING]
     return moved

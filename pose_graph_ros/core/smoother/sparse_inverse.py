@@ -37,8 +37,8 @@ def all_covariances(head, out):  # type: ignore[no-untyped-def]
     inverse = np.empty(1024)
     row_f = np.empty(96)
     for root in range(head[tb.N_CLIQUES]):
-        if clique_i[root, tb.N_FRONTAL] == 0 or clique_i[root, tb.PARENT] >= 0:
-            continue  # a free row, or no root
+        if clique_i[root, tb.N_FRONTAL] <= 0 or clique_i[root, tb.PARENT] >= 0:
+            continue  # a free row, a prior, or no root
         cliques[0] = root
         depth, end = 1, 0
         while depth > 0:
@@ -64,6 +64,9 @@ def all_covariances(head, out):  # type: ignore[no-untyped-def]
             for m in range(n // 3):
                 node_i[pool_i[row[tb.NODES] + m], tb.INDEX] = 3 * m
             while child >= 0:
+                if clique_i[child, tb.N_FRONTAL] == 0:
+                    child = clique_i[child, tb.SIBLING]
+                    continue
                 size = 3 * clique_i[child, tb.N_SEPARATOR]
                 if end + size * size > len(blocks):
                     longer = np.empty(2 * (end + size * size))

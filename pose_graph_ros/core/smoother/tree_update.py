@@ -22,6 +22,8 @@ DONE, MORE_MEMORY, BAD_PIVOT, INTERRUPTED = range(4)
 # Limits of amalgamated cliques: stored zero blocks (3x3) and frontal nodes.
 RELAXED_ZEROS = 16
 RELAXED_FRONTAL = 16
+# Value of TOUCHED for nodes that are ordered before all others, since they are about to leave.
+LEAVES = 2
 
 
 @kernel(allocates=True)
@@ -84,12 +86,16 @@ def rebuild(head, marked, affected):  # type: ignore[no-untyped-def]
     """
     pool_f, work_f, node_i = tb.pool_f(head), tb.work_f(head), tb.node_i(head)
     clique_i, pool_i = tb.clique_i(head), tb.pool_i(head)
-    n_last = newest_last(affected, head[tb.NEWEST])
-    orphans, start, adjacency = structure(head, marked, affected)
+    n_leaving = _leaving_first(head, affected)
+    n_last = newest_last(affected[n_leaving:], head[tb.NEWEST])
+    orphans, start, adjacency = structure(head, marked, _loose_priors(head), affected)
     n_cliques, offset, n_frontal, parent, nodes = minimum_degree(
-        len(affected), len(orphans), n_last, start, adjacency)
+        len(affected), len(orphans), n_leaving, n_last, start, adjacency)
+    n_apart = 0     # cliques of nodes that are about to leave
+    while n_apart < n_cliques and nodes[offset[n_apart]] < n_leaving:
+        n_apart += 1
     into, frontal = amalgamate(
-        n_cliques, n_frontal, offset, parent, RELAXED_ZEROS, RELAXED_FRONTAL)
+        n_cliques, n_frontal, offset, parent, n_apart, RELAXED_ZEROS, RELAXED_FRONTAL)
     need_f, need_i, largest = np.int64(0), np.int64(0), np.int64(0)
     for k in range(n_cliques):
         if into[k] == k:
@@ -104,6 +110,7 @@ def rebuild(head, marked, affected):  # type: ignore[no-untyped-def]
             or largest > len(work_f)):
         return MORE_MEMORY
     _push_drift_down(head, marked, orphans)
+    head[tb.LOOSE] = -1
     for k in range(len(marked)):
         transaction_log.drop_clique(head, marked[k])
     # the rows of the new cliques; an amalgamated child's frontal nodes precede its parent's
@@ -139,6 +146,32 @@ def rebuild(head, marked, affected):  # type: ignore[no-untyped-def]
                 return BAD_PIVOT
     _find_roots(head, clique)
     return DONE
+
+
+@kernel
+def _leaving_first(head, affected):  # type: ignore[no-untyped-def]
+    """Move the nodes that are about to leave to the front of the list; return their number."""
+    node_i = tb.node_i(head)
+    n = 0
+    for k in range(len(affected)):
+        if node_i[affected[k], tb.TOUCHED] == LEAVES:
+            affected[n], affected[k] = affected[k], affected[n]
+            n += 1
+    return n
+
+
+@kernel(allocates=True)
+def _loose_priors(head):  # type: ignore[no-untyped-def]
+    """Return the priors without a parent."""
+    clique_i = tb.clique_i(head)
+    c, n = head[tb.LOOSE], 0
+    while c >= 0:
+        c, n = clique_i[c, tb.SIBLING], n + 1
+    loose = np.empty(n, np.int32)
+    c = head[tb.LOOSE]
+    for k in range(n):
+        loose[k], c = c, clique_i[c, tb.SIBLING]
+    return loose
 
 
 @kernel

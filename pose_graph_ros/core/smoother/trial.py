@@ -21,6 +21,7 @@ from pose_graph_ros.core.config import SolverConfig
 from pose_graph_ros.core.geometry import se2
 from pose_graph_ros.core.geometry.se2 import FloatArray, IntArray
 from pose_graph_ros.core.graph.graph import Graph, GraphUpdate
+from pose_graph_ros.core.graph.priors import packed, Prior
 
 # With more iterations it would converge where an update does not: at a minimum with errors so
 # large that Gauss-Newton leads away from it.
@@ -111,10 +112,17 @@ class Trial:
                 (before.observed_ids, before.observed.weight, now.observed_ids,
                  now.observed.weight, self._update.weigh_observed))]
         was_fixed = copy.fixed[copy.node_rows(now.node_ids)]
+        known = {_key(prior) for prior in before.priors}
         copy.apply(_gone(copy, self._graph)._replace(
+            priors=[prior for prior in now.priors if _key(prior) not in known],
             weigh_edges=weights[0], weigh_observed=weights[1],
             fix=self._graph.node_ids[now.fixed & ~was_fixed].tolist(),
             free=self._graph.node_ids[was_fixed & ~now.fixed].tolist()))
+
+
+def _key(prior: Prior) -> bytes:
+    """Return all of a prior as bytes."""
+    return prior.nodes.tobytes() + packed(prior).tobytes()
 
 
 def _gone(copy: Graph, graph: Graph) -> GraphUpdate:

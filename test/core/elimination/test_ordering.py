@@ -33,14 +33,14 @@ class Ordering(NamedTuple):
 
 
 def ordered(n: int, edges: Pairs, elements: list[list[int]] = [], n_last: int = 0,  # noqa: B006
-            ) -> Ordering:
+            n_before: int = 0) -> Ordering:
     lists = [[n + k for k, element in enumerate(elements) if i in element]
              + sorted({b for a, b in edges if a == i} | {a for a, b in edges if b == i}
                       - {i}) for i in range(n)] + elements
     start = np.cumsum([0, *map(len, lists)]).astype(np.int32)
     adjacency = np.array([j for row in lists for j in row], dtype=np.int32)
     n_cliques, offset, n_frontal, parent, nodes = minimum_degree(
-        n, len(elements), n_last, start, adjacency)
+        n, len(elements), n_before, n_last, start, adjacency)
     ends = [(offset[k], offset[k] + n_frontal[k], offset[k + 1]) for k in range(n_cliques)]
     return Ordering(
         [nodes[begin:middle].tolist() for begin, middle, _ in ends],
@@ -77,14 +77,17 @@ def graphs(draw: st.DrawFn) -> tuple[int, Pairs, list[list[int]], int]:
     return n, edges, elements, draw(st.integers(0, min(n, 6)))
 
 
-@given(graphs())
+@given(graphs(), st.integers(0, 30))
 @settings(max_examples=100)
 def test_cliques_are_what_elimination_node_by_node_gives(
-    graph: tuple[int, Pairs, list[list[int]], int],
+    graph: tuple[int, Pairs, list[list[int]], int], seed: int,
 ) -> None:
     n, edges, elements, n_last = graph
-    result = ordered(n, edges, elements, n_last)
+    n_before = seed % (n - n_last + 1)
+    result = ordered(n, edges, elements, n_last, n_before)
     assert sorted(result.order) == list(range(n))
+    assert set(result.order[:n_before]) == set(range(n_before))
+    assert all((frontal[0] < n_before) == (frontal[-1] < n_before) for frontal in result.frontal)
     near = iter(fill(n, edges, elements, result.order))
     for frontal, separator in zip(result.frontal, result.separator, strict=True):
         assert len(set(frontal + separator)) == len(frontal) + len(separator)
@@ -93,13 +96,14 @@ def test_cliques_are_what_elimination_node_by_node_gives(
             assert next(near) == set(frontal[k + 1:]) | set(separator)
 
 
-@given(graphs())
+@given(graphs(), st.integers(0, 30))
 @settings(max_examples=100)
 def test_the_separator_of_a_clique_is_a_part_of_its_parent(
-    graph: tuple[int, Pairs, list[list[int]], int],
+    graph: tuple[int, Pairs, list[list[int]], int], seed: int,
 ) -> None:
     n, edges, elements, n_last = graph
-    result = ordered(n, edges, elements, n_last)
+    n_before = seed % (n - n_last + 1)
+    result = ordered(n, edges, elements, n_last, n_before)
     nodes = [set(f + s) for f, s in zip(result.frontal, result.separator, strict=True)]
     for k, (separator, parent) in enumerate(zip(result.separator, result.parent, strict=True)):
         if len(separator) == 0:
@@ -109,6 +113,8 @@ def test_the_separator_of_a_clique_is_a_part_of_its_parent(
             assert set(separator) <= nodes[parent]
     for element, parent in zip(elements, result.parent_of_element, strict=True):
         assert set(element) <= nodes[parent]
+        # what is below the nodes before all others has one of them
+        assert min(element) < n_before or result.frontal[parent][0] >= n_before
 
 
 @given(graphs())

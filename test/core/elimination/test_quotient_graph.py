@@ -47,7 +47,7 @@ def test_before_any_clique_the_neighbours_are_those_of_the_edges(
     affected = np.array(sorted(data.draw(st.sets(
         st.integers(0, n - 1), min_size=1))), dtype=np.int32)
     orphans, start, adjacency = structure(
-        graph.memory.head, np.empty(0, dtype=np.int32), affected)
+        graph.memory.head, *np.empty((2, 0), dtype=np.int32), affected)
     assert len(orphans) == 0
     used = {frozenset(pair) for pair in pairs[1:].tolist()}
     for k, node in enumerate(affected.tolist()):
@@ -77,20 +77,22 @@ def trees(draw: st.DrawFn) -> tuple[list[int], list[set[int]], list[int]]:
     return frontal, separators, parents
 
 
-@given(trees(), st.integers(0, 30), st.integers(1, 12))
+@given(trees(), st.integers(0, 12), st.integers(0, 30), st.integers(1, 12))
 def test_merged_cliques_hold_all_blocks_and_few_zeros(
-    tree: tuple[list[int], list[set[int]], list[int]], most_zeros: int, most_frontal: int,
+    tree: tuple[list[int], list[set[int]], list[int]], n_apart: int, most_zeros: int,
+    most_frontal: int,
 ) -> None:
     frontal, separators, parents = tree
     n, ends = len(frontal), np.cumsum(frontal)
     offset = np.cumsum([0, *(f + len(s) for f, s in zip(frontal, separators, strict=True))])
     into, merged = amalgamate(
         n, np.array(frontal, np.int32), offset.astype(np.int32), np.array(parents, np.int32),
-        most_zeros, most_frontal)
+        n_apart, most_zeros, most_frontal)
     members: dict[int, list[int]] = {}
     for k, target in enumerate(into.tolist()):
         assert target >= k
         assert into[target] == target   # nothing is merged into what is merged itself
+        assert (k < n_apart) == (target < n_apart)
         members.setdefault(target, []).append(k)
     # nothing is merged into the clique of the newest pose
     assert members[n - 1] == [n - 1]
@@ -116,7 +118,7 @@ def test_without_zeros_only_what_fits_exactly_is_merged() -> None:
     # cliques {0|1 2}, {1|2 3}, {2|3}, {3}: 1 into 2 is exact, 0 into 1 misses block 3
     offset = np.array([0, 3, 6, 8, 9], np.int32)
     parent = np.array([1, 2, 3, -1], np.int32)
-    into, frontal = amalgamate(4, counts, offset, parent, nothing, 10)
+    into, frontal = amalgamate(4, counts, offset, parent, 0, nothing, 10)
     assert into.tolist() == [0, 2, 2, 3]
     assert frontal[2] == 2
-    assert amalgamate(4, counts, offset, parent, 1, 1)[0].tolist() == [0, 1, 2, 3]
+    assert amalgamate(4, counts, offset, parent, 0, 1, 1)[0].tolist() == [0, 1, 2, 3]

@@ -1,0 +1,167 @@
+# Copyright 2026 The pose_graph_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""
+Dense priors: what constraints that have left a graph say about the nodes that remain.
+
+A prior is a quadratic form in the displacement d of its nodes from reference poses,
+
+    d^T U d - 2 u^T d + c
+
+with the information U, the vector u and the energy c. An *anchored* prior knows where its nodes
+are in the map, and d is the difference of the poses. A relative one does not. Its displacement is
+that in a frame which turns with its nodes, by the mean turn phi of their headings, and moves with
+the first of them, so a rigid motion of all its nodes changes nothing:
+
+    d_k = (R_phi^T (t_k - t_0) - (t_ref_k - t_ref_0), th_k - th_ref_k - phi)
+
+Its derivative by a change delta of the poses is P M delta, with M = diag(R_phi^T, 1) of each node
+and P = I - r m^T: r = (S R_phi^T (t_k - t_0), 1) is the derivative of the coordinates by -phi, and
+m takes the mean of the headings. So U turns into M^T P^T U P M, which has a rigid motion in its
+null space wherever the nodes are.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+
+from pose_graph_ros.core.exceptions import GraphUpdateError
+from pose_graph_ros.core.geometry import se2
+from pose_graph_ros.core.geometry.se2 import FloatArray, IntArray
+
+# How far below zero, with the diagonal scaled to 1, the smallest eigenvalue may be, and how far
+# the triangles may differ.
+_TOLERANCE = 1e-5
+# Numbers on the diagonal below this fraction of the largest may be what rounding leaves of zero.
+_FLOOR = 1e-8
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Prior:
+    """A quadratic form in the poses of k hidden nodes; see the module."""
+
+    nodes: IntArray
+    """Ids of the nodes, shape (k,)."""
+    reference: FloatArray
+    """Poses from which displacements are counted, shape (k, 3) [m, m, rad]."""
+    information: FloatArray
+    """U, shape (3k, 3k) [1/m^2, 1/(m rad), 1/rad^2]."""
+    vector: FloatArray
+    """u, shape (3k,) [1/m, 1/rad]: minus half the gradient at the reference."""
+    energy: float
+    """c: energy at the reference [sigma^2]."""
+    anchored: bool
+    """Whether it says where its nodes are in the map, and not only in each other."""
+
+
+class PriorModel(NamedTuple):
+    """A prior at certain poses of its nodes, for a change of these in map axes."""
+
+    energy: float
+    """[sigma^2]"""
+    gradient: FloatArray
+    """Half the gradient of the energy, shape (3k,)."""
+    information: FloatArray
+    """Shape (3k, 3k)."""
+
+
+def model(prior: Prior, poses: FloatArray) -> PriorModel:
+    """
+    Return the energy of a prior at other poses, with its derivatives.
+
+    Parameters
+    ----------
+    prior : Prior
+    poses : ndarray, shape (k, 3), of its nodes [m, m, rad]
+
+    """
+    k, U = len(prior.nodes), prior.information
+    turns = se2.wrap(poses[:, 2] - prior.reference[:, 2])
+    if prior.anchored:
+        d = (poses - prior.reference)
+        d[:, 2] = turns
+        P = M = np.eye(3 * k)
+    else:
+        turns = turns[0] + se2.wrap(turns - turns[0])
+        phi = float(np.mean(turns))
+        c, s = np.cos(phi), np.sin(phi)
+        R = np.array(((c, -s), (s, c)))
+        d, r = np.empty((k, 3)), np.ones((k, 3))
+        local = (poses[:, :2] - poses[0, :2]) @ R
+        d[:, :2] = local - (prior.reference[:, :2] - prior.reference[0, :2])
+        d[:, 2] = turns - phi
+        r[:, 0], r[:, 1] = -local[:, 1], local[:, 0]
+        P = np.eye(3 * k) - np.outer(r.ravel(), np.tile((0.0, 0.0, 1.0 / k), k))
+        M = np.kron(np.eye(k), np.array(((c, s, 0.0), (-s, c, 0.0), (0.0, 0.0, 1.0))))
+    flat, J = d.ravel(), P @ M
+    g = U @ flat - prior.vector
+    return PriorModel(
+        float(flat @ (g - prior.vector) + prior.energy), J.T @ g, J.T @ U @ J)
+
+
+def check_priors(priors: Sequence[Prior], leaving: Sequence[int]) -> None:
+    """
+    Raise GraphUpdateError for wrong shapes and numbers; nodes are not looked up.
+
+    Parameters
+    ----------
+    priors : sequence of Prior
+    leaving : sequence of int, nodes that none of them may have
+
+    """
+    for n, prior in enumerate(priors):
+        k = len(prior.nodes)
+        shapes = [np.shape(part) for part in (prior.reference, prior.information, prior.vector)]
+        if k == 0 or shapes != [(k, 3), (3 * k, 3 * k), (3 * k,)]:
+            raise GraphUpdateError(
+                f'priors[{n}]: expected shapes (k, 3), (3k, 3k) and (3k,) for k = {k} nodes, '
+                f'got {shapes}')
+        if len(np.unique(prior.nodes)) < k:
+            raise GraphUpdateError(
+                f'priors[{n}]: a node is there twice: {np.asarray(prior.nodes).tolist()}')
+        if np.any(np.isin(prior.nodes, np.fromiter(leaving, np.int64))):
+            raise GraphUpdateError(f'priors[{n}]: a node leaves with the same update')
+        if not all(np.all(np.isfinite(part)) for part in (
+                prior.reference, prior.information, prior.vector, prior.energy)):
+            raise GraphUpdateError(f'priors[{n}]: a number is not finite')
+        diagonal = np.diagonal(prior.information)
+        root = np.sqrt(np.maximum(diagonal, max(_FLOOR * np.max(diagonal), 1e-300)))
+        scaled = prior.information / np.outer(root, root)
+        skew = float(np.max(np.abs(scaled - scaled.T)))
+        smallest = float(np.linalg.eigvalsh(0.5 * (scaled + scaled.T))[0])
+        if skew > _TOLERANCE or smallest < -_TOLERANCE:
+            raise GraphUpdateError(
+                f'priors[{n}].information is not symmetric and positive semidefinite: '
+                f'asymmetry {skew:.1e}, smallest eigenvalue {smallest:.1e}')
+
+
+def packed(prior: Prior) -> FloatArray:
+    """Return the numbers of a prior as the tables hold them; see `prior_rows`."""
+    n = 3 * len(prior.nodes)
+    both = 0.5 * (prior.information + prior.information.T)
+    rows = np.column_stack((both, prior.vector))
+    upper = np.concatenate([rows[k, k:] for k in range(n)])
+    return np.concatenate((upper, prior.reference.ravel(), (prior.energy,)))
+
+
+def unpacked(nodes: IntArray, values: FloatArray, *, anchored: bool) -> Prior:
+    """
+    Return a prior from its numbers in the tables.
+
+    Parameters
+    ----------
+    nodes : ndarray of int, shape (k,), ids
+    values : ndarray, what `packed` has returned
+    anchored : bool
+
+    """
+    n = 3 * len(nodes)
+    rows, at = np.zeros((n, n + 1)), 0
+    for k in range(n):
+        rows[k, k:] = values[at:at + n + 1 - k]
+        at += n + 1 - k
+    U = np.triu(rows[:, :n])
+    return Prior(
+        nodes, values[at:at + n].reshape(-1, 3).copy(), U + np.triu(U, 1).T, rows[:, n].copy(),
+        float(values[at + n]), anchored)

@@ -1,0 +1,314 @@
+# Copyright 2026 The pose_graph_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""
+Marginalisation: nodes leave a graph, and what their constraints say about the others remains.
+
+With m the leaving nodes, s their neighbours, and the system `H delta = b` of all constraints and
+priors that have a leaving node, linearized at the present poses, the marginal is
+
+    U = H_ss - H_sm H_mm^+ H_ms,    u = b_s - H_sm H_mm^+ b_m,    c = chi2 - b_m^T H_mm^+ b_m
+
+The pseudo-inverse minimises over what is not determined, as the heading of a node of which only
+the position was observed: that says nothing about any neighbour. A fixed leaving node keeps its
+pose, so it has no column in H_mm. `docs/solver.md` tells what is exact and what is not.
+"""
+
+from collections.abc import Collection, Iterator, Sequence
+from typing import NamedTuple
+
+import numpy as np
+
+from pose_graph_ros.core.compiled.jit import kernel, ROWS
+from pose_graph_ros.core.exceptions import GraphUpdateError
+from pose_graph_ros.core.geometry import se2
+from pose_graph_ros.core.geometry.se2 import FloatArray, IntArray
+from pose_graph_ros.core.graph import normal_equations, tables as tb
+from pose_graph_ros.core.graph.constraints import EdgeKind, Edges, ObservedKind, ObservedNodes
+from pose_graph_ros.core.graph.graph import Graph, GraphRows, GraphUpdate
+from pose_graph_ros.core.graph.priors import model, Prior
+
+# Smallest eigenvalue of a pivot that counts, as a fraction of what the constraints of its node add
+# to it: smaller ones are what rounding leaves of zero.
+LEAST_PIVOT = 1e-13
+# A marginal with a diagonal below this fraction of what was added to it says nothing.
+_NOTHING = 1e-14
+# Kinds of edges that turn with their poses.
+_RELATIVE = (EdgeKind.ODOMETRY, EdgeKind.LOOP_CLOSURE, EdgeKind.PRIOR)
+
+
+class Marginal(NamedTuple):
+    """What constraints that leave a graph say about the nodes that remain."""
+
+    prior: Prior | None
+    """On all nodes that remain, at their present poses; None if there is no information."""
+    edges: IntArray
+    """Ids of the edges in it."""
+    observed: IntArray
+    """Ids of the observed nodes in it."""
+
+
+def marginalize(graph: Graph, nodes: Collection[int]) -> GraphUpdate:
+    """
+    Return the update with which nodes leave a graph; their information remains.
+
+    It is linear at the present poses of the nodes and their neighbours. Each connected part of the
+    leaving nodes makes one new constraint on its neighbours: an edge between two poses if nothing
+    in it knows where they are in the map, an observed node on a single pose, else a `Prior`.
+    Constraints with weight 0 just leave. The graph does not change. Raises GraphUpdateError for a
+    node that is not in the graph.
+
+    Parameters
+    ----------
+    graph : Graph
+    nodes : collection of int, ids of hidden nodes
+
+    """
+    edges, observed, priors = [], [], []
+    leaving = _checked(graph, nodes)
+    for members in _parts(graph, leaving):
+        prior = marginal(graph, members).prior
+        if prior is None:
+            continue
+        is_pose = bool(np.all(graph.is_pose[graph.node_rows(prior.nodes)]))
+        if len(prior.nodes) == 2 and not prior.anchored and is_pose:
+            edges.append(as_edge(prior))
+        elif len(prior.nodes) == 1 and is_pose:
+            observed.append(as_observed(prior))
+        else:
+            priors.append(prior)
+    return GraphUpdate(
+        edges=Edges.joined(edges), observed=ObservedNodes.joined(observed),
+        remove_nodes=leaving.tolist(), priors=tuple(priors))
+
+
+def marginal(
+    graph: Graph, nodes: Collection[int], edges: Collection[int] = (),
+    observed: Collection[int] = (),
+) -> Marginal:
+    """
+    Return what all constraints of leaving nodes, and further ones, say about the other nodes.
+
+    Parameters
+    ----------
+    graph : Graph
+    nodes : collection of int, ids of the leaving nodes; raises as `marginalize`
+    edges, observed : collection of int
+        Ids of constraints that go as well; their nodes remain unless they leave.
+
+    """
+    leaving = _checked(graph, nodes)
+    part = _part(graph, leaving, list(edges), list(observed))
+    inside, fixed, poses = np.isin(part.node_ids, leaving), part.fixed, part.poses
+    H, b = _system(part)
+    energy = part.energies().chi2
+    for row in np.flatnonzero(inside & fixed):  # it is known to lie where it is
+        at = slice(3 * row, 3 * row + 3)
+        H[at], H[:, at], b[at] = 0.0, 0.0, 0.0
+    scale = np.diagonal(H).copy()
+    energy -= _eliminate(H, b, np.flatnonzero(inside & ~fixed), scale)
+    kept = np.flatnonzero(~inside)
+    columns = (3 * kept[:, None] + np.arange(3)).ravel()
+    U, u = H[np.ix_(columns, columns)], b[columns]
+    tiny = np.diagonal(U) <= _NOTHING * scale[columns]
+    U[tiny], U[:, tiny], u[tiny] = 0.0, 0.0, 0.0
+    # the nodes about which it says anything
+    kept = kept[np.any(np.any(U != 0.0, axis=1).reshape(-1, 3), axis=1)]
+    prior = None
+    if len(kept) > 0:
+        says = np.flatnonzero(np.isin(columns // 3, kept))
+        prior = Prior(part.node_ids[kept].astype(np.int64), poses[kept].copy(),
+                      _symmetric(U[np.ix_(says, says)]), u[says], energy,
+                      bool(np.any(inside & fixed)) or _is_anchored(part))
+    return Marginal(prior, part.edge_ids.astype(np.int64), part.observed_ids.astype(np.int64))
+
+
+def as_edge(prior: Prior) -> Edges:
+    """Return an edge between the two poses of a relative prior, with its gradient and Hessian."""
+    first, second = np.argsort(prior.nodes)
+    start, end = prior.reference[first], prior.reference[second]
+    at = slice(3 * second, 3 * second + 3)
+    information = prior.information[at, at]
+    # the error in map axes at the reference
+    h = -_pseudo_inverse(information) @ prior.vector[at]
+    turn = se2.wrap(end[2] - start[2] - h[2])
+    c, s = np.cos(start[2]), np.sin(start[2])
+    d = end[:2] - start[:2] - h[:2]
+    mean = np.array((c * d[0] + s * d[1], c * d[1] - s * d[0], turn))
+    R = _rotation(start[2] + turn)
+    return Edges([prior.nodes[first]], [prior.nodes[second]], mean[None],
+                 _symmetric(R.T @ information @ R)[None], [EdgeKind.PRIOR])
+
+
+def as_observed(prior: Prior) -> ObservedNodes:
+    """Return an observed node on the single pose of a prior, with its gradient and Hessian."""
+    mean = prior.reference[0] + _pseudo_inverse(prior.information) @ prior.vector
+    # without information on the heading the error is in map axes, as that of a position
+    mean[2] = se2.wrap(mean[2]) if np.any(prior.information[2]) else 0.0
+    R = _rotation(mean[2])
+    return ObservedNodes(prior.nodes, mean=mean[None],
+                         information=_symmetric(R.T @ prior.information @ R)[None],
+                         kind=[ObservedKind.PRIOR])
+
+
+def _checked(graph: Graph, nodes: Collection[int]) -> IntArray:
+    """Return ids of nodes, ascending; raise GraphUpdateError if one is not in the graph."""
+    ids = np.unique(np.fromiter(nodes, np.int64, len(nodes)))
+    gone = ids[graph.node_rows(ids) < 0]
+    if len(gone) > 0:
+        raise GraphUpdateError(f'marginalize: hidden node {gone[0]} is not in the graph')
+    return ids
+
+
+def _parts(graph: Graph, leaving: IntArray) -> Iterator[IntArray]:
+    """Yield the connected parts of the leaving nodes, each ascending."""
+    root = {node: node for node in leaving.tolist()}
+
+    def find(node: int) -> int:
+        while root[node] != node:
+            root[node] = root[root[node]]
+            node = root[node]
+        return node
+
+    edges = graph.edges
+    groups = _ends(edges.rows(edges.weight > 0.0)).T.tolist()
+    groups += [prior.nodes.tolist() for prior in graph.priors]
+    for group in groups:
+        inside = [find(node) for node in group if node in root]
+        for node in inside[1:]:
+            root[find(node)] = find(inside[0])
+    parts: dict[int, list[int]] = {}
+    for node in leaving.tolist():
+        parts.setdefault(find(node), []).append(node)
+    for members in parts.values():
+        yield np.array(members)
+
+
+def _ends(edges: Edges) -> IntArray:
+    """Return the ends of edges, -1 for none, shape (number of ends, M)."""
+    return np.stack((edges.i, edges.j, edges.k))
+
+
+def _is_anchored(graph: Graph) -> bool:
+    """Tell whether a constraint knows where its nodes are in the map."""
+    return bool(graph.n_observed > 0 or not np.all(np.isin(graph.edges.kind, _RELATIVE))
+                or any(prior.anchored for prior in graph.priors))
+
+
+def _part(
+    graph: Graph, leaving: IntArray, more: Sequence[int], more_observed: Sequence[int],
+) -> Graph:
+    """Return the part of a graph with the constraints of leaving nodes and further ones."""
+    edges, observed = graph.edges, graph.observed
+    of_edges = (np.any(np.isin(_ends(edges), leaving), axis=0)
+                | np.isin(graph.edge_ids, more)) & (edges.weight > 0.0)
+    of_observed = (np.isin(observed.node, leaving)
+                   | np.isin(graph.observed_ids, more_observed)) & (observed.weight > 0.0)
+    edges, observed = edges.rows(of_edges), observed.rows(of_observed)
+    priors = [prior for prior in graph.priors if np.any(np.isin(prior.nodes, leaving))]
+    ends = _ends(edges).ravel()
+    ids = np.unique(np.concatenate((
+        leaving, ends[ends >= 0], observed.node, *(prior.nodes for prior in priors))))
+    rows = graph.node_rows(ids)
+    part = Graph()
+    part.fill(GraphRows(
+        graph.poses[rows], graph.node_kind[rows], graph.fixed[rows], edges, observed, ids,
+        graph.edge_ids[of_edges], graph.observed_ids[of_observed], graph.next_ids,
+        graph.dimension[rows], priors))
+    return part
+
+
+def _system(graph: Graph) -> tuple[FloatArray, FloatArray]:
+    """Return H and b of all constraints and priors of a graph, for changes of its poses."""
+    n = 3 * graph.n_nodes
+    front = np.zeros((n, n + 1))
+    assemble(graph.memory.head, front)
+    H, b = np.triu(front[:, :n]), front[:, n].copy()
+    H = H + np.triu(H, 1).T
+    for prior in graph.priors:
+        rows = graph.node_rows(prior.nodes)
+        at = (3 * rows[:, None] + np.arange(3)).ravel()
+        linear = model(prior, graph.poses[rows])
+        H[np.ix_(at, at)] += linear.information
+        b[at] -= linear.gradient
+    return H, b
+
+
+@kernel(signature=(tb.HEAD, ROWS))
+def assemble(head, front):  # type: ignore[no-untyped-def]
+    """
+    Add all constraints of a graph to the equations of all its nodes.
+
+    Parameters
+    ----------
+    front : ndarray, shape (3N, 3N + 1)
+        Receives the upper triangle of H and, in the last column, b.
+
+    """
+    edge_f, observed_f = tb.edge_f(head), tb.observed_f(head)
+    edge_i, observed_i = tb.edge_i(head), tb.observed_i(head)
+    flat, ld = front.reshape(front.size), front.shape[1]
+    for e in range(head[tb.N_EDGES]):
+        if edge_f[e, tb.WEIGHT] > 0.0:
+            third = edge_i[e, tb.END_K]
+            normal_equations.add_edge(head, e, 3 * edge_i[e, tb.END_I], 3 * edge_i[e, tb.END_J],
+                             3 * third if third >= 0 else -1, flat, ld)
+    for k in range(head[tb.N_OBSERVED]):
+        if observed_f[k, tb.WEIGHT] > 0.0:
+            normal_equations.add_observed(head, k, 3 * observed_i[k, tb.OBS_NODE], flat, ld)
+
+
+def _eliminate(H: FloatArray, b: FloatArray, nodes: IntArray, scale: FloatArray) -> float:
+    """
+    Eliminate nodes in place, those with the fewest neighbours first; return b_m^T H_mm^+ b_m.
+
+    Parameters
+    ----------
+    H, b : ndarray, shapes (3N, 3N) and (3N,)
+    nodes : ndarray of int, rows of the nodes
+    scale : ndarray, shape (3N,), what the constraints have added to the diagonal
+
+    """
+    left, decrease = set(nodes.tolist()), 0.0
+    linked = np.any(H.reshape(len(H) // 3, 3, -1, 3) != 0.0, axis=(1, 3))
+    while left:
+        v = min(left, key=lambda node: (int(np.count_nonzero(linked[node])), node))
+        left.remove(v)
+        near = np.flatnonzero(linked[v])
+        near = near[near != v]
+        at, columns = slice(3 * v, 3 * v + 3), (3 * near[:, None] + np.arange(3)).ravel()
+        inverse = _pseudo_inverse(H[at, at], scale[at])
+        gain = H[columns, at] @ inverse
+        decrease += float(b[at] @ inverse @ b[at])
+        H[np.ix_(columns, columns)] -= gain @ H[at, columns]
+        b[columns] -= gain @ b[at]
+        linked[np.ix_(near, near)] = True
+        linked[v] = linked[:, v] = False
+    return decrease
+
+
+def _pseudo_inverse(matrix: FloatArray, scale: FloatArray | None = None) -> FloatArray:
+    """
+    Return the pseudo-inverse of a positive semidefinite matrix, shape (n, n).
+
+    Parameters
+    ----------
+    matrix : ndarray, shape (n, n)
+    scale : ndarray, shape (n,), optional, size of its diagonal before cancellation
+
+    """
+    diagonal = np.diagonal(matrix) if scale is None else scale
+    root = np.sqrt(np.where(diagonal > 0.0, diagonal, 1.0))
+    values, vectors = np.linalg.eigh(_symmetric(matrix / np.outer(root, root)))
+    good = values > LEAST_PIVOT
+    half = vectors[:, good] / np.sqrt(values[good]) / root[:, None]
+    return np.asarray(half @ half.T)
+
+
+def _symmetric(matrix: FloatArray) -> FloatArray:
+    return 0.5 * (matrix + matrix.T)
+
+
+def _rotation(angle: float) -> FloatArray:
+    """Return the matrix that rotates the axes of a pose."""
+    c, s = np.cos(angle), np.sin(angle)
+    return np.array(((c, -s, 0.0), (s, c, 0.0), (0.0, 0.0, 1.0)))

@@ -1,0 +1,181 @@
+# Copyright 2026 The pose_graph_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""Dense priors: a quadratic form that turns with its nodes, the same for smoother and batch."""
+
+from dataclasses import replace
+from typing import Any
+
+from hypothesis import given, settings, strategies as st
+import numpy as np
+import pytest
+from random_graphs import random_poses
+from slow_smoother import differences, EXACT, state, world
+
+from pose_graph_ros.core.batch import gauss_newton, optimizer
+from pose_graph_ros.core.batch.optimizer import Status
+from pose_graph_ros.core.config import SolverConfig
+from pose_graph_ros.core.exceptions import GraphUpdateError
+from pose_graph_ros.core.geometry import se2
+from pose_graph_ros.core.geometry.se2 import FloatArray
+from pose_graph_ros.core.graph.graph import Graph, GraphUpdate
+from pose_graph_ros.core.graph.priors import model, packed, Prior, unpacked
+from pose_graph_ros.core.smoother.incremental import IncrementalSmoother
+
+seeds, flags = st.integers(0, 2**32 - 1), st.booleans()
+
+
+def rigid_motions(poses: FloatArray) -> FloatArray:
+    """Return the three infinitesimal rigid motions of poses, shape (3k, 3)."""
+    motions = np.zeros((len(poses), 3, 3))
+    motions[:, 0, 0] = motions[:, 1, 1] = motions[:, 2, 2] = 1.0
+    motions[:, 0, 2], motions[:, 1, 2] = -poses[:, 1], poses[:, 0]
+    return motions.reshape(-1, 3)
+
+
+def random_prior(
+    rng: np.random.Generator, nodes: list[int], reference: FloatArray, *, anchored: bool,
+) -> Prior:
+    k = len(nodes)
+    root = 10.0 * rng.normal(size=(3 * k, 3 * k))
+    if not anchored:
+        null = np.linalg.qr(rigid_motions(reference))[0]
+        root -= root @ null @ null.T
+    U = root.T @ root
+    return Prior(np.array(nodes), reference, U, U @ rng.normal(0.0, 0.01, 3 * k),
+                 float(rng.uniform(0.0, 9.0)), anchored)
+
+
+@given(seeds, st.integers(1, 5), flags)
+def test_the_gradient_is_the_derivative_of_the_energy(seed: int, k: int, anchored: bool) -> None:
+    rng = np.random.default_rng(seed)
+    reference = random_poses(rng, k)
+    prior = random_prior(rng, list(range(k)), reference, anchored=anchored)
+    poses = reference + rng.normal(0.0, 0.3, (k, 3))
+    found, step = model(prior, poses), 1e-6
+    numeric = [
+        (model(prior, poses + change).energy - model(prior, poses - change).energy) / (4.0 * step)
+        for change in step * np.eye(3 * k).reshape(-1, k, 3)]
+    np.testing.assert_allclose(
+        found.gradient, numeric, atol=1e-5 * np.max(np.abs(prior.information)))
+
+
+@given(seeds, st.integers(1, 5), st.floats(-4.0, 4.0))
+def test_a_rigid_motion_changes_nothing_in_a_relative_prior(
+    seed: int, k: int, angle: float,
+) -> None:
+    rng = np.random.default_rng(seed)
+    reference = random_poses(rng, k)
+    prior = random_prior(rng, list(range(k)), reference, anchored=False)
+    poses = reference + rng.normal(0.0, 0.3, (k, 3))
+    moved = se2.compose(np.array((*rng.normal(size=2), angle)), poses)
+    before, after = model(prior, poses), model(prior, moved)
+    tolerance = 1e-8 * np.max(np.abs(prior.information))
+    np.testing.assert_allclose(after.energy, before.energy, atol=tolerance)
+    # nor does it gain any information on where the nodes are
+    np.testing.assert_allclose(after.information @ rigid_motions(moved), 0.0, atol=tolerance)
+    np.testing.assert_allclose(after.gradient @ rigid_motions(moved), 0.0, atol=tolerance)
+
+
+def graph_with_priors(seed: int, *, held: bool) -> tuple[IncrementalSmoother, Any]:
+    """Return a smoother of a random world with a relative and an anchored prior."""
+    here = world(seed)
+    smoother = IncrementalSmoother(EXACT)
+    smoother.update(GraphUpdate(hidden=np.array(here.truth), fix=[0]))
+    smoother.update(here.new_nodes(9))
+    smoother.update(GraphUpdate(edges=here.edges(here.pairs(2))))
+    rng, poses = here.rng, np.array(here.truth)
+    priors = []
+    for anchored in (False, True):
+        nodes = rng.permutation(10)[:rng.integers(1, 5)].tolist()
+        reference = se2.wrapped(poses[nodes] + rng.normal(0.0, 0.02, (len(nodes), 3)))
+        priors.append(random_prior(rng, nodes, reference, anchored=anchored))
+    result = smoother.update(GraphUpdate(priors=priors, free=[] if held else [0]))
+    assert result.status is Status.CONVERGED
+    return smoother, here
+
+
+@given(seeds, flags)
+@settings(max_examples=25)
+def test_smoother_and_batch_find_the_same_minimum(seed: int, held: bool) -> None:
+    smoother, here = graph_with_priors(seed, held=held)
+    for _ in range(2):
+        copy = Graph()
+        copy.fill(smoother.graph.rows())
+        result = optimizer.optimize(copy, SolverConfig())
+        assert result.status is Status.CONVERGED
+        right = np.empty((copy.n_nodes, 3))
+        gauss_newton.evaluate(copy.memory.head, right)
+        information = max(float(np.max(p.information)) for p in copy.priors)
+        np.testing.assert_allclose(right[~copy.fixed], 0.0, atol=1e-6 * information)
+        np.testing.assert_allclose(smoother.poses, copy.poses, atol=1e-6)
+        np.testing.assert_allclose(smoother.chi2(), result.chi2, rtol=1e-8, atol=1e-8)
+        np.testing.assert_allclose(copy.energies().chi2, result.chi2, rtol=1e-8, atol=1e-8)
+        # the same matrix as well
+        other = IncrementalSmoother(EXACT, copy)
+        np.testing.assert_allclose(smoother.covariances(), other.covariances(), atol=1e-6)
+        smoother.update(here.joined(
+            here.new_nodes(2), observed=here.observed([int(here.rng.integers(10))])))
+
+
+@given(seeds, flags)
+@settings(max_examples=25)
+def test_priors_survive_what_removes_all_cliques(seed: int, held: bool) -> None:
+    smoother, _ = graph_with_priors(seed, held=held)
+    before = smoother.graph.priors
+    graph = Graph()
+    graph.fill(smoother.graph.rows())
+    assert optimizer.optimize(graph, SolverConfig()).status is Status.CONVERGED
+    graph.set_poses(graph.poses)
+    assert IncrementalSmoother(EXACT, graph)._eliminate()
+    key = {prior.nodes.tobytes(): prior for prior in graph.priors}
+    assert len(key) == len(before)
+    for prior in before:
+        assert packed(prior).tobytes() == packed(key[prior.nodes.tobytes()]).tobytes()
+
+
+@given(seeds)
+@settings(max_examples=15)
+def test_a_failed_update_takes_its_priors_back(seed: int) -> None:
+    smoother, here = graph_with_priors(seed, held=True)
+    before = state(smoother.graph)
+    lost = here.drive(0)[None]     # a node that nothing determines
+    prior = random_prior(here.rng, [0, 1], smoother.poses[:2].copy(), anchored=False)
+    result = smoother.update(GraphUpdate(hidden=lost, priors=[prior]))
+    assert result.status is Status.FAILED
+    assert differences(before, state(smoother.graph)) == []
+    assert len(smoother.graph.priors) == 2
+
+
+def test_a_prior_alone_holds_its_nodes() -> None:
+    rng, poses = np.random.default_rng(1), np.zeros((3, 3))
+    poses[:, 0] = range(3)
+    prior = random_prior(rng, [0, 1, 2], poses, anchored=True)
+    smoother = IncrementalSmoother(EXACT)
+    assert smoother.update(
+        GraphUpdate(hidden=poses, priors=[prior])).status is Status.CONVERGED
+    np.testing.assert_allclose(
+        smoother.covariance(2), np.linalg.inv(prior.information)[6:, 6:], rtol=1e-6)
+    loose = IncrementalSmoother(EXACT)
+    assert loose.update(GraphUpdate(hidden=poses, priors=[
+        random_prior(rng, [0, 1, 2], poses, anchored=False)])).status is Status.FAILED
+
+
+def test_a_packed_prior_is_unpacked_to_the_bit() -> None:
+    prior = random_prior(np.random.default_rng(3), [4, 2], np.ones((2, 3)), anchored=False)
+    again = unpacked(prior.nodes, packed(prior), anchored=False)
+    assert packed(again).tobytes() == packed(prior).tobytes()
+
+
+@pytest.mark.parametrize(('change', 'message'), [
+    ({'nodes': np.array([0, 9])}, 'hidden nodes'),
+    ({'nodes': np.array([1, 1])}, 'twice'),
+    ({'reference': np.zeros((1, 3))}, 'shapes'),
+    ({'energy': np.nan}, 'finite'),
+    ({'information': -np.eye(6)}, 'semidefinite'),
+])
+def test_invalid_priors_are_refused(change: dict[str, Any], message: str) -> None:
+    prior = random_prior(np.random.default_rng(2), [0, 1], np.zeros((2, 3)), anchored=True)
+    graph = Graph()
+    with pytest.raises(GraphUpdateError, match=message):
+        graph.apply(GraphUpdate(hidden=np.zeros((2, 3)), priors=[replace(prior, **change)]))
+    assert graph.n_nodes == 0

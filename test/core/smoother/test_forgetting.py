@@ -1,0 +1,281 @@
+# Copyright 2026 The pose_graph_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""Nodes that leave take nothing along: not from the tree, and not as a pure function."""
+
+from dataclasses import replace
+
+from hypothesis import given, settings, strategies as st
+import numpy as np
+import pytest
+from slow_smoother import cliques, differences, EXACT, SlowGraph, state, World, world
+
+from pose_graph_ros.core.batch.optimizer import Status
+from pose_graph_ros.core.exceptions import GraphUpdateError
+from pose_graph_ros.core.geometry import se2
+from pose_graph_ros.core.geometry.se2 import FloatArray
+from pose_graph_ros.core.graph.constraints import EdgeKind, Edges, ObservedKind, ObservedNodes
+from pose_graph_ros.core.graph.graph import Graph, GraphUpdate
+from pose_graph_ros.core.graph.priors import model
+from pose_graph_ros.core.marginalization.marginalize import marginalize
+from pose_graph_ros.core.smoother.incremental import IncrementalSmoother
+
+# Tolerance of poses [m, rad] and of covariances, relative to the largest.
+CLOSE = 1e-9
+
+seeds, flags = st.integers(0, 2**32 - 1), st.booleans()
+
+
+def driven(seed: int, steps: int = 12) -> tuple[IncrementalSmoother, World]:
+    """Return a smoother at the minimum of a world with closures, fixes, biases and doubts."""
+    smoother, slow, here = IncrementalSmoother(EXACT), SlowGraph(), world(seed)
+    updates = [GraphUpdate(hidden=np.array(here.truth), fix=[0])]
+    for _ in range(steps):
+        update = updates.pop() if len(updates) > 0 else here.mixture(slow)
+        if smoother.update(update).status is not Status.FAILED:
+            slow = slow.edited(update)
+        del here.truth[len(slow.poses):]
+    smoother.update(here.joined(
+        here.new_nodes(2), observed=here.observed([0, 1], position=True)))
+    return smoother, here
+
+
+def copied(smoother: IncrementalSmoother) -> IncrementalSmoother:
+    """Return a smoother of a copy of the graph, all of which is eliminated at the same poses."""
+    other = IncrementalSmoother(EXACT)
+    other.graph.fill(smoother.graph.rows())
+    other.graph.begin()
+    other._step(0)
+    return other
+
+
+def system(graph: Graph, poses: FloatArray | None = None) -> tuple[FloatArray, FloatArray]:
+    """Return H, shape (3N, 3N), and b, shape (3N,), of all nodes at poses, by dense matrices."""
+    poses = graph.poses if poses is None else poses
+    edges, observed = graph.edges, graph.observed
+    slow = SlowGraph(
+        poses, graph.fixed,
+        replace(edges, i=graph.node_rows(edges.i), j=graph.node_rows(edges.j)),
+        replace(observed, node=graph.node_rows(observed.node)))
+    H, b = slow.system()
+    for prior in graph.priors:
+        rows = graph.node_rows(prior.nodes)
+        at = (3 * rows[:, None] + np.arange(3)).ravel()
+        linear = model(prior, poses[rows])
+        H[np.ix_(at, at)] += linear.information
+        b[at] += linear.gradient
+    return H, b
+
+
+def some(rng: np.random.Generator, graph: Graph, fraction: float = 0.5) -> list[int]:
+    """Return ids of some nodes that may leave; fixed ones do so rarely."""
+    ids = graph.node_ids[rng.random(graph.n_nodes) < fraction]
+    return [int(node) for node in rng.permutation(ids) if node != graph.newest_pose]
+
+
+def assert_close(actual: FloatArray, expected: FloatArray, tolerance: float = CLOSE) -> None:
+    scale = max(float(np.max(np.abs(expected), initial=0.0)), 1e-12)
+    np.testing.assert_allclose(actual / scale, expected / scale, atol=tolerance)
+
+
+def assert_same_information(graph: Graph, other: Graph, tolerance: float = CLOSE) -> None:
+    assert graph.node_ids.tolist() == other.node_ids.tolist()
+    (H, b), (G, c) = system(graph), system(other, graph.poses)
+    root = 1.0 / np.sqrt(np.maximum(np.diagonal(H), 1e-12))
+    np.testing.assert_allclose(G * root * root[:, None], H * root * root[:, None], atol=tolerance)
+    np.testing.assert_allclose(c * root, b * root, atol=1e3 * tolerance)
+
+
+@given(seeds, flags)
+@settings(max_examples=25)
+def test_the_nodes_that_remain_do_not_move(seed: int, pure: bool) -> None:
+    smoother, here = driven(seed)
+    graph, leaving = smoother.graph, some(here.rng, smoother.graph)
+    kept = np.setdiff1d(graph.node_ids, leaving)
+    poses, chi2 = graph.poses_of(kept), smoother.chi2()
+    covariances = smoother.covariances()[graph.node_rows(kept)]
+    if pure:
+        assert smoother.update(marginalize(graph, leaving)).status is Status.CONVERGED
+    else:
+        forgotten = smoother.forget(leaving)
+        assert forgotten.nodes.tolist() == sorted(leaving)
+        # of what leaves as a whole nothing remains, not even its energy
+        assert smoother.chi2() <= chi2 * (1.0 + 1e-6) + 1e-6
+    for _ in range(2):
+        assert graph.node_ids.tolist() == kept.tolist()
+        np.testing.assert_allclose(se2.wrapped(graph.poses - poses), 0.0, atol=1e-7)
+        assert_close(smoother.covariances(), covariances, 1e-7)
+        smoother = copied(smoother)     # optimised again, from scratch
+        graph = smoother.graph
+
+
+@given(seeds)
+@settings(max_examples=25)
+def test_the_tree_has_the_result_of_the_pure_function(seed: int) -> None:
+    smoother, here = driven(seed)
+    other, leaving = copied(smoother), some(here.rng, smoother.graph)
+    edges, observed = smoother.graph.edges, smoother.graph.observed
+    update = marginalize(other.graph, leaving)
+    other.graph.begin()
+    other.graph.apply(update)
+    other._step(0)
+    forgotten = smoother.forget(leaving)
+    assert_same_information(smoother.graph, other.graph, 1e-7)
+    gone = np.isin(edges.i, leaving) | np.isin(edges.j, leaving)
+    assert len(forgotten.edges) == np.sum(gone)
+    assert len(forgotten.observed) == np.sum(np.isin(observed.node, leaving))
+
+
+@given(seeds)
+@settings(max_examples=20)
+def test_the_order_in_which_nodes_leave_does_not_matter(seed: int) -> None:
+    smoother, here = driven(seed)
+    other, pure = copied(smoother), copied(smoother)
+    leaving = some(here.rng, smoother.graph)
+    smoother.forget(leaving)
+    for node in leaving:
+        other.forget([node])
+        assert pure.update(marginalize(pure.graph, [node])).status is Status.CONVERGED
+    assert_same_information(smoother.graph, other.graph, 1e-7)
+    assert_same_information(smoother.graph, pure.graph, 1e-7)
+
+
+@given(seeds)
+@settings(max_examples=20)
+def test_whole_subtrees_leave_the_rest_untouched_bit_for_bit(seed: int) -> None:
+    smoother, here = driven(seed)
+    graph = smoother.graph
+    tree = cliques(graph)
+    c = int(here.rng.choice([c for c, clique in tree.items() if clique.parent >= 0]))
+    below, rest = [c], []
+    for each in below:
+        below += [child for child in tree[each].children if child in tree]
+        rest += tree[each].frontal
+    if graph.newest_pose in rest:
+        return
+    kept = np.setdiff1d(graph.node_ids, rest)
+    poses = graph.poses_of(kept).tobytes()
+    values = {k: clique.R.tobytes() for k, clique in tree.items() if k not in below}
+    smoother.forget(rest)
+    assert graph.poses_of(kept).tobytes() == poses
+    assert {k: clique.R.tobytes() for k, clique in cliques(graph).items()} == values
+
+
+@given(seeds, flags)
+@settings(max_examples=20)
+def test_the_gauge_keeps_its_dimension(seed: int, tree: bool) -> None:
+    """Without anything absolute, three motions remain that no constraint resists."""
+    here = world(seed)
+    smoother = IncrementalSmoother(EXACT)
+    smoother.update(GraphUpdate(hidden=np.array(here.truth), fix=[0]))
+    smoother.update(here.new_nodes(12))
+    smoother.update(GraphUpdate(edges=here.edges(here.pairs(4))))
+    leaving = [node for node in some(here.rng, smoother.graph) if node != 0]
+    if tree:
+        smoother.forget(leaving)
+    else:
+        smoother.update(marginalize(smoother.graph, leaving))
+    graph = smoother.graph
+    assert not any(prior.anchored for prior in graph.priors)
+    for angle in (0.0, 2.0):    # also where it has been turned and bent since
+        poses = se2.compose(np.array((1.0, 2.0, angle)), graph.poses)
+        poses += here.rng.normal(0.0, 0.05, poses.shape) * (angle > 0.0)
+        H, _ = system(graph, poses)
+        root = np.sqrt(np.diagonal(H))
+        values = np.linalg.eigvalsh(H / root / root[:, None])
+        assert np.all(np.abs(values[:3]) < 1e-9)
+        assert values[3] > 1e-7
+
+
+@pytest.mark.parametrize('tree', [False, True])
+def test_a_chain_node_leaves_what_one_edge_says(tree: bool) -> None:
+    here = world(4)
+    smoother = IncrementalSmoother(EXACT)
+    smoother.update(GraphUpdate(hidden=np.array(here.truth), fix=[0]))
+    for k in range(1, 6):
+        smoother.update(GraphUpdate(
+            hidden=here.drive(k - 1)[None], edges=here.edges([(k - 1, k)])))
+    update = marginalize(smoother.graph, [3])
+    assert len(update.edges) == 1
+    assert len(update.observed) == len(update.priors) == 0
+    assert (int(update.edges.i[0]), int(update.edges.j[0])) == (2, 4)
+    expected = se2.between(smoother.graph.poses[2], smoother.graph.poses[4])
+    np.testing.assert_allclose(update.edges.mean[0], expected, atol=1e-9)
+    before = smoother.covariances()[[0, 1, 2, 4, 5]]
+    if tree:
+        smoother.forget([3])
+    else:
+        smoother.update(update)
+    assert_close(smoother.covariances(), before)
+
+
+@given(seeds)
+@settings(max_examples=10)
+def test_a_graph_that_turns_by_a_radian_keeps_what_it_knows(seed: int) -> None:
+    """With and without marginalisation, chi2 is the same to the order of the linearization."""
+    here = world(seed, noise=(0.01, 0.01, 0.003), guess=(0.01, 0.01, 0.003))
+    smoother = IncrementalSmoother(EXACT)
+    smoother.update(GraphUpdate(hidden=np.array(here.truth), fix=[0]))
+    smoother.update(here.new_nodes(12))
+    smoother.update(GraphUpdate(edges=here.edges(here.pairs(4))))
+    leaving = [node for node in some(here.rng, smoother.graph, 0.4) if node != 0]
+    whole = copied(smoother)
+    smoother.forget(leaving)
+    turned = se2.compose(np.array((3.0, -1.0, 1.0)), smoother.graph.poses[0])
+    update = GraphUpdate(free=[0], observed=ObservedNodes(
+        [0], None, turned[None], [1e4 * np.eye(3)], [ObservedKind.GLOBAL_POSE]))
+    for each in (smoother, whole):
+        assert each.update(update).status is Status.CONVERGED
+    np.testing.assert_allclose(smoother.chi2(), whole.chi2(), rtol=1e-6, atol=1e-6)
+    np.testing.assert_allclose(
+        smoother.poses, whole.graph.poses_of(smoother.graph.node_ids), atol=1e-6)
+
+
+@given(seeds)
+@settings(max_examples=15)
+def test_copies_and_failed_updates_keep_the_result(seed: int) -> None:
+    smoother, here = driven(seed)
+    smoother.forget(some(here.rng, smoother.graph))
+    other = copied(smoother)
+    assert_same_information(smoother.graph, other.graph)
+    before = state(other.graph)
+    nodes = some(here.rng, other.graph)
+    update = marginalize(other.graph, nodes)
+    lost = update._replace(hidden=np.zeros((1, 3)))     # nothing determines the new node
+    assert other.update(lost).status is Status.FAILED
+    assert differences(before, state(other.graph)) == []
+
+
+@given(seeds)
+@settings(max_examples=10)
+def test_a_trial_that_is_adopted_has_the_priors_made_meanwhile(seed: int) -> None:
+    smoother, here = driven(seed)
+    trial = smoother.trial(GraphUpdate(), smoother.poses.copy())
+    while trial.work():
+        pass
+    smoother.forget(some(here.rng, smoother.graph))
+    before = copied(smoother)
+    if smoother.adopt(trial).status is not Status.FAILED:
+        assert_same_information(before.graph, smoother.graph, 1e-7)
+
+def test_a_position_alone_says_nothing_about_a_heading() -> None:
+    smoother = IncrementalSmoother(EXACT)
+    edge = Edges([0], [1], [[1.0, 0.0, 0.0]], [np.diag([100.0, 100.0, 0.0])], [EdgeKind.ODOMETRY])
+    smoother.update(GraphUpdate(
+        hidden=np.array([[0.0, 0.0, 0.0], [1.0, 0.0, 0.0]]), edges=edge,
+        observed=ObservedNodes([0, 1, 1], None, [[0.0, 0.0, 0.0], [1.0, 0.0, 0.0], [0.0] * 3],
+                               [np.eye(3), np.diag([1.0, 1.0, 0.0]), np.diag([0.0, 0.0, 4.0])],
+                               [0, 1, 2])))
+    update = marginalize(smoother.graph, [0])
+    assert len(update.edges) == len(update.priors) == 0
+    assert len(update.observed) == 1
+    # the heading of node 1 is not a part of the edge
+    assert update.observed.information[0, 2, 2] == pytest.approx(0.0, abs=1e-9)
+
+
+def test_what_cannot_leave_is_refused() -> None:
+    smoother, _ = driven(5)
+    with pytest.raises(GraphUpdateError, match='no hidden node'):
+        smoother.forget([10**6])
+    with pytest.raises(GraphUpdateError, match='newest pose'):
+        smoother.forget([smoother.graph.newest_pose])
+    assert smoother.forget([]).nodes.tolist() == []
