@@ -110,9 +110,11 @@ def test_smoother_and_batch_find_the_same_minimum(seed: int, held: bool) -> None
         np.testing.assert_allclose(smoother.poses, copy.poses, atol=1e-6)
         np.testing.assert_allclose(smoother.chi2(), result.chi2, rtol=1e-8, atol=1e-8)
         np.testing.assert_allclose(copy.energies().chi2, result.chi2, rtol=1e-8, atol=1e-8)
-        # the same matrix as well
+        # the same matrix as well, but for arms that have changed by up to one per cent
         other = IncrementalSmoother(EXACT, copy)
-        np.testing.assert_allclose(smoother.covariances(), other.covariances(), atol=1e-6)
+        expected = other.covariances()
+        np.testing.assert_allclose(
+            smoother.covariances(), expected, atol=0.03 * np.max(np.abs(expected)))
         smoother.update(here.joined(
             here.new_nodes(2), observed=here.observed([int(here.rng.integers(10))])))
 
