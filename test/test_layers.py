@@ -43,8 +43,9 @@ CORE = {
 CORE['core.io'] = set(CORE)
 # The modules on top of the packages: the facade, what it hands out, and who drives it.
 TOP = {'core.estimate', 'core.newest_estimate', 'core.prediction', 'core.transaction',
-       'core.isolation', 'core.refiner', 'core.relocation',
-       'core.error_tuner', 'core.thinner', 'core.backend', 'core.warm_up', 'core.helper_process'}
+       'core.isolation', 'core.forgetting', 'core.refiner', 'core.relocation',
+       'core.error_tuner', 'core.thinner', 'core.backend', 'core.warm_up',
+       'core.helper_process'}
 # Third-party libraries of `core`.
 LIBRARIES = {'numpy', 'scipy', 'numba', 'pyproj'}
 ROS = {'rclpy', 'rosidl_runtime_py', 'ament_index_python', 'launch', 'launch_ros'}

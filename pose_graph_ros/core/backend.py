@@ -16,6 +16,7 @@ from pose_graph_ros.core.batch.optimizer import Solve, Status
 from pose_graph_ros.core.config import BackendConfig
 from pose_graph_ros.core.error_tuner import ErrorTuner
 from pose_graph_ros.core.estimate import Estimate, UpdateReport
+from pose_graph_ros.core.forgetting import Forgetting
 from pose_graph_ros.core.geometry import se2
 from pose_graph_ros.core.geometry.geodesy import MapOrigin
 from pose_graph_ros.core.geometry.se2 import FloatArray, IntArray
@@ -90,6 +91,7 @@ class PoseGraphBackend:
         self._quarantine = Queue()
         self._alignment = AlignmentMonitor(self._config)
         self._thinner = Thinner(self._smoother, self._tuner, self._parts())
+        self._forgetting = Forgetting(self._smoother, self._tuner, self._parts())
         self._settled, self._chi2 = True, 0.0
 
     def configure(self, config: BackendConfig) -> None:
@@ -282,6 +284,7 @@ class PoseGraphBackend:
         """
         report, untried = self._update()
         self._pipeline.queue = untried.joined(self._pipeline.queue)
+        self._forgetting.step(self._config.window)
         self._thinner.step(self._config.thinning)
         return report
 
@@ -383,6 +386,7 @@ class PoseGraphBackend:
         report = isolation.update_with_all(self._update, self._pipeline, self._quarantine)
         if self.graph.n_nodes == 0:
             return report
+        self._forgetting.step(self._config.window)
         self._tuner.decide()
         self._settle()
         undo = self._judge.finish()

@@ -182,6 +182,20 @@ def test_a_loop_closure_to_a_node_is_used_but_has_no_stamp_to_be_drawn_at(tmp_pa
     assert content['loop_closures'] == 0
 
 
+def test_with_a_window_of_a_few_nodes_the_path_is_whole_and_as_good(tmp_path: Path) -> None:
+    write_bag(tmp_path / 'bag', (*odometry(), *fixes(np.zeros(2))))
+    assert run(tmp_path / 'bag', '-o', tmp_path / 'whole') == 0
+    assert run(tmp_path / 'bag', '-o', tmp_path / 'part', '-p', 'window.nodes:=8') == 0
+    whole, part = (summary_of(tmp_path / name) for name in ('whole', 'part'))
+    assert part['hidden_nodes'] == whole['hidden_nodes']
+    assert (whole['frozen_nodes'], part['hidden_nodes'] - part['frozen_nodes'] <= 10) == (0, True)
+    assert part['edges'] < 30 < whole['edges']
+    assert part['poses'] == whole['poses']
+    assert part['counts']['fix.accepted'] + part['counts'].get('fix.before_window', 0) == 80
+    both = [rms(content)['corrected path to fixes used'] for content in (whole, part)]
+    assert both[1] < both[0] + 0.1
+
+
 @pytest.mark.parametrize(('datum', 'axes'), [
     ([], ('east', 'north')), ([50.7, 7.1], ('east', 'north')), ([50.7, 7.1, 0.5], ('x', 'y'))])
 def test_the_axes_of_the_map_are_east_and_north_unless_it_is_turned(

@@ -1,0 +1,105 @@
+# Copyright 2026 The pose_graph_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""
+The oldest hidden nodes leave the graph, and all parts of the engine forget what was on them.
+
+`window.policy` decides which. Their poses are frozen where they are, and what their constraints
+told stays in the graph as a prior on its oldest nodes. A fixed node, the gauge of a graph that is
+not aligned with the map, is frozen with the others but stays in the graph until it is freed: a
+prior of poses relative to it says nothing about where they are in the map.
+"""
+
+import numpy as np
+
+from pose_graph_ros.core.config import WindowConfig
+from pose_graph_ros.core.error_tuner import ErrorTuner
+from pose_graph_ros.core.geometry import se2
+from pose_graph_ros.core.geometry.se2 import FloatArray, IntArray
+from pose_graph_ros.core.io.capture import Parts
+from pose_graph_ros.core.measurements import rejected
+from pose_graph_ros.core.smoother.incremental import IncrementalSmoother
+from pose_graph_ros.core.window.policy import n_leaving
+
+
+class Forgetting:
+    """
+    Keeps the graph within its window.
+
+    Parameters
+    ----------
+    smoother : IncrementalSmoother
+    tuner : ErrorTuner
+    parts : Parts, all others that forget
+
+    """
+
+    def __init__(self, smoother: IncrementalSmoother, tuner: ErrorTuner, parts: Parts) -> None:
+        self._smoother, self._tuner, self._parts = smoother, tuner, parts
+        self._joint: FloatArray | None = None
+        """
+        Pose of the oldest node in the graph, seen from the last frozen one, shape (3,), if that
+        was frozen before the graph was aligned with the map; else None.
+        """
+
+    def step(self, window: WindowConfig) -> int:
+        """Let the nodes beyond the window leave, if a group is due; return their number."""
+        nodes = self._parts.nodes
+        if not window.is_limited or len(nodes) == 0 or self._parts.graph.has_touched:
+            return 0
+        n = n_leaving(window, nodes.table)
+        if n > 0:
+            parts = self._parts
+            n = n_leaving(window, nodes.table, parts.pipeline.needed_ns(
+                aligned=parts.alignment.is_aligned))
+        if n > 0:
+            self._forget(n)
+        return n
+
+    def _forget(self, n: int) -> None:
+        """Let the n oldest nodes leave."""
+        parts, graph, nodes = self._parts, self._parts.graph, self._parts.nodes
+        first = nodes.n_frozen + n
+        oldest = slice(nodes.n_frozen, first)
+        # the oldest one that stays may have been thinned out
+        rows = graph.node_rows(nodes.ids[first:])
+        row = int(rows[rows >= 0][0])
+        # fixed ones of before may have been freed meanwhile
+        leaving = graph.node_ids[:row][~graph.is_bias[:row] & ~graph.fixed[:row]]
+        self._follow_alignment()
+        biases = np.array(self._tuner.leave(leaving), dtype=np.int64)
+        leaving = np.sort(np.concatenate((leaving, biases)))
+        parts.judge.decide_leaving(leaving)
+        poses = nodes.poses(graph)
+        gone = self._smoother.forget(leaving)
+        parts.judge.forget(gone.nodes, gone.edges, gone.observed)
+        parts.reweighting.forget(gone.edges, gone.observed)
+        self._tuner.forget(gone.nodes, gone.edges, gone.observed)
+        nodes.forget(poses[oldest])
+        if not parts.alignment.is_aligned:
+            self._joint = se2.between(poses[first - 1], poses[first])
+        parts.alignment.forget(int(nodes.ids[first]))
+        parts.pipeline.seen.forget(nodes.last_frozen_ns)
+        self._refuse(leaving)
+
+    def _follow_alignment(self) -> None:
+        """
+        Join the path from before the alignment to the graph again, once.
+
+        The angle at which it was moved into the map was a first guess, which is better known by
+        now.
+        """
+        nodes, joint = self._parts.nodes, self._joint
+        if joint is None or not self._parts.alignment.is_aligned:
+            return
+        self._joint = None
+        oldest = nodes.poses(self._parts.graph)[nodes.n_frozen]
+        last = se2.compose(oldest, se2.inverse(joint))
+        nodes.table.move_frozen(se2.compose(last, se2.inverse(nodes.table.frozen[-1])))
+
+    def _refuse(self, nodes: IntArray) -> None:
+        """Count constraints that were to be added to nodes that have left."""
+        pipeline, gone = self._parts.pipeline, {*nodes.tolist()}
+        for queue in (pipeline.queue, self._parts.quarantine):
+            for source in queue.drop(gone):
+                pipeline.count(source, rejected(
+                    'before_window', 'its hidden node left the graph before it was added'))
