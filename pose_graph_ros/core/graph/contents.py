@@ -243,6 +243,11 @@ class GraphContents:
         """All dense priors."""
         return priors_of(self.memory, self.node_ids)
 
+    @property
+    def n_priors(self) -> int:
+        """Number of dense priors."""
+        return int(self.memory.head[tb.N_PRIORS])
+
     def leaving(self) -> GraphUpdate:
         """Return what leaves the graph with the present update; it keeps its rows until then."""
         nodes, edges, observed = (

@@ -25,7 +25,8 @@ def copied_rows(graph: Graph) -> GraphRows:
         edges=in_rows(graph, rows.edges), observed=ObservedNodes(
             graph.node_rows(observed.node), *observed.columns[1:]),
         node_ids=np.arange(n_nodes), edge_ids=np.arange(n_edges),
-        observed_ids=np.arange(n_observed), next_ids=NextIds(n_nodes, n_edges, n_observed))
+        observed_ids=np.arange(n_observed), next_ids=NextIds(n_nodes, n_edges, n_observed),
+        priors=[replace(prior, nodes=graph.node_rows(prior.nodes)) for prior in rows.priors])
 
 
 def in_rows(graph: Graph, edges: Edges) -> Edges:
