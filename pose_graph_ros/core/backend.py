@@ -44,7 +44,6 @@ from pose_graph_ros.core.sources.constraint_queue import Queue, QueuedEdge
 from pose_graph_ros.core.sources.factor_builder import FactorBuilder
 from pose_graph_ros.core.sources.pipeline import MeasurementPipeline
 from pose_graph_ros.core.sources.source_report import SourceReport
-from pose_graph_ros.core.thinner import Thinner
 from pose_graph_ros.core.transaction import Transaction
 
 # Number of edges of a graph up to which an update may change the weights of all odometry.
@@ -78,8 +77,7 @@ class PoseGraphBackend:
         self._solve = solve
         self._smoother = smoother or IncrementalSmoother(self._config.smoother)
         self._nodes = HiddenNodes(self._config, self._make_node)
-        self._newest_node_covariance = np.zeros((3, 3))
-        """In map axes, shape (3, 3)."""
+        self._newest_node_covariance = np.zeros((3, 3))  # in map axes
         self._reweighting = Reweighting()
         self._judge = Judge(self._smoother, self._reweighting, self._config, self._nodes)
         self._factors = FactorBuilder(self._config, self._reweighting)
@@ -90,7 +88,6 @@ class PoseGraphBackend:
         self._pipeline = MeasurementPipeline(self._nodes, self._config)
         self._quarantine = Queue()
         self._alignment = AlignmentMonitor(self._config)
-        self._thinner = Thinner(self._smoother, self._tuner, self._parts())
         self._forgetting = Forgetting(self._smoother, self._tuner, self._parts())
         self._settled, self._chi2 = True, 0.0
 
@@ -284,8 +281,7 @@ class PoseGraphBackend:
         """
         report, untried = self._update()
         self._pipeline.queue = untried.joined(self._pipeline.queue)
-        self._forgetting.step(self._config.window)
-        self._thinner.step(self._config.thinning)
+        self._forgetting.step(self._config)
         return report
 
     def _update(self) -> tuple[UpdateReport, Queue]:
@@ -386,7 +382,7 @@ class PoseGraphBackend:
         report = isolation.update_with_all(self._update, self._pipeline, self._quarantine)
         if self.graph.n_nodes == 0:
             return report
-        self._forgetting.step(self._config.window)
+        self._forgetting.step(self._config)
         self._tuner.decide()
         self._settle()
         undo = self._judge.finish()

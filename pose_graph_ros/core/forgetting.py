@@ -11,13 +11,14 @@ prior of poses relative to it says nothing about where they are in the map.
 
 import numpy as np
 
-from pose_graph_ros.core.config import WindowConfig
+from pose_graph_ros.core.config import BackendConfig, WindowConfig
 from pose_graph_ros.core.error_tuner import ErrorTuner
 from pose_graph_ros.core.geometry import se2
 from pose_graph_ros.core.geometry.se2 import FloatArray, IntArray
 from pose_graph_ros.core.io.capture import Parts
 from pose_graph_ros.core.measurements import rejected
 from pose_graph_ros.core.smoother.incremental import IncrementalSmoother
+from pose_graph_ros.core.thinner import forget, Thinner
 from pose_graph_ros.core.window.policy import n_leaving
 
 
@@ -35,17 +36,24 @@ class Forgetting:
 
     def __init__(self, smoother: IncrementalSmoother, tuner: ErrorTuner, parts: Parts) -> None:
         self._smoother, self._tuner, self._parts = smoother, tuner, parts
+        self._thinner = Thinner(smoother, tuner, parts)
         self._joint: FloatArray | None = None
         """
         Pose of the oldest node in the graph, seen from the last frozen one, shape (3,), if that
         was frozen before the graph was aligned with the map; else None.
         """
 
-    def step(self, window: WindowConfig) -> int:
-        """Let the nodes beyond the window leave, if a group is due; return their number."""
+    def step(self, config: BackendConfig) -> None:
+        """Let the nodes leave that are due, by the window and by thinning."""
+        if len(self._parts.nodes) == 0 or self._parts.graph.has_touched:
+            return
+        if config.window.is_limited:
+            self._step_of_window(config.window)
+        self._thinner.step(config.thinning)
+
+    def _step_of_window(self, window: WindowConfig) -> None:
+        """Let the nodes beyond the window leave, if a group is due."""
         nodes = self._parts.nodes
-        if not window.is_limited or len(nodes) == 0 or self._parts.graph.has_touched:
-            return 0
         n = n_leaving(window, nodes.table)
         if n > 0:
             parts = self._parts
@@ -53,7 +61,6 @@ class Forgetting:
                 aligned=parts.alignment.is_aligned))
         if n > 0:
             self._forget(n)
-        return n
 
     def _forget(self, n: int) -> None:
         """Let the n oldest nodes leave."""
@@ -71,9 +78,7 @@ class Forgetting:
         parts.judge.decide_leaving(leaving)
         poses = nodes.poses(graph)
         gone = self._smoother.forget(leaving)
-        parts.judge.forget(gone.nodes, gone.edges, gone.observed)
-        parts.reweighting.forget(gone.edges, gone.observed)
-        self._tuner.forget(gone.nodes, gone.edges, gone.observed)
+        forget(gone, parts, self._tuner)
         nodes.forget(poses[oldest])
         if not parts.alignment.is_aligned:
             self._joint = se2.between(poses[first - 1], poses[first])

@@ -10,7 +10,7 @@ from pose_graph_ros.core.config import ThinningConfig
 from pose_graph_ros.core.error_tuner import ErrorTuner
 from pose_graph_ros.core.graph.graph_update import Left
 from pose_graph_ros.core.io.capture import Parts
-from pose_graph_ros.core.smoother.incremental import IncrementalSmoother
+from pose_graph_ros.core.smoother.incremental import Forgotten, IncrementalSmoother
 from pose_graph_ros.core.window.thinning import groups, remove, simplify, Thinning
 
 
@@ -33,7 +33,7 @@ class Thinner:
     def step(self, config: ThinningConfig) -> int:
         """Let the nodes leave that are due, and return their number."""
         parts, n = self._parts, 0
-        if config.cell == 0.0 or len(parts.nodes) == 0 or parts.graph.has_touched:
+        if config.cell == 0.0:
             return 0
         places = self._thinning.places(self._smoother, config, self._waiting())
         if places is None:
@@ -43,11 +43,11 @@ class Thinner:
             gone = remove(self._smoother, group.nodes)
             if gone is None:
                 break
-            self._forget(gone)
+            forget(gone, parts, self._tuner)
             parts.nodes.table.thin(*group)
             n += len(group.nodes)
         for gone in simplify(self._smoother):
-            self._forget(gone)
+            forget(gone, parts, self._tuner)
         return n
 
     def _waiting(self) -> set[int]:
@@ -58,7 +58,18 @@ class Thinner:
             found.update(each.attachment.node for each in queue.observed)
         return found
 
-    def _forget(self, gone: Left) -> None:
-        self._parts.judge.forget(gone.nodes, gone.edges, gone.observed)
-        self._parts.reweighting.forget(gone.edges, gone.observed)
-        self._tuner.forget(gone.nodes, gone.edges, gone.observed)
+
+def forget(gone: Left | Forgotten, parts: Parts, tuner: ErrorTuner) -> None:
+    """
+    Let judge, reweighting, tuner and factors forget what has left the graph.
+
+    Parameters
+    ----------
+    gone : Left or Forgotten, ids
+    parts : Parts
+    tuner : ErrorTuner
+
+    """
+    parts.judge.forget(gone.nodes, gone.edges, gone.observed)
+    parts.reweighting.forget(gone.edges, gone.observed)
+    tuner.forget(gone.nodes, gone.edges, gone.observed)

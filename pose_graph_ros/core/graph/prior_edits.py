@@ -7,8 +7,9 @@ from collections.abc import Sequence
 from pose_graph_ros.core.compiled.jit import FLAG, INTEGERS, kernel, NUMBERS
 from pose_graph_ros.core.geometry.se2 import IntArray
 from pose_graph_ros.core.graph import prior_rows, tables as tb, transaction_log
-from pose_graph_ros.core.graph.editing import add_to_scale, touch
+from pose_graph_ros.core.graph.editing import touch
 from pose_graph_ros.core.graph.priors import packed, Prior, unpacked
+from pose_graph_ros.core.graph.scales import add_to_scale
 
 # Numbers of work space for each node of a prior.
 _WORK = 15

@@ -22,7 +22,7 @@ from pose_graph_ros.core.graph import (
     tables as tb,
     transaction_log,
 )
-from pose_graph_ros.core.graph.editing import scale_by_edge
+from pose_graph_ros.core.graph.scales import scale_by_edge
 
 # Return codes of `extend`.
 EXTENDED, NO_ROOM, NOT_A_CHAIN = range(3)

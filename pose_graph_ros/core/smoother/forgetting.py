@@ -16,13 +16,9 @@ import numpy as np
 from pose_graph_ros.core.compiled.jit import INTEGERS, kernel
 from pose_graph_ros.core.elimination import clique_frames
 from pose_graph_ros.core.graph import pools, prior_rows, tables as tb, transaction_log
-from pose_graph_ros.core.graph.editing import (
-    add_to_scale,
-    scale_by_edge,
-    touch,
-    unlink_edge,
-)
+from pose_graph_ros.core.graph.editing import touch, unlink_edge
 from pose_graph_ros.core.graph.pools import row_start, triangle_size
+from pose_graph_ros.core.graph.scales import add_to_scale, scale_by_edge
 from pose_graph_ros.core.smoother.tree_update import LEAVES
 
 # Return codes of `drop`.
