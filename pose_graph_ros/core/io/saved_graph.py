@@ -87,7 +87,10 @@ class SavedGraph:
         for (name, present), end in zip(ids.items(), rows.next_ids, strict=True):
             _increasing(f'graph.{name}', np.concatenate(([-1], present, [end])))
         _require(len(nodes.rows) > 0, 'nodes: expected at least one')
-        _same_length('nodes', nodes, 'stamps_ns', 'rows', 'odometry')
+        _same_length('nodes', nodes, 'stamps_ns', 'rows')
+        _require(len(nodes.frozen) + len(nodes.odometry) == len(nodes.rows),
+                 'nodes: expected a frozen pose or an odometry pose of each, got '
+                 f'{len(nodes.frozen)} and {len(nodes.odometry)} for {len(nodes.rows)} nodes')
         _increasing('nodes.stamps_ns', nodes.stamps_ns)
         _increasing('nodes.rows', nodes.rows)
         poses = rows.node_ids[rows.is_pose]
