@@ -37,7 +37,7 @@ LOOPS = (
     ('loop closures', (State.BELIEVED,), GREEN, '-', 5),
     ('loop closures\nbelieved weakly', (State.WEAKLY_BELIEVED,), GREEN, '--', 5),
     ('loop closures that wait,\nnot used', (State.WAITING,), SKY, '--', 2),
-    ('doubted loop closures,\nnot used', (State.DOUBTED,), GREY, '--', 2))
+    ('doubted or refused\nloop closures, not used', (State.DOUBTED,), GREY, '--', 2))
 """Names of loop closures in the legend, states, colours, lines, and their order in depth."""
 DOUBTED_FIXES: dict[str, Any] = {
     'color': GREY, 'marker': 'x', 'linestyle': 'none', 'markersize': 5.5, 'markeredgewidth': 1.1}
@@ -131,7 +131,7 @@ def _facts(drive: Drive) -> str:
     parts = [f'{numbers.pop("used")} fixes used' + ''.join(
         f', {number} {kind}' for kind, number in numbers.items() if number > 0),
         f'{len(drive.loop_stamps_ns) - doubted - waiting} loop closures' + ''.join(
-            f', {number} {what}' for number, what in ((doubted, 'doubted'), (waiting, 'waiting'))
+            f', {number} {what}' for number, what in ((doubted, 'not used'), (waiting, 'waiting'))
             if number > 0)]
     if len(path) > 1:
         parts[:0] = (f'{(path.stamps_ns[-1] - path.stamps_ns[0]) / SECOND:.0f} s',

@@ -39,7 +39,7 @@ from pose_graph_ros.core.geometry.geodesy import MapOrigin
 from pose_graph_ros.core.geometry.trajectory import Trajectory
 from pose_graph_ros.core.io.g2o import EDGE2_ORDERS
 from pose_graph_ros.core.io.g2o_writing import write_g2o
-from pose_graph_ros.core.judgement.texts import states_by_stamps
+from pose_graph_ros.core.judgement.texts import Key, states_by_stamps
 from pose_graph_ros.core.judgement.verdicts import State, Verdict
 from pose_graph_ros.core.measurements import Answer, LoopClosure, Measurement, OdometrySample
 
@@ -53,6 +53,11 @@ class Replayed(NamedTuple):
     report: UpdateReport  # report of the final optimisation
     refused: Counter[tuple[str, str]]  # messages without a valid measurement, by source and reason
     origin: MapOrigin | None = None  # datum of the graph
+
+    def states(self, verdicts: Sequence[Verdict]) -> dict[Key, State]:
+        """Return what is believed, by source and stamps; refused loop closures are not."""
+        refused = dict.fromkeys(self.backend.refused_closures, State.DOUBTED)
+        return states_by_stamps(verdicts) | refused
 
 
 def run(bag: BagReader, inputs: Inputs, values: Mapping[str, Any]) -> Replayed:
@@ -155,7 +160,7 @@ def execute(options: argparse.Namespace) -> int:
         verdicts = result.backend.verdicts()
         drive = collect_drive(
             bag, inputs, values, estimate.path, options.truth, origin=result.origin,
-            states=states_by_stamps(verdicts))
+            states=result.states(verdicts))
     return _report(options, drive, result, verdicts, seconds)
 
 
@@ -169,11 +174,12 @@ def _execute_g2o(options: argparse.Namespace) -> int:
     backend, report = run_measurements((
         (odometry_source if isinstance(each, OdometrySample) else CLOSURES, each)
         for each in measurements), values)
+    result = Replayed(backend, report, Counter())
     seconds = time.monotonic() - start
     estimate = backend.estimate()
     assert estimate is not None, 'a graph has vertices'
     verdicts = backend.verdicts()
-    states = states_by_stamps(verdicts)
+    states = result.states(verdicts)
     samples = [each for each in measurements if isinstance(each, OdometrySample)]
     loops = [(each.reference_ns or 0, each.stamp_ns) for each in measurements
              if isinstance(each, LoopClosure)]
@@ -184,7 +190,7 @@ def _execute_g2o(options: argparse.Namespace) -> int:
         None, np.array(loops, dtype=np.int64).reshape(-1, 2),
         loop_states=[states.get((CLOSURES, stamp, reference), State.BELIEVED)
                      for reference, stamp in loops])
-    return _report(options, drive, Replayed(backend, report, Counter()), verdicts, seconds)
+    return _report(options, drive, result, verdicts, seconds)
 
 
 def _report(

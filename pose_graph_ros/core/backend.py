@@ -81,10 +81,8 @@ class PoseGraphBackend:
         self._reweighting = Reweighting()
         self._judge = Judge(self._smoother, self._reweighting, self._config, self._nodes)
         self._factors = FactorBuilder(self._config, self._reweighting)
-        self._tuner = ErrorTuner(
-            self._smoother, self._factors, self._reweighting, self._judge)
-        self._refiner = Refiner(
-            self._smoother, self._reweighting, self._judge, self._tuner)
+        self._tuner = ErrorTuner(self._smoother, self._factors, self._reweighting, self._judge)
+        self._refiner = Refiner(self._smoother, self._reweighting, self._judge, self._tuner)
         self._pipeline = MeasurementPipeline(self._nodes, self._config)
         self._quarantine = Queue()
         self._alignment = AlignmentMonitor(self._config)
@@ -119,6 +117,11 @@ class PoseGraphBackend:
     def refusals(self) -> dict[tuple[str, str], str]:
         """Detail of the newest refusal by (source, reason)."""
         return self._pipeline.refusals
+
+    @property
+    def refused_closures(self) -> list[tuple[str, int, int | None]]:
+        """Source and both stamps [ns] of the newest loop closures that were refused."""
+        return list(self._pipeline.refused_closures)
 
     @property
     def node_stamps_ns(self) -> IntArray:
@@ -409,17 +412,13 @@ class PoseGraphBackend:
         return UpdateReport(result.status, '', 0, result.iterations, result.chi2)
 
     def estimate(self, *, with_path: bool = True) -> Estimate | None:
-        """
-        Return the present estimate; None before the first odometry.
-
-        Its path takes time and memory linear in the graph; `with_path=False` omits it.
-        """
+        """Return the estimate, None before the first odometry; its path takes linear time."""
         if self.graph.n_nodes == 0:
             return None
-        noise = self._config.odometry_source(self._nodes.primary).noise
         return newest_estimate.estimate(
-            self._parts(), noise, self._newest_node_covariance, self._chi2,
-            self._tuner.odometry_scale, with_path=with_path)
+            self._parts(), self._config.odometry_source(self._nodes.primary).noise,
+            self._newest_node_covariance, self._chi2, self._tuner.odometry_scale,
+            with_path=with_path)
 
     def saved(self, datum: MapOrigin | None = None) -> SavedGraph:
         """Return the graph with its state since the last update; see `io.capture.capture`."""

@@ -33,6 +33,7 @@ from pose_graph_ros.core.geometry import se2
 from pose_graph_ros.core.geometry.geodesy import TangentPlane
 from pose_graph_ros.core.geometry.trajectory import Trajectory
 from pose_graph_ros.core.io.g2o import read_g2o
+from pose_graph_ros.core.judgement.verdicts import State
 
 TYPES = message_types()
 POSE = 'geometry_msgs/msg/PoseWithCovarianceStamped'
@@ -194,6 +195,23 @@ def test_with_a_window_of_a_few_nodes_the_path_is_whole_and_as_good(tmp_path: Pa
     assert part['counts']['fix.accepted'] + part['counts'].get('fix.before_window', 0) == 80
     both = [rms(content)['corrected path to fixes used'] for content in (whole, part)]
     assert both[1] < both[0] + 0.1
+
+
+def test_a_loop_closure_to_a_node_that_has_left_is_not_drawn_as_used(tmp_path: Path) -> None:
+    truth = circle()
+    ends = truth.stamps_ns[[50, -50]]
+    relative = se2.between(*truth.at(ends))
+    write_bag(tmp_path / 'bag', (
+        *odometry(), *fixes(np.zeros(2)),
+        *loop_closure_messages('/loop_closure', ends[None], relative[None], 0.01 * np.eye(3))))
+    values = checked({'window.nodes': 8})
+    with open_bag(tmp_path / 'bag') as bag:
+        inputs = choose_inputs(bag, source_list(values), {})
+        result = replay.run(bag, inputs, values)
+        drive = collect_drive(
+            bag, inputs, values, truth, None, states=result.states(result.backend.verdicts()))
+    assert result.backend.counts['loop_closure', 'before_window'] == 1
+    assert drive.loops(State.BELIEVED).tolist() == [False]
 
 
 @pytest.mark.parametrize(('datum', 'axes'), [

@@ -2,7 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """From a received measurement to a constraint in the queue, in any order of stamps."""
 
-from collections import Counter
+from collections import Counter, deque
 from collections.abc import Iterator
 
 import numpy as np
@@ -39,6 +39,8 @@ from pose_graph_ros.core.sources.waiting import (
 
 # Maximum number of measurements that wait for the alignment; the oldest are dropped.
 MOST_UNALIGNED = 5000
+# Number of refused loop closures that are remembered.
+MOST_REFUSED = 1000
 
 
 class MeasurementPipeline:
@@ -67,6 +69,9 @@ class MeasurementPipeline:
         """How often each source got each answer: (source, 'accepted' or the reason)."""
         self.refusals: dict[tuple[str, str], str] = {}
         """Detail of the newest refusal by source and reason."""
+        self.refused_closures = deque[tuple[str, int, int | None]](
+            maxlen=MOST_REFUSED)
+        """Source and stamps [ns] of the newest loop closures that could not be attached."""
 
     def configure(self, config: BackendConfig) -> None:
         """Set the settings for later measurements."""
@@ -123,6 +128,12 @@ class MeasurementPipeline:
 
     def _attach(self, measurement: Measurement, source: str) -> Answer:
         """Queue the constraint of a measurement whose stamp odometry has reached."""
+        answer = self._try_to_attach(measurement, source)
+        if answer.status is AnswerStatus.REJECTED and isinstance(measurement, LoopClosure):
+            self.refused_closures.append((source, measurement.stamp_ns, measurement.reference_ns))
+        return answer
+
+    def _try_to_attach(self, measurement: Measurement, source: str) -> Answer:
         attachment = attach(self._nodes, measurement.stamp_ns)
         if isinstance(attachment, Answer):
             return attachment
