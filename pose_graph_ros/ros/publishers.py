@@ -17,6 +17,7 @@ from typing import Any
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
 from geometry_msgs.msg import PoseWithCovarianceStamped
 from nav_msgs.msg import Odometry, Path
+import numpy as np
 from rclpy.node import Node
 from rclpy.publisher import Publisher
 from rclpy.qos import QoSDurabilityPolicy, QoSProfile
@@ -54,6 +55,8 @@ OUTPUTS = {
     '~/verdicts': (DiagnosticArray, LATCHED_QOS),
     '/diagnostics': (DiagnosticArray, OUTPUT_QOS)}
 """Messages and quality of service by topic, but for /tf."""
+MOST_FROZEN = 20_000
+"""Poses that have left the graph in a message; a day at 1 m/s has four times as many."""
 
 
 class Publishers:
@@ -177,7 +180,9 @@ class Publishers:
                 and time.monotonic() - self._path_at >= self._path_period
                 and self._path.get_subscription_count() > 0)
 
-    def publish_path(self, estimate: Estimate, path: Trajectory, graph: int) -> None:
+    def publish_path(
+        self, estimate: Estimate, path: Trajectory, graph: int, n_frozen: int = 0,
+    ) -> None:
         """
         Publish the path of an estimate, if it is of the present graph.
 
@@ -187,15 +192,19 @@ class Publishers:
         path : Trajectory
         graph : int
             Number of its graph.
+        n_frozen : int
+            Number of its first poses that have left the graph: of more than `MOST_FROZEN` only
+            every second one is published, or every third, and so on.
 
         """
+        shown = thinned(path, n_frozen)
         with self._lock:
             if graph != self.graph:
                 return
             self._path_shown, self._path_at = estimate, time.monotonic()
             # a better path with the same newest odometry: 1 ns keeps the stamps increasing
             self._path_stamp_ns = max(estimate.stamp_ns, self._path_stamp_ns + 1)
-            self._path.publish(messages.path_cdr(path, self._path_stamp_ns, self.map_frame))
+            self._path.publish(messages.path_cdr(shown, self._path_stamp_ns, self.map_frame))
 
     def graph_is_due(self) -> bool:
         """Tell whether to publish the markers of the graph: wanted, and not too soon."""
@@ -311,3 +320,23 @@ class Publishers:
             self.graph += 1     # nothing more is published of the graph so far
             for publisher in self._publishers:
                 self._node.destroy_publisher(publisher)
+
+
+def thinned(path: Trajectory, n_frozen: int) -> Trajectory:
+    """
+    Return a path with at most `MOST_FROZEN` of its frozen poses.
+
+    Every n-th of them is kept, from the first on, with the smallest n that is enough: poses that
+    are published stay the same, until n grows.
+
+    Parameters
+    ----------
+    path : Trajectory
+    n_frozen : int, how many of its first poses are frozen
+
+    """
+    step = -(-n_frozen // MOST_FROZEN)
+    if step <= 1:
+        return path
+    kept = np.concatenate((np.arange(0, n_frozen, step), np.arange(n_frozen, len(path))))
+    return Trajectory(path.stamps_ns[kept], path.poses[kept])

@@ -403,7 +403,7 @@ class Session:
         if self.out.path_is_due(estimate) or at_once:
             newest = backend.estimate()
             assert newest is not None
-            self.out.publish_path(estimate, newest.path, graph)
+            self.out.publish_path(estimate, newest.path, graph, newest.n_frozen)
         if self.out.graph_is_due() and (view := backend.view()) is not None:
             self.out.publish_graph(view, estimate.stamp_ns, graph)
         status = worker.status

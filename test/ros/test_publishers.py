@@ -15,6 +15,7 @@ pytest.importorskip('rclpy', reason='ROS 2 is not there: no rclpy')
 from diagnostic_msgs.msg import DiagnosticArray
 from geometry_msgs.msg import PoseWithCovarianceStamped
 from harness import LATCHED, odometry, RELIABLE, stamp_ns, TFMessage, transform, yaw
+from hypothesis import given as given_numbers, settings, strategies as st
 from local_node import LocalNode
 from nav_msgs.msg import Odometry, Path as PathMessage
 import numpy as np
@@ -31,7 +32,7 @@ from pose_graph_ros.core.geometry.trajectory import Trajectory
 from pose_graph_ros.core.graph.graph_view import GraphView, Lines
 from pose_graph_ros.core.measurements import OdometrySample
 from pose_graph_ros.ros import publishers as publishers_module, transforms
-from pose_graph_ros.ros.publishers import Publishers
+from pose_graph_ros.ros.publishers import MOST_FROZEN, Publishers, thinned
 
 SECOND = 1_000_000_000
 NO_LINES = Lines(np.zeros((0, 2, 2)), np.zeros(0))
@@ -268,6 +269,34 @@ def test_the_path_is_due_once_for_each_estimate_and_only_for_a_subscriber(
     assert not given.out.path_is_due(estimate(3.0))
     assert [item.pose.position.x for item in paths[0].poses] == [1.0, 2.0]
     assert stamps(paths[0].poses) == [1.0, 2.0]
+
+
+def test_the_published_path_has_at_most_so_many_frozen_poses_and_all_others(
+    local: LocalNode,
+) -> None:
+    path = trajectory(*range(1, 50_005))
+    frozen = 50_000
+    assert thinned(path, MOST_FROZEN) is path
+    given = Given(local)
+    paths = given.subscribe(PathMessage, 'path', latched=True)
+    given.out.publish_path(estimate(60_000.0), path, graph=0, n_frozen=frozen)
+    given.wait_for(paths, 1)
+    shown = stamps(paths[0].poses)
+    assert shown == [*range(1, frozen + 1, 3), *range(frozen + 1, frozen + 5)]
+    assert len(shown) - 4 <= MOST_FROZEN
+
+
+@settings(max_examples=30, deadline=None)
+@given_numbers(st.integers(0, 100_000), st.integers(0, 5))
+def test_frozen_poses_that_are_shown_begin_with_the_first(frozen: int, others: int) -> None:
+    stamps_ns = np.arange(frozen + others)
+    kept = thinned(Trajectory(stamps_ns, np.zeros((len(stamps_ns), 3))), frozen).stamps_ns
+    shown = kept[kept < frozen]
+    assert len(shown) <= MOST_FROZEN
+    assert len(shown) >= min(frozen, MOST_FROZEN // 2)
+    assert len(np.unique(np.diff(shown))) <= 1
+    np.testing.assert_array_equal(kept[kept >= frozen], stamps_ns[frozen:])
+    assert frozen == 0 or shown[0] == 0
 
 
 def test_a_better_path_at_the_same_odometry_is_a_nanosecond_newer(local: LocalNode) -> None:
