@@ -439,6 +439,7 @@ class PoseGraphBackend:
         backend = cls(config)
         restore(backend._parts(), saved)
         backend._tuner.restored()
+        backend._forgetting.restored()
         backend._newest_node_covariance = np.array(saved.newest_covariance)
         backend._chi2 = saved.chi2
         backend._settled = False    # the next update eliminates all nodes

@@ -51,6 +51,13 @@ class Forgetting:
             self._step_of_window(config.window)
         self._thinner.step(config.thinning)
 
+    def restored(self) -> None:
+        """Tell that the parts have got a saved state."""
+        nodes, parts = self._parts.nodes, self._parts
+        if nodes.n_frozen > 0 and not parts.alignment.is_aligned:
+            last, first = nodes.poses(parts.graph)[nodes.n_frozen - 1:nodes.n_frozen + 1]
+            self._joint = se2.between(last, first)
+
     def _step_of_window(self, window: WindowConfig) -> None:
         """Let the nodes beyond the window leave, if a group is due."""
         nodes = self._parts.nodes

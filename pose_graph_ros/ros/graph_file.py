@@ -33,7 +33,7 @@ class InitialGraph:
         except Exception:
             logger.exception('%s could not be loaded: a new graph is started', self.path)
             return None
-        logger.info('continuing with %d hidden nodes from %s', len(saved.nodes.rows), self.path)
+        logger.info('continuing with %d hidden nodes from %s', len(saved.nodes.ids), self.path)
         return backend
 
 

@@ -213,7 +213,7 @@ class Services:
         files = await self._in_file_thread(write_graph, saved, path)
         left_out = '' if saved.n_left_out == 0 else (
             f'; not in it: {saved.n_left_out} that wait for odometry or for the alignment')
-        return (f'{len(saved.nodes.rows)} hidden nodes in {files[0]}, with '
+        return (f'{len(saved.nodes.ids)} hidden nodes in {files[0]}, with '
                 f'{files[1].name} and {files[2].name}{left_out}')
 
     async def _load(self, path: Path) -> str:
@@ -232,5 +232,5 @@ class Services:
             raise FileFormatError(refusal)
         backend.configure(backend_config(session.values))
         session.load(saved, backend, str(path))
-        return (f'{len(saved.nodes.rows)} hidden nodes from {path}, datum '
+        return (f'{len(saved.nodes.ids)} hidden nodes from {path}, datum '
                 f'{"none" if saved.datum is None else saved.datum}')

@@ -163,23 +163,6 @@ def test_delayed_and_shuffled_within_the_window_the_path_is_the_same() -> None:
     np.testing.assert_allclose(one.path.poses[:, :2], other.path.poses[:, :2], atol=0.3)
 
 
-def test_saved_and_loaded_in_the_middle_the_path_is_the_same() -> None:
-    events, _ = drive(1500)
-    at = 12 * (len(events) // 24)
-    once, first = run(events, WINDOW), run(events[:at], WINDOW)
-    saved = first.saved()
-    saved.check()
-    second = run(events[at:], None, PoseGraphBackend.restored(
-        BackendConfig(window=WINDOW), saved))
-    for backend in (once, second):
-        assert backend.optimize().status is Status.CONVERGED
-    one, other = once.estimate(), second.estimate()
-    assert one is not None
-    assert other is not None
-    assert one.n_frozen == other.n_frozen
-    np.testing.assert_allclose(one.path.poses, other.path.poses, atol=1e-3)
-
-
 def test_a_path_that_has_left_moves_into_the_map_when_the_angle_is_found() -> None:
     events, truth = drive(1500, first_fix=1000, closures=0)
     backend, held = PoseGraphBackend(BackendConfig(window=WINDOW)), False

@@ -651,7 +651,7 @@ def test_a_graph_that_was_loaded_waits_for_odometry(active: Robot) -> None:
     active.wait(lambda: len(paths[-1].poses) == 0, 'the path is taken back')
     session.reset()
     session.load(saved, PoseGraphBackend.restored(backend_config(session.values), saved), 'map')
-    n_hidden = len(saved.nodes.rows)
+    n_hidden = len(saved.nodes.ids)
     active.wait(lambda: len(paths[-1].poses) >= n_hidden, 'its path comes')
     assert all(stamp_ns(message) > 0 for message in (*paths, *(
         marker for array in graphs for marker in array.markers)))

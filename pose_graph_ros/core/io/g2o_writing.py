@@ -10,9 +10,12 @@ from pose_graph_ros.core.geometry.se2 import BoolArray, FloatArray, IntArray
 from pose_graph_ros.core.graph.constraints import EdgeKind, Edges, ObservedNodes, upper
 from pose_graph_ros.core.graph.factor_types import FACTORS
 from pose_graph_ros.core.graph.graph import Graph, GraphRows
+from pose_graph_ros.core.io.saved_priors import standing_for
 
 NOT_USED = '# not used '
 """Begin of the line of a constraint with weight 0."""
+STANDING_FOR_PRIORS = '# instead of dense priors, which g2o does not have, '
+"""Begin of the line behind which there is nothing but edges and observed nodes for priors."""
 # Row and column of each number of an upper triangle.
 _UPPER = ((0, 0), (0, 1), (0, 2), (1, 1), (1, 2), (2, 2))
 
@@ -34,6 +37,8 @@ def write_g2o(graph: Graph, path: Path, ids: IntArray | None = None) -> None:
 def g2o_text(rows: GraphRows, ids: IntArray | None = None) -> str:
     """
     Return the text of a g2o file: vertices, FIX, edges and observed nodes, each in their order.
+
+    Edges and observed nodes that tell about the same as dense priors are the last lines.
 
     Parameters
     ----------
@@ -61,7 +66,18 @@ def g2o_text(rows: GraphRows, ids: IntArray | None = None) -> str:
         ids[is_landmark].tolist(), _texts(rows.poses[is_landmark, :2]), strict=True)]
     lines += [f'FIX {name}' for name in ids[rows.fixed & ~rows.is_bias].tolist()]
     lines += [*_edge_lines(edges, ids), *_observed_lines(observed, ids, used)]
+    if len(rows.priors) > 0:
+        lines += _lines_for_priors(rows, ids)
     return '\n'.join(lines) + '\n'
+
+
+def _lines_for_priors(rows: GraphRows, ids: IntArray) -> list[str]:
+    edges, observed = standing_for(rows)
+    edges, observed = edges.renumbered(rows.rows_of), observed.renumbered(rows.rows_of)
+    lines = [*_edge_lines(edges, ids),
+             *_observed_lines(observed, ids, np.ones(len(observed), dtype=bool))]
+    return [f'{STANDING_FOR_PRIORS}of which there are {len(rows.priors)}: {len(lines)} lines',
+            *lines]
 
 
 def _is_used(observed: ObservedNodes, edges: Edges) -> BoolArray:

@@ -10,7 +10,7 @@ the path for other programs and is not read. See docs/design.md, "Saved graphs".
 """
 
 from collections.abc import Iterator
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, field, fields
 import hashlib
 import json
 import os
@@ -36,10 +36,11 @@ from pose_graph_ros.core.graph.constraints import (
 from pose_graph_ros.core.graph.graph import GraphRows, NextIds
 from pose_graph_ros.core.io.atomic_files import write_files
 from pose_graph_ros.core.io.g2o import LAYOUT
-from pose_graph_ros.core.io.g2o_writing import g2o_text, NOT_USED
+from pose_graph_ros.core.io.g2o_writing import g2o_text, NOT_USED, STANDING_FOR_PRIORS
 from pose_graph_ros.core.io.json_values import annotations, decoded, encoded
-from pose_graph_ros.core.io.old_versions import with_judgement, with_names
+from pose_graph_ros.core.io.old_versions import with_ids, with_judgement, with_names
 from pose_graph_ros.core.io.saved_graph import SavedGraph
+from pose_graph_ros.core.io.saved_priors import restored_priors, saved_priors, SavedPriors
 from pose_graph_ros.core.io.tum import tum_text
 from pose_graph_ros.core.saved_columns import Integers, Numbers, Rows3, Rows4, Rows6
 
@@ -86,6 +87,7 @@ class SavedRows:
     observed_ids: Integers | None = None
     next_ids: NextIds | None = None
     """Ids of the next new rows; None where they follow on the last ones."""
+    priors: SavedPriors = field(default_factory=SavedPriors)
 
 
 def graph_paths(path: Path) -> tuple[Path, Path, Path]:
@@ -218,7 +220,8 @@ def _checked_members(path: Path, content: bytes) -> dict[str, Any]:
             f'{path}: expected a {FORMAT} of version 1 to {VERSION}, created by pose_graph_ros; '
             f'this one is of version {version!r}, created by {members.get("created_by")!r}')
     members = with_names(members) if version == 1 else dict(members)
-    return with_judgement(members) if version < 3 else members
+    members = with_judgement(members) if version < 3 else members
+    return with_ids(members) if version < 4 else members
 
 
 def _saved_rows(rows: GraphRows) -> SavedRows:
@@ -233,12 +236,14 @@ def _saved_rows(rows: GraphRows) -> SavedRows:
         rows.edges.kind.astype(np.int64), rows.edges.weight, edges.i, edges.j, edges.mean,
         upper(edges.information), edges.bias, rows.observed.kind.astype(np.int64),
         rows.observed.weight, on_bias, observed.node, observed.offset, observed.mean,
-        upper(observed.information), node_ids, edge_ids, observed_ids, rows.next_ids)
+        upper(observed.information), node_ids, edge_ids, observed_ids, rows.next_ids,
+        saved_priors(rows.priors))
 
 
 def _graph_rows(rows: SavedRows, text: str) -> GraphRows:
     """Return the rows of a graph from both files; raise ValueError if they do not fit together."""
-    lines = [line.removeprefix(NOT_USED) for line in text.split('\n')]
+    lines = [line.removeprefix(NOT_USED)
+             for line in text.partition(STANDING_FOR_PRIORS)[0].split('\n')]
     vertices = _numbers(lines, 'VERTEX_SE2')
     n = len(vertices) + len(rows.biases), len(rows.edge_kind), len(rows.observed_kind)
     node_ids, edge_ids, observed_ids = (
@@ -259,7 +264,7 @@ def _graph_rows(rows: SavedRows, text: str) -> GraphRows:
     return GraphRows(
         poses, is_bias.astype(np.int32), fixed, _edges(rows, _numbers(lines, 'EDGE_SE2')),
         _observed(rows, lines), node_ids, edge_ids, observed_ids, next_ids,
-        np.full(n[0], 3, dtype=np.int32))
+        np.full(n[0], 3, dtype=np.int32), restored_priors(rows.priors))
 
 
 def _edges(rows: SavedRows, numbers: FloatArray) -> Edges:

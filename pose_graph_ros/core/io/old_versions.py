@@ -3,7 +3,8 @@
 """
 Saved graphs of older versions.
 
-Version 1 holds losses and kinds as numbers, version 2 holds names. Neither has judgements.
+Version 1 holds losses and kinds as numbers, version 2 holds names. Neither has judgements. In
+version 3 the ids of hidden nodes are `rows`.
 """
 
 from typing import Any
@@ -46,3 +47,12 @@ def with_names(members: dict[str, Any]) -> dict[str, Any]:
         if isinstance(fields, dict) and field in fields:
             upgraded[member] = {**fields, field: {'names': list(names), 'of': fields[field]}}
     return upgraded
+
+
+def with_ids(members: dict[str, Any]) -> dict[str, Any]:
+    """Return the members of a file of version 3 as those of version 4."""
+    nodes = members.get('nodes')
+    if not isinstance(nodes, dict) or 'rows' not in nodes:
+        return members
+    renamed = {'ids' if name == 'rows' else name: value for name, value in nodes.items()}
+    return {**members, 'nodes': renamed}

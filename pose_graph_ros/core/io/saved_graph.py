@@ -21,6 +21,7 @@ from pose_graph_ros.core.geometry.se2 import FloatArray, IntArray, wrap
 from pose_graph_ros.core.graph.constraints import check as check_table, EdgeKind, KindArray
 from pose_graph_ros.core.graph.graph import GraphRows
 from pose_graph_ros.core.graph.identities import Ids
+from pose_graph_ros.core.graph.priors import check_priors
 from pose_graph_ros.core.graph.reweighting import SavedLosses
 from pose_graph_ros.core.judgement.closure_states import SavedClosures
 from pose_graph_ros.core.judgement.fix_states import SavedFixes
@@ -69,8 +70,7 @@ class SavedGraph:
     @property
     def path(self) -> FloatArray:
         """Poses of all nodes that are no biases, those that have left included, shape (H, 3)."""
-        frozen, nodes = self.nodes.frozen, self.nodes.rows
-        return np.concatenate((frozen, self.rows.poses[self.rows.rows_of(nodes[len(frozen):])]))
+        return self.nodes.poses(self.rows.node_ids, self.rows.poses)
 
     def check(self) -> None:
         """
@@ -86,17 +86,10 @@ class SavedGraph:
         ids = {'nodes': rows.node_ids, 'edges': rows.edge_ids, 'observed': rows.observed_ids}
         for (name, present), end in zip(ids.items(), rows.next_ids, strict=True):
             _increasing(f'graph.{name}', np.concatenate(([-1], present, [end])))
-        _require(len(nodes.rows) > 0, 'nodes: expected at least one')
-        _same_length('nodes', nodes, 'stamps_ns', 'rows')
-        _require(len(nodes.frozen) + len(nodes.odometry) == len(nodes.rows),
-                 'nodes: expected a frozen pose or an odometry pose of each, got '
-                 f'{len(nodes.frozen)} and {len(nodes.odometry)} for {len(nodes.rows)} nodes')
-        _increasing('nodes.stamps_ns', nodes.stamps_ns)
-        _increasing('nodes.rows', nodes.rows)
-        poses = rows.node_ids[rows.is_pose]
-        _require(np.isin(poses, nodes.rows),
-                 'nodes.rows: expected all hidden nodes of the graph that are no biases')
-        _in_graph('nodes.rows', nodes.rows[len(nodes.frozen):], poses)
+        check_priors(rows.priors, ())
+        for prior in rows.priors:
+            _in_graph('graph.priors', prior.nodes, rows.node_ids)
+        self._check_nodes()
         self._check_odometry()
         if self.datum is not None:
             TangentPlane(*self.datum)   # raises if it is no point on the Earth
@@ -115,7 +108,7 @@ class SavedGraph:
                      'information', 'kind')
         _inside('alignment.source', alignment.source, len(alignment.sources))
         _inside('alignment.kind', alignment.kind, 3)
-        _require(np.isin(alignment.node, nodes.rows), 'alignment.node: expected hidden nodes')
+        _require(np.isin(alignment.node, nodes.ids), 'alignment.node: expected hidden nodes')
         _require(alignment.state in STATES, f'alignment.state: expected one of {STATES}')
         _require(alignment.next_verdict > 0, 'alignment.next_verdict: expected a positive number')
         self._check_judgement(self.judgement.closures)
@@ -125,8 +118,30 @@ class SavedGraph:
             _same_length(name, edges, 'sources', 'i', 'j', 'mean', 'information', 'kind',
                          'stamps_ns')
             _inside(name, edges.kind, EdgeKind.BIAS)
-            _require(np.isin((edges.i, edges.j), nodes.rows),
+            _require(np.isin((edges.i, edges.j), nodes.ids),
                      f'{name}: expected edges between hidden nodes')
+
+    def _check_nodes(self) -> None:
+        rows, nodes, thinned = self.rows, self.nodes, self.nodes.thinned
+        n, n_frozen = len(nodes.ids), len(nodes.frozen)
+        _require(n > 0, 'nodes: expected at least one')
+        _same_length('nodes', nodes, 'stamps_ns', 'ids')
+        _require(n_frozen + len(nodes.odometry) == n and n_frozen < n,
+                 'nodes: expected a frozen pose or an odometry pose of each, got '
+                 f'{n_frozen} and {len(nodes.odometry)} for {n} nodes')
+        _increasing('nodes.stamps_ns', nodes.stamps_ns)
+        _increasing('nodes.ids', nodes.ids)
+        _same_length('nodes.thinned', thinned, 'numbers', 'anchors', 'relative', 'noise')
+        _increasing('nodes.thinned.numbers', thinned.numbers)
+        kept = np.setdiff1d(np.arange(n_frozen, n), thinned.numbers)
+        _require(np.isin(thinned.anchors, kept) & (thinned.numbers >= n_frozen)
+                 & (thinned.numbers < n),
+                 'nodes.thinned: expected nodes that are not frozen, and others beside them')
+        poses = rows.node_ids[rows.is_pose]
+        # a fixed node is frozen with those around it, but stays
+        _require(np.isin(poses, nodes.ids[np.append(np.arange(n_frozen), kept)]),
+                 'nodes.ids: expected all hidden nodes of the graph that are no biases')
+        _in_graph('nodes.ids', nodes.ids[kept], poses)
 
     def _check_odometry(self) -> None:
         nodes = self.nodes
@@ -141,8 +156,8 @@ class SavedGraph:
             _same_length(where, stream, 'stamps_ns', 'samples', 'dense')
             _same_length(where, stream, 'waiting_ns', 'waiting')
             _increasing(where, np.append(stream.stamps_ns, stream.waiting_ns))
-            _require(all(-1 <= k <= len(nodes.rows) for k in (stream.tied, stream.next_to_tie))
-                     and stream.tied < len(nodes.rows) and stream.next_to_tie >= 0,
+            _require(all(-1 <= k <= len(nodes.ids) for k in (stream.tied, stream.next_to_tie))
+                     and stream.tied < len(nodes.ids) and stream.next_to_tie >= 0,
                      f'{where}: expected nodes for its edges')
             _require((stream.last is not None) == (len(stream.stamps_ns) > 0),
                      f'{where}: expected the state at the newest sample, if there is one')
@@ -188,7 +203,7 @@ class SavedGraph:
         _in_graph(where, odometry.rows, self.rows.edge_ids)
         _require(self._kinds(odometry.rows) == EdgeKind.ODOMETRY,
                  f'{where}: expected rows of odometry')
-        _require(np.isin(odometry.ends, self.nodes.rows), f'{where}: expected hidden nodes')
+        _require(np.isin(odometry.ends, self.nodes.ids), f'{where}: expected hidden nodes')
         _require(odometry.weights > 0.0, f'{where}: expected positive weights')
 
     def _check_source(

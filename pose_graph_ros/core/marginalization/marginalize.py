@@ -21,7 +21,7 @@ import numpy as np
 from pose_graph_ros.core.compiled.jit import kernel, ROWS
 from pose_graph_ros.core.exceptions import GraphUpdateError
 from pose_graph_ros.core.geometry import se2
-from pose_graph_ros.core.geometry.se2 import FloatArray, IntArray
+from pose_graph_ros.core.geometry.se2 import BoolArray, FloatArray, IntArray
 from pose_graph_ros.core.graph import normal_equations, tables as tb
 from pose_graph_ros.core.graph.constraints import EdgeKind, Edges, ObservedKind, ObservedNodes
 from pose_graph_ros.core.graph.graph import Graph, GraphRows, GraphUpdate
@@ -120,6 +120,25 @@ def marginal(
                       _symmetric(U[np.ix_(says, says)]), u[says], energy,
                       bool(np.any(inside & fixed)) or _is_anchored(part))
     return Marginal(prior, part.edge_ids.astype(np.int64), part.observed_ids.astype(np.int64))
+
+
+def schur_complement(
+    H: FloatArray, b: FloatArray, leaves: BoolArray,
+) -> tuple[FloatArray, FloatArray]:
+    """
+    Return a system of equations without some of its coordinates, which take their best values.
+
+    Parameters
+    ----------
+    H, b : ndarray, shapes (n, n) and (n,), positive semidefinite
+    leaves : ndarray of bool, shape (n,), which coordinates leave
+
+    """
+    if not np.any(leaves):
+        return H, b
+    gain = H[np.ix_(~leaves, leaves)] @ _pseudo_inverse(H[np.ix_(leaves, leaves)])
+    reduced = H[np.ix_(~leaves, ~leaves)] - gain @ H[np.ix_(leaves, ~leaves)]
+    return _symmetric(reduced), b[~leaves] - gain @ b[leaves]
 
 
 def as_edge(prior: Prior) -> Edges:

@@ -27,6 +27,7 @@ from pose_graph_ros.core.odometry.primary_source import (
 )
 from pose_graph_ros.core.odometry.secondary_edges import SecondaryEdges
 from pose_graph_ros.core.odometry.stream import OdometryStream, SavedStream
+from pose_graph_ros.core.odometry.thinned_nodes import SavedThinned
 from pose_graph_ros.core.saved_columns import as_matrix, as_pose, Integers, Matrix, Rows3
 
 
@@ -45,10 +46,10 @@ class SavedNodes:
 
     stamps_ns: Integers
     """Shape (H,) [ns]."""
-    rows: Integers
-    """Ids of the nodes in the graph, shape (H,)."""
+    ids: Integers
+    """Ids of the nodes, ascending, shape (H,)."""
     odometry: Rows3
-    """Poses by odometry alone of those that are in the graph, shape (H - F, 3) [m, m, rad]."""
+    """Poses by odometry alone of the nodes after the frozen ones, shape (H - F, 3)."""
     leads: tuple[str, ...]
     """Primary sources one after the other, P of them."""
     leads_after_ns: Integers
@@ -67,6 +68,28 @@ class SavedNodes:
     """Poses of the first nodes, which have left the graph, shape (F, 3) [m, m, rad]."""
     travelled: float = 0.0
     """Path length up to the first node in the graph [m]."""
+    thinned: SavedThinned = field(default_factory=SavedThinned)
+    """Nodes that have left although older ones stay."""
+
+    def poses(self, node_ids: IntArray, poses: FloatArray) -> FloatArray:
+        """
+        Return the poses of all nodes, shape (H, 3) [m, m, rad].
+
+        Parameters
+        ----------
+        node_ids : ndarray of int, shape (N,), ids of the nodes in the graph, ascending
+        poses : ndarray, shape (N, 3), their poses
+
+        """
+        table = NodeTable()
+        self.fill(table)
+        at = np.searchsorted(node_ids, self.ids[table.n_frozen:])
+        return table.poses(poses[np.minimum(at, len(poses) - 1)])
+
+    def fill(self, table: NodeTable) -> None:
+        """Fill an empty table."""
+        table.restore(self.stamps_ns, self.ids, self.odometry, self.frozen, self.travelled)
+        table.thinned.restore(self.thinned)
 
 
 class HiddenNodes:
@@ -424,12 +447,11 @@ class HiddenNodes:
             primaries, np.array(after_ns), self.covered_ns, self._base_ns, self._base, span,
             {name: stream.saved(needed_ns, self._secondary.progress[name])
              for name, stream in self.streams.items()},
-            self.table.frozen.copy(), float(self.table.travelled[0]))
+            self.table.frozen.copy(), float(self.table.travelled[0]), self.table.thinned.saved())
 
     def restore(self, saved: SavedNodes) -> None:
         """Set the state of this empty object to a saved one."""
-        self.table.restore(
-            saved.stamps_ns, saved.rows, saved.odometry, saved.frozen, saved.travelled)
+        saved.fill(self.table)
         self._primaries = list(zip(saved.leads_after_ns.tolist(), saved.leads, strict=True))
         self.covered_ns, self._base_ns, self._base = saved.lead_ns, saved.base_ns, saved.base
         if saved.bridge is not None:

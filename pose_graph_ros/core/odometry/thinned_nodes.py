@@ -2,6 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Hidden nodes that have left the graph while older ones stay, as there are others beside them."""
 
+from dataclasses import dataclass, field
 from typing import NamedTuple
 
 import numpy as np
@@ -9,6 +10,7 @@ import numpy.typing as npt
 
 from pose_graph_ros.core.geometry import se2
 from pose_graph_ros.core.geometry.se2 import FloatArray, IntArray
+from pose_graph_ros.core.saved_columns import Integers, Rows3, Rows6
 
 
 class Place(NamedTuple):
@@ -20,6 +22,20 @@ class Place(NamedTuple):
     """Pose in the anchor, shape (3,) [m, m, rad]."""
     noise: FloatArray
     """Covariance of that pose, in the frame of the node, shape (3, 3)."""
+
+
+@dataclass(frozen=True, slots=True)
+class SavedThinned:
+    """Saved nodes that have left although older ones stay."""
+
+    numbers: Integers = field(default_factory=lambda: np.empty(0, dtype=np.int64))
+    """Numbers of the nodes, ascending, shape (T,)."""
+    anchors: Integers = field(default_factory=lambda: np.empty(0, dtype=np.int64))
+    """Numbers of the nodes that stand for them, shape (T,)."""
+    relative: Rows3 = field(default_factory=lambda: np.empty((0, 3)))
+    """Poses in the anchors, shape (T, 3) [m, m, rad]."""
+    noise: Rows6 = field(default_factory=lambda: np.empty((0, 6)))
+    """Upper triangles of the covariances of these, in the frames of the nodes, shape (T, 6)."""
 
 
 class ThinnedNodes:
@@ -90,6 +106,16 @@ class ThinnedNodes:
         self.anchors = self.anchors[begin:].copy()
         self.relative = self.relative[begin:].copy()
         self.noise = self.noise[begin:].copy()
+
+    def saved(self) -> SavedThinned:
+        """Return copies of all columns."""
+        return SavedThinned(self.numbers.copy(), self.anchors.copy(), self.relative.copy(),
+                            self.noise.astype(np.float64))
+
+    def restore(self, saved: SavedThinned) -> None:
+        """Set all columns to saved ones."""
+        self.numbers, self.anchors = saved.numbers.copy(), saved.anchors.copy()
+        self.relative, self.noise = saved.relative.copy(), saved.noise.astype(np.float32)
 
 
 def _upper(matrices: FloatArray) -> npt.NDArray[np.float32]:

@@ -85,7 +85,7 @@ def test_other_programs_read_the_graph_and_the_path(tmp_path: Path) -> None:
     assert graph.n_observed == np.sum(~rows.is_bias[rows.observed.node])
     path = read_tum(tum)
     np.testing.assert_array_equal(path.stamps_ns, saved.nodes.stamps_ns)
-    np.testing.assert_array_equal(path.poses[:, :2], rows.poses[saved.nodes.rows, :2])
+    np.testing.assert_array_equal(path.poses[:, :2], rows.poses[saved.nodes.ids, :2])
     members = json.loads(side.read_text(encoding='ascii'))
     assert members['version'] == 4
     assert members['datum'] == {
@@ -400,7 +400,7 @@ def test_ids_with_gaps_come_back_and_are_those_of_the_g2o_file(tmp_path: Path) -
     saved = small_graph()
     rows, nodes = saved.rows, saved.nodes
     with_gaps = replace(
-        saved, nodes=replace(nodes, rows=2 * nodes.rows + 5), rows=rows._replace(
+        saved, nodes=replace(nodes, ids=2 * nodes.ids + 5), rows=rows._replace(
             edges=rows.edges.renumbered(lambda ids: 2 * ids + 5),
             node_ids=2 * rows.node_ids + 5, edge_ids=3 * rows.edge_ids,
             next_ids=NextIds(1000, 1000, 7)),
