@@ -441,8 +441,8 @@ class PoseGraphBackend:
         backend._tuner.restored()
         backend._forgetting.restored()
         backend._newest_node_covariance = np.array(saved.newest_covariance)
-        backend._chi2 = saved.chi2
-        backend._settled = False    # the next update eliminates all nodes
+        # the next update eliminates all nodes
+        backend._settled, backend._chi2 = False, saved.chi2
         return backend
 
     def _parts(self) -> Parts:

@@ -28,7 +28,7 @@ from pose_graph_ros.core.judgement.fix_states import SavedFixes
 from pose_graph_ros.core.judgement.judge import SavedJudgement
 from pose_graph_ros.core.judgement.odometry_states import SavedOdometry
 from pose_graph_ros.core.judgement.verdicts import Decision, State
-from pose_graph_ros.core.odometry.hidden_nodes import SavedNodes
+from pose_graph_ros.core.odometry.saved_nodes import SavedNodes
 from pose_graph_ros.core.saved_columns import Matrix
 from pose_graph_ros.core.sources.constraint_queue import SavedEdges
 from pose_graph_ros.core.sources.source_constraints import SavedSource
