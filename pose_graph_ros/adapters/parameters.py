@@ -126,7 +126,8 @@ PARAMETERS: tuple[Parameter, ...] = (
               'keeps. If 0, there is no limit.', 0.0, 1e9),
     Parameter('window.prior', _WINDOW.prior.value, '', 'What stays of those that leave: `dense`, '
               'one constraint of all their neighbours, or `sparse`, a few constraints of pairs '
-              'of them, which are cheaper and less certain.', choices=_values(config.Prior)),
+              'of them, which are cheaper and less certain; priors with '
+              'modelled errors stay dense.', choices=_values(config.Prior)),
     Parameter('thinning.cell', _THINNING.cell, 'm', 'Where a place is driven again and again, few '
               'hidden nodes stay in the graph: the oldest ones, and rather those with fixes or '
               'loop closures, in each square cell with sides of this length. The others leave it '

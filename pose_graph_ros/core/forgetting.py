@@ -11,15 +11,18 @@ prior of poses relative to it says nothing about where they are in the map.
 
 import numpy as np
 
-from pose_graph_ros.core.config import BackendConfig, WindowConfig
+from pose_graph_ros.core.config import BackendConfig, Prior, WindowConfig
 from pose_graph_ros.core.error_tuner import ErrorTuner
 from pose_graph_ros.core.geometry import se2
 from pose_graph_ros.core.geometry.se2 import FloatArray, IntArray
+from pose_graph_ros.core.graph.graph_update import Left
 from pose_graph_ros.core.io.capture import Parts
 from pose_graph_ros.core.measurements import rejected
 from pose_graph_ros.core.smoother.incremental import IncrementalSmoother
 from pose_graph_ros.core.thinner import forget, Thinner
 from pose_graph_ros.core.window.policy import n_leaving
+from pose_graph_ros.core.window.sparse_removal import sparse_marginalization
+from pose_graph_ros.core.window.thinning import relative_noise, removed
 
 
 class Forgetting:
@@ -67,10 +70,10 @@ class Forgetting:
             n = n_leaving(window, nodes.table, parts.pipeline.needed_ns(
                 aligned=parts.alignment.is_aligned))
         if n > 0:
-            self._forget(n)
+            self._forget(n, window.prior)
 
-    def _forget(self, n: int) -> None:
-        """Let the n oldest nodes leave."""
+    def _forget(self, n: int, prior: Prior) -> None:
+        """Let the n oldest nodes leave, with a dense or a sparse prior instead."""
         parts, graph, nodes = self._parts, self._parts.graph, self._parts.nodes
         first = nodes.n_frozen + n
         oldest = slice(nodes.n_frozen, first)
@@ -84,14 +87,33 @@ class Forgetting:
         leaving = np.sort(np.concatenate((leaving, biases)))
         parts.judge.decide_leaving(leaving)
         poses = nodes.poses(graph)
-        gone = self._smoother.forget(leaving)
-        forget(gone, parts, self._tuner)
+        self._pass_on_anchors(first)
+        gone = self._removed(leaving) if prior is Prior.SPARSE else None
+        forget(gone or self._smoother.forget(leaving), parts, self._tuner)
         nodes.forget(poses[oldest])
         if not parts.alignment.is_aligned:
             self._joint = se2.between(poses[first - 1], poses[first])
         parts.alignment.forget(int(nodes.ids[first]))
         parts.pipeline.seen.forget(nodes.last_frozen_ns)
         self._refuse(leaving)
+
+    def _removed(self, leaving: IntArray) -> Left | None:
+        """Return what has left with nodes; None if the solver has failed."""
+        return removed(self._smoother, sparse_marginalization(self._parts.graph, leaving))
+
+    def _pass_on_anchors(self, first: int) -> None:
+        """Attach nodes that were thinned out to others if theirs leave, those before a number."""
+        table, graph = self._parts.nodes.table, self._parts.graph
+        thinned = table.thinned
+        leave = np.unique(thinned.anchors[(thinned.anchors < first) & (thinned.numbers >= first)])
+        if len(leave) == 0:
+            return
+        kept = np.setdiff1d(np.arange(first, len(table)), thinned.numbers)
+        ends, starts = graph.poses_of(table.ids[leave]), graph.poses_of(table.ids[kept])
+        nearest = np.array([np.argmin(np.hypot(*(starts[:, :2] - end[:2]).T)) for end in ends])
+        ids, anchors = table.ids[leave], table.ids[kept[nearest]]
+        table.thin(ids, anchors, se2.between(starts[nearest], ends),
+                   relative_noise(self._smoother, anchors, ids))
 
     def _follow_alignment(self) -> None:
         """

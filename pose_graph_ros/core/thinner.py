@@ -11,7 +11,8 @@ from pose_graph_ros.core.error_tuner import ErrorTuner
 from pose_graph_ros.core.graph.graph_update import Left
 from pose_graph_ros.core.io.capture import Parts
 from pose_graph_ros.core.smoother.incremental import Forgotten, IncrementalSmoother
-from pose_graph_ros.core.window.thinning import groups, remove, simplify, Thinning
+from pose_graph_ros.core.window.sparse_removal import sparse_removal
+from pose_graph_ros.core.window.thinning import groups, removed, simplify, Thinning
 
 
 class Thinner:
@@ -40,7 +41,8 @@ class Thinner:
             return 0
         for group in groups(parts.graph, places):
             parts.judge.decide_leaving(group.nodes)
-            gone = remove(self._smoother, group.nodes)
+            gone = removed(
+                self._smoother, sparse_removal(parts.graph, group.nodes))
             if gone is None:
                 break
             forget(gone, parts, self._tuner)

@@ -2,10 +2,18 @@
 # SPDX-License-Identifier: Apache-2.0
 """The back end in a place that is driven often, with `thinning.cell`."""
 
+from dataclasses import replace
+
 import numpy as np
 
 from pose_graph_ros.core.backend import PoseGraphBackend
-from pose_graph_ros.core.config import BackendConfig, MeasurementSource, Robust, ThinningConfig
+from pose_graph_ros.core.config import (
+    BackendConfig,
+    MeasurementSource,
+    Robust,
+    ThinningConfig,
+    WindowConfig,
+)
 from pose_graph_ros.core.geometry import se2
 from pose_graph_ros.core.geometry.se2 import FloatArray
 from pose_graph_ros.core.measurements import AnswerStatus, LoopClosure, OdometrySample
@@ -18,8 +26,14 @@ def stamp(k: int) -> int:
     return (k + 1) * 1_000_000_000
 
 
-def driven(config: BackendConfig) -> tuple[PoseGraphBackend, FloatArray]:
-    """Return a back end after laps on a circle, a closure each fifth node, and the true poses."""
+def driven(
+    config: BackendConfig, saved_at: int = -1,
+) -> tuple[PoseGraphBackend, FloatArray]:
+    """
+    Return a back end after laps on a circle, a closure each fifth node, and the true poses.
+
+    At a node it is replaced by what its saved state gives.
+    """
     rng, backend = np.random.default_rng(3), PoseGraphBackend(config)
     angle = 2.0 * np.pi / PER_LAP * np.arange(PER_LAP * LAPS)
     truth = se2.wrapped(np.column_stack((6.0 * np.cos(angle), 6.0 * np.sin(angle), angle)))
@@ -37,9 +51,11 @@ def driven(config: BackendConfig) -> tuple[PoseGraphBackend, FloatArray]:
                 stamp(k), pose=se2.compose(
                     se2.between(truth[other], true), SIGMA * rng.standard_normal(3)),
                 covariance=np.diag(SIGMA**2), **named), 'loop')
-            assert answer.status is not AnswerStatus.REJECTED
+            assert answer.status is not AnswerStatus.REJECTED or answer.reason == 'before_window'
         if k % 3 == 0:
             backend.update()
+        if k == saved_at:
+            backend = PoseGraphBackend.restored(config, backend.saved())
     backend.update()
     return backend, truth
 
@@ -65,3 +81,36 @@ def test_the_graph_does_not_grow_and_the_path_is_whole() -> None:
         paths.append(estimate.trajectory.poses[:n])
         assert np.max(np.hypot(*(paths[-1] - truth[:n])[:, :2].T)) < 0.5
     assert np.sqrt(np.mean((paths[1] - paths[0])[:, :2]**2)) < 0.1
+
+
+def test_with_a_window_nodes_that_were_thinned_out_leave_with_it_and_lose_their_anchors() -> None:
+    config = replace(settings(2.0), window=WindowConfig(nodes=2 * PER_LAP))
+    backend, truth = driven(config)
+    estimate, saved = backend.estimate(), backend.saved()
+    saved.check()
+    thinned, n_frozen = saved.nodes.thinned, len(saved.nodes.frozen)
+    assert n_frozen > 2 * PER_LAP
+    assert len(thinned.numbers) > 20
+    assert np.min(thinned.numbers) >= n_frozen
+    assert np.all(backend.graph.node_rows(saved.nodes.ids[thinned.anchors]) >= 0)
+    assert backend.graph.n_nodes < PER_LAP + 30
+    n = len(truth) - 1
+    assert estimate is not None
+    assert estimate.n_hidden == n
+    error = estimate.path.poses[:n] - truth[:n]
+    assert np.max(np.hypot(*error[:, :2].T)) < 0.5
+    # the places of those whose anchors have changed are as certain as the graph
+    for number in thinned.numbers.tolist():
+        place = backend._nodes.table.thinned.place(number)
+        assert place is not None
+        assert np.max(np.abs(place.mean[:2])) < 4.0
+        assert 0.0 < np.trace(place.noise[:2, :2]) < 1.0
+
+
+def test_saved_halfway_a_thinned_graph_goes_on_as_without() -> None:
+    once, other = (driven(settings(2.0), at)[0] for at in (-1, 3 * PER_LAP))
+    one, two = once.estimate(), other.estimate()
+    assert one is not None
+    assert two is not None
+    assert abs(once.graph.n_nodes - other.graph.n_nodes) <= 10
+    assert np.max(np.hypot(*(one.path.poses - two.path.poses)[:, :2].T)) < 0.1

@@ -103,6 +103,7 @@ def test_the_newest_pose_is_that_of_the_whole_graph_but_the_graph_is_small(
     assert part.graph.n_nodes - other.n_biases <= 115 + 1
     assert part.graph.n_edges < 300
     assert part.graph.n_observed < 150
+    assert len(part.graph.priors) == (window.prior is Prior.DENSE)
 
 
 def test_what_has_left_does_not_change_any_more_and_nothing_grows() -> None:

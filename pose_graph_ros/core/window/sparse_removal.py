@@ -11,12 +11,15 @@ in proportion to the number of nodes however often nodes leave.
 import numpy as np
 
 from pose_graph_ros.core.geometry.se2 import BoolArray, IntArray
-from pose_graph_ros.core.graph.constraints import EdgeKind, Edges, ObservedKind
+from pose_graph_ros.core.graph.constraints import EdgeKind, Edges, ObservedKind, ObservedNodes
 from pose_graph_ros.core.graph.graph import Graph, GraphUpdate
 from pose_graph_ros.core.graph.graph_update import Left
-from pose_graph_ros.core.marginalization.pose_marginal import POSE_EDGES, pose_marginal
+from pose_graph_ros.core.graph.priors import Prior
+from pose_graph_ros.core.marginalization.marginalize import marginal, marginalize
 from pose_graph_ros.core.marginalization.sparsification import SparsePrior, sparsify
 
+# Kinds of edges between two poses.
+POSE_EDGES = (EdgeKind.ODOMETRY, EdgeKind.LOOP_CLOSURE, EdgeKind.PRIOR)
 # Edges beyond the tree, for each of its nodes. A tree alone costs 8 % in rms where a hall is
 # driven 30 times, this 1 %.
 EXTRA = 0.5
@@ -24,7 +27,7 @@ EXTRA = 0.5
 
 def can_leave(graph: Graph, nodes: IntArray) -> bool:
     """
-    Tell whether all edges of nodes lead to other poses, as `sparse_removal` needs it.
+    Tell whether all edges and priors of nodes are on poses, as `sparse_removal` needs it.
 
     Parameters
     ----------
@@ -33,7 +36,13 @@ def can_leave(graph: Graph, nodes: IntArray) -> bool:
 
     """
     edges = graph.edges
-    return bool(np.all(np.isin(edges.kind[_touching(edges, nodes)], POSE_EDGES)))
+    return bool(np.all(np.isin(edges.kind[_touching(edges, nodes)], POSE_EDGES)) and all(
+        _is_on_poses(graph, prior) for prior in graph.priors if np.any(
+            np.isin(prior.nodes, nodes))))
+
+
+def _is_on_poses(graph: Graph, prior: Prior) -> bool:
+    return bool(np.all(graph.is_pose[graph.node_rows(prior.nodes)]))
 
 
 def sparse_removal(graph: Graph, nodes: IntArray) -> GraphUpdate:
@@ -50,13 +59,15 @@ def sparse_removal(graph: Graph, nodes: IntArray) -> GraphUpdate:
     """
     edges, observed = graph.edges, graph.observed
     of_edges = _touching(edges, nodes)
-    around = np.setdiff1d(np.concatenate((edges.i[of_edges], edges.j[of_edges])), nodes)
+    of_priors = [prior.nodes for prior in graph.priors if np.any(np.isin(prior.nodes, nodes))]
+    around = np.setdiff1d(
+        np.concatenate((edges.i[of_edges], edges.j[of_edges], *of_priors)), nodes)
     earlier = ((edges.kind == EdgeKind.PRIOR) & np.isin(edges.i, around)
                & np.isin(edges.j, around))
     earlier_observed = (observed.kind == ObservedKind.PRIOR) & np.isin(observed.node, around)
     sparse = _approximation(
-        graph, nodes, of_edges | earlier,
-        (np.isin(observed.node, nodes) & (observed.weight > 0.0)) | earlier_observed)
+        marginal(graph, nodes, graph.edge_ids[earlier].tolist(),
+                 graph.observed_ids[earlier_observed].tolist()).prior)
     return GraphUpdate(
         edges=sparse.edges, observed=sparse.observed, remove_nodes=nodes.tolist(),
         drop_edges=graph.edge_ids[earlier].tolist(),
@@ -69,12 +80,38 @@ def _touching(edges: Edges, nodes: IntArray) -> BoolArray:
         np.isin(edges.i, nodes) | np.isin(edges.j, nodes) | np.isin(edges.k, nodes))
 
 
-def _approximation(
-    graph: Graph, nodes: IntArray, edges: BoolArray, observed: BoolArray,
-) -> SparsePrior:
-    """Return what stands for some constraints, by row, when nodes leave."""
-    prior = pose_marginal(graph, nodes, edges, observed)
-    return sparsify(prior.nodes, prior.poses, prior.information, prior.vector,
+def sparse_marginalization(graph: Graph, nodes: IntArray) -> GraphUpdate:
+    """
+    Return the update by which nodes of any kind leave, with as few dense priors as possible.
+
+    As `marginalize`, but priors on poses become edges and observed nodes, by which no covariance
+    becomes smaller. Those with biases or landmarks stay dense: they are small, as only the newest
+    biases outlive their nodes.
+
+    Parameters
+    ----------
+    graph : Graph
+    nodes : ndarray of int, ids of hidden nodes
+
+    """
+    update = marginalize(graph, nodes.tolist())
+    edges, observed, dense = [update.edges], [update.observed], []
+    for prior in update.priors:
+        if _is_on_poses(graph, prior):
+            sparse = _approximation(prior)
+            edges.append(sparse.edges)
+            observed.append(sparse.observed)
+        else:
+            dense.append(prior)
+    return update._replace(
+        edges=Edges.joined(edges), observed=ObservedNodes.joined(observed), priors=dense)
+
+
+def _approximation(prior: Prior | None) -> SparsePrior:
+    """Return what stands for a prior on poses."""
+    if prior is None:
+        return SparsePrior(Edges(), ObservedNodes(), 0.0)
+    return sparsify(prior.nodes, prior.reference, prior.information, prior.vector,
                     anchored=prior.anchored, n_extra=round(EXTRA * len(prior.nodes)))
 
 
@@ -102,11 +139,9 @@ def with_fewer_edges(graph: Graph, most: float) -> GraphUpdate | None:
         group = _dense_group(near, first)
         inside = prior[np.isin(edges.i[prior], group) & np.isin(edges.j[prior], group)]
         if len(inside) > len(group) - 1 + round(EXTRA * len(group)):
-            chosen = np.zeros(len(edges), dtype=bool)
-            chosen[inside] = True
-            sparse = _approximation(graph, group[:0], chosen, np.zeros(graph.n_observed, bool))
+            ids = graph.edge_ids[inside].tolist()
             return GraphUpdate(
-                edges=sparse.edges, drop_edges=graph.edge_ids[inside].tolist())
+                edges=_approximation(marginal(graph, (), ids).prior).edges, drop_edges=ids)
     return None
 
 
@@ -135,7 +170,7 @@ def leaving(graph: Graph, update: GraphUpdate) -> Left:
     """
     edges, observed = graph.edges, graph.observed
     nodes = np.array(update.remove_nodes, dtype=np.int64)
-    gone = np.isin(edges.i, nodes) | np.isin(edges.j, nodes)
+    gone = np.isin(edges.i, nodes) | np.isin(edges.j, nodes) | np.isin(edges.k, nodes)
     return Left(
         np.sort(nodes), np.union1d(graph.edge_ids[gone], list(update.drop_edges)).astype(np.int64),
         np.union1d(graph.observed_ids[np.isin(observed.node, nodes)],

@@ -26,12 +26,11 @@ from pose_graph_ros.core.geometry import se2
 from pose_graph_ros.core.geometry.se2 import BoolArray, FloatArray, IntArray
 from pose_graph_ros.core.graph.constraints import EdgeKind
 from pose_graph_ros.core.graph.graph import Graph
-from pose_graph_ros.core.graph.graph_update import Left
+from pose_graph_ros.core.graph.graph_update import GraphUpdate, Left
 from pose_graph_ros.core.smoother.incremental import IncrementalSmoother
 from pose_graph_ros.core.window.sparse_removal import (
     can_leave,
     leaving,
-    sparse_removal,
     with_fewer_edges,
 )
 
@@ -188,17 +187,16 @@ def groups(graph: Graph, places: Places) -> Iterator[Places]:
         places = places.rows(~inside)
 
 
-def remove(smoother: IncrementalSmoother, nodes: IntArray) -> Left | None:
+def removed(smoother: IncrementalSmoother, update: GraphUpdate) -> Left | None:
     """
-    Return what has left the graph with a group of nodes, or None if the solver has failed.
+    Return what has left the graph with an update, or None if the solver has failed.
 
     Parameters
     ----------
     smoother : IncrementalSmoother
-    nodes : ndarray of int, ids, one of `groups`
+    update : GraphUpdate
 
     """
-    update = sparse_removal(smoother.graph, nodes)
     gone = leaving(smoother.graph, update)
     return None if smoother.update(update).status is Status.FAILED else gone
 
@@ -209,8 +207,8 @@ def simplify(smoother: IncrementalSmoother) -> Iterator[Left]:
         update = with_fewer_edges(smoother.graph, MOST_EDGES)
         if update is None:
             return
-        gone = leaving(smoother.graph, update)
-        if smoother.update(update).status is Status.FAILED:
+        gone = removed(smoother, update)
+        if gone is None:
             return
         yield gone
 
@@ -231,8 +229,30 @@ def certain(smoother: IncrementalSmoother, found: Crowd, config: ThinningConfig)
     """
     graph = smoother.graph
     start, end = graph.poses_of(found.anchors), graph.poses_of(found.leaving)
+    noise = relative_noise(smoother, found.anchors, found.leaving)
+    sure = (np.linalg.eigvalsh(noise[:, :2, :2])[:, -1] <= (0.5 * config.cell)**2) & (
+        noise[:, 2, 2] <= (0.5 * config.angle)**2)
+    return Places(found.leaving[sure], found.anchors[sure],
+                  se2.between(start[sure], end[sure]), noise[sure])
+
+
+def relative_noise(
+    smoother: IncrementalSmoother, anchors: IntArray, nodes: IntArray,
+) -> FloatArray:
+    """
+    Return the covariances of the poses of nodes in others, shape (L, 3, 3).
+
+    They are in the frames of the nodes.
+
+    Parameters
+    ----------
+    smoother : IncrementalSmoother, without edits that wait
+    anchors, nodes : ndarray of int, shape (L,), ids
+
+    """
+    start, end = smoother.graph.poses_of(anchors), smoother.graph.poses_of(nodes)
     noise = np.empty((len(start), 3, 3))
-    for k, (anchor, node) in enumerate(zip(*map(np.ndarray.tolist, found[::-1]), strict=True)):
+    for k, (anchor, node) in enumerate(zip(anchors.tolist(), nodes.tolist(), strict=True)):
         # from both poses in map axes to the frame of the node
         jacobian = np.hstack((-np.eye(3), np.eye(3)))
         jacobian[:2, 2] = end[k, 1] - start[k, 1], start[k, 0] - end[k, 0]
@@ -240,10 +260,7 @@ def certain(smoother: IncrementalSmoother, found: Crowd, config: ThinningConfig)
         axes[:2, :2] = se2.rotation(end[k, 2]).T
         jacobian = axes @ jacobian
         noise[k] = jacobian @ smoother.joint_covariance(anchor, node) @ jacobian.T
-    sure = (np.linalg.eigvalsh(noise[:, :2, :2])[:, -1] <= (0.5 * config.cell)**2) & (
-        noise[:, 2, 2] <= (0.5 * config.angle)**2)
-    return Places(found.leaving[sure], found.anchors[sure],
-                  se2.between(start[sure], end[sure]), noise[sure])
+    return noise
 
 
 def informed(graph: Graph) -> BoolArray:

@@ -11,10 +11,15 @@ from pose_graph_ros.core.geometry import se2
 from pose_graph_ros.core.geometry.se2 import FloatArray
 from pose_graph_ros.core.graph.constraints import EdgeKind, Edges, ObservedNodes
 from pose_graph_ros.core.graph.graph import Graph, GraphUpdate
+from pose_graph_ros.core.marginalization.marginalize import marginalize
 from pose_graph_ros.core.odometry.thinned_nodes import ThinnedNodes
 from pose_graph_ros.core.smoother.incremental import IncrementalSmoother
-from pose_graph_ros.core.window.sparse_removal import sparse_removal, with_fewer_edges
-from pose_graph_ros.core.window.thinning import groups, remove, simplify, Thinning
+from pose_graph_ros.core.window.sparse_removal import (
+    sparse_marginalization,
+    sparse_removal,
+    with_fewer_edges,
+)
+from pose_graph_ros.core.window.thinning import groups, removed, simplify, Thinning
 
 EXACT = SmootherConfig(alpha=0.0, budget=1e-20, max_iterations=20)
 
@@ -40,6 +45,42 @@ def test_no_covariance_becomes_smaller(seed: int, n: int, n_leaving: int) -> Non
     after = covariances(graph)
     difference = after - before[np.setdiff1d(np.arange(n), leaving)]
     assert np.min(np.linalg.eigvalsh(difference)) > -1e-6 * np.max(np.abs(after))
+
+
+@given(st.integers(0, 2**32 - 1))
+@settings(max_examples=10)
+def test_nor_does_one_if_nodes_have_left_with_a_dense_prior_before(seed: int) -> None:
+    graph = consistent_graph(seed, n_nodes=12)
+    smoother = IncrementalSmoother(EXACT, graph)
+    before = covariances(graph)
+    smoother.update(marginalize(graph, [1, 2, 3]))
+    dense = covariances(graph)
+    np.testing.assert_allclose(dense, np.delete(before, [1, 2, 3], axis=0), rtol=1e-5, atol=1e-9)
+    for remove in (sparse_removal, sparse_marginalization):
+        copy = Graph()
+        copy.fill(graph.rows())
+        IncrementalSmoother(EXACT, copy).update(remove(copy, np.array([4, 5, 6])))
+        assert len(copy.priors) <= len(graph.priors)
+        after = covariances(copy)
+        difference = after - np.delete(before, range(1, 7), axis=0)
+        # what the prior has told is not lost
+        assert np.all(np.isfinite(after))
+        assert np.min(np.linalg.eigvalsh(difference)) > -1e-5 * np.max(np.abs(after))
+
+
+def test_a_prior_with_a_bias_stays_dense() -> None:
+    i = np.arange(4)
+    poses = np.column_stack((np.arange(5.0), np.zeros((5, 2))))
+    graph = Graph()
+    graph.apply(GraphUpdate(hidden=poses, biases=np.zeros((1, 3)), fix=[0], edges=Edges.joined([
+        Edges(i, i + 1, se2.between(poses[:-1], poses[1:]), np.tile(np.eye(3), (4, 1, 1)), 0 * i),
+        Edges([2, 3], [5, 5], poses[2:4], np.tile(np.eye(3), (2, 1, 1)), [EdgeKind.BIAS] * 2,
+              bias=np.ones((2, 4)))]),
+        observed=ObservedNodes([5], mean=np.zeros((1, 3)), information=np.eye(3)[None], kind=[0])))
+    before = covariances(graph)
+    IncrementalSmoother(EXACT, graph).update(sparse_marginalization(graph, np.array([1, 2])))
+    assert [prior.nodes.tolist() for prior in graph.priors] == [[0, 3, 5]]
+    np.testing.assert_allclose(covariances(graph), before[[0, 3, 4, 5]], atol=1e-3)
 
 
 def test_a_node_of_a_chain_becomes_an_edge_without_loss() -> None:
@@ -104,7 +145,8 @@ def test_the_graph_of_a_place_that_is_driven_often_does_not_grow() -> None:
         places = thinning.places(smoother, config)
         if places is not None:
             for group in groups(smoother.graph, places):
-                assert remove(smoother, group.nodes) is not None
+                assert removed(
+                    smoother, sparse_removal(smoother.graph, group.nodes)) is not None
                 thinned.add(*group)
             for _ in simplify(smoother):
                 pass
