@@ -11,7 +11,12 @@ import pytest
 from pose_graph_ros.core.alignment.monitor import AlignmentState
 from pose_graph_ros.core.backend import PoseGraphBackend
 from pose_graph_ros.core.batch.optimizer import Status
-from pose_graph_ros.core.config import BackendConfig, Prior, WindowConfig
+from pose_graph_ros.core.config import (
+    BackendConfig,
+    MeasurementSource,
+    Prior,
+    WindowConfig,
+)
 from pose_graph_ros.core.geometry import se2
 from pose_graph_ros.core.geometry.se2 import FloatArray
 from pose_graph_ros.core.measurements import (
@@ -104,6 +109,25 @@ def test_the_newest_pose_is_that_of_the_whole_graph_but_the_graph_is_small(
     assert part.graph.n_edges < 300
     assert part.graph.n_observed < 150
     assert len(part.graph.priors) == (window.prior is Prior.DENSE)
+
+
+def test_with_modelled_errors_a_sparse_prior_keeps_what_it_has_of_biases_dense() -> None:
+    events, _ = drive(1200)
+    correlated = {'fix': MeasurementSource(correlation_time=20.0)}
+    found = [run(events, None, PoseGraphBackend(BackendConfig(
+        window=WindowConfig(nodes=60, prior=prior), measurements=correlated)))
+        for prior in (Prior.DENSE, Prior.SPARSE)]
+    one, other = (backend.estimate() for backend in found)
+    assert one is not None
+    assert other is not None
+    assert one.n_frozen == other.n_frozen > 120
+    assert found[1].graph.n_nodes == found[0].graph.n_nodes
+    for prior in found[1].graph.priors:
+        assert np.any(found[1].graph.is_bias[found[1].graph.node_rows(prior.nodes)])
+    sigma = np.sqrt(np.diag(one.covariance))
+    assert np.all(np.abs(se2.between(one.T_map_base, other.T_map_base)) < 0.5 * sigma)
+    assert np.all(np.diag(other.covariance) > 0.9 * np.diag(one.covariance))
+    assert np.all(np.diag(other.covariance) < 1.5 * np.diag(one.covariance))
 
 
 def test_what_has_left_does_not_change_any_more_and_nothing_grows() -> None:

@@ -17,10 +17,12 @@ from pose_graph_ros.core.backend import PoseGraphBackend
 from pose_graph_ros.core.batch.optimizer import Status
 from pose_graph_ros.core.config import BackendConfig, WindowConfig
 from pose_graph_ros.core.estimate import Estimate
+from pose_graph_ros.core.geometry import se2
 from pose_graph_ros.core.io.g2o import read_g2o
 from pose_graph_ros.core.io.g2o_writing import STANDING_FOR_PRIORS
 from pose_graph_ros.core.io.graph_files import read_graph, write_graph
 from pose_graph_ros.core.io.saved_graph import SavedGraph
+from pose_graph_ros.core.measurements import OdometrySample
 
 
 def through_files(saved: SavedGraph, folder: Path) -> SavedGraph:
@@ -56,6 +58,21 @@ def test_a_drive_goes_on_with_its_window_as_without_saving(
     assert one.n_frozen == other.n_frozen > len(saved.nodes.frozen)
     np.testing.assert_allclose(one.path.poses, other.path.poses, atol=1e-3)
     np.testing.assert_allclose(one.covariance, other.covariance, rtol=0.02, atol=1e-6)
+
+
+def test_with_a_second_odometry_the_same(tmp_path: Path) -> None:
+    rng, events = np.random.default_rng(5), []
+    for source, what in drive(1500)[0]:
+        events.append((source, what))
+        if isinstance(what, OdometrySample):
+            events.append(('visual', OdometrySample(
+                what.stamp_ns + 30_000_000, se2.compose(
+                    np.array([1.0, 2.0, -1.0]), what.pose + rng.normal(0.0, 1e-3, 3)))))
+    one, other, saved = interrupted(events, BackendConfig(window=WINDOW), tmp_path)
+    assert one.n_edges > 1.5 * (one.n_hidden - one.n_frozen)
+    assert len(saved.nodes.streams['visual'].stamps_ns) < 1000
+    assert one.n_frozen == other.n_frozen > len(saved.nodes.frozen)
+    np.testing.assert_allclose(one.path.poses, other.path.poses, atol=1e-3)
 
 
 def test_one_without_alignment_keeps_its_fixed_node_and_is_aligned_later(tmp_path: Path) -> None:
