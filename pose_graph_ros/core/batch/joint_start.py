@@ -132,7 +132,7 @@ def _poses(graph: Graph, v: ComplexArray) -> FloatArray:
     theta = np.where(graph.fixed, graph.poses[:, 2], se2.wrap(np.angle(v[n:])))
     poses = np.column_stack((v[:n].real, v[:n].imag, theta))
     poses[graph.is_bias & ~graph.fixed] = 0.0
-    poses[~graph.is_pose, 2] = 0.0
+    poses[~graph.is_pose & ~graph.fixed, 2] = 0.0
     return poses
 
 

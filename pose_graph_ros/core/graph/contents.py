@@ -146,7 +146,8 @@ class GraphContents:
     @property
     def is_bias(self) -> BoolArray:
         """Whether hidden nodes are biases, shape (N,)."""
-        return self.node_kind == NodeKind.BIAS
+        return np.asarray(
+            self.memory['node_i'][:self.n_nodes, tb.NODE_KIND] == NodeKind.BIAS)
 
     @property
     def is_pose(self) -> BoolArray:

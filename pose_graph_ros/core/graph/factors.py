@@ -32,6 +32,7 @@ from pose_graph_ros.core.compiled.jit import kernel, NUMBERS
 from pose_graph_ros.core.graph import tables as tb
 from pose_graph_ros.core.graph.factor_types import (
     angle,
+    BIAS,
     error,
     factors_of_end,
     heading_offset,
@@ -165,6 +166,8 @@ def _check(f, kind, start, end, delta_k, phi):  # type: ignore[no-untyped-def]
         turned += (to_x - frame_c) ** 2 + (to_y - frame_s) ** 2
     linear = f[tb.LIN_K] + fth * end[tb.DELTA + 2] - th + delta_k
     eth = wrap(linear)
+    if kind == BIAS:    # a factor times a heading that is wrapped
+        eth = wrap(fth * end[tb.POSE + 2] - start[tb.POSE + 2] + heading_offset(f, kind))
     rth = eth - linear
     if abs(rth) < 1.0:
         rth = 0.0  # rounding of the wrap; at a jump it is a multiple of 2 pi

@@ -11,7 +11,7 @@ from pose_graph_ros.core.alignment.monitor import AlignmentMonitor, AlignmentSta
 from pose_graph_ros.core.config import BackendConfig
 from pose_graph_ros.core.geometry import se2
 from pose_graph_ros.core.geometry.se2 import FloatArray
-from pose_graph_ros.core.graph.graph import Graph
+from pose_graph_ros.core.graph.graph import Graph, GraphUpdate
 from pose_graph_ros.core.measurements import (
     Absolute,
     GlobalPose,
@@ -45,7 +45,7 @@ NODES = driven(70)
 
 def graph_at(poses: FloatArray) -> Graph:
     graph = Graph()
-    graph.append_nodes(poses, np.zeros(len(poses), dtype=bool))
+    graph.apply(GraphUpdate(hidden=poses))
     return graph
 
 
