@@ -147,7 +147,7 @@ class GraphContents:
     def is_bias(self) -> BoolArray:
         """Whether hidden nodes are biases, shape (N,)."""
         return np.asarray(
-            self.memory['node_i'][:self.n_nodes, tb.NODE_KIND] == NodeKind.BIAS)
+            self.memory['node_i'][:self.n_nodes, tb.NODE_KIND] == int(NodeKind.BIAS))
 
     @property
     def is_pose(self) -> BoolArray:
