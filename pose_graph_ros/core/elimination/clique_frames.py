@@ -52,10 +52,10 @@ def mean_turn(head, c):  # type: ignore[no-untyped-def]
 def present_turn(head, c):  # type: ignore[no-untyped-def]
     """Return the angle of a clique's frame at the present estimate of its separator [rad]."""
     clique_i, clique_f = tb.clique_i(head), tb.clique_f(head)
-    if clique_i[c, tb.ANCHORED] != 0:
-        return 0.0
     if clique_i[c, tb.N_FRONTAL] == 0:
-        phi = prior_rows.mean_turn(head, c)
+        phi = prior_rows.present_frame(head, c)
+    elif clique_i[c, tb.ANCHORED] != 0:
+        phi = 0.0
     else:
         phi = mean_turn(head, c) - clique_f[c, tb.TURN_ZERO]
     return phi if abs(phi) > LEAST_TURN else 0.0
@@ -184,10 +184,10 @@ def rotated_triangle(update, n, cos, sin, to):  # type: ignore[no-untyped-def]
 
 @kernel
 def frame_slip(head, c):  # type: ignore[no-untyped-def]
-    """Return a clique's slip [rad], which is 0 if it is anchored or has no parent."""
+    """Return a clique's slip [rad], which is 0 if it does not turn or has no parent."""
     clique_i, clique_f = tb.clique_i(head), tb.clique_f(head)
     f, parent = clique_f[c], clique_i[c, tb.PARENT]
-    if clique_i[c, tb.ANCHORED] != 0 or parent < 0:
+    if parent < 0 or (clique_i[c, tb.ANCHORED] != 0 and clique_i[c, tb.N_FRONTAL] > 0):
         return 0.0
     return present_turn(head, c) - f[tb.TURN_SEEN] - present_turn(head, parent)
 

@@ -21,7 +21,7 @@ def linearize(head, c, phi, to, work):  # type: ignore[no-untyped-def]
     Parameters
     ----------
     c : int, row of the prior
-    phi : float, turn of its frame [rad]; 0 if it is anchored
+    phi : float, turn of its frame [rad]
     to : ndarray, flat, receives 3k columns and the right-hand side, laid out by `pools.row_start`
     work : ndarray, work space of 12 numbers for each node
 
@@ -65,7 +65,7 @@ def linearize(head, c, phi, to, work):  # type: ignore[no-untyped-def]
 @kernel
 def linearization_error2(head, c, work):  # type: ignore[no-untyped-def]
     """
-    Return the squared linearization error of a prior that is not anchored [sigma^2].
+    Return the squared linearization error of a prior that turns with its nodes [sigma^2].
 
     Since it was linearized its frame has turned by beta against that of its parent, and positions
     in the frame have changed by D. The displacement is then wrong by
@@ -86,6 +86,8 @@ def linearization_error2(head, c, work):  # type: ignore[no-untyped-def]
     g, r, w = work[n:2 * n], work[2 * n:3 * n], work[3 * n:4 * n]
     change = work[4 * n:5 * n]
     prior_rows.change_of_frame(head, c, r, change)
+    if row[tb.ANCHORED] != 0:
+        prior_rows.add_reference_arms(head, c, r)
     versine, lag = 1.0 - math.cos(beta), beta - math.sin(beta)
     of_nodes = of_frame = compliance = moved = arms = 0.0
     for i in range(0, n, 3):

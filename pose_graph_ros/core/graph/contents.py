@@ -265,7 +265,8 @@ class GraphContents:
         return Energies(
             energies(edge_errors(poses, edges), edges.weighted_information),
             energies(observed_errors(poses, observed), observed.weighted_information),
-            np.array([model(prior, poses[self.node_rows(prior.nodes)]).energy
+            np.array([model(prior, poses[self.node_rows(prior.nodes)], self.is_pose[
+                self.node_rows(prior.nodes)]).energy
                       for prior in self.priors]))
 
     def edge_errors(self, edges: Edges, poses: FloatArray | None = None) -> FloatArray:

@@ -66,6 +66,7 @@ class Graph(GraphContents):
         super().__init__()
         self.n_moves = 0
         """How often `set_poses` has moved the nodes."""
+        self._updating = False
 
     def set_weights(self, weights: tuple[FloatArray, FloatArray]) -> None:
         """Set the weights of all edges and observed nodes to what `weights` has returned."""
@@ -81,7 +82,7 @@ class Graph(GraphContents):
         Apply an update; a GraphUpdateError for an invalid part leaves the graph unchanged.
 
         Between `begin` and `commit` or `rollback`, what leaves keeps its rows; `commit` takes them
-        out.
+        out. Otherwise they are taken out at once.
         """
         edits = any(map(len, update[FIRST_EDIT:]))
         if edits:
@@ -145,7 +146,7 @@ class Graph(GraphContents):
             self.ensure(self.n_nodes + len(update.priors), self.n_edges, self.n_observed)
             add_priors(self.memory, update.priors, [
                 self.node_rows(prior.nodes) for prior in update.priors])
-        if head[tb.LOG_I_END] == 0:     # not within an update
+        if not self._updating:
             self._compact()
 
     def _compact(self) -> Left:
@@ -259,6 +260,7 @@ class Graph(GraphContents):
 
     def begin(self) -> None:
         """Begin an update; `rollback` reverts all edits and steps after it."""
+        self._updating = True
         if not transaction_log.begin(self.memory.head):
             self.memory.restart_stamps()
             transaction_log.begin(self.memory.head)
@@ -266,8 +268,10 @@ class Graph(GraphContents):
     def commit(self) -> Left:
         """End an update and keep its changes; return what has left, whose rows are taken out."""
         transaction_log.commit(self.memory.head)
+        self._updating = False
         return self._compact()
 
     def rollback(self) -> None:
         """Revert all edits and steps since `begin`, bit for bit."""
         transaction_log.rollback(self.memory.head)
+        self._updating = False

@@ -20,12 +20,14 @@ import numpy as np
 
 from pose_graph_ros.core.compiled.jit import kernel
 from pose_graph_ros.core.graph import pools, tables as tb, transaction_log
+from pose_graph_ros.core.graph.factor_types import NodeKind
 from pose_graph_ros.core.graph.factors import wrap
 from pose_graph_ros.core.graph.normal_equations import weakest_of
 from pose_graph_ros.core.graph.pools import row_start, triangle_size
 
 # Parent of a prior that this update has removed.
 REMOVED = -2
+_POSE = int(NodeKind.POSE)
 
 
 @kernel
@@ -40,6 +42,18 @@ def _references(row):  # type: ignore[no-untyped-def]
     """Return where in pool_f the reference poses of a prior begin, given its row."""
     n = 3 * row[tb.N_SEPARATOR]
     return row[tb.VALUES] + triangle_size(n, n)
+
+
+@kernel
+def turns(head, c):  # type: ignore[no-untyped-def]
+    """Tell whether a prior has a frame that turns with its nodes; see `priors.turns`."""
+    node_i, pool_i, row = tb.node_i(head), tb.pool_i(head), tb.clique_i(head)[c]
+    if row[tb.ANCHORED] == 0:
+        return True
+    for k in range(row[tb.NODES], row[tb.NODES] + row[tb.N_SEPARATOR]):
+        if node_i[pool_i[k], tb.NODE_KIND] != _POSE:
+            return False
+    return row[tb.N_SEPARATOR] > 1
 
 
 @kernel
@@ -64,14 +78,14 @@ def displacement(head, c, phi, d, r):  # type: ignore[no-untyped-def]
     Parameters
     ----------
     c : int, row of the prior
-    phi : float, turn of its frame [rad]; 0 if it is anchored
-    d, r : ndarray, shape (3k,), output; r is zero if it is anchored
+    phi : float, turn of its frame [rad], from `present_frame`
+    d, r : ndarray, shape (3k,), output; r is zero if the prior does not turn
 
     """
     node_f, pool_i, row = tb.node_f(head), tb.pool_i(head), tb.clique_i(head)[c]
     reference = tb.pool_f(head)[_references(row):]
     begin, n = row[tb.NODES], row[tb.N_SEPARATOR]
-    if row[tb.ANCHORED] != 0:
+    if not turns(head, c):
         for k in range(n):
             f, i = node_f[pool_i[begin + k]], 3 * k
             d[i], d[i + 1] = f[tb.POSE] - reference[i], f[tb.POSE + 1] - reference[i + 1]
@@ -81,14 +95,20 @@ def displacement(head, c, phi, d, r):  # type: ignore[no-untyped-def]
     cos, sin = math.cos(phi), math.sin(phi)
     first = node_f[pool_i[begin]]
     turn = wrap(first[tb.POSE + 2] - reference[2])
+    anchored = row[tb.ANCHORED] != 0
+    # the point about which it turns, and how much of a rigid turn about it is displacement
+    px = reference[0] if anchored else first[tb.POSE]
+    py = reference[1] if anchored else first[tb.POSE + 1]
+    tangent = 1.0 if anchored else 0.0
     for k in range(n):
         f, i = node_f[pool_i[begin + k]], 3 * k
-        dx, dy = f[tb.POSE] - first[tb.POSE], f[tb.POSE + 1] - first[tb.POSE + 1]
+        dx, dy = f[tb.POSE] - px, f[tb.POSE + 1] - py
         x, y = cos * dx + sin * dy, cos * dy - sin * dx
-        d[i] = x - (reference[i] - reference[0])
-        d[i + 1] = y - (reference[i + 1] - reference[1])
-        d[i + 2] = turn - phi + wrap(f[tb.POSE + 2] - reference[i + 2] - turn)
-        r[i], r[i + 1], r[i + 2] = -y, x, 1.0
+        rx, ry = reference[i] - reference[0], reference[i + 1] - reference[1]
+        d[i], d[i + 1] = x - rx - tangent * phi * ry, y - ry + tangent * phi * rx
+        d[i + 2] = (turn - (1.0 - tangent) * phi
+                    + wrap(f[tb.POSE + 2] - reference[i + 2] - turn))
+        r[i], r[i + 1], r[i + 2] = tangent * ry - y, x - tangent * rx, 1.0 - tangent
 
 
 @kernel
@@ -133,6 +153,24 @@ def change_of_frame(head, c, r, out):  # type: ignore[no-untyped-def]
 
 
 @kernel
+def add_reference_arms(head, c, r):  # type: ignore[no-untyped-def]
+    """
+    Make r of an anchored prior the derivative of the coordinates in its frame by -phi.
+
+    Parameters
+    ----------
+    c : int, row of the prior
+    r : ndarray, shape (3k,), from `displacement`
+
+    """
+    row = tb.clique_i(head)[c]
+    reference = tb.pool_f(head)[_references(row):]
+    for i in range(0, 3 * row[tb.N_SEPARATOR], 3):
+        r[i] -= reference[i + 1] - reference[1]
+        r[i + 1] += reference[i] - reference[0]
+
+
+@kernel
 def product(head, c, x, out):  # type: ignore[no-untyped-def]
     """
     Write U x.
@@ -163,7 +201,7 @@ def evaluate(head, c, phi, work):  # type: ignore[no-untyped-def]
     Parameters
     ----------
     c : int, row of the prior
-    phi : float, turn of its frame [rad]; 0 if it is anchored
+    phi : float, turn of its frame [rad], from `present_frame`
     work : ndarray, work space of 9 numbers for each node
         Receives the displacement d, half the gradient U d - u in the frame, and r.
 
@@ -183,8 +221,8 @@ def evaluate(head, c, phi, work):  # type: ignore[no-untyped-def]
 
 @kernel
 def present_frame(head, c):  # type: ignore[no-untyped-def]
-    """Return the turn of the frame of a prior [rad], which is 0 if it is anchored."""
-    return 0.0 if tb.clique_i(head)[c, tb.ANCHORED] != 0 else mean_turn(head, c)
+    """Return the turn of the frame of a prior [rad], which is 0 if it does not turn."""
+    return mean_turn(head, c) if turns(head, c) else 0.0
 
 
 @kernel

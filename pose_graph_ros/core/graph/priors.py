@@ -8,9 +8,9 @@ A prior is a quadratic form in the displacement d of its nodes from reference po
     d^T U d - 2 u^T d + c
 
 with the information U, the vector u and the energy c. An *anchored* prior knows where its nodes
-are in the map, and d is the difference of the poses. A relative one does not. Its displacement is
-that in a frame which turns with its nodes, by the mean turn phi of their headings, and moves with
-the first of them, so a rigid motion of all its nodes changes nothing:
+are in the map, a relative one does not. The displacement of a relative one is that in a frame
+that turns with its nodes, by the mean turn phi of their headings, and moves with the first of
+them, so a rigid motion of all its nodes changes nothing:
 
     d_k = (R_phi^T (t_k - t_0) - (t_ref_k - t_ref_0), th_k - th_ref_k - phi)
 
@@ -18,6 +18,19 @@ Its derivative by a change delta of the poses is P M delta, with M = diag(R_phi^
 and P = I - r m^T: r = (S R_phi^T (t_k - t_0), 1) is the derivative of the coordinates by -phi, and
 m takes the mean of the headings. So U turns into M^T P^T U P M, which has a rigid motion in its
 null space wherever the nodes are.
+
+An anchored prior turns, too, about the reference t_ref_0 of its first node, but its displacement
+has the linear effect of the turn:
+
+    d_k = (R_phi^T (t_k - t_ref_0) - (t_ref_k - t_ref_0) + phi S (t_ref_k - t_ref_0),
+           th_k - th_ref_k)
+
+Now r = (S (R_phi^T (t_k - t_ref_0) - (t_ref_k - t_ref_0)), 0). At the reference P is I; elsewhere
+it maps each rigid motion of the nodes where they are to one of the nodes where they were. So what
+the prior knows of relative poses says nothing about the map, as little as the constraints beside
+it, however often these are linearized again. With the mere difference of the poses the heading of
+the whole would gain information that nobody measured. It is taken for a single node, and where a
+node is no pose.
 """
 
 from collections.abc import Sequence
@@ -28,7 +41,7 @@ import numpy as np
 
 from pose_graph_ros.core.exceptions import GraphUpdateError
 from pose_graph_ros.core.geometry import se2
-from pose_graph_ros.core.geometry.se2 import FloatArray, IntArray
+from pose_graph_ros.core.geometry.se2 import BoolArray, FloatArray, IntArray
 
 # How far below zero, with the diagonal scaled to 1, the smallest eigenvalue may be, and how far
 # the triangles may differ.
@@ -66,7 +79,7 @@ class PriorModel(NamedTuple):
     """Shape (3k, 3k)."""
 
 
-def model(prior: Prior, poses: FloatArray) -> PriorModel:
+def model(prior: Prior, poses: FloatArray, is_pose: BoolArray) -> PriorModel:
     """
     Return the energy of a prior at other poses, with its derivatives.
 
@@ -74,11 +87,12 @@ def model(prior: Prior, poses: FloatArray) -> PriorModel:
     ----------
     prior : Prior
     poses : ndarray, shape (k, 3), of its nodes [m, m, rad]
+    is_pose : ndarray of bool, shape (k,), which of its nodes are poses
 
     """
     k, U = len(prior.nodes), prior.information
     turns = se2.wrap(poses[:, 2] - prior.reference[:, 2])
-    if prior.anchored:
+    if prior.anchored and (k == 1 or not np.all(is_pose)):
         d = (poses - prior.reference)
         d[:, 2] = turns
         P = M = np.eye(3 * k)
@@ -87,11 +101,16 @@ def model(prior: Prior, poses: FloatArray) -> PriorModel:
         phi = float(np.mean(turns))
         c, s = np.cos(phi), np.sin(phi)
         R = np.array(((c, -s), (s, c)))
-        d, r = np.empty((k, 3)), np.ones((k, 3))
-        local = (poses[:, :2] - poses[0, :2]) @ R
-        d[:, :2] = local - (prior.reference[:, :2] - prior.reference[0, :2])
-        d[:, 2] = turns - phi
-        r[:, 0], r[:, 1] = -local[:, 1], local[:, 0]
+        d, r = np.empty((k, 3)), np.empty((k, 3))
+        arms = prior.reference[:, :2] - prior.reference[0, :2]
+        about = prior.reference[0, :2] if prior.anchored else poses[0, :2]
+        local = (poses[:, :2] - about) @ R
+        d[:, :2], d[:, 2] = local - arms, turns - phi
+        r[:, 0], r[:, 1], r[:, 2] = -local[:, 1], local[:, 0], 1.0
+        if prior.anchored:
+            rigid = np.column_stack((-arms[:, 1], arms[:, 0], np.ones(k)))
+            d += phi * rigid
+            r -= rigid
         P = np.eye(3 * k) - np.outer(r.ravel(), np.tile((0.0, 0.0, 1.0 / k), k))
         M = np.kron(np.eye(k), np.array(((c, s, 0.0), (-s, c, 0.0), (0.0, 0.0, 1.0))))
     flat, J = d.ravel(), P @ M

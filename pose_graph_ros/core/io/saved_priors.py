@@ -68,7 +68,8 @@ def standing_for(rows: GraphRows) -> tuple[Edges, ObservedNodes]:
     edges, observed = [], []
     for prior in rows.priors:
         at = rows.rows_of(prior.nodes)
-        linear, is_pose = model(prior, rows.poses[at]), rows.is_pose[at]
+        is_pose = rows.is_pose[at]
+        linear = model(prior, rows.poses[at], is_pose)
         if not np.any(is_pose):
             continue
         U, u = schur_complement(

@@ -246,7 +246,7 @@ def _system(graph: Graph) -> tuple[FloatArray, FloatArray]:
     for prior in graph.priors:
         rows = graph.node_rows(prior.nodes)
         at = (3 * rows[:, None] + np.arange(3)).ravel()
-        linear = model(prior, graph.poses[rows])
+        linear = model(prior, graph.poses[rows], graph.is_pose[rows])
         H[np.ix_(at, at)] += linear.information
         b[at] -= linear.gradient
     return H, b

@@ -208,7 +208,7 @@ def back_substitute(head):  # type: ignore[no-untyped-def]
                 if clique_i[child, tb.N_FRONTAL] == 0:
                     transaction_log.log_clique(head, child)
                     prior_rows.update_energy(head, child)
-                    if clique_i[child, tb.ANCHORED] == 0:
+                    if prior_rows.turns(head, child):
                         work_i[2 * head[tb.NODE_ROOM] + head[tb.N_TURNED]] = child
                         head[tb.N_TURNED] += 1
                     child = clique_i[child, tb.SIBLING]

@@ -175,6 +175,7 @@ class IncrementalSmoother:
                 self.graph.rollback()
                 raise
             if code in (refinement.REFINED, refinement.UNFINISHED):
+                self.graph.commit()
                 moved = float(self._memory['scalars'][tb.LARGEST_MOVE])
                 return Refinement(finished=code == refinement.REFINED, moved=moved)
             self.graph.rollback()
@@ -431,6 +432,7 @@ class IncrementalSmoother:
             result = other._step(step.AFTER_BATCH)
             if result.status is not Status.FAILED:
                 self.graph.memory = self._memory = other.graph.memory
+                self.graph.commit()
                 return result
         self.graph.rollback()
         return UpdateResult(

@@ -136,6 +136,17 @@ def test_an_id_that_has_left_is_refused_by_name(name: str) -> None:
     assert differences(before, state(graph)) == []
 
 
+@pytest.mark.parametrize('end', ['commit', 'rollback'])
+def test_after_an_update_what_leaves_is_taken_out_at_once_again(end: str) -> None:
+    graph = graph_of(5)
+    graph.begin()
+    graph.apply(GraphUpdate(remove_nodes=[4]))
+    getattr(graph, end)()
+    for node in (3, 6):
+        graph.apply(GraphUpdate(remove_nodes=[node]))
+        assert graph.node_rows(node) == -1
+
+
 def test_within_an_update_rows_stay_and_a_rollback_brings_all_back() -> None:
     graph = graph_of(5)
     before = state(graph)

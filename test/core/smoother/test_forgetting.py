@@ -60,7 +60,7 @@ def system(graph: Graph, poses: FloatArray | None = None) -> tuple[FloatArray, F
     for prior in graph.priors:
         rows = graph.node_rows(prior.nodes)
         at = (3 * rows[:, None] + np.arange(3)).ravel()
-        linear = model(prior, poses[rows])
+        linear = model(prior, poses[rows], graph.is_pose[rows])
         H[np.ix_(at, at)] += linear.information
         b[at] += linear.gradient
     return H, b
