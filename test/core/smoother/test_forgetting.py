@@ -89,6 +89,7 @@ def assert_same_information(graph: Graph, other: Graph, tolerance: float = CLOSE
 @settings(max_examples=25)
 def test_the_nodes_that_remain_do_not_move(seed: int, pure: bool) -> None:
     smoother, here = driven(seed)
+    smoother = copied(smoother)     # as the Jacobians of a smoother may lag a little
     graph, leaving = smoother.graph, some(here.rng, smoother.graph)
     kept = np.setdiff1d(graph.node_ids, leaving)
     poses, chi2 = graph.poses_of(kept), smoother.chi2()
@@ -102,8 +103,8 @@ def test_the_nodes_that_remain_do_not_move(seed: int, pure: bool) -> None:
         assert smoother.chi2() <= chi2 * (1.0 + 1e-6) + 1e-6
     for _ in range(2):
         assert graph.node_ids.tolist() == kept.tolist()
-        np.testing.assert_allclose(se2.wrapped(graph.poses - poses), 0.0, atol=1e-7)
-        assert_close(smoother.covariances(), covariances, 1e-7)
+        np.testing.assert_allclose(se2.wrapped(graph.poses - poses), 0.0, atol=1e-9)
+        assert_close(smoother.covariances(), covariances, 1e-9)
         smoother = copied(smoother)     # optimised again, from scratch
         graph = smoother.graph
 
@@ -119,7 +120,7 @@ def test_the_tree_has_the_result_of_the_pure_function(seed: int) -> None:
     other.graph.apply(update)
     other._step(0)
     forgotten = smoother.forget(leaving)
-    assert_same_information(smoother.graph, other.graph, 1e-7)
+    assert_same_information(smoother.graph, other.graph, 1e-9)
     gone = np.isin(edges.i, leaving) | np.isin(edges.j, leaving)
     assert len(forgotten.edges) == np.sum(gone)
     assert len(forgotten.observed) == np.sum(np.isin(observed.node, leaving))
@@ -135,8 +136,8 @@ def test_the_order_in_which_nodes_leave_does_not_matter(seed: int) -> None:
     for node in leaving:
         other.forget([node])
         assert pure.update(marginalize(pure.graph, [node])).status is Status.CONVERGED
-    assert_same_information(smoother.graph, other.graph, 1e-7)
-    assert_same_information(smoother.graph, pure.graph, 1e-7)
+    assert_same_information(smoother.graph, other.graph, 1e-9)
+    assert_same_information(smoother.graph, pure.graph, 1e-9)
 
 
 @given(seeds)
@@ -228,6 +229,19 @@ def test_a_graph_that_turns_by_a_radian_keeps_what_it_knows(seed: int) -> None:
     np.testing.assert_allclose(smoother.chi2(), whole.chi2(), rtol=1e-6, atol=1e-6)
     np.testing.assert_allclose(
         smoother.poses, whole.graph.poses_of(smoother.graph.node_ids), atol=1e-6)
+
+
+@given(seeds)
+@settings(max_examples=20)
+def test_what_is_forgotten_can_be_rolled_back_bit_for_bit(seed: int) -> None:
+    """As an update, with its prior; the tree has had an update meanwhile."""
+    smoother, here = driven(seed)
+    graph, before = smoother.graph, state(smoother.graph)
+    nodes = some(here.rng, graph)
+    graph.begin()
+    graph.apply(marginalize(graph, nodes))
+    graph.rollback()
+    assert differences(before, state(graph)) == []
 
 
 @given(seeds)
