@@ -5,6 +5,7 @@
 from pathlib import Path
 from typing import Any
 
+from matplotlib import rc_context
 from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
@@ -29,6 +30,8 @@ TALL, TALL_HEIGHT, TALL_WIDTHS = 1.15, 8.4, (4.5, 7.5)
 OUTAGE_S = 5.0  # an outage is a time without fixes above this [s] and above 10 median periods
 MIN_FIXES = 3  # with fewer fixes no outages are shown
 SECOND = 10**9  # one second [ns]
+MOST_POINTS = 20_000
+"""Of a line or a kind of marks: more take hundreds of MB, and do not show."""
 TICK_SPACING = 1.6  # largest spacing of the grid of the map [inch]
 TWO_DIGITS = 10.0  # errors below this are shown with two digits after the point [m]
 LOG_RATIO = 4.0  # if errors of odometry exceed others by this factor, the axis is logarithmic
@@ -84,7 +87,9 @@ def draw_drive(drive: Drive, file: Path, title: str) -> None:
                 color=INK, va='top', parse_math=False)
     figure.text(
         LEFT / WIDTH, 1.0 - 0.57 / height, _facts(drive), fontsize=12, color=GREY, va='top')
-    figure.savefig(file)
+    # the renderer keeps all pixels that a piece of a line touches, each time it does
+    with rc_context({'agg.path.chunksize': 1000}):
+        figure.savefig(file)
 
 
 def _add_axes(figure: Figure, box: tuple[float, float, float, float]) -> Axes:
@@ -154,15 +159,15 @@ def _draw_map(axes: Axes, drive: Drive, odometry: Trajectory) -> None:
         return f'{name}\nmedian {row.median:.{digits}f} m, rms {row.rms:.{digits}f} m'
 
     path = drive.corrected
-    axes.plot(*path.poses[:, :2].T, color=BLUE, linewidth=3.4, solid_capstyle='round', zorder=3,
+    axes.plot(*_some(path.poses[:, :2]).T, color=BLUE, linewidth=3.4, solid_capstyle='round', zorder=3,
               label=label('corrected path'))
     if drive.truth is not None:
-        axes.plot(*drive.truth.poses[:, :2].T, color=INK, linewidth=0.8, linestyle=(0, (6, 4)),
+        axes.plot(*_some(drive.truth.poses[:, :2]).T, color=INK, linewidth=0.8, linestyle=(0, (6, 4)),
                   zorder=4, label='truth')
-    axes.plot(*odometry.poses[:, :2].T, color=PURPLE, linewidth=1.3, zorder=1,
+    axes.plot(*_some(odometry.poses[:, :2]).T, color=PURPLE, linewidth=1.3, zorder=1,
               label=label('odometry alone'))
     used, doubted, held_out = (
-        drive.fix_positions[chosen] for chosen in drive.fix_kinds.values())
+        _some(drive.fix_positions[chosen]) for chosen in drive.fix_kinds.values())
     if len(used):
         axes.plot(*used.T, 'o', color=ORANGE, markersize=4.5, markeredgewidth=0, alpha=0.55,
                   zorder=2, label=label('fixes'))
@@ -176,7 +181,7 @@ def _draw_map(axes: Axes, drive: Drive, odometry: Trajectory) -> None:
     for name, states, colour, line, order in LOOPS:
         shown = inside & drive.loops(*states)
         if np.any(shown):
-            ends = path.at(drive.loop_stamps_ns[shown])[..., :2]
+            ends = path.at(_some(drive.loop_stamps_ns[shown]))[..., :2]
             apart = np.full((len(ends), 1, 2), np.nan)
             axes.plot(*np.concatenate((ends, apart), axis=1).reshape(-1, 2).T, linestyle=line,
                       color=colour, linewidth=1.2, marker='o', markerfacecolor='none',
@@ -232,7 +237,7 @@ def _draw_errors(axes: Axes, drive: Drive, odometry: Trajectory) -> None:
     highest = []
     for path, line_stamps, line_positions, style in lines:
         covered, errors = distances(path, line_stamps, line_positions)
-        axes.plot((covered - begin) * 1e-9, errors, **style)
+        axes.plot((_some(covered) - begin) * 1e-9, _some(errors), **style)
         highest.append(float(np.percentile(errors, 99.0)) if len(errors) else 0.0)
     axes.set_xlim(0.0, max((end - begin) * 1e-9, 1.0))
     if highest[0] > LOG_RATIO * max(highest[1:], default=0.0) > 0.0:
@@ -247,6 +252,11 @@ def _draw_errors(axes: Axes, drive: Drive, odometry: Trajectory) -> None:
     for outage in _outages(drive, begin, end):
         axes.axvspan(*outage, color=SHADE, zorder=0)
         axes.set_title('shaded: no fixes used', loc='right', fontsize=12, color=GREY)
+
+
+def _some(points: np.ndarray) -> np.ndarray:
+    """Return every n-th point, from the first on, so that there are not too many to draw."""
+    return points[::max(-(-len(points) // MOST_POINTS), 1)]
 
 
 def _outages(drive: Drive, begin: int, end: int) -> list[tuple[float, float]]:

@@ -29,7 +29,7 @@ from pose_graph_ros.core.judgement.verdicts import State
 from pose_graph_ros.core.measurements import Fix, GlobalPose, LoopClosure, OdometrySample
 
 # Largest number of samples of a path that are kept for comparison and the picture.
-MOST_SAMPLES = 400_000
+MOST_SAMPLES = 200_000
 
 TRUTH_TYPES = ('nav_msgs/msg/Odometry', 'geometry_msgs/msg/PoseStamped',
                'geometry_msgs/msg/PoseWithCovarianceStamped')

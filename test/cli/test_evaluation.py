@@ -6,6 +6,8 @@ from collections.abc import Callable
 from dataclasses import replace
 import json
 from pathlib import Path
+import subprocess
+import sys
 
 from hypothesis import given, settings, strategies as st
 from hypothesis.extra.numpy import arrays
@@ -266,3 +268,39 @@ def test_the_paths_are_drawn_in_their_colours(turn: float, shape: str, tmp_path:
     for colour in (BLUE, GREEN, VERMILION):
         rgb = [int(colour[k:k + 2], 16) for k in (1, 3, 5)]
         assert np.sum(np.all(np.abs(pixels - rgb) < 3.0, axis=-1)) > 20, colour
+
+
+MEMORY = '''
+import resource, sys
+from pathlib import Path
+import numpy as np
+from pose_graph_ros.cli.evaluation import Drive
+from pose_graph_ros.cli.picture import draw_drive
+from pose_graph_ros.core.geometry.trajectory import Trajectory
+
+def circles(n):
+    stamps = np.arange(n)
+    angle = 0.05 * stamps
+    return Trajectory(stamps, np.column_stack((20 * np.cos(angle), 20 * np.sin(angle), angle)))
+
+def peak():
+    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+
+def draw(n):
+    path = circles(n)
+    draw_drive(Drive(path, path.stamps_ns, path.poses[:, :2] + 1.0, np.zeros(n, dtype=bool), path,
+                     None, np.column_stack((path.stamps_ns[:-100:10], path.stamps_ns[100::10]))),
+               Path(sys.argv[1]), 'circles')
+
+draw(1000)
+before = peak()
+draw(200_000)
+print((peak() - before) / 1024)
+'''
+
+
+def test_a_picture_of_a_drive_of_days_takes_little_memory(tmp_path: Path) -> None:
+    printed = subprocess.run(
+        [sys.executable, '-c', MEMORY, str(tmp_path / 'drive.png')], check=True,
+        capture_output=True, text=True).stdout
+    assert float(printed) < 100.0, 'MB; drawn as single lines, they take 640'
