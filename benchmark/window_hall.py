@@ -20,7 +20,8 @@ from pose_graph_ros.core.graph.constraints import EdgeKind, Edges
 from pose_graph_ros.core.graph.graph import GraphUpdate
 from pose_graph_ros.core.odometry.thinned_nodes import ThinnedNodes
 from pose_graph_ros.core.smoother.incremental import IncrementalSmoother
-from pose_graph_ros.core.window.thinning import groups, remove, simplify, Thinning
+from pose_graph_ros.core.window.sparse_removal import sparse_removal
+from pose_graph_ros.core.window.thinning import groups, removed, simplify, Thinning
 
 LENGTH, WIDTH, RADIUS = 30.0, 20.0, 3.0
 """Of the hall, and of the bends [m]."""
@@ -135,7 +136,7 @@ def run(course: Drive, passes: int, config: ThinningConfig) -> Record:
         places = thinning.places(smoother, config)
         if places is not None:
             for group in groups(smoother.graph, places):
-                if remove(smoother, group.nodes) is None:
+                if removed(smoother, sparse_removal(smoother.graph, group.nodes)) is None:
                     break
                 thinned.add(*group)
             for _ in simplify(smoother):

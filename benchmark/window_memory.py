@@ -67,7 +67,7 @@ def section(
         'A day', f'Odometry at {rate:.0f} Hz, fixes at 5 Hz, a loop closure every 10 s (in the '
         'hall every 5 s, up to 100 laps back), an update every half second, with default '
         'settings, each drive in a process of its own. Resident memory of the process after a '
-        'garbage collection, with Python, NumPy and compiled code (see hour 0 of the picture); '
+        'garbage collection, with Python, NumPy and compiled code; '
         f'mean times of calls. Flat means: the last hour at most {GROWN:g} times the memory and '
         f'{SLOWER:g} times the time of an update of the first.')
     file = folder / FILE

@@ -159,11 +159,11 @@ def _draw_map(axes: Axes, drive: Drive, odometry: Trajectory) -> None:
         return f'{name}\nmedian {row.median:.{digits}f} m, rms {row.rms:.{digits}f} m'
 
     path = drive.corrected
-    axes.plot(*_some(path.poses[:, :2]).T, color=BLUE, linewidth=3.4, solid_capstyle='round', zorder=3,
-              label=label('corrected path'))
+    axes.plot(*_some(path.poses[:, :2]).T, color=BLUE, linewidth=3.4, solid_capstyle='round',
+              zorder=3, label=label('corrected path'))
     if drive.truth is not None:
-        axes.plot(*_some(drive.truth.poses[:, :2]).T, color=INK, linewidth=0.8, linestyle=(0, (6, 4)),
-                  zorder=4, label='truth')
+        axes.plot(*_some(drive.truth.poses[:, :2]).T, color=INK, linewidth=0.8,
+                  linestyle=(0, (6, 4)), zorder=4, label='truth')
     axes.plot(*_some(odometry.poses[:, :2]).T, color=PURPLE, linewidth=1.3, zorder=1,
               label=label('odometry alone'))
     used, doubted, held_out = (
