@@ -17,8 +17,8 @@ PACKAGE = Path(pose_graph_ros.__file__).parent
 MODULES = sorted(path.relative_to(PACKAGE) for path in PACKAGE.rglob('*.py'))
 
 # What everything in `core` may import: settings, values and errors.
-BASE = {'core.exceptions', 'core.config', 'core.measurements', 'core.saved_columns',
-        'core.setting_checks'}
+BASE = {'core.exceptions', 'core.config', 'core.gyro_config', 'core.measurements',
+        'core.saved_columns', 'core.setting_checks'}
 # The packages of `core`, and the other packages that each may import.
 CORE = {
     'core.compiled': set(),

@@ -8,7 +8,7 @@ import logging
 from typing import NamedTuple
 
 from pose_graph_ros.adapters.bags import BagError, BagMessage, BagReader, MessageError
-from pose_graph_ros.adapters.sources import CLOSURES, Kind, KNOWN_SOURCES, Source
+from pose_graph_ros.adapters.sources import CLOSURES, Kind, KNOWN_SOURCES, ODOMETRY_KINDS, Source
 
 logger = logging.getLogger(__name__)
 
@@ -50,7 +50,7 @@ def choose_inputs(
     """
     Return the topics that feed the sources: wanted ones, else by parameter, else guessed.
 
-    Guesses are made for `odom`, `fix` and `imu`, if the bag has one topic of their type, for
+    Guesses are made for `odom`, `fix`, `imu` and `gyro`, if the bag has one of their type, for
     `loop_closure`, if its usual topic is in the bag, and for `global_pose`, if one topic of poses
     is left and no source of fixes has a topic. Fixes are not guessed if global poses are wanted.
 
@@ -84,7 +84,7 @@ def choose_inputs(
         elif name not in chosen:
             logger.warning('%s: no topic %s for %s', reader.path, topic, name)
     topics = {name: _checked(reader, name, kinds[name], topic) for name, topic in chosen.items()}
-    for name in ('odom', 'fix', CLOSURES, 'global_pose', 'imu'):
+    for name in ('odom', 'fix', CLOSURES, 'global_pose', 'imu', 'gyro'):
         if name in topics or name not in kinds or name in named:
             continue
         guess = _guess(reader, name, kinds, topics, asked=asked)
@@ -92,7 +92,7 @@ def choose_inputs(
             topics[name] = guess
     ordered = {name: topics[name] for name in kinds if name in topics}
     inputs = Inputs(ordered, {name: kinds[name] for name in ordered}, hold_out)
-    if len(inputs.of(Kind.ODOMETRY)) == 0:
+    if len(inputs.of(*ODOMETRY_KINDS)) == 0:
         raise BagError(f'{reader.path}: no topic of type {Kind.ODOMETRY.message_type} for the '
                        f'odometry; the bag has {reader.describe()}')
     return inputs
@@ -122,7 +122,8 @@ def _guess(
     """Return the topic of a source for which none was given; None if there is no candidate."""
     kind, option = kinds[name], f'--{_option(name)}'
     free = [topic for topic, info in reader.topics.items()
-            if info.type == kind.message_type and topic not in topics.values()]
+            if info.type == kind.message_type
+            and (kind is Kind.GYRO or topic not in topics.values())]
     if kind is Kind.LOOP_CLOSURE:
         usual = '/' + KNOWN_SOURCES[CLOSURES][1]
         return usual if usual in free else None

@@ -8,6 +8,7 @@ Invalid data never raises: they return an `Answer` with the reason. Covariances 
 unchanged; `core.sources.validation` applies the covariance policy of the source.
 """
 
+from collections.abc import Sequence
 import math
 import re
 from typing import Any
@@ -16,7 +17,7 @@ import numpy as np
 
 from pose_graph_ros.adapters.sources import NANOSECONDS
 from pose_graph_ros.core.geometry import covariance, se2
-from pose_graph_ros.core.geometry.scalar_se2 import wrap_one
+from pose_graph_ros.core.geometry.scalar_se2 import Pose, wrap_one
 from pose_graph_ros.core.geometry.se2 import FloatArray
 from pose_graph_ros.core.measurements import (
     Answer,
@@ -76,7 +77,9 @@ def planar_pose(pose: Message) -> FloatArray | None:
     return np.array((position.x, position.y, wrap_one(yaw)))
 
 
-def odometry_sample(message: Message, offset_ns: int = 0) -> OdometrySample | Answer:
+def odometry_sample(
+    message: Message, offset_ns: int = 0, *, with_twist: bool = False,
+) -> OdometrySample | Answer:
     """
     Return the sample in a nav_msgs/Odometry, or the reason for rejecting it.
 
@@ -87,6 +90,8 @@ def odometry_sample(message: Message, offset_ns: int = 0) -> OdometrySample | An
     message : nav_msgs/Odometry
     offset_ns : int
         Added to the stamp [ns].
+    with_twist : bool
+        Whether its twist is needed, and must be finite.
 
     """
     pose = planar_pose(message.pose.pose)
@@ -97,15 +102,25 @@ def odometry_sample(message: Message, offset_ns: int = 0) -> OdometrySample | An
         return rejected('too_large', f'odometry pose {pose.tolist()}')
     linear = message.twist.twist.linear
     speed = math.hypot(linear.x, linear.y)
+    twist = planar_twist(message.twist.twist) if with_twist else None
+    if isinstance(twist, Answer):
+        return twist
     return OdometrySample(
         stamp_ns(message, offset_ns), pose, speed if math.isfinite(speed) else 0.0,
-        _twist_variance(message))
+        twist_variance(message.twist.covariance), twist)
 
 
-def _twist_variance(message: Message) -> FloatArray | None:
+def planar_twist(twist: Message) -> Pose | Answer:
+    """Return (v_x, v_y, yaw rate) of a Twist, or the reason for rejecting it."""
+    x, y, rate = float(twist.linear.x), float(twist.linear.y), float(twist.angular.z)
+    if not (math.isfinite(x) and math.isfinite(y) and math.isfinite(rate)):
+        return rejected('not_finite', f'twist ({x}, {y}), yaw rate {rate}')
+    return x, y, rate
+
+
+def twist_variance(values: Sequence[float]) -> FloatArray | None:
     """Return the variances of v_x, v_y and yaw rate, shape (3,); None if they are unknown."""
     # element by element: NumPy operations on three elements take ten times as long
-    values = message.twist.covariance
     variance = float(values[0]), float(values[7]), float(values[35])
     usable = all(0.0 <= value <= covariance.LARGEST_VARIANCE for value in variance)
     return np.array(variance) if usable and any(variance) else None

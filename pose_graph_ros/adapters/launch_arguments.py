@@ -25,7 +25,8 @@ def arguments(share: Path) -> dict[str, tuple[str, str]]:
     config = share / 'config'
     inputs = {
         source: (AS_IN_FILE, f'topic of {kind.message_type.replace("/msg/", "/")}; sets '
-                 f'{source}.topic' + (', if sources lists imu' if kind is Kind.IMU else ''))
+                 f'{source}.topic' + (
+                     f', if sources lists {source}' if kind in (Kind.IMU, Kind.GYRO) else ''))
         for source, (kind, _) in KNOWN_SOURCES.items()}
     return {
         'params_file': (str(config / 'pose_graph.yaml'), 'yaml file of parameters'),

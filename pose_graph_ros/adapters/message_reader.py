@@ -8,6 +8,7 @@ from typing import Any
 from pose_graph_ros.adapters import conversions
 from pose_graph_ros.adapters.conversions import frame, Message
 from pose_graph_ros.adapters.fixes import datum_of, FixReader
+from pose_graph_ros.adapters.rates import GyroReader, TwistReader, VELOCITY_READERS
 from pose_graph_ros.adapters.sources import Kind, NANOSECONDS, Source, source_list
 from pose_graph_ros.adapters.static_frames import StaticFrames
 from pose_graph_ros.core.measurements import Answer, Measurement, OdometrySample, rejected
@@ -49,10 +50,13 @@ class MessageReader:
         self.fixes = {
             source.name: FixReader(source, self.datum, self.frames, base_frame)
             for source in self.sources.values() if source.kind is Kind.FIX}
+        self._velocities: dict[str, GyroReader | TwistReader] = {
+            name: VELOCITY_READERS[source.kind](source, self.frames, base_frame)
+            for name, source in self.sources.items() if source.kind in VELOCITY_READERS}
 
     def configure(self, values: Mapping[str, Any]) -> None:
         """
-        Use other time offsets, lever arms and yaw offsets for messages from now on.
+        Use other time offsets, lever arms, yaw offsets and mountings for messages from now on.
 
         Sources, topics, frames, datum, static transforms and counts stay.
         """
@@ -60,6 +64,8 @@ class MessageReader:
             before = self.sources[source.name]
             self._guards[source.name].shift(source.time_offset_ns - before.time_offset_ns)
             self.sources[source.name] = source
+            if (reader := self._velocities.get(source.name)) is not None:
+                reader.source = source
             if source.kind is Kind.FIX:
                 self.fixes[source.name].source = source
 
@@ -83,21 +89,24 @@ class MessageReader:
         if stamp_ns > LARGEST_STAMP_NS:
             return rejected('stamp_out_of_range', f'{stamp_ns} ns')
         # the engine rejects stamps of zero or less
-        if (source.kind is Kind.ODOMETRY and stamp_ns > 0
+        if ((source.kind.is_odometry or source.kind is Kind.GYRO) and stamp_ns > 0
                 and not self._guards[name].accepts(stamp_ns)):
             return rejected('stamp_leap', f'{1e-9 * stamp_ns:.3f} s is far from those before')
         return measurement
 
     def _read(self, source: Source, message: Message) -> OdometrySample | Measurement | Answer:
-        offset_ns = source.time_offset_ns
+        name, offset_ns = source.name, source.time_offset_ns
         match source.kind:
             case Kind.ODOMETRY:
-                return conversions.odometry_sample(message, offset_ns)
+                return conversions.odometry_sample(
+                    message, offset_ns, with_twist=source.integrates_twist)
             case Kind.GLOBAL_POSE:
                 return conversions.global_pose(message, self._map_frame, offset_ns)
             case Kind.FIX:
-                return self.fixes[source.name].position(message)
+                return self.fixes[name].position(message)
             case Kind.IMU:
                 return conversions.heading(message, self.datum.yaw, source.yaw_offset, offset_ns)
+            case Kind.TWIST | Kind.GYRO:
+                return self._velocities[name].read(message)
             case Kind.LOOP_CLOSURE:
                 return conversions.loop_closure(message, offset_ns)

@@ -16,9 +16,16 @@ import sys
 from typing import Any
 
 from pose_graph_ros.adapters.parameter_names import explanation
-from pose_graph_ros.adapters.sources import DEFAULT_SOURCES, Kind, KNOWN_SOURCES, source_names
+from pose_graph_ros.adapters.sources import (
+    DEFAULT_SOURCES,
+    Kind,
+    KNOWN_SOURCES,
+    ODOMETRY_KINDS,
+    source_names,
+)
 from pose_graph_ros.core import config
 from pose_graph_ros.core.exceptions import ConfigError
+from pose_graph_ros.core.gyro_config import GyroSource, Integrate, RateNoise
 
 Value = bool | float | str | list[float] | list[str]
 
@@ -57,6 +64,7 @@ def _values(choices: type[Enum]) -> tuple[str, ...]:
 
 _BACKEND, _ODOMETRY = config.BackendConfig(), config.OdometrySource()
 _MEASUREMENT, _COVARIANCE = config.MeasurementSource(), config.CovariancePolicy()
+_RATES = GyroSource()
 _NODES, _ALIGNMENT, _NOISE = _BACKEND.nodes, _BACKEND.alignment, _ODOMETRY.noise
 _WINDOW, _THINNING = _BACKEND.window, _BACKEND.thinning
 
@@ -151,10 +159,11 @@ PARAMETERS: tuple[Parameter, ...] = (
 )
 
 _ALL = tuple(Kind)
-_WHEELS = (Kind.ODOMETRY,)
-_OTHERS = tuple(kind for kind in Kind if kind is not Kind.ODOMETRY)
+_WHEELS, _GYRO = ODOMETRY_KINDS, (Kind.GYRO,)
+_NOT_GYROS = tuple(kind for kind in Kind if kind is not Kind.GYRO)
+_OTHERS = tuple(kind for kind in _NOT_GYROS if not kind.is_odometry)
 _POSITIONS = (Kind.GLOBAL_POSE, Kind.FIX)
-_NOT_POSITIONS = tuple(kind for kind in Kind if kind not in _POSITIONS)
+_NOT_POSITIONS = tuple(kind for kind in _NOT_GYROS if kind not in _POSITIONS)
 _JUDGED = (*_POSITIONS, Kind.LOOP_CLOSURE)
 _NOT_CLOSURES = tuple(kind for kind in _OTHERS if kind is not Kind.LOOP_CLOSURE)
 
@@ -168,6 +177,10 @@ SOURCE_PARAMETERS: tuple[Parameter, ...] = (
     Parameter('noise', _ODOMETRY.noise_from.value, '', 'Origin of the odometry noise: `model` '
               'uses distance and rotation, `twist` the twist covariance times the time step.',
               choices=_values(config.NoiseFrom), kinds=_WHEELS, change=Change.UNCONFIGURED),
+    Parameter('integrate', _ODOMETRY.integrate.value, '', 'Origin of the motion: the `pose` in '
+              'the messages, or their `twist`, integrated between messages.',
+              choices=_values(Integrate), kinds=(Kind.ODOMETRY,),
+              change=Change.UNCONFIGURED),
     Parameter('sigma_distance', _NOISE.sigma_distance, 'm/sqrt(m)', 'Odometry noise along the '
               'path, per square root of the distance.', 0.0, 10.0, kinds=_WHEELS),
     Parameter('sigma_lateral', _NOISE.sigma_lateral, 'm/sqrt(m)', 'Odometry noise across the '
@@ -181,9 +194,32 @@ SOURCE_PARAMETERS: tuple[Parameter, ...] = (
               100.0, sizes=(2,), kinds=_WHEELS),
     Parameter('reorder_window', _ODOMETRY.reorder_window, 's', 'Messages older than the newest '
               'one by less than this time are sorted in; older ones are ignored.', 0.0, 60.0,
-              kinds=_WHEELS),
+              kinds=(*_WHEELS, *_GYRO)),
     Parameter('maximum_speed', _ODOMETRY.maximum_speed, 'm/s', 'Faster motion is treated as a '
               'jump of the odometry.', 0.01, 1e4, kinds=_WHEELS),
+    Parameter('mounting', 'tf', '', 'Whether the z axis of the gyroscope points `up` or `down`. '
+              'With `tf` the rotation from its frame to the robot base frame is taken from '
+              '/tf_static; messages are refused until it is there.',
+              choices=('tf', 'up', 'down'), kinds=_GYRO),
+    Parameter('noise', _RATES.noise_from.value, '', 'Origin of the noise of the rate: `message` '
+              'uses the variance in the messages, if it is positive, `model` uses `sigma_rate`.',
+              choices=_values(RateNoise), kinds=_GYRO),
+    Parameter('sigma_rate', _RATES.sigma_rate, 'rad/sqrt(s)', 'Noise density of the rate (angle '
+              'random walk).', 1e-9, 10.0, kinds=_GYRO),
+    Parameter('sigma_turn', _RATES.sigma_turn, 'rad/sqrt(rad)', 'Noise of the rotation, per '
+              'square root of the rotation; stands for the error of the scale.', 0.0, 10.0,
+              kinds=_GYRO),
+    Parameter('sigma_bias', _RATES.sigma_bias, 'rad/s', 'Standard deviation of the bias when the '
+              'sensor is switched on. At rest by the wheels, a mean rate of up to five of these '
+              'is a measurement of the bias.', 1e-9, 10.0, kinds=_GYRO,
+              change=Change.UNCONFIGURED),
+    Parameter('sigma_bias_walk', _RATES.sigma_bias_walk, 'rad/s/sqrt(s)', 'Random walk of the '
+              'bias.', 1e-12, 1.0, kinds=_GYRO, change=Change.UNCONFIGURED),
+    Parameter('bias_period', _RATES.bias_period, 's', 'Time between two states of the bias.', 0.1,
+              3600.0, kinds=_GYRO, change=Change.UNCONFIGURED),
+    Parameter('maximum_gap', _RATES.maximum_gap, 's', 'Longest time between two messages over '
+              'which the rate is integrated. A longer one leaves the rotation between two hidden '
+              'nodes out.', 1e-3, 10.0, kinds=_GYRO),
     *(Parameter('covariance_policy', 'repair' if policy.repair else 'refuse', '',
                 'Whether to repair an invalid covariance or to refuse its measurement.',
                 choices=('repair', 'refuse'), kinds=kinds) for kinds, policy in (
@@ -233,7 +269,7 @@ SOURCE_PARAMETERS: tuple[Parameter, ...] = (
     Parameter('rejection_threshold', _MEASUREMENT.rejection_threshold, '', 'Error in standard '
               'deviations above which the robust loss reduces the weight of a measurement. If '
               'none is wrong, 0.3 % of headings, 1.1 % of positions and 2.9 % of poses exceed 3. '
-              'For `tukey` take 5.', 0.1, 1e3, kinds=_ALL),
+              'For `tukey` take 5.', 0.1, 1e3, kinds=_NOT_GYROS),
     *(Parameter('minimum_period', period, 's', 'Minimum time between the stamps of two '
                 'measurements; of closer ones the first to arrive is used. If 0, all are used.',
                 0.0, 3600.0, kinds=kinds) for kinds, period in (

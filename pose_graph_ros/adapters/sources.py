@@ -10,6 +10,7 @@ from typing import Any
 
 from pose_graph_ros.core import config
 from pose_graph_ros.core.exceptions import ConfigError
+from pose_graph_ros.core.gyro_config import GyroSource, Integrate, RateNoise
 
 NANOSECONDS = 1_000_000_000
 _POSE = 'geometry_msgs/msg/PoseWithCovarianceStamped'
@@ -23,24 +24,33 @@ class Kind(Enum):
     FIX = 'fix'
     IMU = 'imu'
     LOOP_CLOSURE = 'loop_closure'
+    TWIST = 'twist'
+    GYRO = 'gyro'
 
     @property
     def message_type(self) -> str:
         """Type of the messages."""
         return MESSAGE_TYPES[self]
 
+    @property
+    def is_odometry(self) -> bool:
+        """Whether the source is one of odometry."""
+        return self in ODOMETRY_KINDS
+
 
 MESSAGE_TYPES = {
     Kind.ODOMETRY: 'nav_msgs/msg/Odometry', Kind.GLOBAL_POSE: _POSE,
     Kind.FIX: 'sensor_msgs/msg/NavSatFix', Kind.IMU: 'sensor_msgs/msg/Imu',
-    Kind.LOOP_CLOSURE: _POSE}
+    Kind.LOOP_CLOSURE: _POSE, Kind.TWIST: 'geometry_msgs/msg/TwistWithCovarianceStamped',
+    Kind.GYRO: 'sensor_msgs/msg/Imu'}
+ODOMETRY_KINDS = (Kind.ODOMETRY, Kind.TWIST)
 
 SET_POSE = 'set_pose'  # name under which poses that a user sets are counted
 CLOSURES = 'loop_closure'  # name of the source of loop closures that always exists
 KNOWN_SOURCES = {
     'odom': (Kind.ODOMETRY, 'odom'), 'global_pose': (Kind.GLOBAL_POSE, 'global_pose'),
     'fix': (Kind.FIX, 'gps/fix'), 'imu': (Kind.IMU, 'imu/data'),
-    CLOSURES: (Kind.LOOP_CLOSURE, 'loop_closure')}
+    CLOSURES: (Kind.LOOP_CLOSURE, 'loop_closure'), 'gyro': (Kind.GYRO, 'imu/data')}
 """Default kind and topic of the predefined sources."""
 DEFAULT_SOURCES = ('odom', 'global_pose', 'fix')
 
@@ -56,6 +66,9 @@ class Source:
     lever_arm: tuple[float, ...] = (0.0, 0.0)
     """Antenna of fixes in the frame of the robot (x, y) [m]; zero if not given."""
     yaw_offset: float = 0.0  # added to the yaw of an IMU [rad]
+    mounting: str = 'tf'
+    """How a gyroscope is mounted: `tf` (by /tf_static), or its z axis points `up` or `down`."""
+    integrates_twist: bool = False  # whether the motion of odometry is that of its twists
 
 
 def source_list(values: Mapping[str, Any]) -> tuple[Source, ...]:
@@ -64,8 +77,14 @@ def source_list(values: Mapping[str, Any]) -> tuple[Source, ...]:
         Source(name, Kind(values[f'{name}.type']), values[f'{name}.topic'],
                round(values[f'{name}.time_offset'] * NANOSECONDS),
                tuple(values.get(f'{name}.lever_arm', (0.0, 0.0))),
-               values.get(f'{name}.yaw_offset', 0.0))
+               values.get(f'{name}.yaw_offset', 0.0),
+               values.get(f'{name}.mounting', 'tf'), _integrates_twist(name, values))
         for name in source_names(values['sources']))
+
+
+def _integrates_twist(name: str, values: Mapping[str, Any]) -> bool:
+    return values[f'{name}.type'] == Kind.TWIST.value or (
+        values.get(f'{name}.integrate') == Integrate.TWIST.value)
 
 
 def source_names(listed: list[str]) -> list[str]:
@@ -85,13 +104,15 @@ def backend_config(values: Mapping[str, Any]) -> config.BackendConfig:
     Raises `ConfigError` if these contradict each other, or have no source of odometry.
     """
     odometry: dict[str, config.OdometrySource] = {}
-    measurements = {SET_POSE: config.SET_POSES}
+    measurements, gyros = {SET_POSE: config.SET_POSES}, dict[str, GyroSource]()
     for source in source_list(values):
         own = {name.removeprefix(f'{source.name}.'): value for name, value in values.items()
                if name.startswith(f'{source.name}.')}
         try:
-            if source.kind is Kind.ODOMETRY:
-                odometry[source.name] = _odometry_source(own)
+            if source.kind.is_odometry:
+                odometry[source.name] = _odometry_source(own, source)
+            elif source.kind is Kind.GYRO:
+                gyros[source.name] = _gyro_source(own)
             else:
                 measurements[source.name] = _measurement_source(own)
         except ConfigError as error:
@@ -112,7 +133,7 @@ def backend_config(values: Mapping[str, Any]) -> config.BackendConfig:
             sigma_heading=values['alignment.sigma_heading'],
             minimum_baseline=values['alignment.minimum_baseline'],
             baseline_in_sigmas=values['alignment.baseline_in_sigmas']),
-        odometry=odometry, measurements=measurements,
+        odometry=odometry, measurements=measurements, gyros=gyros,
         odometry_patience=values['odometry_patience'],
         window=config.WindowConfig(
             seconds=values['window.seconds'], metres=values['window.metres'],
@@ -123,7 +144,7 @@ def backend_config(values: Mapping[str, Any]) -> config.BackendConfig:
             newest=math.ceil(values['thinning.newest'])))
 
 
-def _odometry_source(own: Mapping[str, Any]) -> config.OdometrySource:
+def _odometry_source(own: Mapping[str, Any], source: Source) -> config.OdometrySource:
     position, heading = own['sigma_floor']
     return config.OdometrySource(
         noise=config.OdometryNoise(
@@ -132,9 +153,16 @@ def _odometry_source(own: Mapping[str, Any]) -> config.OdometrySource:
             sigma_heading_turn=own['sigma_heading_turn'],
             sigma_floor_position=position, sigma_floor_heading=heading),
         noise_from=config.NoiseFrom(own['noise']), covariance_scale=own['covariance_scale'],
+        integrate=Integrate.TWIST if source.integrates_twist else Integrate.POSE,
         sigma_scale=own['sigma_scale'],
         reorder_window=own['reorder_window'], maximum_speed=own['maximum_speed'],
         loss=config.Loss(own['robust_loss']), rejection_threshold=own['rejection_threshold'])
+
+
+def _gyro_source(own: Mapping[str, Any]) -> GyroSource:
+    same = ('sigma_rate', 'sigma_bias', 'sigma_bias_walk', 'sigma_turn', 'bias_period',
+            'maximum_gap', 'covariance_scale', 'reorder_window')
+    return GyroSource(RateNoise(own['noise']), **{name: own[name] for name in same})
 
 
 def _measurement_source(own: Mapping[str, Any]) -> config.MeasurementSource:

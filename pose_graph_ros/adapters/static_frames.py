@@ -7,6 +7,7 @@ import math
 import numpy as np
 
 from pose_graph_ros.adapters.conversions import frame, Message
+from pose_graph_ros.core.geometry.scalar_se2 import Pose
 from pose_graph_ros.core.geometry.se2 import FloatArray
 
 LONGEST_CHAIN = 100  # largest number of frames from one to its root; protects against cycles
@@ -45,11 +46,46 @@ class StaticFrames:
             Frame of the coordinates.
 
         """
+        found = self._transform(name, base)
+        return None if found is None else found[1]
+
+    def rotation(self, name: str, base: str) -> FloatArray | None:
+        """
+        Return the rotation from a frame to another one, shape (3, 3); None if it is unknown.
+
+        Parameters
+        ----------
+        name : str
+            Frame of a vector that is to be rotated.
+        base : str
+            Frame of the rotated vector.
+
+        """
+        found = self._transform(name, base)
+        return None if found is None else found[0]
+
+    def planar(self, name: str, base: str) -> Pose | None:
+        """
+        Return the pose of a frame in the plane of another one [m, m, rad]; None if unknown.
+
+        Parameters
+        ----------
+        name, base : str
+
+        """
+        found = self._transform(name, base)
+        if found is None:
+            return None
+        rotation, (x, y, _) = found
+        return float(x), float(y), math.atan2(rotation[1, 0], rotation[0, 0])
+
+    def _transform(self, name: str, base: str) -> tuple[FloatArray, FloatArray] | None:
+        """Return rotation and translation of a frame in another one; None if unknown."""
         of_name, of_base = self._chain(name), self._chain(base)
-        for ancestor, (_, point) in of_name.items():
+        for ancestor, (turn, point) in of_name.items():
             if ancestor in of_base:
                 rotation, translation = of_base[ancestor]
-                return np.asarray(rotation.T @ (point - translation))
+                return rotation.T @ turn, rotation.T @ (point - translation)
         return None
 
     def _chain(self, name: str) -> dict[str, tuple[FloatArray, FloatArray]]:

@@ -19,6 +19,7 @@ Message = tuple[str, str, int, Any]
 _TYPES = message_types()
 _ODOMETRY = 'nav_msgs/msg/Odometry'
 _FIX = 'sensor_msgs/msg/NavSatFix'
+_IMU = 'sensor_msgs/msg/Imu'
 _POSE = 'geometry_msgs/msg/PoseWithCovarianceStamped'
 
 
@@ -92,6 +93,31 @@ def fix_messages(
         yield topic, _FIX, stamp, _TYPES[_FIX](
             _header(stamp, 'gps'), status(status.STATUS_FIX, status.SERVICE_GPS), *fix,
             covariance, _TYPES[_FIX].COVARIANCE_TYPE_DIAGONAL_KNOWN)
+
+
+def rate_messages(
+    topic: str, stamps_ns: IntArray, rates: FloatArray, sigma: float,
+) -> Iterator[Message]:
+    """
+    Return sensor_msgs/Imu messages of a gyroscope alone, in base_link.
+
+    Parameters
+    ----------
+    topic : str
+    stamps_ns : ndarray, shape (M,)
+    rates : ndarray, shape (M,)
+        Yaw rates [rad/s].
+    sigma : float
+        Standard deviation of each rate [rad/s].
+
+    """
+    vector, quaternion = (
+        _TYPES[f'geometry_msgs/msg/{key}'] for key in ('Vector3', 'Quaternion'))
+    none, covariance = np.append(-1.0, np.zeros(8)), sigma**2 * np.eye(3).ravel()
+    for stamp, rate in zip(stamps_ns.tolist(), rates.tolist(), strict=True):
+        yield topic, _IMU, stamp, _TYPES[_IMU](
+            _header(stamp, 'base_link'), quaternion(0.0, 0.0, 0.0, 1.0), none,
+            vector(0.0, 0.0, rate), covariance, vector(0.0, 0.0, 0.0), none)
 
 
 def loop_closure_messages(

@@ -30,6 +30,8 @@ def add_inputs(parser: argparse.ArgumentParser) -> None:
             ('--loop-closure', f'{pose} relative to another pose'),
             ('--imu', 'sensor_msgs/Imu with an absolute heading, if the parameter sources lists '
                       'imu'),
+            ('--gyro', 'sensor_msgs/Imu with an angular velocity, if the parameter sources lists '
+                       'gyro'),
             ('--truth', 'Odometry, PoseStamped or PoseWithCovarianceStamped in the map, only used '
                         'for comparison')):
         group.add_argument(option, metavar='TOPIC', help=text)

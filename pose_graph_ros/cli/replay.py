@@ -26,7 +26,7 @@ from pose_graph_ros.adapters.bag_inputs import (
 )
 from pose_graph_ros.adapters.bags import BagError, BagReader, MessageError, open_bag
 from pose_graph_ros.adapters.message_reader import MessageReader
-from pose_graph_ros.adapters.sources import backend_config, CLOSURES, Kind, source_list
+from pose_graph_ros.adapters.sources import backend_config, CLOSURES, ODOMETRY_KINDS, source_list
 from pose_graph_ros.cli import options as shared
 from pose_graph_ros.cli.evaluation import Drive
 from pose_graph_ros.cli.g2o_inputs import read_measurements
@@ -155,7 +155,7 @@ def execute(options: argparse.Namespace) -> int:
         seconds = time.monotonic() - start
         estimate = result.backend.estimate()
         if estimate is None:
-            topics = ' or '.join(inputs.topics[name] for name in inputs.of(Kind.ODOMETRY))
+            topics = ' or '.join(inputs.topics[name] for name in inputs.of(*ODOMETRY_KINDS))
             raise BagError(f'{options.bag}: no usable odometry on {topics}')
         verdicts = result.backend.verdicts()
         drive = collect_drive(
@@ -169,7 +169,7 @@ def _execute_g2o(options: argparse.Namespace) -> int:
     values = shared.parameter_values(options, {'odom.noise': 'twist'})
     measurements = read_measurements(options.bag, options.stamps, options.edge2)
     odometry_source = next(
-        source.name for source in source_list(values) if source.kind is Kind.ODOMETRY)
+        source.name for source in source_list(values) if source.kind.is_odometry)
     start = time.monotonic()
     backend, report = run_measurements((
         (odometry_source if isinstance(each, OdometrySample) else CLOSURES, each)

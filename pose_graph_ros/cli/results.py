@@ -15,7 +15,7 @@ from pose_graph_ros.adapters.bag_inputs import Inputs, read_inputs, read_static_
 from pose_graph_ros.adapters.bags import BagError, BagReader, MessageError
 from pose_graph_ros.adapters.conversions import planar_pose, stamp_ns
 from pose_graph_ros.adapters.message_reader import MessageReader
-from pose_graph_ros.adapters.sources import Kind
+from pose_graph_ros.adapters.sources import Kind, ODOMETRY_KINDS
 from pose_graph_ros.cli.evaluation import Drive, evaluate, format_table, summary
 from pose_graph_ros.cli.picture import draw_drive
 from pose_graph_ros.core.compiled.growing_array import GrowingArray
@@ -142,7 +142,7 @@ def collect_drive(
         reader.frames.receive(frames.decode())
     if origin is not None:
         reader.datum.keep(origin)
-    preferred = inputs.of(Kind.ODOMETRY)[0]
+    preferred = inputs.of(*ODOMETRY_KINDS)[0]
     odometry, fixes = PathCollector(), _Positions()
     unused = GrowingArray((), np.bool_)
     loops: list[tuple[int, int]] = []

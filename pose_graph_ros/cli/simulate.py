@@ -10,6 +10,8 @@ The car of `circuit` drives along some streets twice, on the second lap along al
 - fixes: a slow (Gauss-Markov) and a white error, an outage of 70 s around the start of lap 2, and
   a stretch with reflected signals (multipath), which put them to one side while they claim to be
   as good as ever;
+- on request a gyroscope, with white noise and a bias that wanders, and wheels whose heading drifts
+  with the distance;
 - loop closures at places that are visited again in the same direction, and false ones: a stretch
   of one street is taken for one of another, and single pictures for any that look alike.
 
@@ -30,6 +32,7 @@ from pose_graph_ros.cli.bag_messages import (
     fix_messages,
     loop_closure_messages,
     odometry_messages,
+    rate_messages,
     write_bag,
 )
 from pose_graph_ros.cli.circuit import drive_circuit, gauss_markov, PERIOD_S
@@ -49,6 +52,8 @@ SLIP_S = 0.012  # relative excess of a wheel's speed in a slip event, integrated
 HEADING_WANDER = 1.2e-3  # standard deviation of the time-correlated error of the yaw rate [rad/s]
 WANDER_TIME_S = 40.0  # time constant of this error [s]
 ODOMETRY_VARIANCES = (1e-3, 1e-3, 1e6, 1e6, 1e6, 3e-2)  # constant, as many drivers set them
+GYRO_SIGMA = 5e-4  # white noise of the gyroscope, as the angle random walk [rad/sqrt(s)]
+GYRO_BIAS, GYRO_BIAS_WALK = 0.01, 2e-5  # bias at the start [rad/s], its walk [rad/s/sqrt(s)]
 FIX_PERIOD_S = 0.5
 FIX_SIGMA_SLOW = 1.2  # standard deviation of the time-correlated error of fixes [m]
 FIX_SIGMA_WHITE = 0.4  # and of their white error [m]
@@ -59,7 +64,7 @@ MULTIPATH_OFFSET = (14.0, -9.0)  # what they add to the fixes, to the east and t
 MULTIPATH_SIGMA = 1.5  # standard deviation of its changes from fix to fix [m]
 OUTAGE_S = (-40.0, 30.0)  # start and end of the outage of fixes from the second lap on [s]
 LATENCIES_NS = {'/odom': 4_000_000, '/ground_truth': 4_000_000, '/gps/fix': 130_000_000,
-                '/loop_closure': 800_000_000}
+                '/loop_closure': 800_000_000, '/imu/data': 2_000_000}
 """Time from the stamp of a measurement to its recording, by topic [ns]."""
 LOOP_SIGMAS = (0.1, 0.1, np.deg2rad(1.0))  # standard deviations of loop closures [m, m, rad]
 LOOP_SPACING = 25.0  # length of the stretches of the path with at most one loop closure each [m]
@@ -86,22 +91,30 @@ class SimulatedDrive:
     loop_poses: FloatArray  # measured later pose in the earlier one, shape (L, 3) [m, m, rad]
     fix_is_wrong: BoolArray  # whether a fix is a reflected one, shape (M,)
     loop_is_false: BoolArray  # whether a loop closure ties two different places, shape (L,)
+    rate_stamps_ns: IntArray  # of the gyroscope, shape (R,) [ns]; none without one
+    rates: FloatArray  # its yaw rates, shape (R,) [rad/s]
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Add the arguments of this tool."""
     parser.add_argument('out', type=Path, help='folder of the rosbag2')
     parser.add_argument('--seed', type=int, default=1, help='(default: %(default)s)')
+    parser.add_argument('--gyro', action='store_true', help='with a gyroscope on /imu/data')
+    parser.add_argument('--heading-drift', metavar='RAD_PER_M', type=float, default=0.0,
+                        help='drift of the heading by the wheels [rad/m] (default: %(default)s)')
 
 
 def execute(options: argparse.Namespace) -> int:
     """Run the tool; return the exit code."""
-    write_drive(simulate_drive(options.seed), options.out)
+    write_drive(simulate_drive(options.seed, gyro=options.gyro,
+                               heading_drift=options.heading_drift), options.out)
     print(f'written: {options.out}')
     return 0
 
 
-def simulate_drive(seed: int = 1, duration_s: float = 440.0) -> SimulatedDrive:
+def simulate_drive(
+    seed: int = 1, duration_s: float = 440.0, *, gyro: bool = False, heading_drift: float = 0.0,
+) -> SimulatedDrive:
     """
     Return a simulated drive; equal arguments give equal drives.
 
@@ -111,13 +124,17 @@ def simulate_drive(seed: int = 1, duration_s: float = 440.0) -> SimulatedDrive:
         Seed of the sensor errors, the position within the lane and the waits at traffic lights.
     duration_s : float
         Length of the recording, 10 s or more [s]; the second lap begins after about 310 s.
+    gyro : bool
+        Whether with a gyroscope; all else is the same without.
+    heading_drift : float
+        What the heading by the wheels drifts by, per distance [rad/m].
 
     """
     generator = np.random.default_rng(seed)
     motion = drive_circuit(generator, duration_s)
     truth = Trajectory(START_NS + np.round(motion.time * 1e9).astype(np.int64), motion.poses)
 
-    odometry = _odometry(generator, truth)
+    odometry = _odometry(generator, truth, heading_drift)
     fix_stamps, fix_positions = _fixes(generator, truth, motion.lap_time)
     loop_stamps, loop_poses = _loop_closures(generator, truth, motion.distance)
 
@@ -127,6 +144,7 @@ def simulate_drive(seed: int = 1, duration_s: float = 440.0) -> SimulatedDrive:
     is_false = order >= len(loop_stamps)
 
     fixes = CITY.to_geodetic(fix_positions)
+    rates = _rates(seed, motion.poses[:, 2]) if gyro else np.empty(0)
     truth_stamps = _jittered_stamps(generator, truth, ODOMETRY_PERIOD_S)
     poses = truth.at(truth_stamps)
     plane = TangentPlane(*fixes[0].tolist())
@@ -135,12 +153,15 @@ def simulate_drive(seed: int = 1, duration_s: float = 440.0) -> SimulatedDrive:
         truth=Trajectory(truth_stamps, poses), odometry=odometry,
         fix_stamps_ns=fix_stamps, fixes=fixes, fix_is_wrong=wrong, loop_is_false=is_false,
         loop_stamps_ns=np.concatenate((loop_stamps, false_stamps))[order],
-        loop_poses=np.concatenate((loop_poses, false_poses))[order])
+        loop_poses=np.concatenate((loop_poses, false_poses))[order],
+        rate_stamps_ns=truth.stamps_ns[:len(rates)], rates=rates)
 
 
 def write_drive(drive: SimulatedDrive, folder: str | Path, *, overwrite: bool = False) -> None:
     """
     Write a drive as a rosbag2 with `/odom`, `/gps/fix`, `/loop_closure` and `/ground_truth`.
+
+    With a gyroscope it has `/imu/data` as well.
 
     Parameters
     ----------
@@ -153,6 +174,8 @@ def write_drive(drive: SimulatedDrive, folder: str | Path, *, overwrite: bool = 
     messages = (
         *odometry_messages('/odom', 'odom', drive.odometry, ODOMETRY_VARIANCES),
         *odometry_messages('/ground_truth', 'map', drive.truth, (0.0,) * 6),
+        *rate_messages('/imu/data', drive.rate_stamps_ns, drive.rates,
+                       GYRO_SIGMA / np.sqrt(PERIOD_S)),
         *fix_messages('/gps/fix', drive.fix_stamps_ns, drive.fixes, FIX_SIGMA),
         *loop_closure_messages('/loop_closure', drive.loop_stamps_ns, drive.loop_poses,
                                np.diag(np.square(LOOP_SIGMAS))))
@@ -171,7 +194,18 @@ def _jittered_stamps(
     return stamps
 
 
-def _odometry(generator: np.random.Generator, truth: Trajectory) -> Trajectory:
+def _rates(seed: int, heading: FloatArray) -> FloatArray:
+    """Return the yaw rates of a gyroscope at all true headings, which are not wrapped, (R,)."""
+    generator, n = np.random.default_rng((seed, 1)), len(heading)
+    walk = np.cumsum(generator.normal(0.0, GYRO_BIAS_WALK * np.sqrt(PERIOD_S), n))
+    bias = generator.normal(0.0, GYRO_BIAS) + walk
+    noise = generator.normal(0.0, GYRO_SIGMA / np.sqrt(PERIOD_S), n)
+    return np.asarray(np.gradient(heading, PERIOD_S) + bias + noise)
+
+
+def _odometry(
+    generator: np.random.Generator, truth: Trajectory, heading_drift: float,
+) -> Trajectory:
     """Return `T_odom_base`, integrated from simulated measurements of the wheels."""
     steps = se2.between(truth.poses[:-1], truth.poses[1:])
     forward, turn = np.hypot(steps[:, 0], steps[:, 1]), steps[:, 2]
@@ -190,7 +224,7 @@ def _odometry(generator: np.random.Generator, truth: Trajectory) -> Trajectory:
     wander = gauss_markov(generator, len(steps), HEADING_WANDER, PERIOD_S / WANDER_TIME_S)
     forward = 0.5 * (left + right) + generator.normal(0.0, 3e-4, len(steps)) * (forward > 1e-4)
     turn = (right - left) / (TRACK_SCALE * TRACK_WIDTH) + np.where(
-        forward > 1e-4, wander * PERIOD_S, 0.0)
+        forward > 1e-4, wander * PERIOD_S, 0.0) + heading_drift * forward
 
     start = se2.wrap(truth.poses[0, 2] - 2.0)
     heading = start + np.concatenate(([0.0], np.cumsum(turn)))

@@ -81,6 +81,7 @@ class PoseGraphBackend:
         self._reweighting = Reweighting()
         self._judge = Judge(self._smoother, self._reweighting, self._config, self._nodes)
         self._factors = FactorBuilder(self._config, self._reweighting)
+        self.gyro_biases = self._factors.gyros.values
         self._tuner = ErrorTuner(self._smoother, self._factors, self._reweighting, self._judge)
         self._refiner = Refiner(self._smoother, self._reweighting, self._judge, self._tuner)
         self._pipeline = MeasurementPipeline(self._nodes, self._config)
@@ -140,8 +141,7 @@ class PoseGraphBackend:
 
     def set_aside(self, n: int) -> list[str]:
         """Return the names of the newest n constraints that were set aside."""
-        newest = Queue(self._quarantine.edges[-n:], self._quarantine.observed[-n:])
-        return constraint_names.queued(newest, self._nodes)[-n:]
+        return constraint_names.queued(self._quarantine.newest(n), self._nodes)[-n:]
 
     @property
     def revision(self) -> int:
@@ -376,7 +376,7 @@ class PoseGraphBackend:
 
     def finish(self) -> None:
         """Process all samples in the reorder windows, without waiting for older ones."""
-        self._nodes.finish()
+        self._pipeline.finish()
         self._collect()
 
     def optimize(self) -> UpdateReport:

@@ -13,8 +13,9 @@ from enum import Enum
 import math
 
 from pose_graph_ros.core.exceptions import ConfigError
+from pose_graph_ros.core.gyro_config import GyroSource, Integrate
 from pose_graph_ros.core.measurements import HeadingOnly, LoopClosure, Measurement
-from pose_graph_ros.core.setting_checks import require, require_member
+from pose_graph_ros.core.setting_checks import require, require_member, require_same
 
 # Motion since the last hidden node below which the robot stands still [m], [rad].
 REST_DISTANCE = 0.05
@@ -123,6 +124,7 @@ class OdometrySource:
 
     noise: OdometryNoise = field(default_factory=OdometryNoise)
     noise_from: NoiseFrom = NoiseFrom.MODEL
+    integrate: Integrate = Integrate.POSE
     covariance_scale: float = 1.0
     """Factor on the covariance of every increment."""
     sigma_scale: float = 0.0
@@ -139,6 +141,7 @@ class OdometrySource:
         require(self, 'covariance_scale', 'maximum_speed', 'rejection_threshold', positive=True)
         require(self, 'reorder_window', 'sigma_scale')
         require_member(self, 'noise_from', NoiseFrom)
+        require_member(self, 'integrate', Integrate)
         require_member(self, 'loss', Loss)
 
 
@@ -385,6 +388,8 @@ class BackendConfig:
     """Sources of odometry by name, the preferred one first; others have the defaults."""
     measurements: Mapping[str, MeasurementSource] = field(default_factory=dict)
     """Sources of measurements by name; others have the defaults of their kind."""
+    gyros: Mapping[str, GyroSource] = field(default_factory=dict)
+    """Gyroscopes by name; others have the defaults."""
     odometry_patience: float = 2.0
     """Silence of the primary odometry source after which another one replaces it [s]."""
     window: WindowConfig = field(default_factory=WindowConfig)
@@ -398,6 +403,10 @@ class BackendConfig:
     def odometry_source(self, name: str) -> OdometrySource:
         """Return the settings of a source of odometry."""
         return self.odometry.get(name, OdometrySource())
+
+    def gyro(self, name: str) -> GyroSource:
+        """Return the settings of a gyroscope."""
+        return self.gyros.get(name, GyroSource())
 
     @property
     def odometry_scale(self) -> float:
@@ -421,26 +430,21 @@ class BackendConfig:
         """
         Return the wanted settings if a back end with these settings can change to them.
 
-        Settings of stored data cannot change: `noise_from`, as noise is summed up sample by
-        sample, the correlation of errors, as the graph contains states for it, and the smoother.
+        Settings of stored data cannot change: `noise_from` and `integrate`, as noise and twists
+        are summed up sample by sample, the correlation of errors and the bias of a gyroscope, as
+        the graph contains states for them, and the smoother.
         Raises ConfigError if one of these differs; the message names it with both values.
         """
-        _require_same('SmootherConfig', self.smoother, wanted.smoother)
+        require_same(type(self).__name__, self, wanted, 'smoother')
         for name in sorted({*self.odometry, *wanted.odometry}):
-            _require_same(f'{name}: OdometrySource.noise_from',
-                          self.odometry_source(name).noise_from,
-                          wanted.odometry_source(name).noise_from)
+            require_same(f'{name}: OdometrySource', self.odometry_source(name),
+                         wanted.odometry_source(name), 'noise_from', 'integrate')
+        for name in sorted({*self.gyros, *wanted.gyros}):
+            require_same(f'{name}: GyroSource', self.gyro(name), wanted.gyro(name),
+                         'sigma_bias', 'sigma_bias_walk', 'bias_period')
         default = MeasurementSource()
         for name in sorted({*self.measurements, *wanted.measurements}):
-            old = self.measurements.get(name, default)
-            new = wanted.measurements.get(name, default)
-            for setting in ('correlation_time', 'correlation', 'white_share'):
-                _require_same(f'{name}: MeasurementSource.{setting}',
-                              getattr(old, setting), getattr(new, setting))
+            require_same(f'{name}: MeasurementSource', self.measurements.get(name, default),
+                         wanted.measurements.get(name, default), 'correlation_time',
+                         'correlation', 'white_share')
         return wanted
-
-
-def _require_same(what: str, present: object, wanted: object) -> None:
-    if wanted != present:
-        raise ConfigError(
-            f'{what}: cannot change while it runs, expected {present!r}, got {wanted!r}')

@@ -104,11 +104,10 @@ def update_with_all(
         report = report.before(again)
     if len(quarantine) > 0:
         pipeline.queue.extend(quarantine)
-        quarantine.edges, quarantine.observed = [], []
+        quarantine.replace_by(Queue())
         again, untried = update()
         # they are the first ones the next time
-        first = untried.joined(quarantine)
-        quarantine.edges, quarantine.observed = first.edges, first.observed
+        quarantine.replace_by(untried.joined(quarantine))
         report = report.before(again)
     return report
 

@@ -13,6 +13,7 @@ from enum import Enum
 
 import numpy as np
 
+from pose_graph_ros.core.geometry.scalar_se2 import Pose
 from pose_graph_ros.core.geometry.se2 import FloatArray
 
 # Largest valid coordinate in a map or in odometry [m, rad]; a larger one is a faulty number.
@@ -32,6 +33,22 @@ class OdometrySample:
     """Of the twist in the same message [m/s]; 0 if it has none."""
     twist_variance: FloatArray | None = None
     """Of (v_x, v_y, yaw rate) in the robot's frame, shape (3,); None if unknown."""
+    twist: Pose | None = None
+    """
+    (v_x, v_y, yaw rate) in the robot's frame [m/s, m/s, rad/s]; used, and then needed, if the
+    motion of the source is integrated from twists.
+    """
+
+
+@dataclass(frozen=True, slots=True)
+class YawRate:
+    """Yaw rate of the robot by a gyroscope, with its bias."""
+
+    stamp_ns: int
+    rate: float
+    """About the vertical axis of the robot, counterclockwise [rad/s]."""
+    variance: float = 0.0
+    """Of the rate [rad^2/s^2]; 0 if unknown."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -111,7 +128,9 @@ class LoopClosure:
 
 Absolute = GlobalPose | Position | HeadingOnly
 """Measurements relative to the map."""
-Measurement = Absolute | LoopClosure | Fix
+PoseMeasurement = Absolute | LoopClosure | Fix
+"""Measurements that are attached to hidden nodes by their stamps."""
+Measurement = PoseMeasurement | YawRate
 
 
 class AnswerStatus(Enum):

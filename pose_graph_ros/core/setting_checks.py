@@ -42,3 +42,21 @@ def require_member(settings: object, name: str, kind: type[Enum]) -> None:
     if not isinstance(value, kind):
         raise ConfigError(f'{type(settings).__name__}.{name}: expected one of '
                           f'{", ".join(map(str, kind))}, got {value!r}')
+
+
+def require_same(what: str, present: object, wanted: object, *names: str) -> None:
+    """
+    Raise ConfigError if one of the named settings differs, as it cannot change while it runs.
+
+    Parameters
+    ----------
+    what : str, of the settings, for the message
+    present, wanted : object
+    *names : str, attributes of both
+
+    """
+    for name in names:
+        old, new = getattr(present, name), getattr(wanted, name)
+        if old != new:
+            raise ConfigError(
+                f'{what}.{name}: cannot change while it runs, expected {old!r}, got {new!r}')

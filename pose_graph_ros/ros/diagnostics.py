@@ -51,6 +51,7 @@ def _state(session: 'Session') -> dict[str, object]:
     found |= {f'received.{source}': count for source, count in sorted(received.items())}
     found |= {f'{source}.{answer}': count
               for (source, answer), count in sorted((status.counts + rejected).items())}
+    found |= {f'{source}.bias': f'{bias:.6f}' for source, bias in status.biases.items()}
     found |= {f'quarantined.{rank}': name for rank, name in enumerate(status.set_aside, 1)}
     if estimate is not None:
         found.update({

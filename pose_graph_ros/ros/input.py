@@ -82,7 +82,7 @@ class Input:
         self.received[name] += 1
         self.liveness.receive(name, time.monotonic())
         # the stamp is without `time_offset`: a change of that must not look like a jump of time
-        is_primary = source.kind is Kind.ODOMETRY and primary in ('', name)
+        is_primary = source.kind.is_odometry and primary in ('', name)
         decision = self.time_jumps.receive(
             ReceivedMessage(name, message, stamp_ns(message), is_primary))
         self._received_at = time.monotonic()

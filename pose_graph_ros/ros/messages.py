@@ -13,7 +13,7 @@ import math
 import struct
 
 from builtin_interfaces.msg import Time
-from geometry_msgs.msg import PoseWithCovarianceStamped
+from geometry_msgs.msg import PoseWithCovarianceStamped, TwistWithCovarianceStamped
 from nav_msgs.msg import Odometry
 import numpy as np
 from rclpy.serialization import deserialize_message
@@ -31,7 +31,8 @@ from pose_graph_ros.core.prediction import Prediction
 
 CLASSES = {Kind.ODOMETRY: Odometry, Kind.FIX: NavSatFix, Kind.IMU: Imu,
            Kind.GLOBAL_POSE: PoseWithCovarianceStamped,
-           Kind.LOOP_CLOSURE: PoseWithCovarianceStamped}
+           Kind.LOOP_CLOSURE: PoseWithCovarianceStamped,
+           Kind.TWIST: TwistWithCovarianceStamped, Kind.GYRO: Imu}
 """Class of the messages by kind of source."""
 # Variance of height, roll and pitch in messages for filters: they are not estimated [m^2, rad^2].
 UNKNOWN_VARIANCE = 1e6

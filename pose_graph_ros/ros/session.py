@@ -57,6 +57,7 @@ from pose_graph_ros.ros.worker import Worker
 logger = logging.getLogger(__name__)
 
 STOP_TIMEOUT = 0.5  # longest wait at the end for what the worker does [s]
+IN_FRAMES = (Kind.FIX, Kind.GYRO, Kind.TWIST)  # sources that need /tf_static
 SILENCE_PERIOD = 0.2  # period of the check whether all sources are silent [s]
 
 
@@ -145,8 +146,9 @@ class Session:
     def activate(self) -> None:
         """Create the subscriptions and start the timers."""
         sources = self.input.reader.sources.values()
-        # first, since the first fix needs the transforms
-        if TFMessage is not None and any(source.kind is Kind.FIX for source in sources):
+        # first, since the first fix and rates need the transforms
+        if TFMessage is not None and any(
+                source.kind in IN_FRAMES for source in sources):
             self._subscribe(STATIC_TOPIC, TFMessage, self.input.reader.frames.receive, STATIC_QOS)
         for topic in SET_POSE_TOPICS:
             self._subscribe(topic, PoseWithCovarianceStamped, self._on_set_pose, SET_POSE_QOS)
@@ -254,7 +256,8 @@ class Session:
         covers = self._continuity[name].covers(estimate, sample)
         if estimate is None or estimate.primary != name:
             return
-        self._check_frames(message)
+        if self.input.reader.sources[name].kind is Kind.ODOMETRY:
+            self._check_frames(message)
         if covers:
             self.out.publish_pose(estimate, message, sample, self.input.reader.datum)
         elif not self.input.paused:

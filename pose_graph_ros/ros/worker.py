@@ -59,6 +59,8 @@ class WorkerStatus:
     """How well the measurements of each source fit."""
     verdicts: Mapping[str, SourceVerdicts] = field(default_factory=dict)
     """How many constraints of each source are believed."""
+    biases: Mapping[str, float] = field(default_factory=dict)
+    """Newest estimate of the bias of each gyroscope [rad/s]."""
     n_changes: int = 0  # number of changes of verdicts
 
 
@@ -327,5 +329,6 @@ class Worker:
             solve_mean=self._solve_total / max(self._solves, 1), solve_max=self._solve_max,
             report=status.report if report is None else report,
             sources=status.sources if report is None else backend.reports(),
+            biases=backend.gyro_biases(backend.graph),
             verdicts=verdicts, n_changes=status.n_changes + len(changes))
         return len(changes)

@@ -84,15 +84,16 @@ def test_the_short_yaml_file_changes_nothing_whatever_in_it_is_put_to_use() -> N
 
 def test_every_parameter_says_when_it_changes() -> None:
     changes = {parameter.name: parameter.change for parameter in all_parameters(
-        {'sources': ['odom', 'global_pose', 'fix', 'imu']})}
+        {'sources': ['odom', 'global_pose', 'fix', 'imu', 'gyro']})}
     taken = {name.rpartition('.')[2] if '.' in name else name
              for name, change in changes.items() if change is Change.UNCONFIGURED}
     assert taken == {'map_frame', 'odom_frame', 'base_link_frame', 'datum', 'wait_for_datum',
                      'topic', 'noise', 'correlation_time', 'correlation_model', 'white_share',
-                     'load_graph_on_start'}
+                     'load_graph_on_start', 'integrate', 'sigma_bias', 'sigma_bias_walk',
+                     'bias_period'}
     assert {name for name, change in changes.items() if change is Change.START} == {
         'sources', 'autostart', 'odom.type', 'global_pose.type', 'fix.type', 'imu.type',
-        'loop_closure.type'}
+        'loop_closure.type', 'gyro.type'}
 
 
 def test_the_yaml_file_holds_every_default() -> None:

@@ -45,3 +45,22 @@ def between_one(a: Pose, b: Pose) -> Pose:
     c, s = math.cos(a[2]), math.sin(a[2])
     dx, dy = b[0] - a[0], b[1] - a[1]
     return c * dx + s * dy, c * dy - s * dx, wrap_one(b[2] - a[2])
+
+
+def exp_one(twist: Pose) -> Pose:
+    """
+    Return the motion by a constant velocity for a unit of time, the exponential map of SE(2).
+
+    The angle of the motion is wrapped, its path is not: it may be of many turns.
+
+    Parameters
+    ----------
+    twist : Pose, velocity in the moving frame [m, m, rad per unit of time]
+
+    """
+    x, y, theta = twist
+    # sin(theta) / theta, and (1 - cos(theta)) / theta without its cancellation
+    half = 0.5 * theta
+    sinc = math.sin(half) / half if half != 0.0 else 1.0
+    along, across = sinc * math.cos(half), sinc * math.sin(half)
+    return along * x - across * y, across * x + along * y, wrap_one(theta)

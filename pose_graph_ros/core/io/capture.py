@@ -88,7 +88,9 @@ def capture(
         verdicts={each.id: sentence(each) for each in parts.judge.verdicts(MOST_BELIEVED)
                   if each.kind is Judged.LOOP_CLOSURE or is_notable(each)},
         newest_covariance=as_matrix(newest_covariance), chi2=chi2, n_left_out=len(left_out),
-        datum=datum)
+        datum=datum, gyros=parts.pipeline.gyros.saved(
+            parts.pipeline.queue.turns + parts.quarantine.turns),
+        gyro_biases=parts.factors.gyros.saved())
 
 
 def restore(parts: Parts, saved: SavedGraph) -> None:
@@ -110,6 +112,10 @@ def restore(parts: Parts, saved: SavedGraph) -> None:
         parts.pipeline.seen.restore(name, source.seen_ns, source.seen_references)
         parts.factors.restore(name, source)
     parts.factors.n_bias_edges = int(np.sum(saved.rows.edges.kind == EdgeKind.BIAS))
+    for name, gyro in saved.gyros.items():
+        parts.pipeline.queue.turns += parts.pipeline.gyros.restore(name, gyro)
+    for name, bias in saved.gyro_biases.items():
+        parts.factors.gyros.restore(name, bias)
     parts.reweighting.restore(saved.edge_losses, saved.observed_losses)
     parts.alignment.load(saved.alignment)
     parts.judge.restore(saved.judgement, int(parts.nodes.stamps_ns[-1]))

@@ -18,26 +18,28 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import numpy.typing as npt
 
 from pose_graph_ros import __version__
 from pose_graph_ros.core.exceptions import FileFormatError, FileWriteError
 from pose_graph_ros.core.geometry.geodesy import MapOrigin, TangentPlane
-from pose_graph_ros.core.geometry.se2 import FloatArray, IntArray
+from pose_graph_ros.core.geometry.se2 import BoolArray, FloatArray, IntArray
 from pose_graph_ros.core.geometry.trajectory import Trajectory
 from pose_graph_ros.core.graph.constraints import (
-    EdgeKind,
     EdgeKinds,
     Edges,
     full,
+    NodeKind,
     ObservedKinds,
     ObservedNodes,
     upper,
 )
+from pose_graph_ros.core.graph.factor_types import FACTORS
 from pose_graph_ros.core.graph.graph import GraphRows, NextIds
 from pose_graph_ros.core.io.atomic_files import write_files
 from pose_graph_ros.core.io.g2o import LAYOUT
 from pose_graph_ros.core.io.g2o_writing import g2o_text, NOT_USED, STANDING_FOR_PRIORS
-from pose_graph_ros.core.io.json_values import annotations, decoded, encoded
+from pose_graph_ros.core.io.json_values import annotations, decoded, encoded, optional
 from pose_graph_ros.core.io.old_versions import with_ids, with_judgement, with_names
 from pose_graph_ros.core.io.saved_graph import SavedGraph
 from pose_graph_ros.core.io.saved_priors import restored_priors, saved_priors, SavedPriors
@@ -50,6 +52,7 @@ VERSION = 4
 SUFFIXES = ('.g2o', '.json', '.tum')
 _OPENING, _MIDDLE = b'{\n"sha256": "', b'",\n'
 _DIGITS = 64
+IN_G2O = [kind for kind, factor in FACTORS.items() if factor.tag == 'EDGE_SE2']
 # Columns of the numbers behind a tag in a row of node, offset, mean and information.
 _OBSERVED = {'OBSERVED_SE2_OFFSET': range(13), 'EDGE_PRIOR_SE2': (0, *range(4, 13)),
              'EDGE_PRIOR_SE2_XY': (0, 4, 5, 7, 8, 10)}
@@ -62,10 +65,10 @@ class SavedRows:
     fixed: Integers
     """Ids of the fixed hidden nodes."""
     biases: Integers
-    """Ids of the hidden nodes that are biases; all others are vertices of the g2o file."""
+    """Ids of the hidden nodes that are no poses (biases, landmarks); poses are in the g2o file."""
     bias_values: Rows3
     edge_kind: EdgeKinds
-    """Of all edges. Those of kind `bias` are given here, others in the g2o file."""
+    """Of all edges. Those of `IN_G2O` are read from the g2o file, others are given here."""
     edge_weight: Numbers
     bias_edge_i: Integers
     bias_edge_j: Integers
@@ -88,6 +91,12 @@ class SavedRows:
     next_ids: NextIds | None = None
     """Ids of the next new rows; None where they follow on the last ones."""
     priors: SavedPriors = field(default_factory=SavedPriors)
+    bias_edge_k: Integers | None = None
+    """Third nodes of the edges that are given here, -1 without; None if no edge has one."""
+    bias_dimensions: Integers | None = None
+    """Numbers of coordinates of `biases`; None if all have 3."""
+    landmarks: Integers | None = None
+    """Ids of those of `biases` that are landmarks; None without."""
 
 
 def graph_paths(path: Path) -> tuple[Path, Path, Path]:
@@ -137,7 +146,8 @@ def read_graph(path: Path) -> SavedGraph:
     g2o_path, path, members, g2o = _verified(path)
     try:
         hints = annotations(SavedGraph)
-        rest = {name: decoded(hints[name], members.pop(name), name) for name in _members()}
+        rest = {name: decoded(hints[name], members.pop(name), name) for name in _members()
+                if name in members or name not in optional(SavedGraph)}
         rows: SavedRows = decoded(SavedRows, members.pop('graph'), 'graph')
         saved = SavedGraph(rows=_graph_rows(rows, g2o.decode('ascii')), **rest)
         saved.check()
@@ -225,19 +235,23 @@ def _checked_members(path: Path, content: bytes) -> dict[str, Any]:
 
 
 def _saved_rows(rows: GraphRows) -> SavedRows:
-    edges = rows.edges.rows(rows.edges.kind == EdgeKind.BIAS)
+    edges = rows.edges.rows(~np.isin(rows.edges.kind, IN_G2O))
     on_bias = np.flatnonzero(np.isin(rows.observed.node, rows.node_ids[rows.is_bias]))
-    observed = rows.observed.rows(on_bias)
+    observed, others = rows.observed.rows(on_bias), ~rows.is_pose
     node_ids, edge_ids, observed_ids = (
         None if len(ids) == end else ids for ids, end in zip(
             (rows.node_ids, rows.edge_ids, rows.observed_ids), rows.next_ids, strict=True))
+    dimensions = None if rows.dimension is None else rows.dimension[others].astype(np.int64)
+    landmarks = rows.node_ids[rows.node_kind == NodeKind.LANDMARK]
     return SavedRows(
-        rows.node_ids[rows.fixed], rows.node_ids[rows.is_bias], rows.poses[rows.is_bias],
+        rows.node_ids[rows.fixed], rows.node_ids[others], rows.poses[others],
         rows.edges.kind.astype(np.int64), rows.edges.weight, edges.i, edges.j, edges.mean,
         upper(edges.information), edges.bias, rows.observed.kind.astype(np.int64),
         rows.observed.weight, on_bias, observed.node, observed.offset, observed.mean,
         upper(observed.information), node_ids, edge_ids, observed_ids, rows.next_ids,
-        saved_priors(rows.priors))
+        saved_priors(rows.priors), edges.k if np.any(edges.k >= 0) else None,
+        None if dimensions is None or np.all(dimensions == 3) else dimensions,
+        landmarks if len(landmarks) > 0 else None)
 
 
 def _graph_rows(rows: SavedRows, text: str) -> GraphRows:
@@ -254,21 +268,40 @@ def _graph_rows(rows: SavedRows, text: str) -> GraphRows:
     for name, chosen in (('fixed', rows.fixed), ('biases', rows.biases)):
         if not np.all(np.isin(chosen, node_ids)):
             raise ValueError(f'graph.{name}: expected hidden nodes')
-    is_bias, fixed = np.isin(node_ids, rows.biases), np.isin(node_ids, rows.fixed)
-    if not np.array_equal(vertices[:, 0], node_ids[~is_bias]):
+    is_pose, fixed = ~np.isin(node_ids, rows.biases), np.isin(node_ids, rows.fixed)
+    if not np.array_equal(vertices[:, 0], node_ids[is_pose]):
         raise ValueError('expected the hidden nodes that are no biases as vertices, in order')
     poses = np.zeros((len(node_ids), 3))
-    poses[~is_bias] = vertices[:, 1:]
-    _fill(poses, np.flatnonzero(is_bias), rows.bias_values, 'biases')
+    poses[is_pose] = vertices[:, 1:]
+    _fill(poses, np.flatnonzero(~is_pose), rows.bias_values, 'biases')
     next_ids = NextIds(*n) if rows.next_ids is None else rows.next_ids
+    kind, dimension = _kinds_and_dimensions(rows, node_ids, is_pose)
     return GraphRows(
-        poses, is_bias.astype(np.int32), fixed, _edges(rows, _numbers(lines, 'EDGE_SE2')),
-        _observed(rows, lines), node_ids, edge_ids, observed_ids, next_ids,
-        np.full(n[0], 3, dtype=np.int32), restored_priors(rows.priors))
+        poses, kind, fixed, _edges(rows, _numbers(lines, 'EDGE_SE2')), _observed(rows, lines),
+        node_ids, edge_ids, observed_ids, next_ids, dimension,
+        restored_priors(rows.priors))
+
+
+def _kinds_and_dimensions(
+    rows: SavedRows, node_ids: IntArray, is_pose: BoolArray,
+) -> tuple[IntArray, IntArray]:
+    """Return kinds and dimensions of all hidden nodes."""
+    kind = np.where(is_pose, int(NodeKind.POSE), int(NodeKind.BIAS))
+    if rows.landmarks is not None:
+        if not np.all(np.isin(rows.landmarks, rows.biases)):
+            raise ValueError('graph.landmarks: expected nodes that are no poses')
+        kind[np.isin(node_ids, rows.landmarks)] = int(NodeKind.LANDMARK)
+    is_landmark = kind == NodeKind.LANDMARK
+    dimension = np.where(is_landmark, 2, 3)
+    if rows.bias_dimensions is not None:
+        _fill(dimension, np.flatnonzero(~is_pose), rows.bias_dimensions, 'dimensions')
+    if np.any((dimension < 1) | (dimension > 3) | (is_landmark & (dimension != 2))):
+        raise ValueError('graph.bias_dimensions: expected 1 to 3, and 2 for landmarks')
+    return kind.astype(np.int32), dimension.astype(np.int32)
 
 
 def _edges(rows: SavedRows, numbers: FloatArray) -> Edges:
-    to_bias = rows.edge_kind == EdgeKind.BIAS
+    to_bias = ~np.isin(rows.edge_kind, IN_G2O)
     in_g2o, in_json = np.flatnonzero(~to_bias), np.flatnonzero(to_bias)
     bias = np.zeros((len(to_bias), 4))
     _fill(bias, in_json, rows.bias_edge_bias, 'edges to biases')
@@ -277,10 +310,13 @@ def _edges(rows: SavedRows, numbers: FloatArray) -> Edges:
     _fill(both, in_json, np.column_stack(
         (rows.bias_edge_i, rows.bias_edge_j, rows.bias_edge_mean, rows.bias_edge_information)),
         'edges to biases')
+    third = np.full(len(to_bias), -1, dtype=np.int64)
+    if rows.bias_edge_k is not None:
+        _fill(third, in_json, rows.bias_edge_k, 'third nodes')
     return Edges(
         both[:, 0].astype(np.int64), both[:, 1].astype(np.int64), both[:, 2:5].copy(),
         full(both[:, 5:]), rows.edge_kind.astype(np.uint8),
-        _weights(rows.edge_weight, len(both)), bias)
+        _weights(rows.edge_weight, len(both)), bias, third)
 
 
 def _observed(rows: SavedRows, lines: list[str]) -> ObservedNodes:
@@ -316,7 +352,9 @@ def _numbers(lines: list[str], tag: str) -> FloatArray:
     return numbers.reshape(-1, n)
 
 
-def _fill(table: FloatArray, rows: IntArray, numbers: FloatArray, name: str) -> None:
+def _fill(
+    table: npt.NDArray[Any], rows: IntArray, numbers: npt.NDArray[Any], name: str,
+) -> None:
     """Set rows of a table; raise ValueError if their number is wrong."""
     if len(rows) != len(numbers):
         raise ValueError(f'graph: expected {len(rows)} {name}, got {len(numbers)}')

@@ -86,14 +86,14 @@ def decoded(kind: Any, plain: Any, where: str) -> Any:
         _expect(isinstance(plain, dict), where, 'an object', plain)
         hints = annotations(kind)
         # a field with a default may be missing: older versions did not write it
-        _expect(plain.keys() <= hints.keys() and plain.keys() >= hints.keys() - _optional(kind),
+        _expect(plain.keys() <= hints.keys() and plain.keys() >= hints.keys() - optional(kind),
                 where, f'the fields {sorted(hints)}', plain)
         return kind(**{name: decoded(hint, plain[name], f'{where}.{name}'.lstrip('.'))
                        for name, hint in hints.items() if name in plain})
     return _single(kind, plain, where)
 
 
-def _optional(kind: Any) -> set[str]:
+def optional(kind: Any) -> set[str]:
     """Return the names of the fields of a class that have a default."""
     if not is_dataclass(kind):
         return set(kind._field_defaults)

@@ -8,7 +8,7 @@ reads it. Settings are not part of it: a loaded graph has those of the engine th
 """
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
@@ -29,8 +29,10 @@ from pose_graph_ros.core.judgement.judge import SavedJudgement
 from pose_graph_ros.core.judgement.odometry_states import SavedOdometry
 from pose_graph_ros.core.judgement.verdicts import Decision, State
 from pose_graph_ros.core.odometry.saved_nodes import SavedNodes
+from pose_graph_ros.core.odometry.turns import SavedGyro
 from pose_graph_ros.core.saved_columns import Matrix
 from pose_graph_ros.core.sources.constraint_queue import SavedEdges
+from pose_graph_ros.core.sources.gyro_bias import SavedGyroBias
 from pose_graph_ros.core.sources.source_constraints import SavedSource
 
 # Tolerances within which a datum equals that of the saved graph [m], [rad].
@@ -66,6 +68,10 @@ class SavedGraph:
     """Number of received measurements that are neither in the graph nor saved."""
     datum: MapOrigin | None
     """Datum of the map, if it has one."""
+    gyros: Mapping[str, SavedGyro] = field(default_factory=dict)
+    """Gyroscopes by name."""
+    gyro_biases: Mapping[str, SavedGyroBias] = field(default_factory=dict)
+    """The states of their biases in the graph."""
 
     @property
     def path(self) -> FloatArray:
@@ -91,6 +97,7 @@ class SavedGraph:
             _in_graph('graph.priors', prior.nodes, rows.node_ids)
         self._check_nodes()
         self._check_odometry()
+        self._check_gyros()
         if self.datum is not None:
             TangentPlane(*self.datum)   # raises if it is no point on the Earth
         for name, source in self.sources.items():
@@ -154,7 +161,8 @@ class SavedGraph:
         for name, stream in nodes.streams.items():
             where = f'nodes.streams.{name}'
             _same_length(where, stream, 'stamps_ns', 'samples', 'dense')
-            _same_length(where, stream, 'waiting_ns', 'waiting')
+            _same_length(where, stream, 'waiting_ns', 'waiting', *(
+                ('waiting_twists',) if len(stream.waiting_twists) > 0 else ()))
             _increasing(where, np.append(stream.stamps_ns, stream.waiting_ns))
             _require(all(-1 <= k <= len(nodes.ids) for k in (stream.tied, stream.next_to_tie))
                      and stream.tied < len(nodes.ids) and stream.next_to_tie >= 0,
@@ -168,6 +176,35 @@ class SavedGraph:
         covered = nodes.streams[nodes.leads[-1]].stamps_ns
         _require(covered[0] <= nodes.base_ns <= covered[-1],
                  'nodes.base_ns: expected an instant that the primary odometry covers')
+
+    def _check_gyros(self) -> None:
+        rows = self.rows
+        biases = rows.node_ids[rows.is_bias]
+        for name, gyro in self.gyros.items():
+            where = f'gyros.{name}'
+            _same_length(f'{where}.rates', gyro.rates, 'stamps_ns', 'rates')
+            _increasing(f'{where}.rates.stamps_ns', gyro.rates.stamps_ns)
+            _require(0 < gyro.next_node <= len(self.nodes.ids),
+                     f'{where}.next_node: expected a hidden node')
+            _same_length(where, gyro, 'waiting_ns', 'waiting_ends', 'waiting')
+            _require(gyro.waiting[:, 1] > 0.0, f'{where}.waiting: expected positive variances')
+            _require(gyro.waiting[:, (2, 4)] >= 0.0,
+                     f'{where}.waiting: expected times and variances')
+            _require(np.isin(gyro.waiting_ends, self.nodes.ids),
+                     f'{where}.waiting_ends: expected hidden nodes')
+        for name, bias in self.gyro_biases.items():
+            where = f'gyro_biases.{name}'
+            _same_length(where, bias, 'numbers', 'ids')
+            _increasing(f'{where}.numbers', bias.numbers)
+            _increasing(f'{where}.ids', bias.ids)
+            _in_graph(f'{where}.ids', bias.ids, biases)
+            edges, states = bias.edges.T
+            _in_graph(f'{where}.edges', edges, rows.edge_ids)
+            _in_graph(f'{where}.edges', states, biases)
+            _increasing(f'{where}.edges', edges)
+            _require(self._kinds(edges) == EdgeKind.TURN,
+                     f'{where}.edges: expected edges of rotations')
+            _require(bias.width_ns > 0, f'{where}.width_ns: expected a positive number')
 
     def _check_judgement(self, closures: SavedClosures) -> None:
         where = 'judgement.closures'

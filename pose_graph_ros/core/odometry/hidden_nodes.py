@@ -74,6 +74,8 @@ class HiddenNodes:
         the primary source has no sample as old as that node; else None.
         """
         self._secondary = SecondaryEdges()
+        self.relocated: set[int] = set()
+        """Numbers of the nodes at which the robot was put by hand."""
 
     def __len__(self) -> int:
         return len(self.table)
@@ -255,6 +257,7 @@ class HiddenNodes:
         if node < 0:
             return node
         stamp_ns = max(self.covered_ns, int(self.stamps_ns[-1])) + 1
+        self.relocated.add(len(self))
         self._append(
             stamp_ns, node, as_pose(timeline.poses[-1]), se2.compose(self.odometry[-1], moved))
         self._base_ns = self.covered_ns

@@ -10,7 +10,7 @@ import numpy as np
 from pose_graph_ros.core.geometry.scalar_se2 import Pose
 from pose_graph_ros.core.geometry.se2 import FloatArray, IntArray
 from pose_graph_ros.core.odometry.node_table import NodeTable
-from pose_graph_ros.core.odometry.stream import SavedStream
+from pose_graph_ros.core.odometry.saved_stream import SavedStream
 from pose_graph_ros.core.odometry.thinned_nodes import SavedThinned
 from pose_graph_ros.core.saved_columns import Integers, Matrix, Rows3
 

@@ -4,15 +4,22 @@
 
 import bisect
 from collections.abc import Iterator
-from dataclasses import dataclass, replace
+from dataclasses import replace
 import math
 from typing import NamedTuple
 
 import numpy as np
 
 from pose_graph_ros.core.config import NoiseFrom, OdometrySource
-from pose_graph_ros.core.geometry.scalar_se2 import between_one, compose_one, Pose, wrap_one
+from pose_graph_ros.core.geometry.scalar_se2 import (
+    between_one,
+    compose_one,
+    exp_one,
+    Pose,
+    wrap_one,
+)
 from pose_graph_ros.core.geometry.se2 import FloatArray, IntArray
+from pose_graph_ros.core.gyro_config import Integrate
 from pose_graph_ros.core.measurements import (
     ACCEPTED,
     Answer,
@@ -30,6 +37,7 @@ from pose_graph_ros.core.odometry.gaps import (
 )
 from pose_graph_ros.core.odometry.jumps import is_jump, MEMORY_TIME, Speeds, SpeedWindow, UNKNOWN
 from pose_graph_ros.core.odometry.motion import Motion, odometry_covariance
+from pose_graph_ros.core.odometry.saved_stream import NO_TWIST, SavedInstant, SavedStream
 from pose_graph_ros.core.odometry.timeline import (
     next_row,
     NOTHING,
@@ -37,7 +45,6 @@ from pose_graph_ros.core.odometry.timeline import (
     Row,
     Variances,
 )
-from pose_graph_ros.core.saved_columns import Flags, Integers, Rows7, Rows8
 
 # Largest variance of a twist that is used; those beyond, and zero, stand for unknown
 # [m^2/s^2, rad^2/s^2].
@@ -46,55 +53,13 @@ LARGEST_TWIST_VARIANCE = 1e4
 # stamps of this number of consecutive samples that came after it.
 FAR_AHEAD_NS = 10_000_000_000
 MANY_BEHIND = 5
+# Longest time over which twists are integrated; a longer one is a gap [s].
+LONGEST_TWIST = 1.0
+# Largest number of a twist [m/s, rad/s].
+LARGEST_TWIST = 1e4
 # Time before the newest sample whose samples are all saved with a graph, for measurements that
 # come late [ns].
 RECENT_NS = 60_000_000_000
-
-
-@dataclass(frozen=True, slots=True)
-class SavedInstant:
-    """Saved state of a source at its newest settled sample, see `Row` and `SpeedWindow`."""
-
-    raw: Pose
-    """Pose as received [m, m, rad]."""
-    offset: Pose | None
-    """Pose of the odometry frame in the frame without jumps; None before the first jump."""
-    counted: Pose
-    counted_ns: int
-    held: Pose
-    rate: tuple[float, float, float, float, float, float, float] | None
-    """Velocity, recent and greatest speeds; None before they are known."""
-    since_ns: int
-    since: Pose
-    way: tuple[float, float]
-    """Path length [m] and sum of absolute turns [rad] since then."""
-    jumped: bool
-    """Whether odometry jumped to this sample."""
-
-
-@dataclass(frozen=True, slots=True)
-class SavedStream:
-    """Saved odometry source: its samples next to the hidden nodes, and its newest ones."""
-
-    stamps_ns: Integers
-    """Stamps of settled samples, shape (T,) [ns]."""
-    samples: Rows8
-    """Their rows, as returned by `OdometryTimeline.thinned`, shape (T, 8)."""
-    dense: Flags
-    """As `OdometryTimeline.dense`, shape (T,)."""
-    resting: bool
-    """As `OdometryTimeline.resting`."""
-    last: SavedInstant | None
-    waiting_ns: Integers
-    """Stamps of samples that are not settled, shape (W,) [ns]."""
-    waiting: Rows7
-    """As received: pose, speed, variances of the twist (zero where unknown), shape (W, 7)."""
-    restarted_ns: int
-    """As `OdometryStream.restarted_ns`."""
-    tied: int
-    """Newest node that the samples cover, where the next secondary edge begins; -1 for none."""
-    next_to_tie: int
-    """Next node to check for a secondary edge."""
 
 
 class _Sample(NamedTuple):
@@ -104,6 +69,8 @@ class _Sample(NamedTuple):
     pose: Pose
     speed: float
     variance: Variances | None
+    twist: Pose = NO_TWIST
+    """(v_x, v_y, yaw rate) [m/s, m/s, rad/s], if twists are integrated."""
 
 
 class _Instant(NamedTuple):
@@ -121,6 +88,8 @@ class _Instant(NamedTuple):
     """Whether odometry jumped to this sample."""
     restarted: bool = False
     """Whether odometry restarted at this sample, after a graph was loaded."""
+    twist: Pose = NO_TWIST
+    """As `_Sample.twist`."""
 
 
 class OdometryStream:
@@ -197,6 +166,10 @@ class OdometryStream:
         if not (abs(x) <= LARGEST_COORDINATE and abs(y) <= LARGEST_COORDINATE
                 and abs(theta) <= LARGEST_COORDINATE):
             return rejected(value_defect(sample.pose) or '', f'odometry pose {[x, y, theta]}')
+        twist = sample.twist or NO_TWIST
+        if not all(abs(value) <= LARGEST_TWIST for value in twist):
+            return rejected('too_large' if all(map(math.isfinite, twist)) else 'not_finite',
+                            f'twist {twist}')
         if sample.stamp_ns <= self.settled_ns:
             return rejected(*self._late(sample.stamp_ns))
         at = len(self._waiting)
@@ -210,7 +183,7 @@ class OdometryStream:
         variance = sample.twist_variance
         self._waiting.insert(at, _Sample(
             sample.stamp_ns, (x, y, wrap_one(theta)), sample.speed,
-            None if variance is None else tuple(variance.tolist())))
+            None if variance is None else tuple(variance.tolist()), twist))
         behind = self._waiting[-1].stamp_ns - sample.stamp_ns > FAR_AHEAD_NS + self._window_ns
         self._n_behind = self._n_behind + 1 if behind else 0
         if self._n_behind >= MANY_BEHIND:
@@ -295,7 +268,8 @@ class OdometryStream:
             stamps, rows, dense, self.timeline.resting,
             None if self._last is None else _saved_instant(self._last),
             np.array([sample.stamp_ns for sample in self._waiting], dtype=np.int64), waiting,
-            self.restarted_ns, *tied)
+            self.restarted_ns, *tied, waiting_twists=np.array(
+                [sample.twist for sample in self._waiting]).reshape(-1, 3))
 
     def restore(self, saved: SavedStream) -> None:
         """Set the state of this empty stream to a saved one."""
@@ -304,9 +278,11 @@ class OdometryStream:
             self.timeline.restore(
                 saved.stamps_ns, saved.samples, saved.dense, self._last.row,
                 resting=saved.resting)
-        for stamp_ns, (x, y, theta, speed, *variance) in zip(
-                saved.waiting_ns.tolist(), saved.waiting.tolist(), strict=True):
-            self._waiting.append(_Sample(stamp_ns, (x, y, theta), speed, tuple(variance)))
+        twists = saved.waiting_twists.tolist() or [NO_TWIST] * len(saved.waiting)
+        for stamp_ns, (x, y, theta, speed, *variance), twist in zip(
+                saved.waiting_ns.tolist(), saved.waiting.tolist(), twists, strict=True):
+            self._waiting.append(
+                _Sample(stamp_ns, (x, y, theta), speed, tuple(variance), tuple(twist)))
         self.restarted_ns = saved.restarted_ns
         self.saved_ns = self.newest_ns
 
@@ -343,23 +319,28 @@ class OdometryStream:
 
     def _next_instant(self, before: _Instant | None, sample: _Sample) -> _Instant:
         """Return the state at a sample from the state at the sample before."""
-        stamp_ns, raw = sample.stamp_ns, sample.pose
+        stamp_ns, raw, twist = sample.stamp_ns, sample.pose, sample.twist
         if before is None:
             return _Instant(raw, next_row(None, stamp_ns, raw), None,
-                            SpeedWindow(UNKNOWN, stamp_ns, raw), jumped=False)
-        motion = between_one(before.raw, raw)
+                            SpeedWindow(UNKNOWN, stamp_ns, raw), jumped=False, twist=twist)
         elapsed = (stamp_ns - before.row.stamp_ns) * 1e-9
+        integrates = self._source.integrate is Integrate.TWIST
+        motion = (_integrated(before.twist, twist, elapsed) if integrates
+                  else between_one(before.raw, raw))
         step = math.hypot(motion[0], motion[1]), abs(motion[2])
-        jump = is_jump(
+        jump = (integrates and elapsed > LONGEST_TWIST) or is_jump(
             before.window.speeds, step, elapsed, sample.speed, self._source.maximum_speed)
         if before.row.stamp_ns <= self.saved_ns < stamp_ns and (jump or elapsed > RESUMED_WITHIN):
-            return _after_restart(before, stamp_ns, raw)
+            return _after_restart(before, stamp_ns, raw)._replace(twist=twist)
         if jump:
-            return _after_jump(before, stamp_ns, raw, elapsed)
-        pose = raw if before.offset is None else compose_one(before.offset, raw)
+            return _after_jump(before, stamp_ns, raw, elapsed)._replace(twist=twist)
+        if integrates:
+            pose = compose_one(before.row.pose, motion)
+        else:
+            pose = raw if before.offset is None else compose_one(before.offset, raw)
         row = next_row(before.row, stamp_ns, pose, self._step_variance(sample, step, elapsed))
-        return _Instant(
-            raw, row, before.offset, before.window.moved(stamp_ns, pose, step), jumped=False)
+        return _Instant(raw, row, before.offset, before.window.moved(stamp_ns, pose, step),
+                        jumped=False, twist=twist)
 
     def _step_variance(
         self, sample: _Sample, step: tuple[float, float], elapsed: float,
@@ -377,6 +358,12 @@ class OdometryStream:
             variance * elapsed if 0.0 < variance <= LARGEST_TWIST_VARIANCE else instead
             for variance, instead in zip(sample.variance, by_model, strict=True))
         return x, y, theta
+
+
+def _integrated(first: Pose, last: Pose, elapsed: float) -> Pose:
+    """Return the motion during a time [s] by the mean of the twists at its begin and end."""
+    x, y, theta = (0.5 * (one + other) * elapsed for one, other in zip(first, last, strict=True))
+    return exp_one((x, y, theta))
 
 
 def _after_jump(before: _Instant, stamp_ns: int, raw: Pose, elapsed: float) -> _Instant:
@@ -407,7 +394,7 @@ def _saved_instant(last: _Instant) -> SavedInstant:
         *speeds.velocity, *speeds.recent, *speeds.greatest)
     return SavedInstant(
         last.raw, last.offset, last.row.counted, last.row.counted_ns, last.row.held, rate,
-        since_ns, since, path, last.jumped)
+        since_ns, since, path, last.jumped, last.twist)
 
 
 def _restored_instant(saved: SavedStream, last: SavedInstant) -> _Instant:
@@ -417,7 +404,8 @@ def _restored_instant(saved: SavedStream, last: SavedInstant) -> _Instant:
     speeds = UNKNOWN if last.rate is None else Speeds(
         last.rate[:3], last.rate[3:5], last.rate[5:])
     return _Instant(last.raw, row, last.offset,
-                    SpeedWindow(speeds, last.since_ns, last.since, last.way), last.jumped)
+                    SpeedWindow(speeds, last.since_ns, last.since, last.way), last.jumped,
+                    twist=last.twist)
 
 
 def _nothing(variance: Variances) -> Variances:

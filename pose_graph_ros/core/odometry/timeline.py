@@ -261,6 +261,29 @@ class OdometryTimeline:
                       float(end.turn - start[4]),
                       np.array(end.variance) - start[5:] + start_variance)
 
+    def rests(self, start_ns: int, end_ns: int) -> list[tuple[int, int]]:
+        """
+        Return the stretches of some time during which the robot does not leave the jitter.
+
+        Each begins and ends at a sample; returned are their stamps [ns]. In the first of them the
+        robot may have begun to stand just then, at the last it may have begun to move.
+
+        Parameters
+        ----------
+        start_ns, end_ns : int, stamps [ns]
+
+        """
+        stamps = self._stamps.values
+        rows = slice(int(np.searchsorted(stamps, start_ns)),
+                     int(np.searchsorted(stamps, end_ns, side='right')))
+        times, path = stamps[rows], self._samples.values[rows, 3:5]
+        if len(times) < 2:
+            return []
+        still = np.all(path[1:] == path[:-1], axis=1) & (
+            self._dense.values[rows][1:] | (np.diff(times) <= LARGEST_GAP_NS))
+        ends = np.flatnonzero(np.diff(np.concatenate(([False], still, [False]))))
+        return [(int(times[begin]), int(times[end])) for begin, end in ends.reshape(-1, 2)]
+
     def pose(self, stamp_ns: int) -> FloatArray:
         """
         Return the interpolated pose in the odometry frame at an instant, shape (3,) [m, m, rad].

@@ -12,8 +12,8 @@ from pose_graph_ros.core.graph.constraints import EdgeKind
 from pose_graph_ros.core.graph.graph import Graph
 from pose_graph_ros.core.graph.graph_view import constraint_tables, ConstraintTable, DIAGONAL
 from pose_graph_ros.core.odometry.hidden_nodes import HiddenNodes
-from pose_graph_ros.core.sources.constraint_queue import Queue
-from pose_graph_ros.core.sources.factor_builder import ConstraintOrigin, FactorBuilder
+from pose_graph_ros.core.sources.constraint_queue import ConstraintOrigin, Queue
+from pose_graph_ros.core.sources.factor_builder import FactorBuilder
 
 
 @dataclass(frozen=True, slots=True)
@@ -77,6 +77,8 @@ def queued(queue: Queue, nodes: HiddenNodes) -> list[str]:
     """
     ends = [(source, np.searchsorted(nodes.ids, (edge.i[0], edge.j[0])).tolist())
             for source, edge, *_ in queue.edges]
+    ends += [(turn.source, np.searchsorted(nodes.ids, (turn.i, turn.j)).tolist())
+             for turn in queue.turns]
     return [f'{source} x{i} - x{j}' for source, (i, j) in ends] + [
         f'{each.source} at {each.measurement.stamp_ns * 1e-9:.3f} s near '
         f'x{int(np.searchsorted(nodes.ids, each.attachment.node))}' for each in queue.observed]

@@ -12,6 +12,7 @@ from pose_graph_ros.core.geometry.se2 import FloatArray
 from pose_graph_ros.core.graph.constraints import EdgeKinds, Edges, ObservedNodes
 from pose_graph_ros.core.measurements import Absolute, Measurement
 from pose_graph_ros.core.odometry.motion import Attachment
+from pose_graph_ros.core.odometry.turns import Turn
 from pose_graph_ros.core.saved_columns import Integers, Pairs, Rows3, Rows6
 
 NO_NOISE: Final[FloatArray] = np.zeros(2)
@@ -62,24 +63,38 @@ class Queue:
 
     edges: list[QueuedEdge] = field(default_factory=list)
     observed: list[AttachedMeasurement] = field(default_factory=list)
+    turns: list[Turn] = field(default_factory=list)
 
     def __len__(self) -> int:
-        return len(self.edges) + len(self.observed)
+        return len(self.edges) + len(self.observed) + len(self.turns)
 
     def extend(self, other: 'Queue') -> None:
         """Append all constraints of another queue."""
         self.edges += other.edges
         self.observed += other.observed
+        self.turns += other.turns
 
     def joined(self, other: 'Queue') -> 'Queue':
         """Return a new queue with the constraints of this one, then those of another one."""
-        return Queue([*self.edges, *other.edges], [*self.observed, *other.observed])
+        return Queue([*self.edges, *other.edges], [*self.observed, *other.observed],
+                     [*self.turns, *other.turns])
+
+    def newest(self, n: int) -> 'Queue':
+        """Return a new queue with the newest n constraints of each type."""
+        return Queue(self.edges[-n:], self.observed[-n:], self.turns[-n:])
+
+    def replace_by(self, other: 'Queue') -> None:
+        """Replace all constraints by those of another queue."""
+        self.edges, self.observed, self.turns = other.edges, other.observed, other.turns
 
     def drop(self, nodes: Collection[int]) -> list[str]:
         """Return the sources of the constraints on nodes that have left, after removing them."""
         gone = [each.source for each in self.edges if each.is_on(nodes)]
         gone += [each.source for each in self.observed if each.attachment.node in nodes]
+        gone += [turn.source for turn in self.turns if turn.i in nodes or turn.j in nodes]
         if len(gone) > 0:
+            self.turns = [
+                turn for turn in self.turns if turn.i not in nodes and turn.j not in nodes]
             self.edges = [each for each in self.edges if not each.is_on(nodes)]
             self.observed = [
                 each for each in self.observed if each.attachment.node not in nodes]
@@ -89,9 +104,18 @@ class Queue:
         """Return the first half of the constraints and the rest, as new queues."""
         half = len(self) // 2
         n_edges = min(half, len(self.edges))
-        n_observed = half - n_edges
-        return (Queue(self.edges[:n_edges], self.observed[:n_observed]),
-                Queue(self.edges[n_edges:], self.observed[n_observed:]))
+        n_observed = min(half - n_edges, len(self.observed))
+        n_turns = half - n_edges - n_observed
+        return (Queue(self.edges[:n_edges], self.observed[:n_observed], self.turns[:n_turns]),
+                Queue(self.edges[n_edges:], self.observed[n_observed:], self.turns[n_turns:]))
+
+
+class ConstraintOrigin(NamedTuple):
+    """The measurement that a constraint was made from."""
+
+    source: str
+    stamp_ns: int
+    """[ns]; -1 for an edge between poses."""
 
 
 class NewConstraint(NamedTuple):

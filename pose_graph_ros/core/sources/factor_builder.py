@@ -4,7 +4,6 @@
 
 from collections.abc import Collection, Mapping
 from dataclasses import replace
-from typing import NamedTuple
 
 import numpy as np
 
@@ -23,6 +22,7 @@ from pose_graph_ros.core.measurements import GlobalPose, LoopClosure
 from pose_graph_ros.core.sources import source_report
 from pose_graph_ros.core.sources.constraint_queue import (
     AttachedMeasurement,
+    ConstraintOrigin,
     NewConstraint,
     NO_NOISE,
     Queue,
@@ -39,20 +39,13 @@ from pose_graph_ros.core.sources.gauss_markov import (
     GaussMarkovBias,
     LEAST_WHITE,
 )
+from pose_graph_ros.core.sources.gyro_bias import GyroBiases
 from pose_graph_ros.core.sources.measurement_constraints import motion_noise
 from pose_graph_ros.core.sources.source_constraints import SavedSource, SourceConstraints
 from pose_graph_ros.core.sources.source_report import SourceReport
 
 # A report is renewed after so many more measurements, as a share of those in the graph.
 MORE_RESIDUALS = 0.05
-
-
-class ConstraintOrigin(NamedTuple):
-    """The measurement that a constraint was made from."""
-
-    source: str
-    stamp_ns: int
-    """[ns]; -1 for an edge between poses."""
 
 
 class FactorBuilder:
@@ -82,6 +75,8 @@ class FactorBuilder:
         self.new: list[NewConstraint] = []
         """Constraints of the update that was built last."""
         self._n_new_bias_edges = 0
+        self.gyros = GyroBiases(config)
+        """Biases of gyroscopes, and the edges of their rotations."""
         self._abandoned: list[int] = []
         """Ids of biases that hold no measurement any more."""
         self._new_weights: dict[int, float] = {}
@@ -108,14 +103,15 @@ class FactorBuilder:
 
         """
         additions = Additions(graph.next_ids)
-        for model in self._error_models.values():
+        for model in (*self._error_models.values(), self.gyros):
             model.begin()
         self.new = [
             NewConstraint(True, additions.add_edge(edge), source, stamp_ns, LoopClosure, reference)
             for source, edge, stamp_ns, reference in queue.edges]
         self.new += [self._add(attached, additions) for attached in sorted(
             queue.observed, key=lambda attached: attached.measurement.stamp_ns)]
-        self._n_new_bias_edges = len(additions.edges) - len(queue.edges)
+        self.gyros.add(queue.turns, graph, additions)
+        self._n_new_bias_edges = len(additions.edges) - len(queue.edges) - self.gyros.n_new
         for model in self._error_models.values() if settle else ():
             if isinstance(model, InflatedWeights):
                 model.settle(additions)
@@ -233,7 +229,7 @@ class FactorBuilder:
         others : mapping, further models of sources, which are not in use yet
 
         """
-        biases = [*self._abandoned]
+        biases = [*self._abandoned, *self.gyros.leaving(edges)]
         for source, constraints in self._constraints.items():
             models = [each[source] for each in (self._error_models, others) if source in each]
             left = constraints.rows.values[~self.leaving(source, edges, observed), 0]
@@ -268,6 +264,7 @@ class FactorBuilder:
 
         """
         gone, kept = {*nodes.tolist()}, {}
+        self.gyros.forget(gone, edges)
         self._abandoned = [node for node in self._abandoned if node not in gone]
         for source, constraints in self._constraints.items():
             model, left = self._error_models.get(source), self.leaving(source, edges, observed)
@@ -299,7 +296,7 @@ class FactorBuilder:
 
     def rollback(self) -> None:
         """Discard the update that was built last."""
-        for model in self._error_models.values():
+        for model in (*self._error_models.values(), self.gyros):
             model.rollback()
 
     def commit(self) -> None:
@@ -323,6 +320,7 @@ class FactorBuilder:
                 edges.append_one(number)
         for each, weight in self._new_weights.items():
             self._reweighting.set_base_weight(each, weight)
+        self.gyros.commit()
         # from here on there is nothing that `rollback` could forget
         for model in self._error_models.values():
             model.begin()
@@ -346,7 +344,8 @@ class FactorBuilder:
             at = int(np.searchsorted(edges.values, number))
             if at < len(edges) and edges.values[at] == number:
                 return ConstraintOrigin(source, -1)
-        return None
+        gyro = self.gyros.source_of(number) if edge else None
+        return None if gyro is None else ConstraintOrigin(gyro, -1)
 
     def bias_origin(self, node: int) -> ConstraintOrigin | None:
         """Return the source of a bias, by its id, and when its bin begins."""
@@ -354,7 +353,8 @@ class FactorBuilder:
             begin_ns = model.begin_ns(node) if isinstance(model, GaussMarkovBias) else None
             if begin_ns is not None:
                 return ConstraintOrigin(source, begin_ns)
-        return None
+        found = self.gyros.begin_of(node)
+        return None if found is None else ConstraintOrigin(*found)
 
     def saved(self) -> dict[str, SavedSource]:
         """Return the state of each source, with empty `seen_ns` and `seen_references`."""

@@ -82,6 +82,7 @@ class Additions:
     first: NextIds
     """Ids of the first new rows."""
     biases: list[FloatArray] = field(default_factory=list)
+    dimensions: list[int] = field(default_factory=list)
     edges: list[Edges] = field(default_factory=list)
     observed: list[ObservedNodes] = field(default_factory=list)
     remove_edges: list[int] = field(default_factory=list)
@@ -91,13 +92,23 @@ class Additions:
     def update(self) -> GraphUpdate:
         """Return the update with all changes but the weights."""
         return GraphUpdate(
-            biases=np.array(self.biases).reshape(-1, 3), edges=Edges.joined(self.edges),
+            biases=np.array(self.biases).reshape(-1, 3), dimensions=self.dimensions,
+            edges=Edges.joined(self.edges),
             observed=ObservedNodes.joined(self.observed), remove_edges=self.remove_edges,
             remove_observed=self.remove_observed)
 
-    def add_bias(self) -> int:
-        """Add a bias state and return its id."""
-        self.biases.append(np.zeros(3))
+    def add_bias(self, value: float = 0.0, dimension: int = 3) -> int:
+        """
+        Return the id of a bias state that is added.
+
+        Parameters
+        ----------
+        value : float, initial value of its first number
+        dimension : int, how many numbers it has
+
+        """
+        self.biases.append(np.array((value, 0.0, 0.0)))
+        self.dimensions.append(dimension)
         return self.first.node + len(self.biases) - 1
 
     def add_edge(self, edge: Edges) -> int:

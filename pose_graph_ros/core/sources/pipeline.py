@@ -17,11 +17,14 @@ from pose_graph_ros.core.measurements import (
     HeadingOnly,
     LoopClosure,
     Measurement,
+    PoseMeasurement,
     rejected,
     value_defect,
+    YawRate,
 )
 from pose_graph_ros.core.odometry.hidden_nodes import HiddenNodes
 from pose_graph_ros.core.odometry.motion import Attachment
+from pose_graph_ros.core.odometry.turns import Gyros
 from pose_graph_ros.core.sources.constraint_queue import AttachedMeasurement, Queue, QueuedEdge
 from pose_graph_ros.core.sources.measurement_constraints import (
     absolute_constraint,
@@ -59,6 +62,8 @@ class MeasurementPipeline:
 
     def __init__(self, nodes: HiddenNodes, config: BackendConfig) -> None:
         self._nodes, self._config = nodes, config
+        self.gyros = Gyros(nodes, config)
+        """Yaw rates, from which rotations between the hidden nodes are made."""
         self.waiting = WaitingMeasurements()
         """Measurements that wait for odometry to reach their stamps."""
         self.seen = SeenStamps()
@@ -76,6 +81,7 @@ class MeasurementPipeline:
     def configure(self, config: BackendConfig) -> None:
         """Set the settings for later measurements."""
         self._config = config
+        self.gyros.configure(config)
 
     def add(self, measurement: Measurement, source: str) -> Answer:
         """
@@ -87,9 +93,30 @@ class MeasurementPipeline:
         source : str
 
         """
+        if isinstance(measurement, YawRate):
+            answer = self.count(source, self.gyros.add(measurement, source))
+            self._take_turns()
+            return answer
         return self.count(source, self._add(measurement, source))
 
-    def _add(self, measurement: Measurement, source: str) -> Answer:
+    def finish(self) -> None:
+        """Settle all odometry and yaw rates, without waiting for older ones."""
+        self._nodes.finish()
+        self.gyros.finish()
+
+    def _take_turns(self) -> None:
+        """Make the rotations that are due, and count what happened to the rates."""
+        gyros = self.gyros
+        gyros.extend()
+        self.queue.turns += gyros.new
+        gyros.new.clear()
+        for source, stream in gyros.streams.items():
+            for reason, count in (('gap', gyros.n_gaps[source]), ('sorted', stream.n_sorted),
+                                  ('stamp_ahead', stream.n_dropped)):
+                if count > 0:
+                    self.counts[source, reason] = count
+
+    def _add(self, measurement: PoseMeasurement, source: str) -> Answer:
         settings = self._config.measurement_source(source, type(measurement))
         validated = validate(measurement, settings.covariance)
         if isinstance(validated, Answer):
@@ -109,7 +136,7 @@ class MeasurementPipeline:
                 self.counts[source, repair] += 1
         return answer
 
-    def _wait(self, measurement: Measurement, source: str) -> Answer:
+    def _wait(self, measurement: PoseMeasurement, source: str) -> Answer:
         """Let a measurement wait for odometry; if too many wait, drop the one due last."""
         excess = self.waiting.push(source, measurement)
         if excess is not None:
@@ -121,12 +148,14 @@ class MeasurementPipeline:
         return Answer(AnswerStatus.PENDING, 'pending', 'waits for odometry to reach its stamp')
 
     def attach_due(self) -> None:
-        """Attach the measurements whose stamps odometry has reached."""
+        """Attach the measurements whose stamps odometry has reached, and make rotations."""
+        if len(self.gyros.streams) > 0:
+            self._take_turns()
         if len(self.waiting) > 0:
             for waiting in self.waiting.pop_due(self._nodes.covered_ns):
                 self.count(waiting.source, self._attach(waiting.measurement, waiting.source))
 
-    def _attach(self, measurement: Measurement, source: str) -> Answer:
+    def _attach(self, measurement: PoseMeasurement, source: str) -> Answer:
         """Queue the constraint of a measurement whose stamp odometry has reached."""
         answer = self._try_to_attach(measurement, source)
         if answer.status is AnswerStatus.REJECTED and isinstance(measurement, LoopClosure):
@@ -183,8 +212,8 @@ class MeasurementPipeline:
         If the graph is not aligned with the map, observed nodes stay in the queue; the oldest ones
         beyond `MOST_UNALIGNED` are dropped and counted.
         """
-        ready = Queue(edges=self.queue.edges)
-        self.queue.edges = []
+        ready = Queue(edges=self.queue.edges, turns=self.queue.turns)
+        self.queue.edges, self.queue.turns = [], []
         if aligned:
             ready.observed, self.queue.observed = self.queue.observed, []
         else:

@@ -23,7 +23,7 @@ from pose_graph_ros.core.measurements import (
     HeadingOnly,
     LARGEST_STAMP,
     LoopClosure,
-    Measurement,
+    PoseMeasurement,
     Position,
     rejected,
     value_defect,
@@ -36,12 +36,12 @@ LEAST_EIGENVALUE = 1e-6
 class Validated(NamedTuple):
     """A measurement that can be used, and what was repaired in it."""
 
-    measurement: Measurement
+    measurement: PoseMeasurement
     repairs: tuple[str, ...]
     """Keys for counting, such as `default_covariance`."""
 
 
-def validate(measurement: Measurement, policy: CovariancePolicy) -> Validated | Answer:
+def validate(measurement: PoseMeasurement, policy: CovariancePolicy) -> Validated | Answer:
     """
     Return a measurement in usable form, or why it is rejected.
 
@@ -50,7 +50,7 @@ def validate(measurement: Measurement, policy: CovariancePolicy) -> Validated | 
 
     Parameters
     ----------
-    measurement : Measurement
+    measurement : PoseMeasurement
     policy : CovariancePolicy
 
     """
@@ -124,7 +124,7 @@ def repaired(cov: FloatArray, policy: CovariancePolicy) -> FloatArray:
     return 0.5 * (result + result.T)
 
 
-def _numbers(measurement: Measurement) -> FloatArray:
+def _numbers(measurement: PoseMeasurement) -> FloatArray:
     if isinstance(measurement, Position):
         return np.concatenate((measurement.position, measurement.lever_arm))
     if isinstance(measurement, HeadingOnly):
@@ -143,7 +143,7 @@ def _overridden(cov: FloatArray, policy: CovariancePolicy) -> FloatArray:
     return np.diag(variances)
 
 
-def _stamps(measurement: Measurement) -> tuple[int, ...]:
+def _stamps(measurement: PoseMeasurement) -> tuple[int, ...]:
     if isinstance(measurement, LoopClosure):
         return (measurement.stamp_ns, measurement.reference_ns or 0,
                 measurement.reference_node or 0)

@@ -10,7 +10,7 @@ from typing import NamedTuple
 import numpy as np
 
 from pose_graph_ros.core.geometry.se2 import IntArray
-from pose_graph_ros.core.measurements import LoopClosure, Measurement
+from pose_graph_ros.core.measurements import LoopClosure, PoseMeasurement
 
 # Maximum number of waiting measurements; bounds the memory if the clock of a sender is ahead.
 MAX_WAITING = 10_000
@@ -24,7 +24,7 @@ class WaitingMeasurement(NamedTuple):
     arrival: int
     """Number of measurements that arrived before it."""
     source: str
-    measurement: Measurement
+    measurement: PoseMeasurement
 
 
 class WaitingMeasurements:
@@ -38,7 +38,7 @@ class WaitingMeasurements:
     def __len__(self) -> int:
         return len(self._waiting)
 
-    def push(self, source: str, measurement: Measurement) -> WaitingMeasurement | None:
+    def push(self, source: str, measurement: PoseMeasurement) -> WaitingMeasurement | None:
         """
         Return the measurement that is dropped if too many wait with the one added, else None.
 
@@ -48,7 +48,7 @@ class WaitingMeasurements:
         Parameters
         ----------
         source : str
-        measurement : Measurement
+        measurement : PoseMeasurement
 
         """
         waiting = WaitingMeasurement(due_ns(measurement), next(self._arrival), source, measurement)
@@ -56,7 +56,7 @@ class WaitingMeasurements:
         return self._waiting.pop(0) if len(self) > MAX_WAITING else None
 
     @property
-    def measurements(self) -> list[tuple[str, Measurement]]:
+    def measurements(self) -> list[tuple[str, PoseMeasurement]]:
         """All waiting measurements, with their sources."""
         return [(waiting.source, waiting.measurement) for waiting in self._waiting]
 
@@ -83,14 +83,14 @@ class SeenStamps:
         self._stamps: dict[str, array[int]] = {}
         self._references: dict[str, array[int]] = {}
 
-    def has(self, source: str, measurement: Measurement) -> bool:
+    def has(self, source: str, measurement: PoseMeasurement) -> bool:
         """
         Tell whether a measurement with the same stamp and reference was added.
 
         Parameters
         ----------
         source : str
-        measurement : Measurement
+        measurement : PoseMeasurement
 
         """
         return self._find(source, measurement) >= 0
@@ -110,14 +110,14 @@ class SeenStamps:
         return ((at > 0 and stamp_ns - stamps[at - 1] < period_ns)
                 or (at < len(stamps) and stamps[at] - stamp_ns < period_ns))
 
-    def add(self, source: str, measurement: Measurement) -> None:
+    def add(self, source: str, measurement: PoseMeasurement) -> None:
         """
         Add a measurement, which is cheap if stamps come in order.
 
         Parameters
         ----------
         source : str
-        measurement : Measurement
+        measurement : PoseMeasurement
 
         """
         stamps = self._stamps.setdefault(source, array('q'))
@@ -125,14 +125,14 @@ class SeenStamps:
         stamps.insert(at, measurement.stamp_ns)
         self._references.setdefault(source, array('q')).insert(at, _reference(measurement))
 
-    def remove(self, source: str, measurement: Measurement) -> None:
+    def remove(self, source: str, measurement: PoseMeasurement) -> None:
         """
         Remove a measurement, if it was added.
 
         Parameters
         ----------
         source : str
-        measurement : Measurement
+        measurement : PoseMeasurement
 
         """
         at = self._find(source, measurement)
@@ -146,7 +146,7 @@ class SeenStamps:
             del stamps[:n], self._references[source][:n]
 
     def saved(
-        self, without: list[tuple[str, Measurement]],
+        self, without: list[tuple[str, PoseMeasurement]],
     ) -> dict[str, tuple[IntArray, IntArray]]:
         """Return stamps and references, shape (M,) each, by source, without some measurements."""
         left_out: dict[str, list[int]] = {}
@@ -172,7 +172,7 @@ class SeenStamps:
         self._stamps[source] = array('q', stamps_ns.tolist())
         self._references[source] = array('q', references.tolist())
 
-    def _find(self, source: str, measurement: Measurement) -> int:
+    def _find(self, source: str, measurement: PoseMeasurement) -> int:
         stamps = self._stamps.get(source)
         if stamps is None:
             return -1
@@ -182,14 +182,14 @@ class SeenStamps:
         return next((at for at in range(begin, end) if references[at] == reference), -1)
 
 
-def due_ns(measurement: Measurement) -> int:
+def due_ns(measurement: PoseMeasurement) -> int:
     """Return the stamp that odometry must have reached to attach a measurement [ns]."""
     if isinstance(measurement, LoopClosure) and measurement.reference_ns is not None:
         return max(measurement.stamp_ns, measurement.reference_ns)
     return measurement.stamp_ns
 
 
-def _reference(measurement: Measurement) -> int:
+def _reference(measurement: PoseMeasurement) -> int:
     """
     Return a number that distinguishes measurements of a source with the same stamp.
 

@@ -31,8 +31,8 @@ from pose_graph_ros.core.backend import PoseGraphBackend
 from pose_graph_ros.core.config import Loss
 from pose_graph_ros.core.exceptions import FileFormatError, FileWriteError
 from pose_graph_ros.core.geometry.geodesy import MapOrigin
-from pose_graph_ros.core.graph.constraints import EdgeKind, ObservedKind
-from pose_graph_ros.core.graph.graph import NextIds
+from pose_graph_ros.core.graph.constraints import EdgeKind, Edges, ObservedKind, ObservedNodes
+from pose_graph_ros.core.graph.graph import Graph, GraphUpdate, NextIds
 from pose_graph_ros.core.io import atomic_files, old_versions
 from pose_graph_ros.core.io.g2o import read_g2o
 from pose_graph_ros.core.io.graph_files import graph_paths, read_datum, read_graph, write_graph
@@ -418,3 +418,72 @@ def test_ids_with_gaps_come_back_and_are_those_of_the_g2o_file(tmp_path: Path) -
         node_ids=[*members['graph']['node_ids'][:-1], 6]))
     with pytest.raises(FileFormatError, match='expected the hidden nodes'):
         read_graph(side)
+
+
+def with_other_nodes(saved: SavedGraph, update: GraphUpdate) -> SavedGraph:
+    graph = Graph()
+    graph.fill(saved.rows)
+    graph.apply(update)
+    return replace(saved, rows=graph.rows())
+
+
+def added(case: str) -> GraphUpdate:
+    """Return nodes that are no poses, the first with id 10, and constraints on them."""
+    turn, place, end, distance = (np.diag(numbers) for numbers in (
+        (0.0, 0.0, 1e4 / 3.0), (4.0, 5.0, 0.0), (7.0, 0.0, 0.0), (1.0 / 0.3, 0.0, 0.0)))
+    if case == 'turns, one without a bias':
+        return GraphUpdate(
+            biases=[(0.1 / 3.0, 0.0, 0.0)], dimensions=[1],
+            edges=Edges([1, 2], [2, 3], [(0.0, 0.0, 0.1), (0.0, 0.0, 0.2)], [turn, turn],
+                        [EdgeKind.TURN] * 2, [1.0, 0.5], [(0.0, 0.0, 0.0, 1.0)] * 2, [10, -1]),
+            observed=ObservedNodes([10], None, [(0.1, 0.0, 0.0)], [end], [0]))
+    if case == 'biases of 1, 2 and 3 coordinates':
+        return GraphUpdate(
+            biases=[(0.1, 0.0, 0.0), (0.3, -0.7, 0.0), (1.0 / 7.0, 2.0, 0.1)],
+            dimensions=[1, 2, 3],
+            edges=Edges([1, 2], [11, 12], [(1.0, 2.0, 0.0), (3.0, 4.0, 0.2)],
+                        [place, place + turn], [EdgeKind.BIAS] * 2, None,
+                        [(0.0, 0.0, 1.0, 1.0)] * 2),
+            observed=ObservedNodes([10, 11, 12], None, np.zeros((3, 3)),
+                                   [end, place, place + turn], [0, 0, 0]))
+    return GraphUpdate(
+        landmarks=[(3.0, 1.0 / 3.0), (5.0, -2.0)],
+        edges=Edges([0, 1, 2], [10, 11, 10], [(3.0, 1.0, 0.0), (4.0, -2.0, 0.0), (1.2, 0.0, 0.0)],
+                    [place, place, distance], [EdgeKind.POINT, EdgeKind.POINT, EdgeKind.RANGE],
+                    None, [(0.0,) * 4, (0.0,) * 4, (0.2, -0.1, 0.0, 0.0)]),
+        observed=ObservedNodes([11], None, [(5.0, -2.0, 0.0)], [place], [ObservedKind.POSITION]))
+
+
+@pytest.mark.parametrize('case', [
+    'turns, one without a bias', 'biases of 1, 2 and 3 coordinates', 'landmarks'])
+def test_other_nodes_and_third_ends_come_back(tmp_path: Path, case: str) -> None:
+    assert small_graph().rows.next_ids.node == 10
+    saved = with_other_nodes(small_graph(), added(case))
+    assert not np.array_equal(saved.rows.dimension, np.full(len(saved.rows.poses), 3))
+    _, side, _ = write_graph(saved, tmp_path / 'map')
+    loaded = read_graph(side)
+    assert_same_value(loaded, saved)
+    graph = Graph()
+    graph.fill(loaded.rows)
+    assert_same_value(graph.rows(), saved.rows)
+    for name, wrong, expected in (('bias_dimensions', [0] * 3, 'dimensions'),
+                                  ('landmarks', [0], 'landmarks: expected nodes that are no'),
+                                  ('bias_edge_k', [10**6] * 3, 'expected a hidden node|third')):
+        write_graph(saved, tmp_path / 'map')
+        rewrite(side, lambda members, field=name, numbers=wrong: members['graph'].update(
+            {field: numbers}))
+        with pytest.raises(FileFormatError, match=expected):
+            read_graph(side)
+
+
+def test_files_without_the_optional_fields_are_read(tmp_path: Path) -> None:
+    _, side, _ = write_graph(saved_drive(), tmp_path / 'map')
+
+    def remove(members: dict[str, Any]) -> None:
+        del members['gyros'], members['gyro_biases']
+        for name in ('bias_edge_k', 'bias_dimensions', 'landmarks', 'node_ids', 'edge_ids',
+                     'observed_ids', 'next_ids'):
+            del members['graph'][name]
+
+    rewrite(side, remove)
+    assert_same_value(read_graph(side), saved_drive())

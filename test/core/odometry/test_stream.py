@@ -4,6 +4,7 @@
 
 from collections.abc import Callable
 from itertools import pairwise
+import math
 import sys
 
 from hypothesis import given, settings, strategies as st
@@ -13,6 +14,7 @@ import pytest
 from pose_graph_ros.core.config import NoiseFrom, OdometryNoise, OdometrySource
 from pose_graph_ros.core.geometry import se2
 from pose_graph_ros.core.geometry.se2 import FloatArray
+from pose_graph_ros.core.gyro_config import Integrate
 from pose_graph_ros.core.measurements import AnswerStatus, OdometrySample
 from pose_graph_ros.core.odometry.gaps import JUMP_SIGMA
 from pose_graph_ros.core.odometry.stream import MANY_BEHIND, OdometryStream
@@ -421,3 +423,83 @@ def test_leaving_out_samples_at_rest_changes_nothing(data: st.DataObject) -> Non
 def test_without_any_sample_there_is_no_newest_one() -> None:
     with pytest.raises(ValueError, match='there is no odometry'):
         OdometryStream(OdometrySource()).newest(0)
+
+
+def by_twist(times: FloatArray, twist: tuple[float, float, float]) -> list[OdometrySample]:
+    """Samples of a constant twist whose poses mean nothing."""
+    return [OdometrySample(EPOCH + round(t * 1e9), np.array((50.0 * (k % 2), 0.0, 0.0)),
+                           twist=twist) for k, t in enumerate(times.tolist())]
+
+
+@given(st.floats(-3.0, 3.0), st.floats(-1.0, 1.0), st.floats(-2.0, 2.0) | st.just(0.0))
+@settings(max_examples=30, deadline=None)
+def test_a_constant_twist_is_integrated_exactly(vx: float, vy: float, rate: float) -> None:
+    times = np.array([0.0, 0.1, 0.35, 0.4, 0.9, 1.0])
+    stream = settled(by_twist(times, (vx, vy, rate)), integrate=Integrate.TWIST)
+    motion = stream.timeline.motion(EPOCH, EPOCH + SECOND).increment
+    # the differential equation in small steps, by the midpoint rule
+    h = 1e-4
+    theta = (np.arange(10_000) + 0.5) * h * rate
+    expected = (np.sum(vx * np.cos(theta) - vy * np.sin(theta)) * h,
+                np.sum(vx * np.sin(theta) + vy * np.cos(theta)) * h, rate)
+    assert motion == pytest.approx(expected, abs=1e-8)
+
+
+def test_twists_between_messages_are_integrated_to_the_second_order() -> None:
+    for step, bound in ((0.1, 0.012), (0.05, 0.003)):
+        times = np.arange(0.0, 10.0 + 1e-9, step)
+        truth = drive(times, lambda t: 1.0 + 0.5 * np.sin(t), np.cos)
+        samples = [OdometrySample(one.stamp_ns, np.zeros(3), twist=(
+            1.0 + 0.5 * math.sin(t), 0.0, math.cos(t)))
+            for one, t in zip(truth, times.tolist(), strict=True)]
+        stream = settled(samples, integrate=Integrate.TWIST)
+        pose = stream.timeline.poses[-1]
+        assert math.hypot(*(pose - truth[-1].pose)[:2]) < bound
+        assert stream.n_jumps == 0
+
+
+def test_the_path_by_twists_does_not_depend_on_the_order() -> None:
+    times = np.arange(0.0, 3.0, 0.02)
+    samples = [OdometrySample(EPOCH + round(t * 1e9), np.zeros(3), twist=(
+        1.0, 0.0, math.sin(t))) for t in times.tolist()]
+    order = np.argsort(times + np.random.default_rng(1).uniform(0.0, 0.2, len(times)))
+    one = settled(samples, integrate=Integrate.TWIST)
+    other = settled([samples[k] for k in order], integrate=Integrate.TWIST)
+    assert contents(one) == contents(other)
+
+
+def test_a_gap_between_twists_is_an_uncertain_motion() -> None:
+    times = np.array([0.0, 0.5, 1.0, 3.5, 4.0])
+    stream = settled(by_twist(times, (1.0, 0.0, 0.0)), integrate=Integrate.TWIST)
+    assert stream.n_jumps == 1
+    motion = stream.timeline.motion(EPOCH + SECOND, EPOCH + 7 * SECOND // 2)
+    assert motion.variance[0] > JUMP_SIGMA[0]**2
+    assert stream.timeline.motion(EPOCH, EPOCH + SECOND).variance[0] == 0.0
+
+
+@pytest.mark.parametrize(('twist', 'reason'), [
+    ((math.nan, 0.0, 0.0), 'not_finite'), ((0.0, 0.0, math.inf), 'not_finite'),
+    ((1e5, 0.0, 0.0), 'too_large')])
+def test_a_bad_twist_is_rejected(twist: tuple[float, float, float], reason: str) -> None:
+    answer = OdometryStream(OdometrySource(integrate=Integrate.TWIST)).add(
+        OdometrySample(EPOCH, np.zeros(3), twist=twist))
+    assert answer.reason == reason
+
+
+def test_a_saved_stream_of_twists_continues_bit_for_bit() -> None:
+    times = np.arange(0.0, 3.0, 0.02)
+    samples = [OdometrySample(EPOCH + round(t * 1e9), np.zeros(3), twist=(
+        1.0, 0.0, math.sin(t))) for t in times.tolist()]
+    whole = settled(samples, integrate=Integrate.TWIST)
+    first = OdometryStream(OdometrySource(integrate=Integrate.TWIST))
+    for sample in samples[:100]:
+        first.add(sample)
+    for _ in first.settle():
+        pass
+    second = OdometryStream(OdometrySource(integrate=Integrate.TWIST))
+    second.restore(first.saved(np.array([EPOCH]), (0, 1)))
+    for sample in samples[100:]:
+        second.add(sample)
+    for _ in second.settle(second.newest_ns):
+        pass
+    assert second.timeline.poses[-1].tobytes() == whole.timeline.poses[-1].tobytes()

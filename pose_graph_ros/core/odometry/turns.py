@@ -1,0 +1,208 @@
+# Copyright 2026 The pose_graph_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""Rotations between consecutive hidden nodes by gyroscopes, and what they measure at rest."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+
+from pose_graph_ros.core.config import BackendConfig
+from pose_graph_ros.core.measurements import Answer, YawRate
+from pose_graph_ros.core.odometry.gyro import GyroStream, RateIntegral, Rotation, SavedRates
+from pose_graph_ros.core.odometry.hidden_nodes import HiddenNodes
+from pose_graph_ros.core.odometry.timeline import STANDING_NS
+from pose_graph_ros.core.saved_columns import Integers, Pairs, Rows5
+
+# Parts of a standstill by the wheels in which the robot may still, or already, turn [ns].
+STOPPING_NS, STARTING_NS = STANDING_NS, STANDING_NS // 3
+# A robot whose gyroscope shows more than this many sigmas of its bias at rest is turned by others.
+MOST_BIAS = 5.0
+# Nodes that are closer than this have no rotation between them: a robot was put elsewhere [ns].
+SHORTEST_NS = 1_000_000
+
+
+class Turn(NamedTuple):
+    """The rotation from one hidden node to the next."""
+
+    source: str
+    i: int
+    """Id of the node that it begins at."""
+    j: int
+    """Id of the node that it leads to."""
+    stamp_ns: int
+    """Middle of the time in between [ns]."""
+    angle: float
+    """Rotation, with the bias during `seconds`, not wrapped [rad]."""
+    variance: float
+    """[rad^2]"""
+    seconds: float
+    """Time for which the robot was not at rest, during which the bias acted [s]."""
+    rest_rate: float = 0.0
+    """Mean rate at rest, which is the bias [rad/s]."""
+    rest_variance: float = 0.0
+    """Of that rate [rad^2/s^2]; 0 if the robot was not at rest."""
+
+
+@dataclass(frozen=True, slots=True)
+class SavedGyro:
+    """Saved state of a gyroscope."""
+
+    rates: SavedRates
+    next_node: int
+    """Number of the hidden node that the next rotation leads to."""
+    waiting_ns: Integers
+    """Stamps of rotations that are not in the graph yet, shape (W,); see `Turn` [ns]."""
+    waiting_ends: Pairs
+    """Ids of their nodes, shape (W, 2)."""
+    waiting: Rows5
+    """Angle, variance, time, and what rest tells, shape (W, 5)."""
+
+
+class Gyros:
+    """
+    Makes a rotation per gyroscope between each two consecutive hidden nodes that it covers.
+
+    Rates are integrated over gaps no longer than a limit; a longer one leaves the rotation out.
+    While the wheels stand, the robot does not turn but for what the wheels say: the rotation has
+    no part of that, and the mean rate measures the bias instead.
+
+    Parameters
+    ----------
+    nodes : HiddenNodes
+    config : BackendConfig
+
+    """
+
+    def __init__(self, nodes: HiddenNodes, config: BackendConfig) -> None:
+        self._nodes, self._config = nodes, config
+        self.streams: dict[str, GyroStream] = {}
+        """By the name of the source."""
+        self.n_gaps: dict[str, int] = {}
+        """Number of rotations that a gap in the rates has left out, by source."""
+        self._next: dict[str, int] = {}
+        """Number of the hidden node that the next rotation leads to, by source."""
+        self.new: list[Turn] = []
+        """Rotations not yet taken; whoever takes them clears the list."""
+
+    def configure(self, config: BackendConfig) -> None:
+        """Set the settings for rotations that are made from now on."""
+        self._config = config
+        for name, stream in self.streams.items():
+            stream.configure(config.gyro(name))
+
+    def add(self, sample: YawRate, source: str) -> Answer:
+        """
+        Return the answer to a sample, after adding it.
+
+        Parameters
+        ----------
+        sample : YawRate
+        source : str
+
+        """
+        return self._stream(source).add(sample)
+
+    def finish(self) -> None:
+        """Settle all samples."""
+        for stream in self.streams.values():
+            stream.settle()
+
+    def extend(self) -> None:
+        """Make the rotations up to the newest node that settled rates have reached."""
+        for source, stream in self.streams.items():
+            stamps_ns = self._nodes.stamps_ns
+            if (node := self._next[source]) >= len(stamps_ns):
+                continue
+            settled_ns = stream.settled_ns
+            if stamps_ns[node] > settled_ns:
+                continue
+            # before the first sample there is nothing to integrate
+            node = max(node, int(np.searchsorted(stamps_ns, stream.first_ns)), 1)
+            while node < len(stamps_ns) and stamps_ns[node] <= settled_ns:
+                self._extend(source, stream, node)
+                node += 1
+            self._next[source] = node
+            stream.forget_before(int(stamps_ns[node - 1]))
+
+    def _extend(self, source: str, stream: GyroStream, node: int) -> None:
+        """Make the rotation to a node, given by its number."""
+        nodes = self._nodes
+        start_ns, end_ns = nodes.stamps_ns[node - 1:node + 1].tolist()
+        if end_ns - start_ns < SHORTEST_NS or node in nodes.relocated:
+            return
+        integral = stream.integral(start_ns, end_ns)
+        if integral is None:
+            self.n_gaps[source] += stream.first_ns <= start_ns
+            return
+        rotation = integral.between(start_ns, end_ns)
+        at_rest, creep, creep_variance = self._at_rest(source, integral, start_ns, end_ns)
+        i, j = nodes.ids[node - 1:node + 1].tolist()
+        middle_ns = (start_ns + end_ns) // 2
+        if at_rest.seconds == 0.0:
+            self.new.append(Turn(source, i, j, middle_ns, *rotation))
+            return
+        angle, variance, seconds = rotation.without(at_rest)
+        self.new.append(Turn(
+            source, i, j, middle_ns, angle + creep, variance + creep_variance, seconds,
+            (at_rest.angle - creep) / at_rest.seconds,
+            (at_rest.variance + creep_variance) / at_rest.seconds**2))
+
+    def _at_rest(
+        self, source: str, integral: RateIntegral, start_ns: int, end_ns: int,
+    ) -> tuple[Rotation, float, float]:
+        """Return the rotation by rates at rest, that by the wheels [rad] and its variance."""
+        total, creep, variance = Rotation(0.0, 0.0, 0.0), 0.0, 0.0
+        if end_ns - start_ns < STOPPING_NS + STARTING_NS + STANDING_NS:
+            return total, creep, variance
+        primary = self._nodes.primary_at(end_ns)
+        timeline = self._nodes.streams[primary].timeline
+        most = MOST_BIAS * self._config.gyro(source).sigma_bias
+        for first_ns, last_ns in timeline.rests(start_ns, end_ns):
+            begin_ns, until_ns = first_ns + STOPPING_NS, last_ns - STARTING_NS
+            if until_ns - begin_ns < STANDING_NS:
+                continue
+            rest = integral.between(begin_ns, until_ns)
+            if abs(rest.angle) > most * rest.seconds:
+                continue
+            total = Rotation(*(one + more for one, more in zip(total, rest, strict=True)))
+            creep += float(timeline.motion(begin_ns, until_ns).increment[2])
+            variance += self._config.odometry_source(primary).noise.sigma_floor_heading**2
+        return total, creep, variance
+
+    def _stream(self, source: str) -> GyroStream:
+        stream = self.streams.get(source)
+        if stream is None:
+            stream = self.streams[source] = GyroStream(self._config.gyro(source))
+            self._next[source], self.n_gaps[source] = 1, 0
+        return stream
+
+    def saved(self, waiting: Sequence[Turn]) -> dict[str, SavedGyro]:
+        """Return the state of each gyroscope, with the rotations that wait for an update."""
+        result = {}
+        for source, stream in self.streams.items():
+            turns = [turn for turn in waiting if turn.source == source]
+            result[source] = SavedGyro(
+                stream.saved(), self._next[source],
+                np.array([turn.stamp_ns for turn in turns], dtype=np.int64),
+                np.array([(turn.i, turn.j) for turn in turns], dtype=np.int64).reshape(-1, 2),
+                np.array([turn[4:] for turn in turns], dtype=np.float64).reshape(-1, 5))
+        return result
+
+    def restore(self, source: str, saved: SavedGyro) -> list[Turn]:
+        """
+        Return the rotations that wait, after restoring the saved state of a gyroscope.
+
+        Parameters
+        ----------
+        source : str
+        saved : SavedGyro
+
+        """
+        self._stream(source).restore(saved.rates)
+        self._next[source] = saved.next_node
+        return [Turn(source, i, j, stamp_ns, *numbers)
+                for stamp_ns, (i, j), numbers in zip(
+                    saved.waiting_ns.tolist(), saved.waiting_ends.tolist(),
+                    saved.waiting.tolist(), strict=True)]

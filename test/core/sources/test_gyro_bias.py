@@ -1,0 +1,166 @@
+# Copyright 2026 The pose_graph_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""Gyroscopes in the engine: heading in outages, bias, rest, late rates, saved graphs."""
+
+from dataclasses import replace
+from pathlib import Path
+
+from gyro_drive import Drive, EPOCH, GYRO, run, SECOND, settings, simulate
+import numpy as np
+import pytest
+
+from pose_graph_ros.core.backend import PoseGraphBackend
+from pose_graph_ros.core.geometry import se2
+from pose_graph_ros.core.graph.constraints import EdgeKind
+from pose_graph_ros.core.io.graph_files import read_graph, write_graph
+from pose_graph_ros.core.measurements import (
+    AnswerStatus,
+    GlobalPose,
+    Measurement,
+    OdometrySample,
+    YawRate,
+)
+
+Events = list[tuple[str, OdometrySample | Measurement]]
+
+
+def feed(backend: PoseGraphBackend, events: Events, every: int = 40) -> PoseGraphBackend:
+    for count, (source, event) in enumerate(events):
+        if isinstance(event, OdometrySample):
+            backend.add_odometry(event, source)
+        else:
+            backend.add_measurement(event, source)
+        if count % every == 0:
+            backend.update()
+    return backend
+
+
+def finished(events: Events) -> PoseGraphBackend:
+    backend = feed(PoseGraphBackend(settings()), events)
+    backend.optimize()
+    return backend
+
+
+def path_of(backend: PoseGraphBackend) -> np.ndarray:
+    return backend.estimate().path.poses
+
+
+@pytest.fixture(scope='module')
+def short() -> Drive:
+    return simulate(1, duration=50.0, outage=(30.0, 45.0))
+
+
+def test_the_heading_in_an_outage_is_several_times_better_and_honest() -> None:
+    with_gyro, without, energies = [], [], []
+    for seed in (1, 2):
+        drive = simulate(seed)
+        for gyro, found in ((False, without), (True, with_gyro)):
+            _, errors = run(drive, gyro=gyro)
+            assert len(errors) > 50
+            found.append(np.mean(errors[:, 0]**2))
+        energies.append(np.mean((errors[:, 0] / errors[:, 1])**2))
+    # `python -m benchmark.inputs --only gyro` has 13.7 over 12 seeds
+    assert np.sqrt(np.mean(without) / np.mean(with_gyro)) > 5.0
+    assert 0.02 < np.mean(energies) < 3.0
+
+
+def test_rest_measures_the_bias() -> None:
+    bias, times = 0.013, np.arange(0.0, 12.0, 0.02)
+    rng = np.random.default_rng(4)
+    events: Events = [('odom', OdometrySample(EPOCH + round(t * 1e9), np.zeros(3)))
+                      for t in times[::5].tolist()]
+    rates = bias + rng.normal(0.0, GYRO.sigma_rate / np.sqrt(0.02), len(times))
+    events += [('gyro', YawRate(EPOCH + round(t * 1e9), rate))
+               for t, rate in zip(times.tolist(), rates.tolist(), strict=True)]
+    events.sort(key=lambda event: event[1].stamp_ns)
+    backend = finished(events)
+    value = backend._factors.gyros.values(backend.graph)['gyro']
+    assert value == pytest.approx(bias, abs=4.0 * GYRO.sigma_rate / np.sqrt(8.0))
+    state = backend.graph.node_rows(np.array([backend._factors.gyros._bias('gyro').newest]))[0]
+    sigma = np.sqrt(backend._smoother.covariances()[state, 0, 0])
+    assert sigma == pytest.approx(GYRO.sigma_rate / np.sqrt(8.66), rel=0.1)
+
+
+def test_a_robot_that_is_turned_while_its_wheels_stand_is_not_at_rest() -> None:
+    times = np.arange(0.0, 12.0, 0.02)
+    events: Events = [('odom', OdometrySample(EPOCH + round(t * 1e9), np.zeros(3)))
+                      for t in times[::5].tolist()]
+    events += [('gyro', YawRate(EPOCH + round(t * 1e9), 0.5)) for t in times.tolist()]
+    events.sort(key=lambda event: event[1].stamp_ns)
+    observed = finished(events).graph.observed
+    assert len(observed) == 1   # the prior of the bias alone
+
+
+def test_late_and_shuffled_rates_give_the_same_graph(short: Drive) -> None:
+    expected = path_of(finished(short.events))
+    rng = np.random.default_rng(2)
+
+    def later(seconds: float, jitter: float) -> Events:
+        due = [event.stamp_ns + SECOND * (seconds + jitter * rng.uniform())
+               if source == 'gyro' else event.stamp_ns for source, event in short.events]
+        return [short.events[k] for k in np.argsort(due, kind='stable')]
+
+    for seconds, jitter in ((0.0, 0.24), (20.0, 0.0), (100.0, 0.24), (-30.0, 0.0)):
+        assert path_of(finished(later(seconds, jitter))) == pytest.approx(expected, abs=1e-9)
+
+
+def test_a_gap_leaves_rotations_out_and_is_counted(short: Drive) -> None:
+    begin, end = EPOCH + 20 * SECOND, EPOCH + 24 * SECOND
+    backend = finished([(source, event) for source, event in short.events
+                        if source != 'gyro' or not begin < event.stamp_ns < end])
+    edges, stamps = backend.graph.edges, backend.node_stamps_ns
+    turns = edges.rows(edges.kind == EdgeKind.TURN)
+    ends = stamps[np.searchsorted(backend._nodes.ids, turns.j)]
+    missing = len(stamps) - 1 - len(turns)
+    assert backend.counts['gyro', 'gap'] == missing == np.sum(
+        (stamps > begin) & (stamps <= end)) + 1
+    assert not np.any((ends > begin) & (ends < end))
+
+
+def test_no_rotation_spans_the_step_to_a_pose_that_is_set(short: Drive) -> None:
+    half = EPOCH + 25 * SECOND
+    backend = feed(PoseGraphBackend(settings()), [
+        each for each in short.events if each[1].stamp_ns <= half])
+    backend.update()
+    before = backend.graph.n_nodes
+    turned = backend.estimate().path.poses[-1] + (0.0, 0.0, 1.5)
+    answer = backend.set_pose(
+        GlobalPose(half, turned, np.diag((0.01, 0.01, 1e-4))), 'set_pose')
+    assert answer.status is AnswerStatus.ACCEPTED
+    feed(backend, [each for each in short.events if half < each[1].stamp_ns <= half + 2 * SECOND
+                   and each[0] != 'fix'])
+    backend.update()
+    moved = backend._nodes.ids[max(backend._nodes.relocated)]
+    edges = backend.graph.edges
+    turns = edges.rows(edges.kind == EdgeKind.TURN)
+    assert moved >= before
+    assert not np.any(turns.j == moved)
+    assert np.any(turns.i == moved)
+    pose = backend.graph.poses_of(np.array([moved]))[0]
+    assert abs(se2.wrap(pose[2] - turned[2])) < 0.01
+
+
+def test_a_saved_graph_continues_as_if_it_had_not_been_saved(
+    short: Drive, tmp_path: Path,
+) -> None:
+    half = len(short.events) // 2 + 7
+    backend = feed(PoseGraphBackend(settings()), short.events[:half])
+    write_graph(backend.saved(), tmp_path / 'map')
+    restored = PoseGraphBackend.restored(settings(), read_graph(tmp_path / 'map'))
+    for each in (backend, restored):
+        feed(each, short.events[half:])
+        each.optimize()
+    assert path_of(restored) == pytest.approx(path_of(backend), abs=1e-9)
+    assert restored.graph.n_nodes == backend.graph.n_nodes
+    names = [each.name for each in restored.largest_energies(2000)]
+    assert any(name.startswith('gyro x') for name in names)
+    assert any(name.startswith('error of gyro at') for name in names)
+
+
+def test_another_period_of_the_bias_begins_a_new_chain(short: Drive) -> None:
+    half = len(short.events) // 2
+    saved = feed(PoseGraphBackend(settings()), short.events[:half]).saved()
+    restored = PoseGraphBackend.restored(settings(replace(GYRO, bias_period=5.0)), saved)
+    feed(restored, short.events[half:])
+    restored.optimize()
+    assert path_of(restored) == pytest.approx(path_of(finished(short.events)), abs=0.3)
