@@ -150,7 +150,7 @@ def test_the_same_settings_again_change_no_bit(config: BackendConfig) -> None:
     (with_fix(correlation=Correlation.INFLATE), r'fix: .*correlation: '),
     (with_fix(white_share=0.5), r'fix: .*white_share: '),
     (replace(CONFIG, measurements={}), r'gnss: .*correlation_time: .* expected 20\.0, got 0\.0'),
-    (replace(CONFIG, smoother=SmootherConfig(alpha=0.5)), 'SmootherConfig: ')])
+    (replace(CONFIG, smoother=SmootherConfig(alpha=0.5)), r'BackendConfig\.smoother: ')])
 def test_what_must_stay_is_refused_and_then_nothing_changes(
     wanted: BackendConfig, said: str,
 ) -> None:

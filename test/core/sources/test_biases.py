@@ -90,7 +90,9 @@ def test_energy_linearization_error_and_scale_are_those_of_the_formulas(seed: in
     i, j = rng.choice(3, 12), 3 + rng.choice(2, 12)
     edges = random_edges_to_biases(rng, i, j)
     edges.bias[::4, :2] = 0.0
-    graph.apply(GraphUpdate(hidden=random_poses(rng, 3), biases=random_poses(rng, 2), edges=edges))
+    biases = random_poses(rng, 2)
+    biases[:, 2] *= 0.5     # a factor times an angle jumps where the angle is wrapped
+    graph.apply(GraphUpdate(hidden=random_poses(rng, 3), biases=biases, edges=edges))
     graph.apply(GraphUpdate(weigh_edges={0: 0.3, 1: 0.0}))
     W, before = graph.edges.weighted_information, graph.poses.copy()
     first = jacobians.linearize_edges(before, edges)
