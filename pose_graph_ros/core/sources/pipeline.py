@@ -162,7 +162,7 @@ class MeasurementPipeline:
             self.refused_closures.append((source, measurement.stamp_ns, measurement.reference_ns))
         return answer
 
-    def _try_to_attach(self, measurement: Measurement, source: str) -> Answer:
+    def _try_to_attach(self, measurement: PoseMeasurement, source: str) -> Answer:
         attachment = attach(self._nodes, measurement.stamp_ns)
         if isinstance(attachment, Answer):
             return attachment
