@@ -36,8 +36,10 @@ from pose_graph_ros.core.graph.factor_types import (
     error,
     factors_of_end,
     heading_offset,
+    is_plain,
     is_relative,
     OBSERVED,
+    ODOMETRY,
     RANGE,
 )
 
@@ -67,7 +69,7 @@ def refer_to_pose(f):  # type: ignore[no-untyped-def]
     f[tb.CHECKED_TURN] = 0.0
 
 
-@kernel
+@kernel(forceinline=True)
 def model(f, kind, start, end, third):  # type: ignore[no-untyped-def]
     """
     Return the error of a constraint, the cosine and sine of its frame, and its arm.
@@ -89,7 +91,7 @@ def model(f, kind, start, end, third):  # type: ignore[no-untyped-def]
     return ex, ey, wrap(eth), c, s, ax, ay
 
 
-@kernel
+@kernel(forceinline=True)
 def _linearize(f, kind, start, end, pose_k, delta_k):  # type: ignore[no-untyped-def]
     """Linearize a constraint; the last two are f_th times POSE and DELTA of the third node."""
     ex, ey, eth, c, s, ax, ay = model(f, kind, start, end, pose_k)
@@ -108,7 +110,7 @@ def _linearize(f, kind, start, end, pose_k, delta_k):  # type: ignore[no-untyped
     f[tb.LIN_K] = eth - (fth * end[tb.DELTA + 2] - th + delta_k)
 
 
-@kernel
+@kernel(forceinline=True)
 def frame(f, kind):  # type: ignore[no-untyped-def]
     """
     Return cosine and sine of the frame at the linearization.
@@ -128,7 +130,7 @@ def frame(f, kind):  # type: ignore[no-untyped-def]
     return math.cos(f[tb.MEAN + 2]), math.sin(f[tb.MEAN + 2])
 
 
-@kernel
+@kernel(forceinline=True)
 def _check(f, kind, start, end, delta_k, phi):  # type: ignore[no-untyped-def]
     """Set the squared linearization error and the energy, as for `check_edge`."""
     ft, fth = factors_of_end(f, kind)
@@ -186,7 +188,7 @@ def _check(f, kind, start, end, delta_k, phi):  # type: ignore[no-untyped-def]
         longer if longer > MUCH_LONGER else 0.0)
 
 
-@kernel
+@kernel(forceinline=True)
 def third(head, e, column):  # type: ignore[no-untyped-def]
     """
     Return the factor of the third node of an edge times one of its numbers, 0 without one.
@@ -204,9 +206,12 @@ def third(head, e, column):  # type: ignore[no-untyped-def]
 @kernel
 def linearize_edge(head, e):  # type: ignore[no-untyped-def]
     """Linearize an edge at the present estimate; the caller has logged its row."""
-    node_f, row = tb.node_f(head), tb.edge_i(head)[e]
-    _linearize(tb.edge_f(head)[e], row[tb.EDGE_KIND], node_f[row[tb.END_I]],
-               node_f[row[tb.END_J]], third(head, e, tb.POSE), third(head, e, tb.DELTA))
+    node_f, row, f = tb.node_f(head), tb.edge_i(head)[e], tb.edge_f(head)[e]
+    kind, start, end = row[tb.EDGE_KIND], node_f[row[tb.END_I]], node_f[row[tb.END_J]]
+    if is_plain(row):
+        _linearize(f, ODOMETRY, start, end, 0.0, 0.0)
+    else:
+        _linearize(f, kind, start, end, third(head, e, tb.POSE), third(head, e, tb.DELTA))
 
 
 @kernel
@@ -220,9 +225,12 @@ def check_edge(head, e, phi):  # type: ignore[no-untyped-def]
     phi : float, turn of its clique's frame since the linearization [rad]; see `clique_frames`
 
     """
-    node_f, row = tb.node_f(head), tb.edge_i(head)[e]
-    _check(tb.edge_f(head)[e], row[tb.EDGE_KIND], node_f[row[tb.END_I]], node_f[row[tb.END_J]],
-           third(head, e, tb.DELTA), phi)
+    node_f, row, f = tb.node_f(head), tb.edge_i(head)[e], tb.edge_f(head)[e]
+    kind, start, end = row[tb.EDGE_KIND], node_f[row[tb.END_I]], node_f[row[tb.END_J]]
+    if is_plain(row):
+        _check(f, ODOMETRY, start, end, 0.0, phi)
+    else:
+        _check(f, kind, start, end, third(head, e, tb.DELTA), phi)
 
 
 @kernel
@@ -239,7 +247,7 @@ def check_observed(head, k):  # type: ignore[no-untyped-def]
     _check(tb.observed_f(head)[k], OBSERVED, node, node, 0.0, 0.0)
 
 
-@kernel
+@kernel(forceinline=True)
 def _form(f, x, y, th):  # type: ignore[no-untyped-def]
     """Return e^T information e."""
     i = tb.INFO

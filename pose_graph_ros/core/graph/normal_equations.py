@@ -9,7 +9,12 @@ blocks of `J^T W J` and `-J^T W h`, with J = (-T, F, G) in map axes.
 
 from pose_graph_ros.core.compiled.jit import kernel
 from pose_graph_ros.core.graph import tables as tb
-from pose_graph_ros.core.graph.factor_types import factors_of_end, OBSERVED
+from pose_graph_ros.core.graph.factor_types import (
+    factors_of_end,
+    is_plain,
+    OBSERVED,
+    ODOMETRY,
+)
 from pose_graph_ros.core.graph.factors import frame, model, third
 
 
@@ -43,7 +48,7 @@ def weakest_of(xx, xy, xt, yy, yt, tt):  # type: ignore[no-untyped-def]
     return determinant / trace, max(tt - joint, 0.0)
 
 
-@kernel
+@kernel(forceinline=True)
 def _turned(f, c, s):  # type: ignore[no-untyped-def]
     """Return the weighted information, rotated by the angle with cosine c and sine s."""
     i, w = tb.INFO, f[tb.WEIGHT]
@@ -54,7 +59,7 @@ def _turned(f, c, s):  # type: ignore[no-untyped-def]
             w * (s * xt + c * yt), w * tt)
 
 
-@kernel
+@kernel(forceinline=True)
 def _add(f, kind, start, end, a, b, k, front, ld):  # type: ignore[no-untyped-def]
     """Add a constraint to a front; parameters as for `add_edge`, rows as for `model`."""
     c, s = frame(f, kind)
@@ -147,9 +152,12 @@ def add_edge(head, e, a, b, k, front, ld):  # type: ignore[no-untyped-def]
         Upper triangle, stored by rows of `ld` numbers, the last of which is the right-hand side.
 
     """
-    node_f, row = tb.node_f(head), tb.edge_i(head)[e]
-    _add(tb.edge_f(head)[e], row[tb.EDGE_KIND], node_f[row[tb.END_I]], node_f[row[tb.END_J]],
-         a, b, k, front, ld)
+    node_f, row, f = tb.node_f(head), tb.edge_i(head)[e], tb.edge_f(head)[e]
+    kind, start, end = row[tb.EDGE_KIND], node_f[row[tb.END_I]], node_f[row[tb.END_J]]
+    if is_plain(row):
+        _add(f, ODOMETRY, start, end, a, b, -1, front, ld)
+    else:
+        _add(f, kind, start, end, a, b, k, front, ld)
 
 
 @kernel
@@ -168,7 +176,7 @@ def add_observed(head, k, a, front, ld):  # type: ignore[no-untyped-def]
     _add(tb.observed_f(head)[k], OBSERVED, node, node, a, -1, -1, front, ld)
 
 
-@kernel
+@kernel(forceinline=True)
 def _gradient(f, kind, nodes, node_f, third, right):  # type: ignore[no-untyped-def]
     """
     Add -b of a constraint to `right`, shape (N, 3); return its energy and two sums of magnitudes.
@@ -208,9 +216,12 @@ def edge_gradient(head, e, right):  # type: ignore[no-untyped-def]
 
     """
     f, row = tb.edge_f(head)[e], tb.edge_i(head)[e]
+    nodes = (row[tb.END_I], row[tb.END_J])
+    if is_plain(row):
+        energy, total, terms, _ = _gradient(f, ODOMETRY, nodes, tb.node_f(head), 0.0, right)
+        return energy, total, terms
     energy, total, terms, gth = _gradient(
-        f, row[tb.EDGE_KIND], (row[tb.END_I], row[tb.END_J]), tb.node_f(head),
-        third(head, e, tb.POSE), right)
+        f, row[tb.EDGE_KIND], nodes, tb.node_f(head), third(head, e, tb.POSE), right)
     if row[tb.END_K] >= 0:
         right[row[tb.END_K], 0] -= f[tb.FACTOR_TH] * gth
     return energy, total, terms
