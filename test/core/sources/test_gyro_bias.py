@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 
 from pose_graph_ros.core.backend import PoseGraphBackend
+from pose_graph_ros.core.config import WindowConfig
 from pose_graph_ros.core.geometry import se2
 from pose_graph_ros.core.graph.constraints import EdgeKind
 from pose_graph_ros.core.io.graph_files import read_graph, write_graph
@@ -115,6 +116,20 @@ def test_a_gap_leaves_rotations_out_and_is_counted(short: Drive) -> None:
     assert backend.counts['gyro', 'gap'] == missing == np.sum(
         (stamps > begin) & (stamps <= end)) + 1
     assert not np.any((ends > begin) & (ends < end))
+
+
+def test_with_a_window_old_biases_leave_and_the_newest_pose_is_as_good(short: Drive) -> None:
+    whole = feed(PoseGraphBackend(settings()), short.events)
+    part = feed(PoseGraphBackend(replace(settings(), window=WindowConfig(seconds=15.0))),
+                short.events)
+    for backend in (whole, part):
+        backend.update()
+    assert part.graph.n_nodes < 0.6 * whole.graph.n_nodes
+    assert np.count_nonzero(part.graph.is_bias) < np.count_nonzero(whole.graph.is_bias)
+    assert len(path_of(part)) == len(path_of(whole))
+    newest, expected = path_of(part)[-1], path_of(whole)[-1]
+    assert newest[:2] == pytest.approx(expected[:2], abs=0.1)
+    assert newest[2] == pytest.approx(expected[2], abs=0.02)
 
 
 def test_no_rotation_spans_the_step_to_a_pose_that_is_set(short: Drive) -> None:
