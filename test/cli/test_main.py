@@ -94,7 +94,8 @@ def test_parameters_are_printed_as_tables_and_as_a_file(
 def test_a_drive_is_simulated_once(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str],
 ) -> None:
-    monkeypatch.setattr(simulate, 'simulate_drive', lambda seed: simulate_drive(seed, 12.0))
+    monkeypatch.setattr(simulate, 'simulate_drive', lambda seed, **options: simulate_drive(
+        seed, 12.0, **options))
     folder = tmp_path / 'drive'
     assert main(['simulate', str(folder), '--seed', '5']) == 0
     assert capsys.readouterr().out == f'written: {folder}\n'
