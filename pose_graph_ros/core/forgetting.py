@@ -76,7 +76,6 @@ class Forgetting:
         """Let the n oldest nodes leave, with a dense or a sparse prior instead."""
         parts, graph, nodes = self._parts, self._parts.graph, self._parts.nodes
         first = nodes.n_frozen + n
-        oldest = slice(nodes.n_frozen, first)
         # the oldest one that stays may have been thinned out
         rows = graph.node_rows(nodes.ids[first:])
         row = int(rows[rows >= 0][0])
@@ -86,13 +85,13 @@ class Forgetting:
         biases = np.array(self._tuner.leave(leaving), dtype=np.int64)
         leaving = np.sort(np.concatenate((leaving, biases)))
         parts.judge.decide_leaving(leaving)
-        poses = nodes.poses(graph)
+        poses = nodes.recent_poses(graph)
         self._pass_on_anchors(first)
         gone = self._removed(leaving) if prior is Prior.SPARSE else None
         forget(gone or self._smoother.forget(leaving), parts, self._tuner)
-        nodes.forget(poses[oldest])
+        nodes.forget(poses[:n])
         if not parts.alignment.is_aligned:
-            self._joint = se2.between(poses[first - 1], poses[first])
+            self._joint = se2.between(poses[n - 1], poses[n])
         parts.alignment.forget(int(nodes.ids[first]))
         parts.pipeline.seen.forget(nodes.last_frozen_ns)
         self._refuse(leaving)
@@ -126,7 +125,7 @@ class Forgetting:
         if joint is None or not self._parts.alignment.is_aligned:
             return
         self._joint = None
-        oldest = nodes.poses(self._parts.graph)[nodes.n_frozen]
+        oldest = nodes.recent_poses(self._parts.graph)[0]
         last = se2.compose(oldest, se2.inverse(joint))
         nodes.table.move_frozen(se2.compose(last, se2.inverse(nodes.table.frozen[-1])))
 

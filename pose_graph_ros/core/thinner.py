@@ -31,14 +31,14 @@ class Thinner:
         self._smoother, self._tuner, self._parts = smoother, tuner, parts
         self._thinning = Thinning()
 
-    def step(self, config: ThinningConfig) -> int:
-        """Let the nodes leave that are due, and return their number."""
-        parts, n = self._parts, 0
+    def step(self, config: ThinningConfig) -> None:
+        """Let the nodes leave that are due."""
+        parts = self._parts
         if config.cell == 0.0:
-            return 0
+            return
         places = self._thinning.places(self._smoother, config, self._waiting())
         if places is None:
-            return 0
+            return
         for group in groups(parts.graph, places):
             parts.judge.decide_leaving(group.nodes)
             gone = removed(
@@ -47,10 +47,8 @@ class Thinner:
                 break
             forget(gone, parts, self._tuner)
             parts.nodes.table.thin(*group)
-            n += len(group.nodes)
         for gone in simplify(self._smoother):
             forget(gone, parts, self._tuner)
-        return n
 
     def _waiting(self) -> set[int]:
         """Return the ids of nodes on which constraints are to be added, or edges are to end."""

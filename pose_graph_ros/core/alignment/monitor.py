@@ -166,7 +166,7 @@ class AlignmentMonitor:
         table = ObservedNodes(np.searchsorted(ids, table.node), *table.columns[1:])
         rows = graph.node_rows(ids)
         found = estimator.recheck(
-            nodes.poses(graph)[nodes.n_frozen:], nodes.odometry, table, self._config.alignment,
+            nodes.recent_poses(graph), nodes.odometry, table, self._config.alignment,
             self._noise(nodes.primary), correlation=self._correlation(self._evidence),
             sigma=self.sigma)
         if self._next_recheck > LAST_RECHECK:

@@ -104,6 +104,10 @@ class HiddenNodes:
         """Return the poses of all hidden nodes, shape (N, 3): frozen ones, then the graph's."""
         return self.table.poses(graph.poses[graph.node_rows(self.ids[self.n_frozen:])])
 
+    def recent_poses(self, graph: Graph) -> FloatArray:
+        """Return the poses of the hidden nodes that are not frozen, shape (N - F, 3)."""
+        return self.table.recent_poses(graph.poses[graph.node_rows(self.ids[self.n_frozen:])])
+
     @property
     def last_frozen_ns(self) -> int:
         """Stamp of the newest node that has left the graph [ns]; -1 if none has."""

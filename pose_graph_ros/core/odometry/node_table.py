@@ -93,17 +93,21 @@ class NodeTable:
         self.thinned.drop_before(self.n_frozen)
 
     def poses(self, present: FloatArray) -> FloatArray:
-        """
-        Return the poses of all nodes in the map, shape (N, 3) [m, m, rad].
+        """Return the poses of all nodes, shape (N, 3); `present` as for `recent_poses`."""
+        recent = self.recent_poses(present)
+        return recent if self.n_frozen == 0 else np.concatenate((self.frozen, recent))
 
-        Those of the nodes from `n_frozen` on are given, shape (N - F, 3), and overwritten where a
-        node has left.
+    def recent_poses(self, present: FloatArray) -> FloatArray:
+        """
+        Return the poses of the nodes that are not frozen, shape (N - F, 3) [m, m, rad].
+
+        They are given, but overwritten where a node was thinned out.
         """
         thinned, first = self.thinned, self.n_frozen
         if len(thinned) > 0:
             present[thinned.numbers - first] = se2.compose(
                 present[thinned.anchors - first], thinned.relative)
-        return present if first == 0 else np.concatenate((self.frozen, present))
+        return present
 
     def attachment(self, number: int, mean: FloatArray, noise: FloatArray) -> Attachment:
         """
