@@ -67,6 +67,10 @@ class Announcer:
             earlier = gathered.get(change.id)
             gathered[change.id] = (
                 change if earlier is None else change._replace(before=earlier.before))
+            if gathered[change.id].before is change.after:
+                # back to what the last line said of it; while a source is doubted for long, there
+                # may be many of these
+                del gathered[change.id]
             if _is_new_doubt(change):
                 self._follow(change)
         for source, each in totals.items():
