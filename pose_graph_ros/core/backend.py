@@ -38,7 +38,8 @@ from pose_graph_ros.core.measurements import (
 from pose_graph_ros.core.odometry.hidden_nodes import HiddenNodes
 from pose_graph_ros.core.refiner import Refiner
 from pose_graph_ros.core.relocation import relocate
-from pose_graph_ros.core.smoother.incremental import IncrementalSmoother, Refinement
+from pose_graph_ros.core.smoother.incremental import IncrementalSmoother
+from pose_graph_ros.core.smoother.results import Refinement
 from pose_graph_ros.core.sources import constraint_names
 from pose_graph_ros.core.sources.constraint_queue import Queue, QueuedEdge
 from pose_graph_ros.core.sources.factor_builder import FactorBuilder
@@ -94,8 +95,7 @@ class PoseGraphBackend:
         """
         Change the settings for all later input.
 
-        Raises ConfigError if a setting that cannot change at run time differs; see
-        `BackendConfig.changed_to`.
+        Raises ConfigError for one that cannot change at run time; see `BackendConfig.changed_to`.
         """
         self._config = self._config.changed_to(config)
         self._nodes.configure(config)

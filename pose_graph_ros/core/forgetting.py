@@ -85,6 +85,7 @@ class Forgetting:
         biases = np.array(self._tuner.leave(leaving), dtype=np.int64)
         leaving = np.sort(np.concatenate((leaving, biases)))
         parts.judge.decide_leaving(leaving)
+        self._smoother.linearize(leaving)
         poses = nodes.recent_poses(graph)
         self._pass_on_anchors(first)
         gone = self._removed(leaving) if prior is Prior.SPARSE else None

@@ -11,7 +11,8 @@ from pose_graph_ros.core.error_tuner import ErrorTuner
 from pose_graph_ros.core.graph.graph import GraphUpdate
 from pose_graph_ros.core.graph.reweighting import PART, Reweighting
 from pose_graph_ros.core.judgement.judge import Judge
-from pose_graph_ros.core.smoother.incremental import IncrementalSmoother, Refinement, UpdateResult
+from pose_graph_ros.core.smoother.incremental import IncrementalSmoother
+from pose_graph_ros.core.smoother.results import Refinement, UpdateResult
 from pose_graph_ros.core.transaction import Transaction
 
 # Maximum number of reweightings in an update.

@@ -10,7 +10,8 @@ from pose_graph_ros.core.config import ThinningConfig
 from pose_graph_ros.core.error_tuner import ErrorTuner
 from pose_graph_ros.core.graph.graph_update import Left
 from pose_graph_ros.core.io.capture import Parts
-from pose_graph_ros.core.smoother.incremental import Forgotten, IncrementalSmoother
+from pose_graph_ros.core.smoother.incremental import IncrementalSmoother
+from pose_graph_ros.core.smoother.results import Forgotten
 from pose_graph_ros.core.window.sparse_removal import sparse_removal
 from pose_graph_ros.core.window.thinning import groups, removed, simplify, Thinning
 

@@ -13,7 +13,7 @@ from pose_graph_ros.core.geometry.se2 import FloatArray
 from pose_graph_ros.core.graph.graph import Graph
 from pose_graph_ros.core.judgement.judge import Judge
 from pose_graph_ros.core.odometry.hidden_nodes import HiddenNodes
-from pose_graph_ros.core.smoother.incremental import UpdateResult
+from pose_graph_ros.core.smoother.results import UpdateResult
 from pose_graph_ros.core.sources.constraint_queue import Queue
 from pose_graph_ros.core.sources.factor_builder import FactorBuilder
 

@@ -43,7 +43,8 @@ from pose_graph_ros.core.measurements import (
     OdometrySample,
     Position,
 )
-from pose_graph_ros.core.smoother.incremental import IncrementalSmoother, UpdateResult
+from pose_graph_ros.core.smoother.incremental import IncrementalSmoother
+from pose_graph_ros.core.smoother.results import UpdateResult
 
 SECOND = 1_000_000_000
 # The promise: the same measurements give the same path, whatever their order [m, rad].

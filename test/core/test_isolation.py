@@ -16,7 +16,8 @@ from pose_graph_ros.core.graph.constraints import Edges
 from pose_graph_ros.core.graph.graph import GraphUpdate
 from pose_graph_ros.core.isolation import isolate
 from pose_graph_ros.core.measurements import GlobalPose, LoopClosure, OdometrySample, Position
-from pose_graph_ros.core.smoother.incremental import IncrementalSmoother, UpdateResult
+from pose_graph_ros.core.smoother.incremental import IncrementalSmoother
+from pose_graph_ros.core.smoother.results import UpdateResult
 from pose_graph_ros.core.sources.constraint_queue import Queue, QueuedEdge
 
 SECOND = 1_000_000_000

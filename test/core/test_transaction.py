@@ -21,7 +21,8 @@ from pose_graph_ros.core.graph.reweighting import Reweighting
 from pose_graph_ros.core.judgement.judge import Judge
 from pose_graph_ros.core.measurements import LoopClosure, OdometrySample, Position
 from pose_graph_ros.core.odometry.hidden_nodes import HiddenNodes
-from pose_graph_ros.core.smoother.incremental import IncrementalSmoother, UpdateResult
+from pose_graph_ros.core.smoother.incremental import IncrementalSmoother
+from pose_graph_ros.core.smoother.results import UpdateResult
 from pose_graph_ros.core.sources.constraint_queue import Queue, QueuedEdge
 from pose_graph_ros.core.sources.factor_builder import FactorBuilder
 from pose_graph_ros.core.transaction import Transaction

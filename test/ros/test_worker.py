@@ -16,7 +16,7 @@ from pose_graph_ros.core.config import BackendConfig, OdometrySource, SmootherCo
 from pose_graph_ros.core.estimate import Estimate
 from pose_graph_ros.core.exceptions import FileFormatError
 from pose_graph_ros.core.measurements import Answer, GlobalPose, LoopClosure, OdometrySample
-from pose_graph_ros.core.smoother.incremental import Refinement
+from pose_graph_ros.core.smoother.results import Refinement
 from pose_graph_ros.ros.worker import GATHERING, Worker
 
 PATIENCE = 60.0

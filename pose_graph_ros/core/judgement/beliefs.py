@@ -22,7 +22,8 @@ from pose_graph_ros.core.judgement.odometry_states import Doubt, OdometryStates
 from pose_graph_ros.core.judgement.residual_scale import ScaleLeft
 from pose_graph_ros.core.judgement.swaps import Found
 from pose_graph_ros.core.judgement.verdicts import State
-from pose_graph_ros.core.smoother.incremental import DIVERGED, IncrementalSmoother
+from pose_graph_ros.core.smoother.incremental import IncrementalSmoother
+from pose_graph_ros.core.smoother.results import DIVERGED
 from pose_graph_ros.core.smoother.trial import continued
 
 

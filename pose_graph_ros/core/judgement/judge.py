@@ -33,11 +33,8 @@ from pose_graph_ros.core.judgement.odometry_states import OdometryStates, SavedO
 from pose_graph_ros.core.judgement.verdicts import Change, Decision, SourceVerdicts, Verdict
 from pose_graph_ros.core.measurements import Answer, LoopClosure
 from pose_graph_ros.core.odometry.hidden_nodes import HiddenNodes
-from pose_graph_ros.core.smoother.incremental import (
-    DIVERGED,
-    IncrementalSmoother,
-    UpdateResult,
-)
+from pose_graph_ros.core.smoother.incremental import IncrementalSmoother
+from pose_graph_ros.core.smoother.results import DIVERGED, UpdateResult
 from pose_graph_ros.core.sources.constraint_queue import NewConstraint
 from pose_graph_ros.core.sources.source_constraints import Held
 

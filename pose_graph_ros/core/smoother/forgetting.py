@@ -65,6 +65,33 @@ def _states(head, nodes):  # type: ignore[no-untyped-def]
     return state, leaves
 
 
+@kernel(signature=(tb.HEAD, INTEGERS))
+def far_from_linear(head, nodes):  # type: ignore[no-untyped-def]
+    """
+    Tell whether the linearization errors of the constraints of leaving nodes are above a budget.
+
+    It is that of a step that moves as many nodes. An edge between two of them counts twice.
+
+    Parameters
+    ----------
+    nodes : ndarray of int, rows of the leaving nodes
+
+    """
+    node_i, edge_i, observed_i = tb.node_i(head), tb.edge_i(head), tb.observed_i(head)
+    edge_f, observed_f, scalars = tb.edge_f(head), tb.observed_f(head), tb.scalars(head)
+    error2 = 0.0
+    for v in nodes:
+        entry = node_i[v, tb.EDGE_LIST]
+        while entry >= 0:
+            error2 += edge_f[entry >> 2, tb.ERROR2]
+            entry = edge_i[entry >> 2, tb.NEXT_I + (entry & 3)]
+        k = node_i[v, tb.OBSERVED_LIST]
+        while k >= 0:
+            error2 += observed_f[k, tb.ERROR2]
+            k = observed_i[k, tb.OBS_NEXT]
+    return error2 > min(scalars[tb.SETTING_BUDGET], scalars[tb.SETTING_SHARE] * len(nodes))
+
+
 @kernel
 def _has_node(head, c, v):  # type: ignore[no-untyped-def]
     """Tell whether a node is in the separator of a clique."""

@@ -3,7 +3,6 @@
 """The incremental smoother; `docs/solver.md` describes the method."""
 
 from collections.abc import Collection, Sequence
-from typing import NamedTuple
 
 import numpy as np
 
@@ -25,54 +24,9 @@ from pose_graph_ros.core.smoother import (
     step,
 )
 from pose_graph_ros.core.smoother.innovations import Innovations
+from pose_graph_ros.core.smoother.results import DIVERGED, Forgotten, Refinement, UpdateResult
 from pose_graph_ros.core.smoother.sparse_inverse import all_covariances
 from pose_graph_ros.core.smoother.trial import Trial
-
-
-class UpdateResult(NamedTuple):
-    """Status and statistics of an update."""
-
-    status: Status
-    """
-    CONVERGED; MAX_ITERATIONS if linearization errors above the budget remain for the next update;
-    FAILED if the update was rolled back.
-    """
-    reason: str
-    """Cause of a failure in one sentence, else empty."""
-    relinearized: int
-    """Constraints and turned clique frames that were linearized again."""
-    eliminated: int
-    """Nodes whose cliques were eliminated again, summed over the iterations."""
-    visited: int
-    """Cliques that were solved for, summed over the iterations."""
-    iterations: int
-    """Back-substitutions of the update."""
-
-
-class Refinement(NamedTuple):
-    """What a call of `IncrementalSmoother.refine` has done."""
-
-    finished: bool
-    """Whether there is nothing more to do before the next update."""
-    moved: float
-    """Largest change of a coordinate of a position [m]."""
-
-
-class Forgotten(NamedTuple):
-    """What `IncrementalSmoother.forget` has taken out of the graph."""
-
-    nodes: IntArray
-    """Ids of the hidden nodes, ascending, shape (N,)."""
-    poses: FloatArray
-    """Their last estimates, shape (N, 3) [m, m, rad]."""
-    edges: IntArray
-    """Ids of all edges that ended at them."""
-    observed: IntArray
-    """Ids of all observed nodes on them."""
-
-
-DIVERGED = 'the iterations diverge'
-"""Reason of an update that has failed because it must not fall back to the batch optimiser."""
 
 # Attempts to order leaving nodes first: a step may touch further ones that wait to be linearized.
 _ATTEMPTS = 4
@@ -162,12 +116,20 @@ class IncrementalSmoother:
         After a failure or an interruption the graph is as before, bit for bit. Raises ValueError
         if edits of the graph wait for an update.
         """
-        self._eliminated()
+        self._require_solved()
         if self.graph.newest_pose < 0:
             return _NOT_REFINED
-        code = refinement.MORE_MEMORY
+        code = self._refine()
+        if code in (refinement.REFINED, refinement.UNFINISHED):
+            moved = float(self._memory['scalars'][tb.LARGEST_MOVE])
+            return Refinement(finished=code == refinement.REFINED, moved=moved)
+        self._memory.head[tb.INTERRUPT] = 0
+        return _NOT_REFINED._replace(finished=code == refinement.FAILED)
+
+    def _refine(self) -> int:
+        """Do an iteration in a transaction; return the code of `refinement.refine`."""
+        head, code = self._memory.head, refinement.MORE_MEMORY
         while code == refinement.MORE_MEMORY:
-            head = self._memory.head
             self.graph.begin()
             try:
                 code = refinement.refine(head)
@@ -176,13 +138,11 @@ class IncrementalSmoother:
                 raise
             if code in (refinement.REFINED, refinement.UNFINISHED):
                 self.graph.commit()
-                moved = float(self._memory['scalars'][tb.LARGEST_MOVE])
-                return Refinement(finished=code == refinement.REFINED, moved=moved)
+                break
             self.graph.rollback()
             if code == refinement.MORE_MEMORY:
                 self._make_room(*head[tb.NEED_F:tb.NEED_WORK + 1].tolist())
-        head[tb.INTERRUPT] = 0
-        return _NOT_REFINED._replace(finished=code == refinement.FAILED)
+        return code
 
     def trial(self, update: GraphUpdate, poses: FloatArray | None = None) -> Trial:
         """
@@ -194,7 +154,7 @@ class IncrementalSmoother:
         poses : ndarray, shape (N, 3), optional, where it starts
 
         """
-        self._eliminated()
+        self._require_solved()
         other = IncrementalSmoother(self._config)
         return Trial(self.graph, other.graph, update, other._eliminate, poses)
 
@@ -267,35 +227,61 @@ class IncrementalSmoother:
         """
         Take nodes out of the graph; what their constraints say about the others becomes priors.
 
-        The result is that of `marginalize`, linear where the tree is, with a prior for each
-        connected part of the nodes. If these are whole subtrees, as the oldest nodes of a chain
-        are, nothing is eliminated, and neither the estimate nor any covariance changes; else they
-        are ordered first, in a step like that of an update. Raises GraphUpdateError, with the
-        graph as before, for a node that is not in the graph, for the newest pose, and if that step
-        fails; ValueError as `refine` does.
+        The result is that of `marginalize`, with a prior for each connected part of the nodes.
+        Constraints that are far from linear are linearized again first, see `linearize`. If the
+        nodes are whole subtrees, as the oldest ones of a chain are, nothing else is eliminated,
+        and neither the estimate nor any covariance changes; else they are ordered first, in a step
+        like that of an update. Raises GraphUpdateError for a node that is not in the graph, for
+        the newest pose, and if that step fails; ValueError as `refine` does.
 
         Parameters
         ----------
         nodes : collection of int, ids of hidden nodes
 
         """
-        self._eliminated()
-        graph = self.graph
-        ids = np.unique(np.fromiter(nodes, np.int64, len(nodes)))
-        rows = graph.node_rows(ids)
-        if np.any(rows < 0):
-            raise GraphUpdateError(f'forget: no hidden node has id {ids[np.argmin(rows)]}')
-        if graph.newest_pose in ids:
-            raise GraphUpdateError(f'forget: {graph.newest_pose} is the newest pose')
+        rows = self._may_leave(nodes)
+        self._linearize(rows)
         self._order_first(rows)
-        poses = graph.poses[rows]
+        poses = self.graph.poses[rows]
         code = forgetting.MORE_MEMORY
         while code == forgetting.MORE_MEMORY:
             code = forgetting.drop(self._memory.head, rows)
             if code == forgetting.MORE_MEMORY:
                 self._make_room(*self._memory.head[tb.NEED_F:tb.NEED_WORK + 1].tolist())
-        left = graph.commit()
+        left = self.graph.commit()
         return Forgotten(left.nodes, poses, left.edges, left.observed)
+
+    def linearize(self, nodes: Collection[int]) -> None:
+        """
+        Linearize again what an update has left, by an iteration of `refine`, before nodes leave.
+
+        What `forget` makes of them keeps its linearization. Nothing happens if the linearization
+        errors of the constraints of the nodes are within the budget of an update that moves them.
+        Whoever wants their last estimate asks for it between the two. Raises as `forget` does.
+
+        Parameters
+        ----------
+        nodes : collection of int, ids of hidden nodes
+
+        """
+        self._linearize(self._may_leave(nodes))
+
+    def _may_leave(self, nodes: Collection[int]) -> IntArray:
+        """Return the rows of nodes, ascending; raise GraphUpdateError if one cannot leave."""
+        self._require_solved()
+        ids = np.unique(np.fromiter(nodes, np.int64, len(nodes)))
+        rows = self.graph.node_rows(ids)
+        if np.any(rows < 0):
+            raise GraphUpdateError(f'forget: no hidden node has id {ids[np.argmin(rows)]}')
+        if self._memory.head[tb.NEWEST] in rows:
+            raise GraphUpdateError(f'forget: {self.graph.newest_pose} is the newest pose')
+        return rows
+
+    def _linearize(self, rows: IntArray) -> None:
+        head = self._memory.head
+        if forgetting.far_from_linear(head, rows):
+            while self._refine() == refinement.INTERRUPTED:
+                head[tb.INTERRUPT] = 0
 
     def _order_first(self, rows: IntArray) -> None:
         """Make whole subtrees of nodes, by row, or raise GraphUpdateError."""
@@ -348,7 +334,7 @@ class IncrementalSmoother:
 
     def covariances(self) -> FloatArray:
         """Return those of all hidden nodes, shape (N, 3, 3); raises as `covariance`."""
-        self._eliminated()
+        self._require_solved()
         out = np.zeros((self.graph.n_nodes, 3, 3))
         all_covariances(self._memory.head, out)
         return out
@@ -362,13 +348,16 @@ class IncrementalSmoother:
         return innovations.at_estimate(
             self._memory.head, edges.renumbered(self._eliminated))
 
-    def _eliminated(self, nodes: Sequence[int] | IntArray = ()) -> IntArray:
-        """Return the rows of hidden nodes in a graph whose edits have all been solved for."""
+    def _require_solved(self) -> None:
         waiting = int(self._memory.head[tb.N_TOUCHED])
         if waiting > 0:
             raise ValueError(
                 f'covariances: expected a graph whose edits have all been solved for, got one '
                 f'with {waiting} hidden nodes that wait for the solver')
+
+    def _eliminated(self, nodes: Sequence[int] | IntArray) -> IntArray:
+        """Return the rows of hidden nodes in a graph whose edits have all been solved for."""
+        self._require_solved()
         end = self.graph.next_ids.node
         wrong = [node for node in nodes
                  if not (isinstance(node, int | np.integer) and 0 <= node < end)]

@@ -24,7 +24,8 @@ from pose_graph_ros.core.measurements import (
     OdometrySample,
     Position,
 )
-from pose_graph_ros.core.smoother.incremental import IncrementalSmoother, UpdateResult
+from pose_graph_ros.core.smoother.incremental import IncrementalSmoother
+from pose_graph_ros.core.smoother.results import UpdateResult
 
 CONFIG = BackendConfig(
     odometry={name: OdometrySource(reorder_window=0.0) for name in ('wheels', 'visual')},

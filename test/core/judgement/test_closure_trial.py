@@ -24,12 +24,9 @@ from pose_graph_ros.core.judgement.closure_judge import IN_PART, LARGE
 from pose_graph_ros.core.judgement.residual_scale import MOST
 from pose_graph_ros.core.judgement.verdicts import Decision, State
 from pose_graph_ros.core.measurements import LoopClosure, OdometrySample
-from pose_graph_ros.core.smoother.incremental import (
-    DIVERGED,
-    IncrementalSmoother,
-    UpdateResult,
-)
+from pose_graph_ros.core.smoother.incremental import IncrementalSmoother
 from pose_graph_ros.core.smoother.innovations import Innovations
+from pose_graph_ros.core.smoother.results import DIVERGED, UpdateResult
 from pose_graph_ros.core.smoother.trial import Trial
 
 SECOND = 10**9

@@ -18,7 +18,8 @@ from pose_graph_ros.core.geometry.se2 import FloatArray
 from pose_graph_ros.core.graph.graph import Graph, GraphUpdate
 from pose_graph_ros.core.judgement.verdicts import Decision, State, Verdict
 from pose_graph_ros.core.measurements import Measurement, OdometrySample, Position
-from pose_graph_ros.core.smoother.incremental import IncrementalSmoother, UpdateResult
+from pose_graph_ros.core.smoother.incremental import IncrementalSmoother
+from pose_graph_ros.core.smoother.results import UpdateResult
 
 SECOND = 1_000_000_000
 Event = OdometrySample | Measurement

@@ -10,7 +10,8 @@ from pose_graph_ros.core.batch.optimizer import Status
 from pose_graph_ros.core.geometry import se2
 from pose_graph_ros.core.graph.constraints import EdgeKind, Edges
 from pose_graph_ros.core.graph.graph import GraphUpdate
-from pose_graph_ros.core.smoother.incremental import DIVERGED, IncrementalSmoother
+from pose_graph_ros.core.smoother.incremental import IncrementalSmoother
+from pose_graph_ros.core.smoother.results import DIVERGED
 from pose_graph_ros.core.smoother.trial import Trial
 
 seeds = st.integers(0, 2**32 - 1)
