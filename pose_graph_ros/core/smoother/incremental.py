@@ -119,14 +119,14 @@ class IncrementalSmoother:
         self._require_solved()
         if self.graph.newest_pose < 0:
             return _NOT_REFINED
-        code = self._refine()
+        code = self._refinement_step()
         if code in (refinement.REFINED, refinement.UNFINISHED):
             moved = float(self._memory['scalars'][tb.LARGEST_MOVE])
             return Refinement(finished=code == refinement.REFINED, moved=moved)
         self._memory.head[tb.INTERRUPT] = 0
         return _NOT_REFINED._replace(finished=code == refinement.FAILED)
 
-    def _refine(self) -> int:
+    def _refinement_step(self) -> int:
         """Do an iteration in a transaction; return the code of `refinement.refine`."""
         head, code = self._memory.head, refinement.MORE_MEMORY
         while code == refinement.MORE_MEMORY:
@@ -280,7 +280,7 @@ class IncrementalSmoother:
     def _linearize(self, rows: IntArray) -> None:
         head = self._memory.head
         if forgetting.far_from_linear(head, rows):
-            while self._refine() == refinement.INTERRUPTED:
+            while self._refinement_step() == refinement.INTERRUPTED:
                 head[tb.INTERRUPT] = 0
 
     def _order_first(self, rows: IntArray) -> None:
