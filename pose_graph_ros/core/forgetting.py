@@ -13,16 +13,20 @@ import numpy as np
 
 from pose_graph_ros.core.config import BackendConfig, Prior, WindowConfig
 from pose_graph_ros.core.error_tuner import ErrorTuner
+from pose_graph_ros.core.exceptions import GraphUpdateError
 from pose_graph_ros.core.geometry import se2
 from pose_graph_ros.core.geometry.se2 import FloatArray, IntArray
 from pose_graph_ros.core.graph.graph_update import Left
 from pose_graph_ros.core.io.capture import Parts
 from pose_graph_ros.core.measurements import rejected
-from pose_graph_ros.core.smoother.incremental import IncrementalSmoother
+from pose_graph_ros.core.smoother.incremental import Forgotten, IncrementalSmoother
 from pose_graph_ros.core.thinner import forget, Thinner
 from pose_graph_ros.core.window.policy import n_leaving
 from pose_graph_ros.core.window.sparse_removal import sparse_marginalization
 from pose_graph_ros.core.window.thinning import relative_noise, removed
+
+# After a failure of the solver no node leaves before so many new ones have come.
+REST = 20
 
 
 class Forgetting:
@@ -45,6 +49,8 @@ class Forgetting:
         Pose of the oldest node in the graph, seen from the last frozen one, shape (3,), if that
         was frozen before the graph was aligned with the map; else None.
         """
+        self._rest = 0
+        """Number of hidden nodes from which on more of them may leave."""
 
     def step(self, config: BackendConfig) -> None:
         """Let the nodes leave that are due, by the window and by thinning."""
@@ -69,7 +75,7 @@ class Forgetting:
             parts = self._parts
             n = n_leaving(window, nodes.table, parts.pipeline.needed_ns(
                 aligned=parts.alignment.is_aligned))
-        if n > 0:
+        if n > 0 and len(nodes) >= self._rest:
             self._forget(n, window.prior)
 
     def _forget(self, n: int, prior: Prior) -> None:
@@ -88,8 +94,10 @@ class Forgetting:
         self._smoother.linearize(leaving)
         poses = nodes.recent_poses(graph)
         self._pass_on_anchors(first)
-        gone = self._removed(leaving) if prior is Prior.SPARSE else None
-        forget(gone or self._smoother.forget(leaving), parts, self._tuner)
+        gone = self._gone(leaving, prior)
+        if gone is None:
+            return
+        forget(gone, parts, self._tuner)
         nodes.forget(poses[:n])
         if not parts.alignment.is_aligned:
             self._joint = se2.between(poses[n - 1], poses[n])
@@ -97,9 +105,18 @@ class Forgetting:
         parts.pipeline.seen.forget(nodes.last_frozen_ns)
         self._refuse(leaving)
 
-    def _removed(self, leaving: IntArray) -> Left | None:
-        """Return what has left with nodes; None if the solver has failed."""
-        return removed(self._smoother, sparse_marginalization(self._parts.graph, leaving))
+    def _gone(self, leaving: IntArray, prior: Prior) -> Left | Forgotten | None:
+        """Return what has left with nodes; None, and they all stay, if the solver has failed."""
+        gone = None if prior is Prior.DENSE else removed(
+            self._smoother, sparse_marginalization(self._parts.graph, leaving))
+        if gone is not None:
+            return gone
+        try:
+            return self._smoother.forget(leaving)
+        except GraphUpdateError:
+            self._parts.pipeline.counts['solver', 'failed'] += 1
+            self._rest = len(self._parts.nodes) + REST
+            return None
 
     def _pass_on_anchors(self, first: int) -> None:
         """Attach nodes that were thinned out to others if theirs leave, those before a number."""

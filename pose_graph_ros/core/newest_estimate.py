@@ -42,9 +42,13 @@ def estimate(
     shift = np.zeros(3)
     if state is AlignmentState.UNALIGNED:
         # if the aligning update failed, its measurements are in the quarantine
-        shift, cov = estimator.guess(graph.poses, newest, in_rows(graph, placed(
-            parts.pipeline.queue.observed + parts.quarantine.observed)))
-        newest = newest + shift
+        waiting = placed(parts.pipeline.queue.observed + parts.quarantine.observed)
+        if len(waiting) > 0:
+            shift, cov = estimator.guess(graph.poses, newest, in_rows(graph, waiting))
+            newest = newest + shift
+        else:
+            # the nodes of all of them have left the graph
+            state = AlignmentState.LOCAL
     stamp_ns = max(nodes.newest_ns, int(nodes.stamps_ns[-1]))
     return Estimate(
         stamp_ns=stamp_ns, T_odom_base=odometry, T_map_base=newest,

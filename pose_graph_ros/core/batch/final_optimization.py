@@ -25,6 +25,9 @@ from pose_graph_ros.core.graph.reweighting import Reweighting
 
 # Maximum number of reweighting iterations.
 REWEIGHTINGS = 200
+# Where contradictions are believed, each solution can take all iterations that it may: that many
+# of these in all.
+MOST_SOLUTIONS = 10
 # Largest change of a weight at which the reweighting has converged.
 SAME_WEIGHT = 1e-12
 # Successive factors on the thresholds of the losses, after plain least squares.
@@ -118,7 +121,7 @@ def _reweighted(
                       for new, old in zip(graph.weights, before, strict=True))
         result = found
         iterations += result.iterations
-        if largest < SAME_WEIGHT:
+        if largest < SAME_WEIGHT or iterations > MOST_SOLUTIONS * config.max_iterations:
             break
     if result.status is Status.FAILED:
         return result

@@ -32,6 +32,7 @@ from pose_graph_ros.core.odometry.saved_nodes import SavedNodes
 from pose_graph_ros.core.odometry.turns import SavedGyro
 from pose_graph_ros.core.saved_columns import Matrix
 from pose_graph_ros.core.sources.constraint_queue import SavedEdges
+from pose_graph_ros.core.sources.gauss_markov import NO_TRANSITION
 from pose_graph_ros.core.sources.gyro_bias import SavedGyroBias
 from pose_graph_ros.core.sources.source_constraints import SavedSource
 
@@ -264,8 +265,13 @@ class SavedGraph:
         _same_length(f'{where}.bins', bins, 'numbers', 'rows', 'ties')
         _increasing(f'{where}.bins.numbers', bins.numbers)
         _in_graph(f'{where}.bins.rows', bins.rows, ids['nodes'])
-        _in_graph(f'{where}.bins.ties', bins.ties[:1], ids['observed'])
-        _in_graph(f'{where}.bins.ties', bins.ties[1:], ids['edges'])
+        has_prior = bins.ties == NO_TRANSITION
+        _require(np.count_nonzero(has_prior) <= 1,
+                 f'{where}.bins.ties: expected at most one {NO_TRANSITION}')
+        if not np.any(has_prior):
+            _in_graph(f'{where}.bins.ties', bins.ties[:1], ids['observed'])
+            has_prior[:1] = True
+        _in_graph(f'{where}.bins.ties', bins.ties[~has_prior], ids['edges'])
         _require(bins.width_ns > 0 and np.all(
             rows.is_bias[rows.rows_of(bins.rows)]),
                  f'{where}.bins: expected biases, and a width')

@@ -30,8 +30,8 @@ from pose_graph_ros.core.judgement.closure_states import (
     WAITING,
 )
 from pose_graph_ros.core.judgement.closures import chances, claims, ClosureTable, GATE
-from pose_graph_ros.core.judgement.consistency import OdometryChain
 from pose_graph_ros.core.judgement.listing import MOST_OTHERS
+from pose_graph_ros.core.judgement.odometry_chain import OdometryChain
 from pose_graph_ros.core.judgement.odometry_states import OdometryStates
 from pose_graph_ros.core.judgement.residual_scale import ScaleLeft
 from pose_graph_ros.core.judgement.retests import Retests

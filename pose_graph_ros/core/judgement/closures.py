@@ -12,8 +12,9 @@ from pose_graph_ros.core.batch.truncated import LIMITS
 from pose_graph_ros.core.compiled.growing_array import GrowingArray
 from pose_graph_ros.core.geometry.se2 import BoolArray, FloatArray, IntArray
 from pose_graph_ros.core.graph.constraints import Edges
-from pose_graph_ros.core.judgement.consistency import Closures, OdometryChain
+from pose_graph_ros.core.judgement.consistency import Closures, squared_distances
 from pose_graph_ros.core.judgement.floors import floored, FLOORS, forward
+from pose_graph_ros.core.judgement.odometry_chain import OdometryChain
 
 # Squared Mahalanobis distance that 99 % of errors with three components are within.
 GATE = float(LIMITS[3])
@@ -226,7 +227,7 @@ class ClosureTable:
         first, second : ndarray of int, shape (P,), rows of `closures`
 
         """
-        return self._chain.squared_distances(closures, first, second)
+        return squared_distances(self._chain, closures, first, second)
 
     def support(self, number: int, usable: BoolArray) -> Support:
         """
@@ -256,7 +257,7 @@ class ClosureTable:
     def _distances(self, a: IntArray, b: IntArray) -> FloatArray:
         """Return squared Mahalanobis distances between closures, by number."""
         every = Closures(*(column.values for column in self._columns[:4]))
-        return self._chain.squared_distances(every, self._slot.values[a], self._slot.values[b])
+        return squared_distances(self._chain, every, self._slot.values[a], self._slot.values[b])
 
 
 def _cells(travel: FloatArray) -> list[tuple[int, int]]:

@@ -30,7 +30,7 @@ from pose_graph_ros.core.graph.constraints import EdgeKind, Edges
 from pose_graph_ros.core.graph.graph import Graph, GraphRows
 from pose_graph_ros.core.judgement import group_search, selection
 from pose_graph_ros.core.judgement.closures import GATE
-from pose_graph_ros.core.judgement.consistency import Closures
+from pose_graph_ros.core.judgement.consistency import Closures, squared_distances
 from pose_graph_ros.core.judgement.floors import floored
 from pose_graph_ros.core.judgement.odometry_motions import Odometry, SIGMAS
 from pose_graph_ros.core.judgement.strain import (
@@ -286,8 +286,8 @@ def places(
     found: dict[tuple[int, int], Place] = {}
     for seed in _seeds(doubted, groups, most_seeds):
         yield
-        squared = odometry.chain.squared_distances(
-            table, np.full(len(numbers), seed), numbers)
+        squared = squared_distances(
+            odometry.chain, table, np.full(len(numbers), seed), numbers)
         agrees = np.zeros(len(edges), dtype=bool)
         agrees[numbers] = squared <= GATE
         agrees[seed] = True

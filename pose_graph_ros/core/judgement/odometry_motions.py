@@ -10,7 +10,7 @@ from pose_graph_ros.core.geometry.se2 import FloatArray, IntArray
 from pose_graph_ros.core.graph import tables as tb
 from pose_graph_ros.core.graph.constraints import EdgeKind
 from pose_graph_ros.core.graph.graph import Graph
-from pose_graph_ros.core.judgement.consistency import OdometryChain
+from pose_graph_ros.core.judgement.odometry_chain import OdometryChain
 
 # Sigmas of the motion over a jump, which the closures over it determine [m, m, rad].
 SIGMAS = 2.0 * np.array(CLOSURE_FLOORS)

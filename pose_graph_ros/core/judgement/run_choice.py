@@ -9,7 +9,7 @@ old ones can be forgotten: their prices pass on to those after them.
 
 import numpy as np
 
-from pose_graph_ros.core.judgement.consistency import OdometryChain
+from pose_graph_ros.core.judgement.odometry_chain import OdometryChain
 from pose_graph_ros.core.judgement.runs import EVENT, LEAST_MEMBERS, Run, Transition
 
 # Number of runs that are remembered; time after which those of few members are forgotten [ns].

@@ -15,8 +15,8 @@ from typing import NamedTuple
 import numpy as np
 
 from pose_graph_ros.core.geometry.se2 import IntArray
-from pose_graph_ros.core.judgement.consistency import OdometryChain
 from pose_graph_ros.core.judgement.fix_states import LONE
+from pose_graph_ros.core.judgement.odometry_chain import OdometryChain
 from pose_graph_ros.core.judgement.run_choice import best_runs, remembered, without_old
 from pose_graph_ros.core.judgement.runs import EVENT, Run
 from pose_graph_ros.core.judgement.stated_noise import StatedNoise

@@ -27,7 +27,8 @@ from pose_graph_ros.core.geometry.se2 import BoolArray, FloatArray, IntArray
 from pose_graph_ros.core.graph.constraints import EdgeKind
 from pose_graph_ros.core.judgement.belief_rule import WRONG_ODDS
 from pose_graph_ros.core.judgement.closures import GATE, NEAR
-from pose_graph_ros.core.judgement.consistency import Closures, OdometryChain
+from pose_graph_ros.core.judgement.consistency import Closures, squared_distances
+from pose_graph_ros.core.judgement.odometry_chain import OdometryChain
 from pose_graph_ros.core.smoother import innovations
 from pose_graph_ros.core.smoother.innovations import Innovations
 
@@ -316,5 +317,5 @@ def agreeing_pairs(problem: TruncatedProblem) -> tuple[IntArray, IntArray]:
     a, b = np.concatenate(pairs).T
     noise = np.asarray(np.linalg.inv(closures.information[usable]), dtype=np.float64)
     table = Closures(closures.i[usable], closures.j[usable], closures.mean[usable], noise)
-    agree = chain.squared_distances(table, a, b) <= GATE
+    agree = squared_distances(chain, table, a, b) <= GATE
     return usable[a[agree]], usable[b[agree]]

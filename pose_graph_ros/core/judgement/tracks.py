@@ -17,7 +17,7 @@ from pose_graph_ros.core.compiled.jit import INTEGER, INTEGERS, kernel, NUMBER, 
 from pose_graph_ros.core.geometry.se2 import FloatArray, IntArray
 from pose_graph_ros.core.graph import factors
 from pose_graph_ros.core.graph.constraints import Edges, ObservedKind, ObservedNodes
-from pose_graph_ros.core.judgement.consistency import OdometryChain
+from pose_graph_ros.core.judgement.odometry_chain import OdometryChain
 from pose_graph_ros.core.sources.gauss_markov import STRETCH
 
 # Least sigmas of a measurement while it is judged, and a factor on its covariance: what is stated

@@ -291,7 +291,7 @@ class IncrementalSmoother:
                 if not forgetting.touch_mixed(self._memory.head, rows):
                     self.graph.rollback()
                     return
-                result = self._step(step.FIRST, fall_back=False)
+                result = self._step(step.FIRST)
             except BaseException:
                 self.graph.rollback()
                 raise

@@ -257,7 +257,8 @@ class _Evaluation:
     """Evaluates points of the lattice, at most once each."""
 
     def __init__(self, positions: MeasuredPath) -> None:
-        self._path = positions
+        # the kernel takes no other layout, which arrays of the past may have
+        self._path = MeasuredPath(*map(np.ascontiguousarray, positions))
         self._heading = 0.0
         self._values: dict[Point, float] = {}
         self.lost: dict[Point, int] = {}

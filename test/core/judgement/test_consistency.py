@@ -9,7 +9,9 @@ import pytest
 from pose_graph_ros.core.geometry import se2
 from pose_graph_ros.core.graph.constraints import EdgeKind, Edges
 from pose_graph_ros.core.graph.graph import GraphUpdate
-from pose_graph_ros.core.judgement.consistency import Closures, OdometryChain
+from pose_graph_ros.core.judgement.consistency import Closures, squared_distances
+from pose_graph_ros.core.judgement.odometry_chain import OdometryChain
+from pose_graph_ros.core.marginalization.marginalize import marginalize
 from pose_graph_ros.core.smoother.incremental import IncrementalSmoother
 
 seeds = st.integers(0, 2**32 - 1)
@@ -110,7 +112,7 @@ def test_distances_are_those_by_composing_everything(seed: int, n: int) -> None:
     chain.extend(drive.smoother.graph)
     closures = drive.closures(4, near=3 if seed % 2 else None)
     first, second = np.nonzero(~np.eye(4, dtype=bool))
-    actual = chain.squared_distances(drive.in_graph(closures), first, second)
+    actual = squared_distances(chain, drive.in_graph(closures), first, second)
     expected = [drive.slow(closures, a, b) for a, b in zip(first, second, strict=True)]
     np.testing.assert_allclose(actual, expected, rtol=1e-5, atol=1e-8)
 
@@ -163,7 +165,7 @@ def test_nodes_outside_the_chain_agree_with_nothing() -> None:
     closures = Closures(np.array([0, 0]), np.array([0, 1]), np.zeros((2, 3)),
                         np.tile(np.eye(3), (2, 1, 1)))
     pairs = np.array([0, 0]), np.array([0, 1])
-    np.testing.assert_array_equal(chain.squared_distances(closures, *pairs), [0.0, np.inf])
+    np.testing.assert_array_equal(squared_distances(chain, closures, *pairs), [0.0, np.inf])
     with pytest.raises(KeyError, match='chained'):
         chain.between(np.array([0]), np.array([1]))
 
@@ -184,3 +186,23 @@ def test_a_long_drive_far_from_its_beginning_keeps_its_precision() -> None:
         arm = se2.adjoint(np.array([-float(k), 0.0, 0.0]))
         expected += arm @ noise @ arm.T
     np.testing.assert_allclose(actual[0], expected, atol=1e-6)
+
+
+def test_a_chain_goes_on_over_nodes_that_have_left() -> None:
+    drive = Drive(3, 12)
+    whole, chain, graph = OdometryChain(), OdometryChain(), drive.smoother.graph
+    whole.extend(graph)
+    drive.smoother.update(marginalize(graph, [drive.rows[k] for k in (0, 4, 5)]))
+    chain.extend(graph)
+    left = np.array([drive.rows[k] for k in (1, 2, 3, 6, 7, 8, 9, 10, 11)])
+    np.testing.assert_array_equal(chain.nodes, left)
+    # where odometry is known it is the same; over the gap the graph tells
+    for begin, end in ((0, 2), (3, 8)):
+        for actual, expected in zip(
+                chain.between(left[[begin]], left[[end]]),
+                whole.between(left[[begin]], left[[end]]), strict=True):
+            np.testing.assert_allclose(actual, expected, atol=1e-12)
+    motion, noise = chain.between(left[[2]], left[[3]])
+    np.testing.assert_allclose(
+        motion[0], se2.between(*graph.poses_of(left[[2, 3]])), atol=1e-12)
+    assert np.all(np.linalg.eigvalsh(noise[0]) > 0.0)

@@ -7,7 +7,7 @@ import pytest
 
 from pose_graph_ros.core.graph.constraints import EdgeKind, Edges
 from pose_graph_ros.core.graph.graph import Graph, GraphUpdate
-from pose_graph_ros.core.judgement.consistency import OdometryChain
+from pose_graph_ros.core.judgement.odometry_chain import OdometryChain
 from pose_graph_ros.core.judgement.runs import EVENT, LEAST_MEMBERS, Run
 from pose_graph_ros.core.judgement.tracks import Track
 

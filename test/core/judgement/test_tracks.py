@@ -10,7 +10,7 @@ import pytest
 from pose_graph_ros.core.geometry import covariance, se2
 from pose_graph_ros.core.graph.constraints import EdgeKind, Edges, ObservedKind, ObservedNodes
 from pose_graph_ros.core.graph.graph import Graph, GraphUpdate
-from pose_graph_ros.core.judgement.consistency import OdometryChain
+from pose_graph_ros.core.judgement.odometry_chain import OdometryChain
 from pose_graph_ros.core.judgement.tracks import (
     biased_observations,
     LEAST_SIGMA,

@@ -1,0 +1,306 @@
+# Copyright 2026 The pose_graph_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""
+The motion between any two hidden nodes by odometry, with its covariance.
+
+The noise xi of an odometry edge to node n, in the frame of n, is the noise `Ad(T_n) xi` in the
+frame that the chain begins in, T_n being the pose of n by odometry. There the noises of edges add
+up, so that two prefix sums give the covariance of the chain between any two nodes.
+"""
+
+import math
+
+import numpy as np
+
+from pose_graph_ros.core.compiled.growing_array import GrowingArray
+from pose_graph_ros.core.compiled.jit import FLAG, INTEGER, INTEGERS, kernel, NUMBERS, ROWS
+from pose_graph_ros.core.config import OdometryNoise
+from pose_graph_ros.core.geometry import se2
+from pose_graph_ros.core.geometry.se2 import FloatArray, IntArray
+from pose_graph_ros.core.graph import factors, tables as tb
+from pose_graph_ros.core.graph.constraints import EdgeKind, full, upper
+from pose_graph_ros.core.graph.factor_types import NodeKind
+from pose_graph_ros.core.graph.graph import Graph
+
+# Weight that one of 0 counts as.
+_LEAST_WEIGHT = 1e-9
+# Noise where nodes have left: by the length and the turn between the nodes that are left.
+_NOISE = OdometryNoise()
+GAP_ALONG, GAP_ACROSS, GAP_BY_WAY, GAP_BY_TURN, GAP_FLOOR = (
+    _NOISE.sigma_distance**2, _NOISE.sigma_lateral**2, _NOISE.sigma_heading_distance**2,
+    _NOISE.sigma_heading_turn**2, _NOISE.sigma_floor_position**2)
+
+
+class OdometryChain:
+    """
+    The hidden nodes of a graph, chained by the odometry edge that each was made with.
+
+    Where nodes have left the graph before the chain was begun, their odometry is not known any
+    more. Then the chain goes on with where the next node is by the graph, and with the noise of
+    default odometry.
+
+    Parameters
+    ----------
+    weighted : bool
+        Whether an edge counts with its present weight; by default it counts with the information
+        that odometry claims.
+    by_row : bool
+        Whether nodes are given by row instead of by id, as long as none leaves the graph.
+
+    """
+
+    def __init__(self, *, weighted: bool = False, by_row: bool = False) -> None:
+        self._weighted, self._by_row = weighted, by_row
+        self._nodes = GrowingArray((), np.int64)
+        self._poses = GrowingArray((3,), np.float64)
+        self._sums = GrowingArray((6,), np.float64)
+        self._travel = GrowingArray((), np.float64)
+        self._next_edge = 0
+        """Id of the first edge that was not looked at."""
+        self._n_gone = 0
+        """Number of nodes that were forgotten since the poses were made relative to the first."""
+        self.noise_factor = 1.0
+        """On the covariances of odometry."""
+
+    def __len__(self) -> int:
+        return len(self._nodes)
+
+    @property
+    def nodes(self) -> IntArray:
+        """Ids of the nodes, in their order."""
+        return self._nodes.values
+
+    @property
+    def poses(self) -> FloatArray:
+        """Their poses by odometry, in the first one, shape (M, 3)."""
+        return self._poses.values
+
+    @property
+    def sums(self) -> FloatArray:
+        """Upper triangles of the summed covariances of the edges up to them, shape (M, 6)."""
+        return self._sums.values
+
+    def extend(self, graph: Graph) -> None:
+        """Append the nodes that were added to the graph since; the work is linear in these."""
+        if len(self) == 0:
+            first = _first(graph)
+            if len(first) == 0:
+                return
+            self._nodes.append(first if self._by_row else graph.node_ids[first])
+            self._poses.append(np.zeros((1, 3)))
+            self._sums.append(np.zeros((1, 6)))
+            self._travel.append(np.zeros(1))
+        head, begin = graph.memory.head, int(np.searchsorted(graph.edge_ids, self._next_edge))
+        self._next_edge = graph.next_ids.edge
+        ends = graph.memory['edge_i'][begin:graph.n_edges]
+        last = len(self) - 1
+        end = int(self._nodes.values[last])
+        if not self._by_row:
+            end = int(graph.node_rows(end))
+        new = begin + np.flatnonzero((ends[:, tb.EDGE_KIND] == EdgeKind.ODOMETRY)
+                                     & (ends[:, tb.END_J] > end))
+        if len(new) == 0:
+            return
+        new = new[np.argsort(graph.memory['edge_i'][new, tb.END_J], kind='stable')]
+        size = graph.n_nodes - end - 1
+        rows, travel = np.empty(size, np.int64), np.empty(size)
+        poses, sums = np.empty((size, 3)), np.empty((size, 6))
+        newest = int(graph.node_rows(graph.newest_pose))
+        for over_gaps in (False, True):
+            n = _extend(head, new, end, self._poses.values[last], self._sums.values[last],
+                        self._weighted, over_gaps, rows, poses, sums, travel)
+            if (n > 0 and rows[n - 1] == newest) or not _has_left(graph):
+                break
+        self._nodes.append(rows[:n] if self._by_row else graph.node_ids[rows[:n]])
+        self._poses.append(poses[:n])
+        self._sums.append(sums[:n])
+        self._travel.append(self._travel.values[last] + travel[:n])
+
+    def forget(self, nodes: IntArray) -> None:
+        """Forget nodes that have left the graph; the motion between all others stays known."""
+        gone = np.isin(self._nodes.values, nodes)
+        n = int(np.count_nonzero(gone))
+        if n == 0:
+            return
+        for column in (self._nodes, self._poses, self._sums, self._travel):
+            if np.all(gone[:n]):
+                column.drop_first(n)
+            else:
+                column.select(np.flatnonzero(~gone))
+        self._n_gone += n
+        if self._n_gone > len(self):
+            self._begin_anew()
+
+    def _begin_anew(self) -> None:
+        """Make poses and sums those in the first node, as they lose digits far away from it."""
+        self._n_gone = 0
+        if len(self) == 0:
+            self._next_edge = 0
+            return
+        first, sums = self._poses.values[:1].copy(), self._sums.values
+        adjoint = se2.adjoint(se2.inverse(first))
+        self._poses.values[:] = se2.between(first, self._poses.values)
+        self._sums.values[:] = upper(
+            adjoint @ full(sums - sums[0]) @ np.swapaxes(adjoint, 1, 2))
+
+    @property
+    def travelled(self) -> FloatArray:
+        """Lengths of the path to them by odometry, shape (M,) [m]."""
+        return self._travel.values
+
+    def travel(self, nodes: IntArray) -> FloatArray:
+        """Return the lengths of the path to nodes by odometry, shape (M,) [m]."""
+        return np.asarray(self._travel.values[self.places(nodes)])
+
+    def between(self, i: IntArray, j: IntArray) -> tuple[FloatArray, FloatArray]:
+        """
+        Return the poses of nodes j in nodes i by odometry, and their covariances.
+
+        Poses have the shape (M, 3) [m, m, rad], covariances the shape (M, 3, 3), in the frames of
+        j. Raises KeyError if a node is not in the chain.
+
+        Parameters
+        ----------
+        i, j : ndarray of int, shape (M,), ids, in any order
+
+        """
+        at_i, at_j = self.places(i), self.places(j)
+        for at in (at_i, at_j):
+            if np.any(at < 0):
+                raise KeyError('expected nodes that are chained by odometry')
+        ahead = np.sign(at_j - at_i)[:, None]
+        adjoint = se2.adjoint(se2.inverse(self._poses.values[at_j]))
+        total = full(ahead * (self._sums.values[at_j] - self._sums.values[at_i]))
+        return (se2.between(self._poses.values[at_i], self._poses.values[at_j]),
+                self.noise_factor * adjoint @ total @ np.swapaxes(adjoint, 1, 2))
+
+    def places(self, nodes: IntArray) -> IntArray:
+        """Return the places of nodes in the chain, -1 for those that are not in it."""
+        own = self._nodes.values
+        if len(own) == 0:
+            return np.full(len(nodes), -1)
+        at = np.minimum(np.searchsorted(own, nodes), len(own) - 1)
+        return np.where(own[at] == nodes, at, -1)
+
+
+def _first(graph: Graph) -> IntArray:
+    """Return the row of the pose that odometry begins at, shape (1,), or (0,) without poses."""
+    ends = graph.memory['edge_i'][:graph.n_edges]
+    odometry = ends[ends[:, tb.EDGE_KIND] == EdgeKind.ODOMETRY]
+    if len(odometry) == 0 or _has_left(graph):
+        return np.flatnonzero(graph.is_pose)[:1]
+    return odometry[np.argmin(odometry[:, tb.END_J])][[tb.END_I]].copy()
+
+
+def _has_left(graph: Graph) -> bool:
+    """Tell whether nodes have left the graph, with their odometry."""
+    return graph.n_priors > 0 or bool(np.any(
+        graph.memory['edge_i'][:graph.n_edges, tb.EDGE_KIND] == EdgeKind.PRIOR))
+
+
+@kernel(signature=(
+    tb.HEAD, INTEGERS, INTEGER, NUMBERS, NUMBERS, FLAG, FLAG, INTEGERS, ROWS, ROWS, NUMBERS),
+    allocates=True)
+def _extend(  # type: ignore[no-untyped-def]
+    head, edges, last, pose, before, weighted, over_gaps, rows, poses, sums, travel,
+):
+    """
+    Return the number of nodes that were appended to a chain.
+
+    Parameters
+    ----------
+    edges : ndarray of int, odometry edges by the rows of their later ends
+    last, pose, before : int, ndarray, ndarray, row, pose and prefix sum of the last node
+    weighted : bool, whether to divide covariances by the weights of the edges
+    over_gaps : bool, whether a pose without odometry from the one before is appended
+    rows, poses, sums, travel : ndarray, output; the travel from the last node
+
+    """
+    edge_f, edge_i, node_i = tb.edge_f(head), tb.edge_i(head), tb.node_i(head)
+    n, m, length = 0, 0, 0.0
+    x, y, th = pose[0], pose[1], pose[2]
+    noise = np.empty(6)
+    for v in range(last + 1, head[tb.N_NODES]):
+        if node_i[v, tb.NODE_KIND] != NodeKind.POSE:
+            continue
+        edge = -1
+        while m < len(edges) and edge_i[edges[m], tb.END_J] <= v:
+            # others are of another source, between nodes that are chained already
+            ends = edge_i[edges[m]]
+            if edge < 0 and ends[tb.END_I] == last and ends[tb.END_J] == v:
+                edge = edges[m]
+            m += 1
+        if edge >= 0:
+            f = edge_f[edge]
+            step = f[tb.MEAN], f[tb.MEAN + 1], f[tb.MEAN + 2]
+            noise[:] = _inverse(f[tb.INFO:tb.INFO + 6])
+            if weighted:
+                noise /= max(f[tb.WEIGHT], _LEAST_WEIGHT)
+        elif over_gaps:
+            step = composed(inverted(_pose(head, last)), _pose(head, v))
+            far = math.sqrt(step[0] * step[0] + step[1] * step[1])
+            noise[:] = 0.0
+            noise[0] = GAP_ALONG * far + GAP_FLOOR
+            noise[3] = GAP_ACROSS * far + GAP_FLOOR
+            noise[5] = GAP_BY_WAY * far + GAP_BY_TURN * abs(step[2]) + GAP_FLOOR
+        else:
+            continue
+        last = v
+        x, y, th = composed((x, y, th), step)
+        length += math.sqrt(step[0] * step[0] + step[1] * step[1])
+        rows[n], travel[n] = last, length
+        poses[n, 0], poses[n, 1], poses[n, 2] = x, y, th
+        xx, xy, xt, yy, yt, tt = noise
+        # Ad Q Ad^T: rotated, then with the arm (y, -x) of the heading
+        c, s = math.cos(th), math.sin(th)
+        xt, yt = c * xt - s * yt, s * xt + c * yt
+        xx, xy, yy = (c * c * xx - 2.0 * c * s * xy + s * s * yy,
+                      c * s * (xx - yy) + (c * c - s * s) * xy,
+                      s * s * xx + 2.0 * c * s * xy + c * c * yy)
+        into = sums[n]
+        into[0] = before[0] + xx + 2.0 * y * xt + y * y * tt
+        into[1] = before[1] + xy - x * xt + y * yt - x * y * tt
+        into[2] = before[2] + xt + y * tt
+        into[3] = before[3] + yy - 2.0 * x * yt + x * x * tt
+        into[4] = before[4] + yt - x * tt
+        into[5] = before[5] + tt
+        before = into
+        n += 1
+    return n
+
+
+@kernel
+def _pose(head, v):  # type: ignore[no-untyped-def]
+    pose = tb.node_f(head)[v]
+    return pose[tb.POSE], pose[tb.POSE + 1], pose[tb.POSE + 2]
+
+
+@kernel
+def inverted(a):  # type: ignore[no-untyped-def]
+    """Return the inverse of a pose, as tuples of numbers."""
+    c, s = math.cos(a[2]), math.sin(a[2])
+    return -c * a[0] - s * a[1], s * a[0] - c * a[1], -a[2]
+
+
+@kernel
+def _inverse(m):  # type: ignore[no-untyped-def]
+    """Return the upper triangle of the inverse of a symmetric matrix, given as its own."""
+    a, b, c, d, e, f = m[0], m[1], m[2], m[3], m[4], m[5]
+    aa, bb, cc = d * f - e * e, c * e - b * f, b * e - c * d
+    scale = 1.0 / (a * aa + b * bb + c * cc)
+    return (scale * aa, scale * bb, scale * cc, scale * (a * f - c * c),
+            scale * (b * c - a * e), scale * (a * d - b * b))
+
+
+@kernel
+def composed(a, b):  # type: ignore[no-untyped-def]
+    """
+    Return the composition of two poses.
+
+    Parameters
+    ----------
+    a, b : tuple of float, (x, y, theta) [m, m, rad]
+
+    """
+    c, s = math.cos(a[2]), math.sin(a[2])
+    return a[0] + c * b[0] - s * b[1], a[1] + s * b[0] + c * b[1], factors.wrap(a[2] + b[2])
