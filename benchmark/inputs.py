@@ -17,7 +17,7 @@ import time
 
 import numpy as np
 
-from benchmark import drives, kept_sections, report
+from benchmark import drives, inputs_gyro, kept_sections, report
 from benchmark.drives import Kind
 from benchmark.metrics import Metric
 from benchmark.section import say, Section, Table
@@ -42,7 +42,7 @@ from pose_graph_ros.core.measurements import (
 )
 from pose_graph_ros.core.sources.validation import validate
 
-SECTIONS = 'nees', 'arrival', 'outliers', 'plaza', 'door', 'stamps', 'cost'
+SECTIONS = 'nees', 'gyro', 'husky', 'arrival', 'outliers', 'plaza', 'door', 'stamps', 'cost'
 NEES = 0.8, 1.3
 """What is asked for."""
 WEAK = 1.5
@@ -414,6 +414,8 @@ def main(arguments: list[str]) -> int:
     options = parser.parse_args(arguments)
     few = max(options.runs // 20, 1)
     made = {'nees': lambda: uncertainty(options.runs, options.case),
+            'gyro': lambda: inputs_gyro.outages(max(options.runs * 2 // 5, 2)),
+            'husky': lambda: inputs_gyro.husky(options.data),
             'arrival': lambda: arrival(few), 'outliers': lambda: outliers(few),
             'plaza': lambda: plaza(few, options.data),
             'door': door, 'stamps': stamps, 'cost': cost}

@@ -86,8 +86,8 @@ class PoseGraphBackend:
         self._tuner = ErrorTuner(self._smoother, self._factors, self._reweighting, self._judge)
         self._refiner = Refiner(self._smoother, self._reweighting, self._judge, self._tuner)
         self._pipeline = MeasurementPipeline(self._nodes, self._config)
-        self._quarantine = Queue()
-        self._alignment = AlignmentMonitor(self._config)
+        self.gyro_differences = self._pipeline.gyros.differences
+        self._quarantine, self._alignment = Queue(), AlignmentMonitor(self._config)
         self._forgetting = Forgetting(self._smoother, self._tuner, self._parts())
         self._settled, self._chi2 = True, 0.0
 

@@ -36,8 +36,9 @@ def estimate(
     graph, nodes, factors = parts.graph, parts.nodes, parts.factors
     node = graph.poses_of(nodes.ids[-1])
     motion, motion_noise, odometry = nodes.newest()
+    motion, motion_noise = _turned(parts, motion, scale**2 * motion_noise)
     newest = se2.compose(node, motion)
-    cov = covariance.propagated(node, newest_covariance, motion, scale**2 * motion_noise)
+    cov = covariance.propagated(node, newest_covariance, motion, motion_noise)
     state, sigma = parts.alignment.copy()
     shift = np.zeros(3)
     if state is AlignmentState.UNALIGNED:
@@ -62,3 +63,22 @@ def estimate(
         odometry_scale=scale,
         trajectory=None if not with_path else Trajectory(
             nodes.stamps_ns, nodes.poses(graph) + shift).continued(stamp_ns, newest))
+
+
+def _turned(
+    parts: Parts, motion: FloatArray, noise: FloatArray,
+) -> tuple[FloatArray, FloatArray]:
+    """Return the motion since the newest node, and its noise, with what a gyroscope says."""
+    gyros, nodes = parts.pipeline.gyros, parts.nodes
+    rotation = None if len(gyros.streams) == 0 else gyros.newest(
+        int(nodes.stamps_ns[-1]), nodes.newest_ns, parts.factors.gyros.values(parts.graph))
+    if rotation is None or noise[2, 2] == 0.0:
+        return motion, noise
+    angle, variance = rotation
+    total = noise[2, 2] + variance
+    gain = noise[:, 2] / total
+    step = float(se2.wrap(angle - motion[2])) * gain
+    # the noise is in the frame at the end of the motion
+    turn = se2.rotation(motion[2])
+    return (np.append(motion[:2] + turn @ step[:2], motion[2] + step[2]),
+            noise - total * np.outer(gain, gain))

@@ -52,6 +52,9 @@ def _state(session: 'Session') -> dict[str, object]:
     found |= {f'{source}.{answer}': count
               for (source, answer), count in sorted((status.counts + rejected).items())}
     found |= {f'{source}.bias': f'{bias:.6f}' for source, bias in status.biases.items()}
+    found |= {f'{source}.odometry_difference': ': '.join(filter(None, (
+        f'{each.sigmas:.2g} sigmas', each.reason)))
+        for source, each in status.differences.items()}
     found |= {f'quarantined.{rank}': name for rank, name in enumerate(status.set_aside, 1)}
     if estimate is not None:
         found.update({

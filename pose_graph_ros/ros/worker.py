@@ -22,6 +22,7 @@ from pose_graph_ros.core.estimate import Estimate, UpdateReport
 from pose_graph_ros.core.exceptions import PoseGraphError
 from pose_graph_ros.core.judgement.verdicts import SourceVerdicts
 from pose_graph_ros.core.measurements import AnswerStatus, Measurement, OdometrySample
+from pose_graph_ros.core.odometry.agreement import Difference
 from pose_graph_ros.core.sources.source_report import SourceReport
 from pose_graph_ros.ros.announcements import Announcer
 
@@ -61,6 +62,8 @@ class WorkerStatus:
     """How many constraints of each source are believed."""
     biases: Mapping[str, float] = field(default_factory=dict)
     """Newest estimate of the bias of each gyroscope [rad/s]."""
+    differences: Mapping[str, Difference] = field(default_factory=dict)
+    """Of the rotations of each gyroscope from those of odometry."""
     n_changes: int = 0  # number of changes of verdicts
 
 
@@ -330,5 +333,6 @@ class Worker:
             report=status.report if report is None else report,
             sources=status.sources if report is None else backend.reports(),
             biases=backend.gyro_biases(backend.graph),
+            differences=backend.gyro_differences(),
             verdicts=verdicts, n_changes=status.n_changes + len(changes))
         return len(changes)

@@ -168,6 +168,30 @@ class GyroStream:
             return None
         return RateIntegral(times_ns, np.array(self._rates[begin:end]), self._source)
 
+    def newest(self, start_ns: int, end_ns: int) -> 'Rotation | None':
+        """
+        Return the rotation between two instants, by samples that need not be settled.
+
+        The newest rate is taken to last until the end, if that is no gap. None as for `integral`.
+
+        Parameters
+        ----------
+        start_ns, end_ns : int, stamps [ns]
+
+        """
+        stamps, rates = self._stamps, self._rates
+        begin = bisect.bisect_right(stamps, start_ns) - 1
+        if begin < 0 or end_ns - start_ns <= 0:
+            return None
+        end = bisect.bisect_left(stamps, end_ns) + 1
+        times, values = stamps[begin:end], rates[begin:end]
+        if end > len(stamps):
+            times, values = [*times, end_ns], [*values, rates[-1]]
+        times_ns = np.array(times, dtype=np.int64)
+        if np.max(np.diff(times_ns)) > self._gap_ns:
+            return None
+        return RateIntegral(times_ns, np.array(values), self._source).between(start_ns, end_ns)
+
     def saved(self) -> SavedRates:
         """Return the samples that are still here."""
         return SavedRates(np.array(self._stamps, dtype=np.int64),
@@ -209,6 +233,10 @@ class RateIntegral:
         bend = np.minimum(UNIFORM_WITHIN * steps**2 / 12.0, 0.25 * np.abs(change) * steps)
         self._densities = density + source.sigma_turn**2 * np.abs(means) + bend**2 / steps
         self._variances = np.append(0.0, np.cumsum(self._densities * steps))
+
+    def rate(self, stamp_ns: int) -> float:
+        """Return the rate at an instant [rad/s]."""
+        return float(np.interp((stamp_ns - self._begin_ns) * 1e-9, self._times, self.rates))
 
     def between(self, start_ns: int, end_ns: int) -> Rotation:
         """

@@ -127,6 +127,10 @@ class NodeTable:
         return Attachment(int(self.ids[place.anchor]), se2.compose(place.mean, mean),
                           adjoint @ place.noise @ adjoint.T + noise)
 
+    def has_left(self, number: int) -> bool:
+        """Return whether a node has left the graph, by its number."""
+        return number < self.n_frozen or self.thinned.place(number) is not None
+
     def thin(
         self, ids: IntArray, anchors: IntArray, relative: FloatArray, noise: FloatArray,
     ) -> None:

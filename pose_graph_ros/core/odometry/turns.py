@@ -2,14 +2,16 @@
 # SPDX-License-Identifier: Apache-2.0
 """Rotations between consecutive hidden nodes by gyroscopes, and what they measure at rest."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
 
 from pose_graph_ros.core.config import BackendConfig
+from pose_graph_ros.core.geometry import se2
 from pose_graph_ros.core.measurements import Answer, YawRate
+from pose_graph_ros.core.odometry.agreement import Agreement, Difference
 from pose_graph_ros.core.odometry.gyro import GyroStream, RateIntegral, Rotation, SavedRates
 from pose_graph_ros.core.odometry.hidden_nodes import HiddenNodes
 from pose_graph_ros.core.odometry.timeline import STANDING_NS
@@ -81,6 +83,9 @@ class Gyros:
         """By the name of the source."""
         self.n_gaps: dict[str, int] = {}
         """Number of rotations that a gap in the rates has left out, by source."""
+        self.too_late: list[str] = []
+        """Sources of rotations whose nodes have left the graph; whoever counts them clears it."""
+        self._agreement: dict[str, Agreement] = {}
         self._next: dict[str, int] = {}
         """Number of the hidden node that the next rotation leads to, by source."""
         self.new: list[Turn] = []
@@ -136,8 +141,12 @@ class Gyros:
         if integral is None:
             self.n_gaps[source] += stream.first_ns <= start_ns
             return
+        if nodes.table.has_left(node - 1) or nodes.table.has_left(node):
+            self.too_late.append(source)
+            return
         rotation = integral.between(start_ns, end_ns)
         at_rest, creep, creep_variance = self._at_rest(source, integral, start_ns, end_ns)
+        self._compare(source, integral, start_ns, end_ns)
         i, j = nodes.ids[node - 1:node + 1].tolist()
         middle_ns = (start_ns + end_ns) // 2
         if at_rest.seconds == 0.0:
@@ -148,6 +157,20 @@ class Gyros:
             source, i, j, middle_ns, angle + creep, variance + creep_variance, seconds,
             (at_rest.angle - creep) / at_rest.seconds,
             (at_rest.variance + creep_variance) / at_rest.seconds**2))
+
+    def _compare(
+        self, source: str, integral: RateIntegral, start_ns: int, end_ns: int,
+    ) -> None:
+        """Compare the rotation between two stamps [ns] with that by odometry."""
+        stream = self._nodes.streams[self._nodes.primary_at(end_ns)]
+        if not (stream.timeline.covers(start_ns) and stream.timeline.covers(end_ns)):
+            return
+        motion, rotation = stream.timeline.motion(start_ns, end_ns), integral.between(
+            start_ns, end_ns)
+        self._agreement[source].add(
+            float(se2.wrap(rotation.angle - motion.increment[2])), rotation.seconds,
+            integral.rate(end_ns) - integral.rate(start_ns), rotation.angle,
+            rotation.variance + float(stream.covariance(motion)[2, 2]))
 
     def _at_rest(
         self, source: str, integral: RateIntegral, start_ns: int, end_ns: int,
@@ -175,8 +198,33 @@ class Gyros:
         stream = self.streams.get(source)
         if stream is None:
             stream = self.streams[source] = GyroStream(self._config.gyro(source))
-            self._next[source], self.n_gaps[source] = 1, 0
+            self._next[source], self._agreement[source] = 1, Agreement()
+            self.n_gaps[source] = 0
         return stream
+
+    def differences(self) -> dict[str, Difference]:
+        """Return how much each gyroscope differs from odometry, where enough is known."""
+        found = {source: each.difference() for source, each in self._agreement.items()}
+        return {source: each for source, each in found.items() if each is not None}
+
+    def newest(
+        self, start_ns: int, end_ns: int, biases: Mapping[str, float],
+    ) -> tuple[float, float] | None:
+        """
+        Return the rotation of the robot between two recent stamps, and its variance.
+
+        Parameters
+        ----------
+        start_ns, end_ns : int, stamps [ns]
+        biases : mapping, of each source [rad/s]; the first one with a rotation is used
+
+        """
+        for source, bias in biases.items():
+            stream = self.streams.get(source)
+            rotation = None if stream is None else stream.newest(start_ns, end_ns)
+            if rotation is not None:
+                return rotation.angle - bias * rotation.seconds, rotation.variance
+        return None
 
     def saved(self, waiting: Sequence[Turn]) -> dict[str, SavedGyro]:
         """Return the state of each gyroscope, with the rotations that wait for an update."""

@@ -16,6 +16,7 @@ the nodes, so the order of arrival does not matter.
 import bisect
 from collections.abc import Sequence
 from dataclasses import dataclass
+import math
 
 import numpy as np
 
@@ -38,8 +39,9 @@ class SavedGyroBias:
     """The states of the bias of one gyroscope that are in the graph."""
 
     width_ns: int
+    """Unit of the numbers [ns]."""
     numbers: Integers
-    """Bin numbers, increasing: bin k begins at the stamp k `width_ns`."""
+    """Increasing: the bin with number k begins at the stamp k `width_ns`."""
     ids: Integers
     """Id of each state in the graph."""
     edges: Pairs
@@ -59,7 +61,8 @@ class GyroBias:
     def __init__(self, source: GyroSource) -> None:
         self._source = source
         self._width_ns = round(source.bias_period * 1e9)
-        self._numbers: list[int] = []
+        self._begins_ns: list[int] = []
+        """Stamp at which the bin of each state begins [ns]."""
         self._ids: list[int] = []
         self._n_before = 0
 
@@ -74,7 +77,7 @@ class GyroBias:
 
     def rollback(self) -> None:
         """Remove what was added since `begin`."""
-        del self._numbers[self._n_before:], self._ids[self._n_before:]
+        del self._begins_ns[self._n_before:], self._ids[self._n_before:]
 
     def add(self, turn: Turn, graph: Graph, additions: Additions) -> tuple[int, int]:
         """
@@ -87,27 +90,27 @@ class GyroBias:
         additions : Additions, receives the edge, a state if it is new, and what rest tells of it
 
         """
-        number = turn.stamp_ns // self._width_ns
-        if not self._numbers or number > self._numbers[-1]:
-            self._make_state(number, turn, graph, additions)
+        begin_ns = turn.stamp_ns // self._width_ns * self._width_ns
+        if not self._begins_ns or begin_ns > self._begins_ns[-1]:
+            self._make_state(begin_ns, turn, graph, additions)
         # one that was set aside for long has the state of the bin before, if its own has none
-        state = self._ids[max(bisect.bisect_right(self._numbers, number) - 1, 0)]
+        state = self._ids[max(bisect.bisect_right(self._begins_ns, turn.stamp_ns) - 1, 0)]
         if turn.rest_variance > 0.0:
             additions.add_observed(_observed(state, turn.rest_rate, turn.rest_variance))
         return additions.add_edge(turn_edge(turn, state)), state
 
     def _make_state(
-        self, number: int, turn: Turn, graph: Graph, additions: Additions,
+        self, begin_ns: int, turn: Turn, graph: Graph, additions: Additions,
     ) -> None:
         source = self._source
-        gap = (number - self._numbers[-1]) * self._width_ns * 1e-9 if self._numbers else np.inf
+        gap = (begin_ns - self._begins_ns[-1]) * 1e-9 if self._begins_ns else np.inf
         value, before = turn.rest_rate, self.newest
         if gap <= SWITCHED_OFF:
             known = int(graph.node_rows(np.array([before]))[0])
             # one of this update has no estimate yet
             value = float(graph.poses[known, 0] if known >= 0 else additions.biases[-1][0])
         state = additions.add_bias(value, dimension=1)
-        self._numbers.append(number)
+        self._begins_ns.append(begin_ns)
         self._ids.append(state)
         if gap <= SWITCHED_OFF:
             additions.add_edge(Edges(
@@ -125,24 +128,26 @@ class GyroBias:
     def forget(self, nodes: set[int]) -> None:
         """Forget the states that have left the graph, by their ids."""
         kept = [k for k, state in enumerate(self._ids) if state not in nodes]
-        self._numbers = [self._numbers[k] for k in kept]
+        self._begins_ns = [self._begins_ns[k] for k in kept]
         self._ids = [self._ids[k] for k in kept]
 
     def begin_ns(self, state: int) -> int | None:
         """Return when the bin of a state begins [ns], by its id; None for another source's."""
         at = bisect.bisect_left(self._ids, state)
         known = at < len(self._ids) and self._ids[at] == state
-        return self._numbers[at] * self._width_ns if known else None
+        return self._begins_ns[at] if known else None
 
     def saved(self, edges: IntArray) -> SavedGyroBias:
         """Return all states, with the edges of its rotations."""
-        return SavedGyroBias(self._width_ns, np.array(self._numbers, dtype=np.int64),
+        # a restored chain may have begun with bins of another width
+        unit_ns = math.gcd(self._width_ns, *self._begins_ns)
+        return SavedGyroBias(unit_ns, np.array(self._begins_ns, dtype=np.int64) // unit_ns,
                              np.array(self._ids, dtype=np.int64), edges)
 
     def restore(self, saved: SavedGyroBias) -> None:
-        """Restore saved states, unless their bins have another width: then a new chain begins."""
-        if saved.width_ns == self._width_ns:
-            self._numbers, self._ids = saved.numbers.tolist(), saved.ids.tolist()
+        """Restore saved states; if bins have another width by now, the chain goes on with it."""
+        self._begins_ns = (saved.numbers * saved.width_ns).tolist()
+        self._ids = saved.ids.tolist()
 
 
 def _information(variance: float) -> FloatArray:
@@ -228,8 +233,6 @@ class GyroBiases:
 
         """
         for turn in sorted(turns, key=lambda turn: turn.stamp_ns):
-            if not np.all(graph.node_rows(np.array((turn.i, turn.j))) >= 0):
-                continue    # a node has left the graph since
             edge, state = self._bias(turn.source).add(turn, graph, additions)
             self._new.append((turn.source, edge, state))
 

@@ -110,6 +110,8 @@ class MeasurementPipeline:
         gyros.extend()
         self.queue.turns += gyros.new
         gyros.new.clear()
+        self.counts.update((source, 'before_window') for source in gyros.too_late)
+        gyros.too_late.clear()
         for source, stream in gyros.streams.items():
             for reason, count in (('gap', gyros.n_gaps[source]), ('sorted', stream.n_sorted),
                                   ('stamp_ahead', stream.n_dropped)):

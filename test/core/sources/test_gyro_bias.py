@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from pose_graph_ros.core.backend import PoseGraphBackend
-from pose_graph_ros.core.config import WindowConfig
+from pose_graph_ros.core.config import OdometryNoise, OdometrySource, WindowConfig
 from pose_graph_ros.core.geometry import se2
 from pose_graph_ros.core.graph.constraints import EdgeKind
 from pose_graph_ros.core.io.graph_files import read_graph, write_graph
@@ -172,10 +172,63 @@ def test_a_saved_graph_continues_as_if_it_had_not_been_saved(
     assert any(name.startswith('error of gyro at') for name in names)
 
 
-def test_another_period_of_the_bias_begins_a_new_chain(short: Drive) -> None:
+def test_with_another_period_the_chain_of_the_bias_goes_on(
+    short: Drive, tmp_path: Path,
+) -> None:
     half = len(short.events) // 2
     saved = feed(PoseGraphBackend(settings()), short.events[:half]).saved()
-    restored = PoseGraphBackend.restored(settings(replace(GYRO, bias_period=5.0)), saved)
-    feed(restored, short.events[half:])
-    restored.optimize()
-    assert path_of(restored) == pytest.approx(path_of(finished(short.events)), abs=0.3)
+    n_before = np.count_nonzero(saved.rows.is_bias)
+    restored = PoseGraphBackend.restored(settings(replace(GYRO, bias_period=4.0)), saved)
+    feed(restored, short.events[half:-220])
+    saved = restored.saved()
+    assert saved.n_left_out == 0
+    write_graph(saved, tmp_path / 'map')
+    again = PoseGraphBackend.restored(
+        settings(replace(GYRO, bias_period=4.0)), read_graph(tmp_path / 'map'))
+    for each in (restored, again):
+        feed(each, short.events[-220:])
+        each.optimize()
+    assert path_of(again) == pytest.approx(path_of(restored), abs=1e-9)
+    assert path_of(restored) == pytest.approx(path_of(finished(short.events)), abs=0.05)
+    # one prior, and the new states begin where the old ones end
+    graph = restored.graph
+    biases = np.flatnonzero(graph.is_bias)
+    assert len(biases) >= n_before + 5
+    kinds = graph.edges.kind
+    assert np.count_nonzero(kinds == EdgeKind.BIAS) == len(biases) - 1
+
+
+def test_rotations_that_come_after_their_nodes_have_left_are_counted(short: Drive) -> None:
+    backend = PoseGraphBackend(replace(settings(), window=WindowConfig(seconds=10.0)))
+    feed(backend, [each for each in short.events if each[0] != 'gyro'])
+    backend.update()
+    frozen = backend._nodes.n_frozen
+    assert frozen > 10
+    feed(backend, [each for each in short.events if each[0] == 'gyro'])
+    backend.optimize()
+    assert backend.counts['gyro', 'before_window'] == frozen
+    turns = np.count_nonzero(backend.graph.edges.kind == EdgeKind.TURN)
+    assert turns == len(backend.node_stamps_ns) - 1 - frozen
+
+
+def test_the_newest_pose_has_the_rotation_by_the_gyroscope() -> None:
+    """Wheels that do not notice a turn, between two hidden nodes."""
+    events: Events = [('odom', OdometrySample(EPOCH + round(t * 1e9), np.zeros(3)))
+                      for t in np.arange(0.0, 6.0, 0.1).tolist()]
+    # the last turn begins after the newest hidden node
+    events += [('gyro', YawRate(EPOCH + round(t * 1e9), 0.3 if t > 5.3 else 0.0))
+               for t in np.arange(0.01, 5.95, 0.02).tolist()]
+    events.sort(key=lambda event: event[1].stamp_ns)
+    noise = OdometryNoise(sigma_heading_distance=0.1)
+    events = [(source, replace(event, pose=np.array((0.2 * (event.stamp_ns - EPOCH) * 1e-9, 0, 0)))
+               if isinstance(event, OdometrySample) else event) for source, event in events]
+    backend = feed(PoseGraphBackend(settings(odometry=OdometrySource(noise=noise))), events)
+    backend.update()
+    last_ns = int(backend.node_stamps_ns[-1])
+    assert last_ns < EPOCH + 5.3 * SECOND
+    estimate = backend.estimate()
+    assert estimate.T_map_base[2] == pytest.approx(0.3 * 0.6, abs=0.02)
+    alone = feed(PoseGraphBackend(settings(odometry=OdometrySource(noise=noise))),
+                 [each for each in events if each[0] != 'gyro']).estimate()
+    assert alone.T_map_base[2] == pytest.approx(0.0, abs=1e-9)
+    assert estimate.covariance[2, 2] < alone.covariance[2, 2]
