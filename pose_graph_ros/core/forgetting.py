@@ -19,7 +19,8 @@ from pose_graph_ros.core.geometry.se2 import FloatArray, IntArray
 from pose_graph_ros.core.graph.graph_update import Left
 from pose_graph_ros.core.io.capture import Parts
 from pose_graph_ros.core.measurements import rejected
-from pose_graph_ros.core.smoother.incremental import Forgotten, IncrementalSmoother
+from pose_graph_ros.core.smoother.incremental import IncrementalSmoother
+from pose_graph_ros.core.smoother.results import Forgotten
 from pose_graph_ros.core.thinner import forget, Thinner
 from pose_graph_ros.core.window.policy import n_leaving
 from pose_graph_ros.core.window.sparse_removal import sparse_marginalization
