@@ -177,23 +177,20 @@ class ErrorTuner:
                 self.finish_change()
         self.finish_change()
 
-    def leave(self, nodes: IntArray) -> list[int]:
+    def leave(self, edges: IntArray, observed: IntArray, first: int) -> list[int]:
         """
-        Return the ids of the biases that are to leave the graph with poses.
+        Return the ids of the biases that are to leave the graph with constraints.
 
-        What the measurements on these show of the errors of their sources is kept, once `forget`
-        says that they have left. At least the newest bias of a source stays.
+        What the measurements among these show of the errors of their sources is kept, once
+        `forget` says that they have left. At least the newest bias of a source stays.
 
         Parameters
         ----------
-        nodes : ndarray of int, ids of the poses
+        edges, observed : ndarray of int, ids of the constraints
+        first : int, id of the first pose whose measurements stay
 
         """
         graph = self._smoother.graph
-        edges, observed = constraints_on(graph, nodes)
-        stays = graph.is_pose
-        stays[graph.node_rows(nodes)] = False
-        first = int(graph.node_ids[np.argmax(stays)])
         self._past = {}
         for source in self._factors.finding():
             constraints = self._factors.constraints(source)
@@ -206,10 +203,20 @@ class ErrorTuner:
         model = None if change is None else change.model or change.failed
         others = {} if change is None or model is None else {change.source: model}
         biases = self._factors.leaving_biases(edges, observed, others)
-        left, _ = constraints_on(graph, np.append(nodes, biases).astype(np.int64))
+        left = np.union1d(edges, constraints_on(graph, np.array(biases, dtype=np.int64))[0])
         self._n_bias_edges = int(np.count_nonzero(
             graph.memory['edge_i'][graph.edge_rows(left), tb.EDGE_KIND] == EdgeKind.BIAS))
         return biases
+
+    def stay(self) -> None:
+        """Forget about the last `leave`, as nothing has left the graph."""
+        self._past, self._n_bias_edges = {}, 0
+
+    @property
+    def needed(self) -> list[int]:
+        """Ids of the poses from which odometry leads to the measurements that are left."""
+        every = (self._factors.constraints(source).past for source in self._factors.finding())
+        return [past.node for past in every if past is not None]
 
     def forget(self, nodes: IntArray, edges: IntArray, observed: IntArray) -> None:
         """
@@ -224,7 +231,7 @@ class ErrorTuner:
         self._factors.n_bias_edges -= self._n_bias_edges
         for source, past in self._past.items():
             self._factors.constraints(source).past = past
-        self._past, self._n_bias_edges = {}, 0
+        self.stay()
         if change is None:
             return
         for model in (change.model, change.failed):

@@ -17,6 +17,7 @@ from pose_graph_ros.core.exceptions import GraphUpdateError
 from pose_graph_ros.core.geometry import se2
 from pose_graph_ros.core.geometry.se2 import FloatArray, IntArray
 from pose_graph_ros.core.graph.graph_update import Left
+from pose_graph_ros.core.graph.incidence import constraints_on
 from pose_graph_ros.core.io.capture import Parts
 from pose_graph_ros.core.measurements import rejected
 from pose_graph_ros.core.smoother.incremental import IncrementalSmoother
@@ -89,14 +90,18 @@ class Forgetting:
         # fixed ones of before may have been freed meanwhile
         leaving = graph.node_ids[:row][~graph.is_bias[:row] & ~graph.fixed[:row]]
         self._follow_alignment()
-        biases = np.array(self._tuner.leave(leaving), dtype=np.int64)
+        stays = graph.is_pose & ~np.isin(graph.node_ids, leaving)
+        biases = np.array(self._tuner.leave(
+            *constraints_on(graph, leaving), int(graph.node_ids[np.argmax(stays)])),
+            dtype=np.int64)
         leaving = np.sort(np.concatenate((leaving, biases)))
-        parts.judge.decide_leaving(leaving)
+        parts.judge.decide_leaving(*constraints_on(graph, leaving))
         self._smoother.linearize(leaving)
         poses = nodes.recent_poses(graph)
         self._pass_on_anchors(first)
         gone = self._gone(leaving, prior)
         if gone is None:
+            self._tuner.stay()
             return
         forget(gone, parts, self._tuner)
         nodes.forget(poses[:n])

@@ -6,14 +6,32 @@ Hidden nodes leave where a place is driven often, and all parts of the engine fo
 `window.thinning` decides which. Constraints in doubt are decided before they leave.
 """
 
+from collections.abc import Iterator
+
+import numpy as np
+
 from pose_graph_ros.core.config import ThinningConfig
 from pose_graph_ros.core.error_tuner import ErrorTuner
-from pose_graph_ros.core.graph.graph_update import Left
+from pose_graph_ros.core.graph.graph_update import GraphUpdate, Left
+from pose_graph_ros.core.graph.incidence import constraints_on
 from pose_graph_ros.core.io.capture import Parts
 from pose_graph_ros.core.smoother.incremental import IncrementalSmoother
 from pose_graph_ros.core.smoother.results import Forgotten
+from pose_graph_ros.core.window.bias_cuts import cut_chains
+from pose_graph_ros.core.window.segments import carriers, first_of, next_segment, Segment
 from pose_graph_ros.core.window.sparse_removal import sparse_removal
-from pose_graph_ros.core.window.thinning import groups, removed, simplify, Thinning
+from pose_graph_ros.core.window.thinning import (
+    certain,
+    Crowd,
+    groups,
+    Places,
+    removed,
+    simplify,
+    Thinning,
+)
+
+# A measurement that comes twice is refused the second time, if it is not older than that [ns].
+REPEATED_NS = 3600 * 1_000_000_000
 
 
 class Thinner:
@@ -31,29 +49,104 @@ class Thinner:
     def __init__(self, smoother: IncrementalSmoother, tuner: ErrorTuner, parts: Parts) -> None:
         self._smoother, self._tuner, self._parts = smoother, tuner, parts
         self._thinning = Thinning()
+        self._work: Iterator[None] = iter(())
 
     def step(self, config: ThinningConfig) -> None:
-        """Let the nodes leave that are due."""
-        parts = self._parts
+        """Let a group of nodes leave, or of old measurements in the map, if one is due."""
         if config.cell == 0.0:
+            self._work = iter(())
             return
-        places = self._thinning.places(self._smoother, config, self._waiting())
+        if next(self._work, self) is self:
+            self._work = self._steps(config)
+            next(self._work, None)
+
+    def _steps(self, config: ThinningConfig) -> Iterator[None]:
+        """Yield after each change of the graph; others may have changed it before the next."""
+        parts, smoother = self._parts, self._smoother
+        places = self._thinning.places(smoother, config, self._held())
         if places is None:
             return
-        for group in groups(parts.graph, places):
-            parts.judge.decide_leaving(group.nodes)
-            gone = removed(
-                self._smoother, sparse_removal(parts.graph, group.nodes))
-            if gone is None:
+        older = parts.graph.node_ids[parts.graph.is_pose][:-config.newest]
+        while True:
+            older = older[parts.graph.node_rows(older) >= 0]
+            segment = next_segment(parts.graph, older, places.nodes)
+            if segment is None:
                 break
+            inside = np.isin(places.nodes, segment.poses)
+            group = self._present(places.rows(inside), config)
+            if not self._measurements_leave(segment, group):
+                break
+            places, older = places.rows(~inside), older[older >= segment.after]
+            yield
+        # others leave with their measurements
+        before = places.nodes < first_of(*carriers(parts.graph))
+        places = self._present(places.rows(before), config)
+        for chosen in groups(parts.graph, places):
+            group = self._present(chosen, config)
+            if len(group.nodes) == 0:
+                continue
+            parts.judge.decide_leaving(*constraints_on(parts.graph, group.nodes))
+            self._leave(group, sparse_removal(parts.graph, group.nodes))
+            yield
+        for gone in simplify(smoother):
             forget(gone, parts, self._tuner)
-            parts.nodes.table.thin(*group)
-        for gone in simplify(self._smoother):
-            forget(gone, parts, self._tuner)
+            yield
+        parts.nodes.drop_samples(config.newest)
+        parts.pipeline.seen.forget(parts.nodes.newest_ns - REPEATED_NS)
 
-    def _waiting(self) -> set[int]:
-        """Return the ids of nodes on which constraints are to be added, or edges are to end."""
-        parts, found = self._parts, set[int]()
+    def _present(self, places: Places, config: ThinningConfig) -> Places:
+        """Return the places, as they are now, of those nodes that may still leave."""
+        graph = self._parts.graph
+        there = (graph.node_rows(places.nodes) >= 0) & (graph.node_rows(places.anchors) >= 0)
+        free = there & ~np.isin(places.nodes, list(self._held()))
+        return certain(self._smoother, Crowd(places.nodes[free], places.anchors[free]), config)
+
+    def _measurements_leave(self, segment: Segment, group: Places) -> bool:
+        """
+        Let the measurements of a stretch leave, and a group of its nodes; tell whether they did.
+
+        Parameters
+        ----------
+        segment : Segment
+        group : Places
+
+        """
+        graph = self._parts.graph
+        edges, observed = constraints_on(graph, group.nodes)
+        edges = np.union1d(edges, segment.edges)
+        observed = np.union1d(observed, segment.observed)
+        # what is decided may have another weight
+        self._parts.judge.decide_leaving(edges, observed)
+        biases = np.array(self._tuner.leave(edges, observed, segment.after), dtype=np.int64)
+        cuts = cut_chains(graph, biases)
+        update = None if cuts is None else sparse_removal(
+            graph, np.sort(np.concatenate((group.nodes, biases))), segment.edges,
+            segment.observed, cuts)
+        left = self._leave(group, update)
+        if not left:
+            self._tuner.stay()
+        return left
+
+    def _leave(self, group: Places, update: GraphUpdate | None) -> bool:
+        """
+        Let nodes leave with an update; tell whether they did.
+
+        Parameters
+        ----------
+        group : Places
+        update : GraphUpdate, optional; None if they cannot leave
+
+        """
+        gone = removed(self._smoother, update)
+        if gone is None:
+            return False
+        forget(gone, self._parts, self._tuner)
+        self._parts.nodes.table.thin(*group)
+        return True
+
+    def _held(self) -> set[int]:
+        """Return the ids of nodes that do not leave, as something is to be added to them."""
+        parts, found = self._parts, set(self._tuner.needed)
         for queue in (parts.pipeline.queue, parts.quarantine):
             found.update(int(end[0]) for each in queue.edges for end in (each.edge.i, each.edge.j))
             found.update(each.attachment.node for each in queue.observed)

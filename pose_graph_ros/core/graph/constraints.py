@@ -239,7 +239,7 @@ _FULL: IntArray = np.array((0, 1, 2, 1, 3, 4, 2, 4, 5))
 
 def full(triangles: FloatArray) -> FloatArray:
     """Return symmetric matrices, shape (M, 3, 3), from their upper triangles, shape (M, 6)."""
-    return triangles[:, _FULL].reshape(-1, 3, 3)
+    return np.ascontiguousarray(triangles[:, _FULL]).reshape(-1, 3, 3)
 
 
 def upper(matrices: FloatArray) -> FloatArray:

@@ -21,7 +21,6 @@ from pose_graph_ros.core.geometry.se2 import FloatArray, IntArray
 from pose_graph_ros.core.graph.constraints import EdgeKind
 from pose_graph_ros.core.graph.graph import GraphUpdate
 from pose_graph_ros.core.graph.graph_view import DrawnRows
-from pose_graph_ros.core.graph.incidence import constraints_on
 from pose_graph_ros.core.graph.reweighting import Reweighting
 from pose_graph_ros.core.judgement import fix_verdicts
 from pose_graph_ros.core.judgement.closure_judge import ClosureJudge
@@ -203,15 +202,19 @@ class Judge:
         judge = self._fixes if is_fix else self._closures
         return judge.decide(name, decision)
 
-    def decide_leaving(self, nodes: IntArray) -> None:
+    def decide_leaving(self, edges: IntArray, observed: IntArray) -> None:
         """
-        Decide on all constraints on nodes that are about to leave the graph, ids, shape (K,).
+        Decide on all constraints that are about to leave the graph.
 
         What is believed then stays as it is weighted. All else leaves unused, for which `verdicts`
         has it after `forget`.
+
+        Parameters
+        ----------
+        edges, observed : ndarray of int, ids
+
         """
         graph = self._smoother.graph
-        edges, observed = constraints_on(graph, nodes)
         unused = [
             *self._closures.decide_leaving(edges), *self._fixes.decide_leaving(edges, observed),
             *self._odometry.decide_leaving(graph, edges, self._believed_after)]

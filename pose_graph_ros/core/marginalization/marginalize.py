@@ -36,6 +36,19 @@ _NOTHING = 1e-14
 _RELATIVE = (EdgeKind.ODOMETRY, EdgeKind.LOOP_CLOSURE, EdgeKind.PRIOR)
 
 
+class Cut(NamedTuple):
+    """An edge that is left out, and what is taken off its leaving end for that."""
+
+    edge: int
+    """Id of the edge."""
+    node: int
+    """Id of the end that leaves."""
+    information: FloatArray
+    """What is taken off, shape (3, 3), in map axes; less than what else is known of the node."""
+    vector: FloatArray
+    """Shape (3,)."""
+
+
 class Marginal(NamedTuple):
     """What constraints that leave a graph say about the nodes that remain."""
 
@@ -83,7 +96,7 @@ def marginalize(graph: Graph, nodes: Collection[int]) -> GraphUpdate:
 
 def marginal(
     graph: Graph, nodes: Collection[int], edges: Collection[int] = (),
-    observed: Collection[int] = (),
+    observed: Collection[int] = (), cuts: Sequence[Cut] = (),
 ) -> Marginal:
     """
     Return what all constraints of leaving nodes, and further ones, say about the other nodes.
@@ -94,20 +107,25 @@ def marginal(
     nodes : collection of int, ids of the leaving nodes; raises as `marginalize`
     edges, observed : collection of int
         Ids of constraints that go as well; their nodes remain unless they leave.
+    cuts : sequence of Cut, edges that are left out, and what is taken off instead
 
     """
     leaving = _checked(graph, nodes)
-    part = _part(graph, leaving, list(edges), list(observed))
+    part = _part(graph, leaving, list(edges), list(observed), [cut.edge for cut in cuts])
     inside, fixed, poses = np.isin(part.node_ids, leaving), part.fixed, part.poses
-    H, b = _system(part)
+    H, b = equations(part)
     energy = part.energies().chi2
+    for cut in cuts:
+        of_cut = _columns(part.node_rows(np.array([cut.node])))
+        H[np.ix_(of_cut, of_cut)] -= cut.information
+        b[of_cut] -= cut.vector
     for row in np.flatnonzero(inside & fixed):  # it is known to lie where it is
         at = slice(3 * row, 3 * row + 3)
         H[at], H[:, at], b[at] = 0.0, 0.0, 0.0
     scale = np.diagonal(H).copy()
-    energy -= _eliminate(H, b, np.flatnonzero(inside & ~fixed), scale)
+    energy -= eliminate(H, b, np.flatnonzero(inside & ~fixed), scale)
     kept = np.flatnonzero(~inside)
-    columns = (3 * kept[:, None] + np.arange(3)).ravel()
+    columns = _columns(kept)
     U, u = H[np.ix_(columns, columns)], b[columns]
     tiny = np.diagonal(U) <= _NOTHING * scale[columns]
     U[tiny], U[:, tiny], u[tiny] = 0.0, 0.0, 0.0
@@ -215,11 +233,13 @@ def _is_anchored(graph: Graph) -> bool:
 
 def _part(
     graph: Graph, leaving: IntArray, more: Sequence[int], more_observed: Sequence[int],
+    without: Sequence[int],
 ) -> Graph:
     """Return the part of a graph with the constraints of leaving nodes and further ones."""
     edges, observed = graph.edges, graph.observed
     of_edges = (np.any(np.isin(_ends(edges), leaving), axis=0)
                 | np.isin(graph.edge_ids, more)) & (edges.weight > 0.0)
+    of_edges &= ~np.isin(graph.edge_ids, without)
     of_observed = (np.isin(observed.node, leaving)
                    | np.isin(graph.observed_ids, more_observed)) & (observed.weight > 0.0)
     edges, observed = edges.rows(of_edges), observed.rows(of_observed)
@@ -236,7 +256,7 @@ def _part(
     return part
 
 
-def _system(graph: Graph) -> tuple[FloatArray, FloatArray]:
+def equations(graph: Graph) -> tuple[FloatArray, FloatArray]:
     """Return H and b of all constraints and priors of a graph, for changes of its poses."""
     n = 3 * graph.n_nodes
     front = np.zeros((n, n + 1))
@@ -245,7 +265,7 @@ def _system(graph: Graph) -> tuple[FloatArray, FloatArray]:
     H = H + np.triu(H, 1).T
     for prior in graph.priors:
         rows = graph.node_rows(prior.nodes)
-        at = (3 * rows[:, None] + np.arange(3)).ravel()
+        at = _columns(rows)
         linear = model(prior, graph.poses[rows], graph.is_pose[rows])
         H[np.ix_(at, at)] += linear.information
         b[at] -= linear.gradient
@@ -276,9 +296,9 @@ def assemble(head, front):  # type: ignore[no-untyped-def]
             normal_equations.add_observed(head, k, 3 * observed_i[k, tb.OBS_NODE], flat, ld)
 
 
-def _eliminate(H: FloatArray, b: FloatArray, nodes: IntArray, scale: FloatArray) -> float:
+def eliminate(H: FloatArray, b: FloatArray, nodes: IntArray, scale: FloatArray) -> float:
     """
-    Eliminate nodes in place, those with the fewest neighbours first; return b_m^T H_mm^+ b_m.
+    Return b_m^T H_mm^+ b_m after eliminating nodes in place, those with few neighbours first.
 
     Parameters
     ----------
@@ -288,13 +308,15 @@ def _eliminate(H: FloatArray, b: FloatArray, nodes: IntArray, scale: FloatArray)
 
     """
     left, decrease = set(nodes.tolist()), 0.0
+    if len(left) == 0:
+        return decrease
     linked = np.any(H.reshape(len(H) // 3, 3, -1, 3) != 0.0, axis=(1, 3))
     while left:
         v = min(left, key=lambda node: (int(np.count_nonzero(linked[node])), node))
         left.remove(v)
         near = np.flatnonzero(linked[v])
         near = near[near != v]
-        at, columns = slice(3 * v, 3 * v + 3), (3 * near[:, None] + np.arange(3)).ravel()
+        at, columns = slice(3 * v, 3 * v + 3), _columns(near)
         inverse = _pseudo_inverse(H[at, at], scale[at])
         gain = H[columns, at] @ inverse
         decrease += float(b[at] @ inverse @ b[at])
@@ -321,6 +343,11 @@ def _pseudo_inverse(matrix: FloatArray, scale: FloatArray | None = None) -> Floa
     good = values > LEAST_PIVOT
     half = vectors[:, good] / np.sqrt(values[good]) / root[:, None]
     return np.asarray(half @ half.T)
+
+
+def _columns(rows: IntArray) -> IntArray:
+    """Return the columns of nodes."""
+    return np.asarray((3 * rows[:, None] + np.arange(3)).ravel())
 
 
 def _symmetric(matrix: FloatArray) -> FloatArray:

@@ -15,7 +15,7 @@ from pose_graph_ros.core.graph.constraints import Edges
 from pose_graph_ros.core.graph.graph import Graph
 from pose_graph_ros.core.measurements import Answer, OdometrySample
 from pose_graph_ros.core.odometry.gaps import gap_motion
-from pose_graph_ros.core.odometry.motion import Attachment
+from pose_graph_ros.core.odometry.motion import Attachment, Motion
 from pose_graph_ros.core.odometry.node_table import NodeTable
 from pose_graph_ros.core.odometry.primary_source import (
     choose_first,
@@ -27,6 +27,7 @@ from pose_graph_ros.core.odometry.primary_source import (
 from pose_graph_ros.core.odometry.saved_nodes import SavedNodes, SavedSpan
 from pose_graph_ros.core.odometry.secondary_edges import SecondaryEdges
 from pose_graph_ros.core.odometry.stream import OdometryStream
+from pose_graph_ros.core.odometry.timeline import next_row, OdometryTimeline
 from pose_graph_ros.core.saved_columns import as_matrix, as_pose
 
 
@@ -74,6 +75,8 @@ class HiddenNodes:
         the primary source has no sample as old as that node; else None.
         """
         self._secondary = SecondaryEdges()
+        self._samples_since_ns = -1
+        """Stamp before which samples may have been dropped as nodes were thinned out [ns]."""
         self.relocated: set[int] = set()
         """Numbers of the nodes at which the robot was put by hand."""
 
@@ -344,6 +347,10 @@ class HiddenNodes:
         node = max(node, self.n_frozen)
         node_ns = int(self.stamps_ns[node])
         stream = self.streams[self.primary_at(max(stamp_ns, node_ns))]
+        if node_ns <= stamp_ns < self._samples_since_ns:
+            motion = self._between_nodes(node, stamp_ns)
+            return self.table.attachment(
+                node, motion.increment, stream.covariance(motion, floor=False))
         if not (stream.timeline.covers(node_ns) and stream.timeline.covers(stamp_ns)):
             return None
         motion = stream.timeline.motion(min(node_ns, stamp_ns), max(node_ns, stamp_ns))
@@ -352,6 +359,39 @@ class HiddenNodes:
             adjoint = se2.adjoint(mean)
             mean, noise = se2.inverse(mean), adjoint @ noise @ adjoint.T
         return self.table.attachment(node, mean, noise)
+
+    def _between_nodes(self, node: int, stamp_ns: int) -> Motion:
+        """
+        Return the motion from a node to an instant before the next one, without the samples there.
+
+        Parameters
+        ----------
+        node : int, its number
+        stamp_ns : int [ns]
+
+        """
+        ends, row = OdometryTimeline(), None
+        for number in (node, node + 1):
+            row = next_row(row, int(self.stamps_ns[number]),
+                           as_pose(self.odometry[number - self.n_frozen]))
+            ends.append(row)
+        return ends.motion(int(self.stamps_ns[node]), stamp_ns)
+
+    def drop_samples(self, newest: int) -> None:
+        """
+        Drop the samples before the newest nodes; `newest` is the number of these.
+
+        The motion from an older node is interpolated between that node and the next one.
+        """
+        if len(self.table.thinned) == 0 or len(self) - newest <= self.n_frozen:
+            return
+        since_ns = int(self.stamps_ns[-newest])
+        for source, stream in self.streams.items():
+            begin = self._secondary.progress[source][0]
+            # the next edge of the source begins there
+            at_ns = since_ns if begin < 0 else min(since_ns, int(self.stamps_ns[begin]))
+            stream.forget(at_ns)
+        self._samples_since_ns = since_ns
 
     def forget(self, poses: FloatArray) -> None:
         """
@@ -404,3 +444,5 @@ class HiddenNodes:
         for name, stream in saved.streams.items():
             self._make_stream(name).restore(stream)
             self._secondary.progress[name] = stream.tied, stream.next_to_tie
+        if len(self.table.thinned) > 0:
+            self._samples_since_ns = int(self.streams[self.primary].timeline.stamps_ns[0])

@@ -53,7 +53,7 @@ class PastPath:
         return MeasuredPath(
             seconds, np.concatenate((self.position, path.position)),
             np.concatenate((self.variance, path.variance)),
-            np.concatenate((self.offset, path.offset)), motion, noise)
+            np.concatenate((self.offset, path.offset)), motion, np.ascontiguousarray(noise))
 
     def extended(
         self, stamps_ns: IntArray, path: MeasuredPath, node: int,

@@ -10,16 +10,17 @@ in proportion to the number of nodes however often nodes leave.
 
 import numpy as np
 
-from pose_graph_ros.core.geometry.se2 import BoolArray, IntArray
+from pose_graph_ros.core.geometry.se2 import IntArray
 from pose_graph_ros.core.graph.constraints import EdgeKind, Edges, ObservedKind, ObservedNodes
 from pose_graph_ros.core.graph.graph import Graph, GraphUpdate
 from pose_graph_ros.core.graph.graph_update import Left
+from pose_graph_ros.core.graph.incidence import constraints_on
 from pose_graph_ros.core.graph.priors import Prior
 from pose_graph_ros.core.marginalization.marginalize import marginal, marginalize
 from pose_graph_ros.core.marginalization.sparsification import SparsePrior, sparsify
+from pose_graph_ros.core.window.bias_cuts import Cuts, NO_CUTS
 
-# Kinds of edges between two poses.
-POSE_EDGES = (EdgeKind.ODOMETRY, EdgeKind.LOOP_CLOSURE, EdgeKind.PRIOR)
+NONE: IntArray = np.empty(0, dtype=np.int64)
 # Edges beyond the tree, for each of its nodes. A tree alone costs 8 % in rms where a hall is
 # driven 30 times, this 1 %.
 EXTRA = 0.5
@@ -27,59 +28,51 @@ EXTRA = 0.5
 MOST_POSES = 20
 
 
-def can_leave(graph: Graph, nodes: IntArray) -> bool:
-    """
-    Tell whether all edges and priors of nodes are on poses, as `sparse_removal` needs it.
-
-    Parameters
-    ----------
-    graph : Graph
-    nodes : ndarray of int, ids of hidden nodes
-
-    """
-    edges = graph.edges
-    return bool(np.all(np.isin(edges.kind[_touching(edges, nodes)], POSE_EDGES)) and all(
-        _is_on_poses(graph, prior) for prior in graph.priors if np.any(
-            np.isin(prior.nodes, nodes))))
-
-
 def _is_on_poses(graph: Graph, prior: Prior) -> bool:
     return bool(np.all(graph.is_pose[graph.node_rows(prior.nodes)]))
 
 
-def sparse_removal(graph: Graph, nodes: IntArray) -> GraphUpdate:
+def sparse_removal(
+    graph: Graph, nodes: IntArray, edges: IntArray = NONE, observed: IntArray = NONE,
+    cuts: Cuts = NO_CUTS,
+) -> GraphUpdate | None:
     """
     Return the update by which nodes leave, and edges and observed nodes take their place.
 
-    No covariance becomes smaller by it.
+    No covariance becomes smaller by it. None if something else than poses is connected with them.
 
     Parameters
     ----------
     graph : Graph
-    nodes : ndarray of int, ids of hidden nodes that `can_leave`
+    nodes : ndarray of int, ids of poses, and of biases that leave with them
+    edges, observed : ndarray of int, ids of further constraints that leave
+    cuts : Cuts, of the chains of the biases
 
     """
-    edges, observed = graph.edges, graph.observed
-    of_edges = _touching(edges, nodes)
+    table, of_nodes = graph.edges, graph.observed
+    with_nodes = constraints_on(graph, nodes)
+    leaves = (np.isin(graph.edge_ids, np.union1d(with_nodes[0], edges)) & (table.weight > 0.0)
+              & ~np.isin(graph.edge_ids, [cut.edge for cut in cuts.cuts]))
+    leave = np.isin(graph.observed_ids, observed) & (of_nodes.weight > 0.0)
     of_priors = [prior.nodes for prior in graph.priors if np.any(np.isin(prior.nodes, nodes))]
-    around = np.setdiff1d(
-        np.concatenate((edges.i[of_edges], edges.j[of_edges], *of_priors)), nodes)
-    earlier = ((edges.kind == EdgeKind.PRIOR) & np.isin(edges.i, around)
-               & np.isin(edges.j, around))
-    earlier_observed = (observed.kind == ObservedKind.PRIOR) & np.isin(observed.node, around)
+    around = np.setdiff1d(np.concatenate((
+        table.i[leaves], table.j[leaves], table.k[leaves], of_nodes.node[leave], *of_priors)),
+        (*nodes, -1))
+    if not np.all(graph.is_pose[graph.node_rows(around)]):
+        return None
+    earlier = ((table.kind == EdgeKind.PRIOR) & np.isin(table.i, around)
+               & np.isin(table.j, around))
+    earlier_observed = (of_nodes.kind == ObservedKind.PRIOR) & np.isin(of_nodes.node, around)
+    more = np.union1d(edges, graph.edge_ids[earlier])
+    more_observed = np.union1d(observed, graph.observed_ids[earlier_observed])
     sparse = _approximation(
-        marginal(graph, nodes, graph.edge_ids[earlier].tolist(),
-                 graph.observed_ids[earlier_observed].tolist()).prior)
+        marginal(graph, nodes, more.tolist(), more_observed.tolist(), cuts.cuts).prior)
     return GraphUpdate(
-        edges=sparse.edges, observed=sparse.observed, remove_nodes=nodes.tolist(),
-        drop_edges=graph.edge_ids[earlier].tolist(),
-        drop_observed=graph.observed_ids[earlier_observed].tolist())
-
-
-def _touching(edges: Edges, nodes: IntArray) -> BoolArray:
-    """Return which edges with a weight have one of the nodes, shape (M,)."""
-    return (edges.weight > 0.0) & (
-        np.isin(edges.i, nodes) | np.isin(edges.j, nodes) | np.isin(edges.k, nodes))
+        edges=sparse.edges, observed=ObservedNodes.joined([sparse.observed, cuts.observed]),
+        remove_nodes=nodes.tolist(),
+        # the others leave with the nodes
+        drop_edges=np.setdiff1d(more, with_nodes[0]).tolist(),
+        drop_observed=np.setdiff1d(more_observed, with_nodes[1]).tolist())
 
 
 def sparse_marginalization(graph: Graph, nodes: IntArray) -> GraphUpdate:

@@ -28,11 +28,7 @@ from pose_graph_ros.core.graph.constraints import EdgeKind
 from pose_graph_ros.core.graph.graph import Graph
 from pose_graph_ros.core.graph.graph_update import GraphUpdate, Left
 from pose_graph_ros.core.smoother.incremental import IncrementalSmoother
-from pose_graph_ros.core.window.sparse_removal import (
-    can_leave,
-    leaving,
-    with_fewer_edges,
-)
+from pose_graph_ros.core.window.sparse_removal import leaving, with_fewer_edges
 
 # Nodes leave whenever so many new ones have been made; so many are looked at each time.
 EVERY, MOST_AT_ONCE = 10, 40
@@ -142,7 +138,7 @@ class Thinning:
         self, smoother: IncrementalSmoother, config: ThinningConfig, keep: Collection[int] = (),
     ) -> Places | None:
         """
-        Return the nodes that leave now; None most times.
+        Return the nodes that leave now, maybe none; None most times.
 
         Parameters
         ----------
@@ -159,12 +155,10 @@ class Thinning:
         found = Crowd(*(ids[~np.isin(found.leaving, list(keep))] for ids in found))
         # those that are not sure enough to leave must not keep others from being looked at
         order = np.argsort(found.leaving < self._next, kind='stable')[:MOST_AT_ONCE]
-        if len(order) == 0:
-            return None
-        self._next = int(found.leaving[order[-1]]) + 1
+        if len(order) > 0:
+            self._next = int(found.leaving[order[-1]]) + 1
         chosen = Crowd(*(ids[np.sort(order)] for ids in found))
-        places = certain(smoother, chosen, config)
-        return places if len(places.nodes) > 0 else None
+        return certain(smoother, chosen, config)
 
 
 def groups(graph: Graph, places: Places) -> Iterator[Places]:
@@ -182,21 +176,22 @@ def groups(graph: Graph, places: Places) -> Iterator[Places]:
         used = edges.weight > 0.0
         members = group(places.nodes, np.column_stack((edges.i[used], edges.j[used])))
         inside = np.isin(places.nodes, members)
-        if can_leave(graph, members):
-            yield places.rows(inside)
+        yield places.rows(inside)
         places = places.rows(~inside)
 
 
-def removed(smoother: IncrementalSmoother, update: GraphUpdate) -> Left | None:
+def removed(smoother: IncrementalSmoother, update: GraphUpdate | None) -> Left | None:
     """
-    Return what has left the graph with an update, or None if the solver has failed.
+    Return what has left the graph with an update, or None if there is none or the solver fails.
 
     Parameters
     ----------
     smoother : IncrementalSmoother
-    update : GraphUpdate
+    update : GraphUpdate, optional
 
     """
+    if update is None:
+        return None
     gone = leaving(smoother.graph, update)
     return None if smoother.update(update).status is Status.FAILED else gone
 

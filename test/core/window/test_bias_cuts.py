@@ -1,0 +1,96 @@
+# Copyright 2026 The pose_graph_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""Measurements leave with older biases, and nothing that stays is known better afterwards."""
+
+from hypothesis import given, settings, strategies as st
+import numpy as np
+
+from pose_graph_ros.core.config import SmootherConfig
+from pose_graph_ros.core.geometry import se2
+from pose_graph_ros.core.geometry.se2 import FloatArray
+from pose_graph_ros.core.graph.constraints import EdgeKind, Edges, ObservedKind, ObservedNodes
+from pose_graph_ros.core.graph.graph import Graph, GraphUpdate
+from pose_graph_ros.core.marginalization.marginalize import equations
+from pose_graph_ros.core.smoother.incremental import IncrementalSmoother
+from pose_graph_ros.core.sources.gauss_markov import (
+    Additions,
+    CorrelatedErrors,
+    GaussMarkovBias,
+)
+from pose_graph_ros.core.window.bias_cuts import cut_chains
+from pose_graph_ros.core.window.segments import next_segment
+from pose_graph_ros.core.window.sparse_removal import sparse_removal
+
+EXACT = SmootherConfig(alpha=0.0, budget=1e-20, max_iterations=20)
+N = 18
+
+
+def drive(seed: int, tau: float, *, headings: bool) -> tuple[Graph, GaussMarkovBias]:
+    """
+    Return a graph in which all constraints agree, with a fix each second, and its biases.
+
+    All errors are 0, so no Jacobian changes when nodes leave.
+    """
+    rng = np.random.default_rng(seed)
+    steps = np.column_stack((
+        rng.uniform(0.5, 2.0, N - 1), rng.normal(0.0, 0.2, N - 1), rng.normal(0.0, 0.3, N - 1)))
+    poses = np.zeros((N, 3))
+    for k, step in enumerate(steps):
+        poses[k + 1] = se2.compose(poses[k], step)
+    i = np.arange(N - 1)
+    graph = Graph()
+    graph.apply(GraphUpdate(hidden=poses, edges=Edges.joined([
+        Edges(i, i + 1, steps, np.tile(np.diag((400.0, 900.0, 1e4)), (N - 1, 1, 1)), 0 * i),
+        Edges([1], [N - 3], se2.between(poses[[1]], poses[[N - 3]]), np.diag((50.0, 20.0, 100.0))[
+            None], [EdgeKind.LOOP_CLOSURE])])))
+    model, additions = GaussMarkovBias(CorrelatedErrors(tau, 1.0, 0.1)), Additions(graph.next_ids)
+    for k in range(N):
+        kind = ObservedKind.GLOBAL_POSE if headings else ObservedKind.POSITION
+        mean = poses[[k]] if headings else np.append(poses[k, :2], 0.0)[None]
+        model.add(k * 1_000_000_000, ObservedNodes(
+            [k], mean=mean, information=[np.diag((1.0, 1.0, 25.0 * headings))], kind=[kind]),
+            np.array((0.01, 0.001)), additions)
+    graph.apply(additions.update())
+    return graph, model
+
+
+def joint_covariance(graph: Graph, nodes: list[int]) -> FloatArray:
+    """Return the covariance of all coordinates of nodes, by a dense inverse."""
+    columns = 3 * graph.node_rows(np.array(nodes))[:, None] + np.arange(3)
+    H, _ = equations(graph)
+    return np.asarray(np.linalg.inv(H)[np.ix_(columns.ravel(), columns.ravel())])
+
+
+@given(st.integers(0, 2**32 - 1), st.sampled_from((2.0, 20.0, 300.0)), st.booleans())
+@settings(max_examples=15)
+def test_no_covariance_becomes_smaller(seed: int, tau: float, headings: bool) -> None:
+    graph, model = drive(seed, tau, headings=headings)
+    before_poses, rng = graph.poses.copy(), np.random.default_rng(seed)
+    first = graph.node_ids.copy()
+    before = joint_covariance(graph, first.tolist())
+    smoother = IncrementalSmoother(EXACT, graph)
+    for _ in range(2):  # the second one takes in what the first has left
+        older = graph.node_ids[graph.is_pose][:-3]
+        leaving = older[rng.random(len(older)) < 0.5]
+        segment = next_segment(graph, older, leaving)
+        if segment is None:
+            break
+        biases = np.array(model.leaving(segment.after * 1_000_000_000))
+        cuts = cut_chains(graph, biases)
+        assert cuts is not None
+        assert len(cuts.cuts) == 1
+        leaving = leaving[np.isin(leaving, segment.poses)]
+        update = sparse_removal(graph, np.sort(np.append(leaving, biases)), segment.edges,
+                                segment.observed, cuts)
+        assert update is not None
+        smoother.update(update)
+        model.forget(set(biases.tolist()))
+        kept = graph.node_ids.tolist()
+        columns = (3 * np.searchsorted(first, kept)[:, None] + np.arange(3)).ravel()
+        after = joint_covariance(graph, kept)
+        scale = 1.0 / np.sqrt(np.diagonal(before)[columns])
+        more = (after - before[np.ix_(columns, columns)]) * scale[:, None] * scale
+        assert np.min(np.linalg.eigvalsh(more)) > -1e-5
+        np.testing.assert_allclose(
+            graph.poses, before_poses[np.searchsorted(first, kept)], atol=1e-6)
+    assert graph.n_nodes < len(first) - 3
