@@ -68,8 +68,8 @@ def linearization_error2(head, c, work):  # type: ignore[no-untyped-def]
     Return the squared linearization error of a prior that turns with its nodes [sigma^2].
 
     Since it was linearized its frame has turned by beta against that of its parent, and positions
-    in the frame have changed by D. The displacement is then wrong by
-    `w = ((1 - cos beta) + (beta - sin beta) S) p + beta S D`, p the positions, and gradients have
+    in the frame have changed by D. The displacement then differs from its linear model by
+    `w = ((1 - cos beta) + (beta - sin beta) S) p - beta S D`, p the positions, and gradients have
     turned: that of the nodes by beta, as in `clique_frames.interface_error2`, and that of the
     frame by `m g^T S D`. A large change of S D against p would falsify covariances in any case.
 
@@ -91,8 +91,8 @@ def linearization_error2(head, c, work):  # type: ignore[no-untyped-def]
     versine, lag = 1.0 - math.cos(beta), beta - math.sin(beta)
     of_nodes = of_frame = compliance = moved = arms = 0.0
     for i in range(0, n, 3):
-        w[i] = versine * r[i + 1] + lag * r[i] + beta * change[i]
-        w[i + 1] = -versine * r[i] + lag * r[i + 1] + beta * change[i + 1]
+        w[i] = versine * r[i + 1] + lag * r[i] - beta * change[i]
+        w[i + 1] = -versine * r[i] + lag * r[i + 1] - beta * change[i + 1]
         w[i + 2] = 0.0
         k = row[tb.VALUES] + row_start(i, n) + i
         iso = 0.5 * (pool_f[k] + pool_f[row[tb.VALUES] + row_start(i + 1, n) + i + 1])

@@ -148,7 +148,11 @@ class GraphRows(NamedTuple):
         return np.asarray(np.searchsorted(self.node_ids, ids), dtype=np.int64)
 
     def since(self, first: NextIds) -> 'GraphRows':
-        """Return the rows that are new since the next ids were these."""
+        """
+        Return the rows that are new since the next ids were these.
+
+        Priors have no ids, so none of them is among these rows.
+        """
         nodes, edges, observed = (
             slice(int(np.searchsorted(ids, begin)), None) for ids, begin in zip(
                 (self.node_ids, self.edge_ids, self.observed_ids), first, strict=True))

@@ -111,6 +111,31 @@ def test_the_nodes_that_remain_do_not_move(seed: int, pure: bool) -> None:
         graph = smoother.graph
 
 
+@given(seeds, flags)
+@settings(max_examples=15)
+def test_priors_that_have_turned_and_bent_leave_nothing_behind(seed: int, pure: bool) -> None:
+    """As above, where what leaves is told by priors that were made at other poses."""
+    smoother, here = driven(seed)
+    leaving = some(here.rng, smoother.graph, 0.3)
+    smoother.forget(leaving)
+    here.gone.update(leaving)
+    more = here.joined(here.new_nodes(3), edges=here.edges(here.pairs(3)),
+                       observed=here.observed(here.poses[:1]))
+    assert smoother.update(more).status is not Status.FAILED
+    smoother = copied(smoother)
+    graph, leaving = smoother.graph, some(here.rng, smoother.graph)
+    kept = np.setdiff1d(graph.node_ids, leaving)
+    poses = graph.poses_of(kept)
+    covariances = smoother.covariances()[graph.node_rows(kept)]
+    if pure:
+        smoother.update(marginalize(graph, leaving))
+    else:
+        smoother.forget(leaving)
+    for each in (smoother, copied(smoother)):
+        np.testing.assert_allclose(se2.wrapped(each.poses - poses), 0.0, atol=1e-9)
+        assert_close(each.covariances(), covariances, 1e-9)
+
+
 @given(seeds)
 @settings(max_examples=25)
 def test_the_tree_has_the_result_of_the_pure_function(seed: int) -> None:
