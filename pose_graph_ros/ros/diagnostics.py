@@ -12,9 +12,12 @@ from typing import TYPE_CHECKING
 
 from diagnostic_msgs.msg import DiagnosticStatus
 
+from pose_graph_ros.adapters.sources import Kind
 from pose_graph_ros.core.alignment.monitor import AlignmentState
 from pose_graph_ros.core.batch.optimizer import Status
 from pose_graph_ros.core.judgement.texts import total_values
+from pose_graph_ros.core.odometry.agreement import CONTRADICTORY
+from pose_graph_ros.core.odometry.turns import MOST_BIAS
 from pose_graph_ros.core.sources.constraint_names import ConstraintEnergy
 from pose_graph_ros.core.sources.source_report import LEAST_ENERGY
 from pose_graph_ros.ros.worker import Worker
@@ -22,6 +25,8 @@ from pose_graph_ros.ros.worker import Worker
 if TYPE_CHECKING:
     from pose_graph_ros.ros.session import Session
 
+# Number of yaw rates and of hidden nodes after which a gyroscope must have been of use.
+MANY = 20
 # Period of the search for the constraints with the largest energies [s], and their number.
 ENERGY_PERIOD, N_ENERGIES = 5.0, 3
 
@@ -226,7 +231,27 @@ def _doubts(session: 'Session') -> Iterator[tuple[bytes, str]]:
             yield warn, (f'The errors of {name} are correlated in time but treated as white, so '
                          f'the covariances are too small: set {name}.correlation_time to about '
                          f'{fit.errors.tau:.2g} s.')
+    yield from ((warn, text) for text in _wrong_gyros(session))
     errors = sum(count for (_, reason), count in status.counts.items()
                  if reason == 'internal_error')
     if errors > 0:
         yield warn, f'Running, but {errors} internal errors are in the log: please report them.'
+
+
+def _wrong_gyros(session: 'Session') -> Iterator[str]:
+    """Yield what is probably wrong with gyroscopes."""
+    status, estimate = session.worker.status, session.worker.estimate
+    for name, source in session.input.reader.sources.items():
+        if source.kind is not Kind.GYRO or estimate is None:
+            continue
+        counts, bias = status.counts, status.biases.get(name, 0.0)
+        used, most = counts[name, 'rotations'], MOST_BIAS * session.values[f'{name}.sigma_bias']
+        if used == 0 and counts[name, 'accepted'] >= MANY <= estimate.n_hidden:
+            yield (f'No message of {name} could be used: either their stamps are not in the time '
+                   f'of odometry, or they are farther apart than {name}.maximum_gap.')
+        difference = status.differences.get(name)
+        if difference is not None and difference.sigmas > CONTRADICTORY and difference.reason:
+            yield f'Of {name} and odometry one is wrong: {difference.reason}.'
+        elif abs(bias) > most:
+            yield (f'The bias of {name} is {bias:.2g} rad/s, more than five times its sigma_bias: '
+                   'check its mounting and its unit, rad/s.')

@@ -81,6 +81,7 @@ def test_the_gyroscope_keeps_the_heading_while_the_wheels_drift(node: NodeProces
         assert client.values['odometry'] == 'wheels'
         # the transform may be read after the first of them, though it was received before
         assert int(client.values['gyro.accepted']) >= round((REST + END) * 20) - 1
+        assert int(client.values['gyro.rotations']) > 45
         assert float(client.values['gyro.bias']) == pytest.approx(BIAS, abs=6e-4)
         client.spin_until(lambda: stamp_ns(client.paths[-1].poses[-1]) > (START + END - 1.0) * 1e9,
                           'the whole path comes')

@@ -17,12 +17,13 @@ pytest.importorskip('rclpy', reason='ROS 2 is not there: no rclpy')
 from circle import fix_at, odometry_at, START, true_pose
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
 from geometry_msgs.msg import PoseWithCovarianceStamped
-from harness import LATCHED, odometry, PATIENCE, pose, PREPARE_PATIENCE, stamp_ns, TFMessage
+from harness import imu, LATCHED, odometry, PATIENCE, pose, PREPARE_PATIENCE, stamp_ns, TFMessage
 from local_node import Driver, LocalNode
 from nav_msgs.msg import Odometry, Path as PathMessage
 import numpy as np
 from rclpy.serialization import serialize_message
 from rclpy.time import Time
+from sensor_msgs.msg import Imu
 from visualization_msgs.msg import MarkerArray
 
 from pose_graph_ros.adapters.parameters import checked
@@ -675,3 +676,30 @@ def test_a_source_that_ends_is_said_to_be_silent_once(
     assert 'fix is silent' in active.health()[1]
     active.session.deactivate()
     active.wait(lambda: active.session.input.silent == [], 'an inactive node misses nobody')
+
+
+@pytest.mark.parametrize('robot', [{
+    'sources': ['odom', 'fix', 'gyro'], 'gyro__mounting': 'up'}], indirect=True)
+def test_gyroscopes_that_are_of_no_use_or_wrong_are_warned_of(active: Robot) -> None:
+    active.publishers['gyro'] = active.local.advertise(Imu, 'imu/data')
+
+    def rates(begin: float, end: float, late: float = 0.0) -> list[Imu]:
+        """Of a gyroscope that is upside down, in the circle of the drive."""
+        messages = [imu(START + late + at, 0.0) for at in np.arange(begin, end, 0.1)]
+        for message in messages:
+            message.angular_velocity.z = -0.1
+        return messages
+
+    active.send('gyro', *rates(0.0, 5.0, 50.0))
+    active.drive(15.0, fixes=False)
+    assert active.values()['gyro.accepted'] == '50'
+    level, text = active.health()
+    assert level == WARN
+    assert 'No message of gyro could be used' in text
+    active.send('gyro', *rates(65.0, 85.0))
+    active.drive(85.0, begin=65.0, fixes=False)
+    assert int(active.values()['gyro.rotations']) > 20
+    level, text = active.health()
+    assert level == WARN
+    assert 'The bias of gyro is -0.19 rad/s' in text
+    assert 'mounting' in text

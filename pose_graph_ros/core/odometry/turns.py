@@ -2,6 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Rotations between consecutive hidden nodes by gyroscopes, and what they measure at rest."""
 
+from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import NamedTuple
@@ -81,10 +82,12 @@ class Gyros:
         self._nodes, self._config = nodes, config
         self.streams: dict[str, GyroStream] = {}
         """By the name of the source."""
-        self.n_gaps: dict[str, int] = {}
-        """Number of rotations that a gap in the rates has left out, by source."""
-        self.too_late: list[str] = []
-        """Sources of rotations whose nodes have left the graph; whoever counts them clears it."""
+        self.counts: Counter[tuple[str, str]] = Counter()
+        """
+        Number of rotations by source: 'rotations' that were made, those that a 'gap' in the rates
+        has left out, and those 'before_window', whose nodes have left the graph. Whoever takes
+        them clears it.
+        """
         self._agreement: dict[str, Agreement] = {}
         self._next: dict[str, int] = {}
         """Number of the hidden node that the next rotation leads to, by source."""
@@ -139,13 +142,15 @@ class Gyros:
             return
         integral = stream.integral(start_ns, end_ns)
         if integral is None:
-            self.n_gaps[source] += stream.first_ns <= start_ns
+            if stream.first_ns <= start_ns:
+                self.counts[source, 'gap'] += 1
             return
         if nodes.table.has_left(node - 1) or nodes.table.has_left(node):
-            self.too_late.append(source)
+            self.counts[source, 'before_window'] += 1
             return
         rotation = integral.between(start_ns, end_ns)
         at_rest, creep, creep_variance = self._at_rest(source, integral, start_ns, end_ns)
+        self.counts[source, 'rotations'] += 1
         self._compare(source, integral, start_ns, end_ns)
         i, j = nodes.ids[node - 1:node + 1].tolist()
         middle_ns = (start_ns + end_ns) // 2
@@ -199,7 +204,6 @@ class Gyros:
         if stream is None:
             stream = self.streams[source] = GyroStream(self._config.gyro(source))
             self._next[source], self._agreement[source] = 1, Agreement()
-            self.n_gaps[source] = 0
         return stream
 
     def differences(self) -> dict[str, Difference]:

@@ -110,10 +110,10 @@ class MeasurementPipeline:
         gyros.extend()
         self.queue.turns += gyros.new
         gyros.new.clear()
-        self.counts.update((source, 'before_window') for source in gyros.too_late)
-        gyros.too_late.clear()
+        self.counts.update(gyros.counts)
+        gyros.counts.clear()
         for source, stream in gyros.streams.items():
-            for reason, count in (('gap', gyros.n_gaps[source]), ('sorted', stream.n_sorted),
+            for reason, count in (('sorted', stream.n_sorted),
                                   ('stamp_ahead', stream.n_dropped)):
                 if count > 0:
                     self.counts[source, reason] = count

@@ -41,7 +41,7 @@ def test_sensors_that_agree_differ_by_a_sigma() -> None:
 
 @pytest.mark.parametrize(('fault', 'words'), [
     ({'early': 0.3}, '0.30 s early'), ({'early': -0.2}, '0.20 s late'),
-    ({'factor': -1.0}, 'mounting'), ({'factor': 1.25}, 'odometry turns 0.8 times'),
+    ({'factor': -1.0}, 'mounting'), ({'factor': 1.25}, 'odometry turns 0.80 times'),
     ({'noise': 0.01}, 'counts twice'), ({'noise': 3.0}, '')])
 def test_what_is_wrong_is_said(fault: dict[str, float], words: str) -> None:
     found = difference(**fault)
