@@ -199,10 +199,11 @@ def information(graph: Graph, nodes: list[int] | None = None) -> FloatArray:
     # the constraints of a clique turn with its frame
     turn = np.array([frame_turn(graph, c) for c in graph.memory['edge_i'][:m, tb.OWNER]])
     ends[:m, 2] = (np.arctan2(rows[:, tb.LIN_SIN], rows[:, tb.LIN_COS]) - edges.mean[:, 2] + turn)
-    # an edge to a bias has the heading itself
+    # an edge to a bias has the factors in place of a frame
     to_bias = edges.kind == EdgeKind.BIAS
     assert np.all(turn[to_bias & (edges.weight > 0.0)] == 0.0)
-    ends[:m][to_bias, 2] += edges.mean[to_bias, 2]
+    ends[:m][to_bias, 2] = (graph.memory['node_f'][edges.i, tb.REF + 2] + rows[:, tb.LIN_TH])[
+        to_bias]
     difference = rows[:, tb.LIN_ARM:tb.LIN_ARM + 2]
     ends[m:, :2] = np.einsum('mij,mj->mi', se2.rotation(turn), difference)
     hidden[:, 2] = graph.memory['node_f'][observed.node, tb.REF + 2] + unary[:, tb.LIN_TH]

@@ -70,7 +70,7 @@ def chordal(graph: Graph, cliques: symbolic.Cliques) -> FloatArray:
 def _n_others(head):  # type: ignore[no-untyped-def]
     node_i, n = tb.node_i(head), 0
     for v in range(head[tb.N_NODES]):
-        n += node_i[v, tb.NODE_KIND] != 0
+        n += node_i[v, tb.NODE_TYPE] != 0
     return n
 
 

@@ -21,6 +21,7 @@ from pose_graph_ros.core.exceptions import LinearSolveError
 from pose_graph_ros.core.geometry import se2
 from pose_graph_ros.core.geometry.se2 import BoolArray, ComplexArray, FloatArray, IntArray
 from pose_graph_ros.core.graph.constraints import EdgeKind, Edges, ObservedKind, ObservedNodes
+from pose_graph_ros.core.graph.factor_types import FACTORS
 from pose_graph_ros.core.graph.graph import Graph
 from pose_graph_ros.core.graph.priors import Prior
 
@@ -30,6 +31,9 @@ PULLS = (1e-4, 1e-3, 1e-2)
 PULLED = 20
 # Fraction with which positions follow from the headings at last.
 FIRMLY = 1e6
+# Kinds of edges that tell where the other end is, and those that are linear in t and u.
+_PLACING = [kind for kind, factor in FACTORS.items() if factor.places]
+_LINEAR = [*_PLACING, *(kind for kind, factor in FACTORS.items() if 0 not in factor.rows)]
 
 
 class _Problem(NamedTuple):
@@ -84,7 +88,7 @@ def _problem(graph: Graph) -> _Problem:
     n, is_bias, fixed = graph.n_nodes, graph.is_bias, graph.fixed
     is_pose, loose = graph.is_pose, ~graph.is_pose
     edges, observed = _of_poses(graph.edges_by_row, graph.observed_by_row, is_bias)
-    loose[edges.j[edges.kind == EdgeKind.POINT]] = False    # landmarks that are seen
+    loose[edges.j[np.isin(edges.kind, _PLACING)]] = False   # landmarks that are seen
     for prior in graph.priors:
         more = _approximated(prior, graph.node_rows(prior.nodes), is_pose)
         edges, observed = Edges.joined([edges, more[0]]), ObservedNodes.joined([observed, more[1]])
@@ -154,7 +158,7 @@ def _of_poses(
         observed = ObservedNodes.joined([observed, ObservedNodes(
             measured.i, offset, measured.mean, information,
             [ObservedKind.GLOBAL_POSE] * len(measured))])
-    return edges.rows(~to_bias & (edges.kind != EdgeKind.RANGE)), observed
+    return edges.rows(~to_bias & np.isin(edges.kind, _LINEAR)), observed
 
 
 def _approximated(

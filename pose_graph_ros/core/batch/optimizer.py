@@ -225,7 +225,7 @@ def optimize_from_two_starts(graph: Graph, config: SolverConfig, solve: Solve) -
 
 def _is_observed(graph: Graph) -> bool:
     """Tell whether the graph has an observed node, or a prior in their place."""
-    return len(graph.observed) > 0 or any(prior.anchored for prior in graph.priors)
+    return graph.n_observed > 0 or any(prior.anchored for prior in graph.priors)
 
 
 def _start(graph: Graph, start: Start, cliques: symbolic.Cliques) -> FloatArray:

@@ -13,7 +13,7 @@ from pose_graph_ros.core.graph import (
     tables as tb,
     transaction_log,
 )
-from pose_graph_ros.core.graph.constraints import EdgeKind
+from pose_graph_ros.core.graph.factor_types import anchors, dimension_of
 from pose_graph_ros.core.graph.pools import row_start, triangle_size
 
 # Where constraints are stiff in one direction and weak in another, as those of a turn on the spot,
@@ -21,10 +21,6 @@ from pose_graph_ros.core.graph.pools import row_start, triangle_size
 # add in their weakest direction, and, because of rounding, of all that they add.
 LEAST_WEAK_PIVOT = 1e-9
 LEAST_STIFF_PIVOT = 1e-15
-# Edges of this kind and the ones after it have a node that is no pose, so the axes of their errors
-# or unknowns do not turn with a clique.
-FIRST_ANCHORING = int(EdgeKind.BIAS)
-PRIOR = int(EdgeKind.PRIOR)     # between poses as well
 
 
 @kernel
@@ -92,8 +88,7 @@ def _eliminate(head, c, relinearize, by_weakest):  # type: ignore[no-untyped-def
                 transaction_log.log_edge(head, e)
                 factors.linearize_edge(head, e)
             edge_i[e, tb.OWNER] = c
-            kind = edge_i[e, tb.EDGE_KIND]
-            anchored |= kind >= FIRST_ANCHORING and kind != PRIOR
+            anchored |= anchors(edge_i[e, tb.EDGE_KIND])
             normal_equations.add_edge(head, e, at_i, at_j, at_k, front, ld)
         entry = node_i[v, tb.OBSERVED_LIST]
         while entry >= 0:
@@ -117,7 +112,7 @@ def _eliminate(head, c, relinearize, by_weakest):  # type: ignore[no-untyped-def
                 front[(3 * k + m + 1) * ld - 1] += more * node_f[v, tb.DELTA + m]
         if node_i[v, tb.FIXED] != 0:
             any_fixed, anchored = True, 1
-        for m in range(node_i[v, tb.DIMENSION], 3):
+        for m in range(dimension_of(node_i[v]), 3):
             front[(3 * k + m) * (ld + 1)] += 1.0
             any_padded = True
     child = row[tb.CHILD]
@@ -139,7 +134,7 @@ def _eliminate(head, c, relinearize, by_weakest):  # type: ignore[no-untyped-def
     if any_padded:
         # 0 for the reciprocal of the pivot: the coordinate is 0, without uncertainty
         for k in range(n_frontal):
-            for m in range(3 * k + node_i[nodes[k], tb.DIMENSION], 3 * k + 3):
+            for m in range(3 * k + dimension_of(node_i[nodes[k]]), 3 * k + 3):
                 front[m * (ld + 1)] = 0.0
     # the rows of R, directly followed by the update matrix
     at = row[tb.VALUES]

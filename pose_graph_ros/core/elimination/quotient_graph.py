@@ -38,6 +38,13 @@ def newest_last(affected, newest):  # type: ignore[no-untyped-def]
     return n_last
 
 
+@kernel
+def _other_ends(edge_i, e, side):  # type: ignore[no-untyped-def]
+    """Return the nodes at the other ends of an edge; the second is -1 where there is but one."""
+    return (edge_i[e, tb.END_J if side == 0 else tb.END_I],
+            edge_i[e, tb.END_J if side == 2 else tb.END_K])
+
+
 @kernel(allocates=True)
 def structure(head, marked, loose, affected):  # type: ignore[no-untyped-def]
     """
@@ -94,9 +101,8 @@ def structure(head, marked, loose, affected):  # type: ignore[no-untyped-def]
         entry = node_i[affected[k], tb.EDGE_LIST]
         while entry >= 0:
             e, side = entry >> 2, entry & 3
-            for m in range(3):
-                other = edge_i[e, m]
-                if m != side and other >= 0 and node_i[other, tb.FRONT] == serial:
+            for other in _other_ends(edge_i, e, side):
+                if other >= 0 and node_i[other, tb.FRONT] == serial:
                     count[k] += 1
             entry = edge_i[e, tb.NEXT_I + side]
     start = np.empty(n + n_orphans + 1, np.int32)
@@ -125,9 +131,8 @@ def structure(head, marked, loose, affected):  # type: ignore[no-untyped-def]
         end = begin_neighbours
         while entry >= 0:
             e, side = entry >> 2, entry & 3
-            for m in range(3):
-                other = edge_i[e, m]
-                if m != side and other >= 0 and node_i[other, tb.FRONT] == serial:
+            for other in _other_ends(edge_i, e, side):
+                if other >= 0 and node_i[other, tb.FRONT] == serial:
                     i = node_i[other, tb.INDEX]
                     if last_seen[i] != k:
                         last_seen[i] = k

@@ -36,7 +36,7 @@ def _new_node_rows(head):  # type: ignore[no-untyped-def]
     node_i = tb.node_i(head)
     leaves = np.empty(head[tb.N_NODES], np.int32)
     for v in range(head[tb.N_NODES]):
-        leaves[v] = node_i[v, tb.NODE_LEAVES]
+        leaves[v] = node_i[v, tb.EDGE_LIST] == tb.LEAVES
     return _numbered(leaves)
 
 
@@ -49,7 +49,7 @@ def _new_edge_rows(head, nodes):  # type: ignore[no-untyped-def]
         row = edge_i[e]
         stays = (nodes[row[tb.END_I]] >= 0 and nodes[row[tb.END_J]] >= 0
                  and (row[tb.END_K] < 0 or nodes[row[tb.END_K]] >= 0))
-        leaves[e] = 0 if stays and row[tb.EDGE_LEAVES] == 0 else 1
+        leaves[e] = 0 if stays and row[tb.NEXT_I] != tb.LEAVES else 1
     return _numbered(leaves)
 
 
@@ -60,7 +60,7 @@ def _new_observed_rows(head, nodes):  # type: ignore[no-untyped-def]
     leaves = np.empty(head[tb.N_OBSERVED], np.int32)
     for k in range(head[tb.N_OBSERVED]):
         row = observed_i[k]
-        leaves[k] = 0 if row[tb.OBS_LEAVES] == 0 and nodes[row[tb.OBS_NODE]] >= 0 else 1
+        leaves[k] = row[tb.OBS_NEXT] == tb.LEAVES or nodes[row[tb.OBS_NODE]] < 0
     return _numbered(leaves)
 
 

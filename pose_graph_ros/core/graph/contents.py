@@ -11,13 +11,13 @@ from pose_graph_ros.core.geometry.se2 import BoolArray, FloatArray, IntArray
 from pose_graph_ros.core.graph import tables as tb
 from pose_graph_ros.core.graph.constraints import (
     Constraints,
-    EdgeKind,
     Edges,
     full,
     NodeKind,
     ObservedNodes,
 )
 from pose_graph_ros.core.graph.error_functions import edge_errors, energies, observed_errors
+from pose_graph_ros.core.graph.factor_types import FACTORS
 from pose_graph_ros.core.graph.graph_update import (
     Energies,
     GraphRows,
@@ -29,9 +29,9 @@ from pose_graph_ros.core.graph.prior_edits import priors_of
 from pose_graph_ros.core.graph.priors import model, Prior
 from pose_graph_ros.core.graph.tables import Memory
 
-# Columns of edge_f with the column `Edges.bias`, and which of them each kind of edge has.
-_BIAS_COLUMNS = [tb.OFFSET, tb.OFFSET + 1, tb.FACTOR_T, tb.FACTOR_TH]
-_HAS_BIAS = {EdgeKind.BIAS: slice(4), EdgeKind.TURN: slice(3, 4), EdgeKind.RANGE: slice(2)}
+# Columns of edge_f with the column `Edges.bias`, for kinds of edges that have them.
+_BIAS_COLUMNS = np.array((tb.OFFSET, tb.OFFSET + 1, tb.FACTOR_T, tb.FACTOR_TH))
+_HAS_BIAS = {kind: list(factor.bias) for kind, factor in FACTORS.items() if factor.bias}
 
 
 class GraphContents:
@@ -146,8 +146,7 @@ class GraphContents:
     @property
     def is_bias(self) -> BoolArray:
         """Whether hidden nodes are biases, shape (N,)."""
-        return np.asarray(
-            self.memory['node_i'][:self.n_nodes, tb.NODE_KIND] == int(NodeKind.BIAS))
+        return self.node_kind == NodeKind.BIAS
 
     @property
     def is_pose(self) -> BoolArray:
@@ -157,12 +156,12 @@ class GraphContents:
     @property
     def node_kind(self) -> npt.NDArray[Any]:
         """`NodeKind` of hidden nodes, shape (N,)."""
-        return self.memory['node_i'][:self.n_nodes, tb.NODE_KIND].copy()
+        return self.memory['node_i'][:self.n_nodes, tb.NODE_TYPE] & 3
 
     @property
     def dimension(self) -> npt.NDArray[Any]:
         """Numbers of coordinates of hidden nodes, shape (N,), 1 to 3."""
-        return self.memory['node_i'][:self.n_nodes, tb.DIMENSION].copy()
+        return 3 - (self.memory['node_i'][:self.n_nodes, tb.NODE_TYPE] >> 2)
 
     @property
     def edges(self) -> Edges:
@@ -183,8 +182,8 @@ class GraphContents:
         numbers, integers = self.memory['edge_f'][rows], self.memory['edge_i'][rows]
         kind, bias = integers[:, tb.EDGE_KIND], np.zeros((len(integers), 4))
         for each, columns in _HAS_BIAS.items():
-            of_kind = np.flatnonzero(kind == each)
-            bias[of_kind, columns] = numbers[of_kind[:, None], _BIAS_COLUMNS[columns]]
+            of_kind = np.flatnonzero(kind == each)[:, None]
+            bias[of_kind, columns] = numbers[of_kind, _BIAS_COLUMNS[columns]]
         return Edges(
             integers[:, tb.END_I], integers[:, tb.END_J], numbers[:, tb.MEAN:tb.MEAN + 3].copy(),
             full(numbers[:, tb.INFO:tb.INFO + 6]), kind, numbers[:, tb.WEIGHT].copy(), bias,
@@ -252,10 +251,10 @@ class GraphContents:
     def leaving(self) -> GraphUpdate:
         """Return what leaves the graph with the present update; it keeps its rows until then."""
         nodes, edges, observed = (
-            ids[self.memory[table][:len(ids), column] != 0].tolist() for ids, table, column in (
-                (self.node_ids, 'node_i', tb.NODE_LEAVES),
-                (self.edge_ids, 'edge_i', tb.EDGE_LEAVES),
-                (self.observed_ids, 'observed_i', tb.OBS_LEAVES)))
+            ids[self.memory[table][:len(ids), column] == tb.LEAVES].tolist()
+            for ids, table, column in ((self.node_ids, 'node_i', tb.EDGE_LIST),
+                                       (self.edge_ids, 'edge_i', tb.NEXT_I),
+                                       (self.observed_ids, 'observed_i', tb.OBS_NEXT)))
         return GraphUpdate(remove_nodes=nodes, drop_edges=edges, drop_observed=observed)
 
     def energies(self, poses: FloatArray | None = None) -> Energies:

@@ -10,7 +10,7 @@ import numpy.typing as npt
 
 from pose_graph_ros.core.exceptions import GraphUpdateError
 from pose_graph_ros.core.geometry.se2 import FloatArray, IntArray
-from pose_graph_ros.core.graph.constraints import NodeKind
+from pose_graph_ros.core.graph.factor_types import NodeKind, type_of
 from pose_graph_ros.core.graph.identities import Ids
 
 
@@ -33,15 +33,15 @@ def checked_poses(name: str, poses: FloatArray) -> FloatArray:
     return array
 
 
-# Kinds and dimensions of some new biases, to save making them.
-_BIASES, _DIMENSIONS = np.full(64, NodeKind.BIAS, np.uint8), np.full(64, 3, np.uint8)
+# Types of some new biases, to save making them.
+_BIASES = np.full(64, NodeKind.BIAS, np.uint8)
 
 
 def other_nodes(
     biases: FloatArray, dimensions: Sequence[int], landmarks: FloatArray,
 ) -> tuple[npt.NDArray[Any], ...]:
     """
-    Return values, shape (S + L, 3), kinds and dimensions of new nodes that are no poses.
+    Return values, shape (S + L, 3), and types of new nodes that are no poses.
 
     Parameters
     ----------
@@ -50,7 +50,7 @@ def other_nodes(
     """
     n = len(biases)
     if len(landmarks) == len(dimensions) == 0 and n <= len(_BIASES):
-        return biases, _BIASES[:n], _DIMENSIONS[:n]
+        return biases, _BIASES[:n]
     biases, points = checked_poses('biases', biases), np.asarray(landmarks, dtype=np.float64)
     if points.ndim != 2 or points.shape[1] != 2:
         raise GraphUpdateError(f'landmarks: expected shape (L, 2), got {points.shape}')
@@ -61,7 +61,8 @@ def other_nodes(
     dimension = np.concatenate((given, np.full(len(points), 2))).astype(np.uint8)
     values = np.concatenate((biases, np.pad(points, ((0, 0), (0, 1)))))
     kind = np.repeat(np.array((NodeKind.BIAS, NodeKind.LANDMARK), np.uint8), (n, len(points)))
-    return np.where(np.arange(3) < dimension[:, None], values, 0.0), kind, dimension
+    return (np.where(np.arange(3) < dimension[:, None], values, 0.0),
+            type_of(kind, dimension))
 
 
 def integers(numbers: Collection[int]) -> IntArray:

@@ -33,6 +33,8 @@ from pose_graph_ros.core.graph.scales import scale_by_edge, scale_by_observed
 
 # Results of `add_rows`.
 ADDED, NO_ROOM, UNSOUND = range(3)
+# In place of a weight: the constraint leaves the graph for good, when `compaction` takes it out.
+DROPPED = -1.0
 
 
 @kernel
@@ -46,22 +48,20 @@ def touch(head, v):  # type: ignore[no-untyped-def]
 
 
 @kernel
-def _start_nodes(head, first, first_other, kinds, dimensions):  # type: ignore[no-untyped-def]
+def _start_nodes(head, first, first_other, types):  # type: ignore[no-untyped-def]
     """Initialise rows of new hidden nodes: poses, then from `first_other` on the others."""
     node_f, node_i = tb.node_f(head), tb.node_i(head)
-    for v in range(first, first_other + len(kinds)):
+    for v in range(first, first_other + len(types)):
         f, i = node_f[v], node_i[v]
         factors.refer_to_pose(f)
         f[tb.SCALE_T] = f[tb.SCALE_R] = 0.0
         i[:] = 0
         i[tb.CLIQUE] = i[tb.EDGE_LIST] = i[tb.OBSERVED_LIST] = -1
         i[tb.NODE_LOGGED] = head[tb.UPDATE]
-        i[tb.DIMENSION] = 3
         tb.node_id(head)[v] = head[tb.NEXT_NODE]
         head[tb.NEXT_NODE] += 1
         if v >= first_other:
-            i[tb.NODE_KIND] = kinds[v - first_other]
-            i[tb.DIMENSION] = dimensions[v - first_other]
+            i[tb.NODE_TYPE] = types[v - first_other]
         touch(head, v)
         head[tb.STRUCTURE] = 1
     if first_other > first:
@@ -232,7 +232,8 @@ def _start_edges(head, first, last):  # type: ignore[no-untyped-def]
         f, row = edge_f[e], edge_i[e]
         factor_types.prepare(f, row[tb.EDGE_KIND])
         f[tb.ERROR2] = f[tb.ENERGY] = 0.0
-        row[tb.EDGE_CHECKED] = row[tb.EDGE_WAITS] = row[tb.EDGE_LEAVES] = 0
+        row[tb.EDGE_CHECKED] = row[tb.EDGE_WAITS] = 0
+        row[tb.NEXT_I] = -1
         row[tb.EDGE_LOGGED] = head[tb.UPDATE]
         weight, f[tb.WEIGHT] = f[tb.WEIGHT], 0.0
         weigh_edge(head, e, weight)
@@ -248,7 +249,7 @@ def _start_observed(head, first, last):  # type: ignore[no-untyped-def]
         head[tb.NEXT_OBSERVED] += 1
         f, row = observed_f[k], observed_i[k]
         f[tb.ERROR2] = f[tb.ENERGY] = 0.0
-        row[tb.OBS_WAITS] = row[tb.OBS_LEAVES] = 0
+        row[tb.OBS_WAITS], row[tb.OBS_NEXT] = 0, -1
         row[tb.OBS_LOGGED] = head[tb.UPDATE]
         weight, f[tb.WEIGHT] = f[tb.WEIGHT], 0.0
         weigh_one_observed(head, k, weight)
@@ -261,11 +262,18 @@ def weigh_edges(head, edges, weights):  # type: ignore[no-untyped-def]
 
     Parameters
     ----------
-    edges, weights : ndarray, shape (M,), ids and weights; 0 takes an edge out of all lists
+    edges, weights : ndarray, shape (M,)
+        Ids and weights; 0 takes an edge out of all lists, DROPPED out of the graph.
 
     """
+    edge_i = tb.edge_i(head)
     for m in range(len(edges)):
-        weigh_edge(head, identities.edge_row(head, edges[m]), weights[m])
+        e = identities.edge_row(head, edges[m])
+        weigh_edge(head, e, max(weights[m], 0.0))
+        if weights[m] == DROPPED and edge_i[e, tb.NEXT_I] != tb.LEAVES:
+            transaction_log.log_edge(head, e)
+            edge_i[e, tb.NEXT_I] = tb.LEAVES
+            head[tb.N_LEAVING] += 1
 
 
 @kernel(signature=(tb.HEAD, INTEGERS, NUMBERS))
@@ -278,8 +286,14 @@ def weigh_observed(head, observed, weights):  # type: ignore[no-untyped-def]
     observed, weights : ndarray, shape (K,), as for `weigh_edges`
 
     """
+    observed_i = tb.observed_i(head)
     for m in range(len(observed)):
-        weigh_one_observed(head, identities.observed_row(head, observed[m]), weights[m])
+        k = identities.observed_row(head, observed[m])
+        weigh_one_observed(head, k, max(weights[m], 0.0))
+        if weights[m] == DROPPED and observed_i[k, tb.OBS_NEXT] != tb.LEAVES:
+            transaction_log.log_observed(head, k)
+            observed_i[k, tb.OBS_NEXT] = tb.LEAVES
+            head[tb.N_LEAVING] += 1
 
 
 @kernel(signature=(tb.HEAD, INTEGERS, FLAG))
@@ -309,10 +323,10 @@ def _lengths_agree(n, mean, information, kind, weight):  # type: ignore[no-untyp
 
 
 @kernel(signature=(
-    tb.HEAD, ROWS, ROWS, BYTES, BYTES, INTEGERS, INTEGERS, ROWS, MATRICES, BYTES, NUMBERS, ROWS,
+    tb.HEAD, ROWS, ROWS, BYTES, INTEGERS, INTEGERS, ROWS, MATRICES, BYTES, NUMBERS, ROWS,
     INTEGERS, INTEGERS, ROWS, ROWS, MATRICES, BYTES, NUMBERS, FLAG))
 def add_rows(  # type: ignore[no-untyped-def]
-    head, hidden, others, kinds, dimensions, i, j, mean, information, kind, weight, bias, k,
+    head, hidden, others, types, i, j, mean, information, kind, weight, bias, k,
     node, offset, observed_mean, observed_information, observed_kind, observed_weight, checked,
 ):
     """
@@ -324,8 +338,8 @@ def add_rows(  # type: ignore[no-untyped-def]
     Parameters
     ----------
     hidden : ndarray, shape (N, 3), poses of new nodes
-    others, kinds, dimensions : ndarray, shapes (S, 3), (S,) and (S,)
-        Values of new nodes that are no poses, their `NodeKind` and dimensions.
+    others, types : ndarray, shapes (S, 3) and (S,)
+        Values of new nodes that are no poses, and their NODE_TYPE.
     i, j, mean, information, kind, weight, bias, k : ndarray, columns of `Edges`
     node, offset, observed_mean, observed_information, observed_kind, observed_weight : ndarray
         Columns of `ObservedNodes`.
@@ -337,8 +351,8 @@ def add_rows(  # type: ignore[no-untyped-def]
     n_nodes = first_other + len(others)
     n_edges = head[tb.N_EDGES] + len(i)
     n_observed = head[tb.N_OBSERVED] + len(node)
-    if (hidden.shape[1] != 3 or others.shape[1] != 3 or len(kinds) != len(others)
-            or len(dimensions) != len(others) or len(j) != len(i) or len(k) != len(i)
+    if (hidden.shape[1] != 3 or others.shape[1] != 3 or len(types) != len(others)
+            or len(j) != len(i) or len(k) != len(i)
             or not _lengths_agree(len(i), mean, information, kind, weight)
             or bias.shape != (len(i), 4)
             or offset.shape != (len(node), 3)
@@ -351,15 +365,15 @@ def add_rows(  # type: ignore[no-untyped-def]
     # rows behind the ends are not part of the graph yet
     valid = rows.write_nodes(head, first, hidden)
     valid = rows.write_nodes(head, first_other, others) and valid
-    valid = rows.write_edges(head, n_nodes, first_other, kinds, dimensions, i, j, mean,
-                             information, kind, weight, bias, k) and valid
+    valid = rows.write_edges(head, n_nodes, first_other, types, i, j, mean, information, kind,
+                             weight, bias, k) and valid
     valid = rows.write_all_observed(
-        head, n_nodes, first_other, kinds, dimensions, node, offset, observed_mean,
-        observed_information, observed_kind, observed_weight) and valid
+        head, n_nodes, first_other, types, node, offset, observed_mean, observed_information,
+        observed_kind, observed_weight) and valid
     if not valid and not checked:
         return UNSOUND
     head[tb.N_NODES] = n_nodes
-    _start_nodes(head, first, first_other, kinds, dimensions)
+    _start_nodes(head, first, first_other, types)
     first, head[tb.N_EDGES] = head[tb.N_EDGES], n_edges
     _start_edges(head, first, n_edges)
     first, head[tb.N_OBSERVED] = head[tb.N_OBSERVED], n_observed

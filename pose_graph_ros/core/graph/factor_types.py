@@ -23,12 +23,15 @@ without a position. All of them are, turned into map axes by the rotation R of t
     R e_t' = d - S a dth_i + constant,    e_th' = f_th dth_j - dth_i + f_th b + constant
 
 for small changes, S = ((0, -1), (1, 0)). Frame and *arm* a are all that a type says of its
-Jacobians. Of the heading of i only the rotation by th_i enters, which is given as (c, s).
+Jacobians; with them `R e_t = d + constant`. Of the heading of i only the rotation by th_i enters,
+which is given as (c, s).
 """
 
 from enum import IntEnum
 import math
-from typing import NamedTuple
+from typing import Any, NamedTuple
+
+import numpy.typing as npt
 
 from pose_graph_ros.core.compiled.jit import kernel
 from pose_graph_ros.core.graph import tables as tb
@@ -85,34 +88,54 @@ class FactorType(NamedTuple):
     """Kinds of the third node, which may be missing."""
     rows: tuple[int, ...] = (0, 1, 2)
     """Rows that the error has; mean and information are zero in the others."""
+    bias: tuple[int, ...] = ()
+    """Columns of `Edges.bias` that it uses."""
     tag: str = ''
     """
     Tag in g2o files, followed by i, j and, of the rows that it has, mean and upper triangle of the
     information.
     """
 
+    @property
+    def places(self) -> bool:
+        """Whether its mean is a position of j in the frame of i."""
+        return self.rows[:2] == (0, 1) and self.j != (NodeKind.BIAS,)
+
 
 _POSE, _BIAS, _LANDMARK = (NodeKind.POSE,), (NodeKind.BIAS,), (NodeKind.LANDMARK,)
 FACTORS = {
     EdgeKind.ODOMETRY: FactorType('odometry', _POSE, _POSE, tag='EDGE_SE2'),
     EdgeKind.LOOP_CLOSURE: FactorType('loop closure', _POSE, _POSE, tag='EDGE_SE2'),
-    EdgeKind.BIAS: FactorType('bias', (*_POSE, *_BIAS), _BIAS),
-    EdgeKind.TURN: FactorType('turn', _POSE, _POSE, _BIAS, rows=(2,)),
+    EdgeKind.BIAS: FactorType('bias', (*_POSE, *_BIAS), _BIAS, bias=(0, 1, 2, 3)),
+    EdgeKind.TURN: FactorType('turn', _POSE, _POSE, _BIAS, rows=(2,), bias=(3,)),
     EdgeKind.POINT: FactorType('point', _POSE, _LANDMARK, rows=(0, 1), tag='EDGE_SE2_XY'),
     EdgeKind.PRIOR: FactorType('prior', _POSE, _POSE, tag='EDGE_SE2'),
-    EdgeKind.RANGE: FactorType('range', _POSE, _LANDMARK, rows=(0,), tag='EDGE_RANGE_SE2_XY'),
+    EdgeKind.RANGE: FactorType(
+        'range', _POSE, _LANDMARK, rows=(0,), bias=(0, 1), tag='EDGE_RANGE_SE2_XY'),
 }
 
 # Numbers of the definitions: kinds of edges, then observed nodes.
-ODOMETRY, BIAS, TURN, RANGE = (
-    int(EdgeKind.ODOMETRY), int(EdgeKind.BIAS), int(EdgeKind.TURN), int(EdgeKind.RANGE))
+ODOMETRY, BIAS, TURN, PRIOR, RANGE = (int(kind) for kind in (
+    EdgeKind.ODOMETRY, EdgeKind.BIAS, EdgeKind.TURN, EdgeKind.PRIOR, EdgeKind.RANGE))
 OBSERVED = len(EdgeKind)
 
 
 @kernel(forceinline=True)
 def is_relative(kind):  # type: ignore[no-untyped-def]
     """Tell whether an error lies in the frame of the pose that was measured from node i."""
-    return kind < BIAS or BIAS < kind < RANGE
+    return kind < BIAS or TURN < kind < RANGE
+
+
+@kernel(forceinline=True)
+def frame_moves(kind):  # type: ignore[no-untyped-def]
+    """Tell whether the frame of an error moves with the nodes, so that it is linearized."""
+    return is_relative(kind) or kind == RANGE
+
+
+@kernel(forceinline=True)
+def anchors(kind):  # type: ignore[no-untyped-def]
+    """Tell whether axes of an edge's errors or unknowns do not turn with its clique."""
+    return kind >= BIAS and kind != PRIOR
 
 
 @kernel(forceinline=True)
@@ -124,6 +147,24 @@ def is_plain(row):  # type: ignore[no-untyped-def]
     the constant ODOMETRY and once for all kinds: this takes a fifth less time.
     """
     return row[tb.EDGE_KIND] < BIAS
+
+
+def type_of(kind: npt.NDArray[Any], dimension: npt.NDArray[Any]) -> npt.NDArray[Any]:
+    """
+    Return the NODE_TYPE of nodes.
+
+    Parameters
+    ----------
+    kind, dimension : ndarray of int, shape (N,), `NodeKind`, and numbers of coordinates
+
+    """
+    return kind + 4 * (3 - dimension)
+
+
+@kernel
+def dimension_of(row):  # type: ignore[no-untyped-def]
+    """Return the number of coordinates of a node, given as its row of node_i."""
+    return 3 - (row[tb.NODE_TYPE] >> 2)
 
 
 @kernel
@@ -144,17 +185,22 @@ def prepare(f, kind):  # type: ignore[no-untyped-def]
 
 
 @kernel(forceinline=True)
-def angle(f, kind):  # type: ignore[no-untyped-def]
+def rotation(f, kind, heading):  # type: ignore[no-untyped-def]
     """
-    Return the angle that (c, s) are turned by against the heading of i [rad].
+    Return cosine and sine of what an error needs of the heading of i: th_i + th_z or th_i.
 
     Parameters
     ----------
     f : ndarray, row of the constraint
     kind : int, `EdgeKind` or OBSERVED
+    heading : float, th_i [rad]
 
     """
-    return f[tb.MEAN + 2] if is_relative(kind) else 0.0
+    if is_relative(kind):
+        heading += f[tb.MEAN + 2]
+    elif f[tb.OFFSET] == 0.0 and f[tb.OFFSET + 1] == 0.0:
+        return 1.0, 0.0     # no arm
+    return math.cos(heading), math.sin(heading)
 
 
 @kernel(forceinline=True)
@@ -190,6 +236,43 @@ def heading_offset(f, kind):  # type: ignore[no-untyped-def]
 
 
 @kernel(forceinline=True)
+def frame(f, kind):  # type: ignore[no-untyped-def]
+    """
+    Return cosine and sine of the frame at the linearization.
+
+    Parameters
+    ----------
+    f : ndarray, row of the constraint
+    kind : int, `EdgeKind` or OBSERVED
+
+    """
+    if frame_moves(kind):
+        return f[tb.LIN_COS], f[tb.LIN_SIN]
+    if kind < OBSERVED or f[tb.MEAN + 2] == 0.0:
+        return 1.0, 0.0
+    return math.cos(f[tb.MEAN + 2]), math.sin(f[tb.MEAN + 2])
+
+
+@kernel(forceinline=True)
+def constant(f, kind, c, s, ax, ay):  # type: ignore[no-untyped-def]
+    """
+    Return `R e_t - d`, in map axes.
+
+    Parameters
+    ----------
+    f : ndarray, row of the constraint
+    kind : int, `EdgeKind` or OBSERVED
+    c, s, ax, ay : float, cosine and sine of the frame R, and arm a [m]
+
+    """
+    if is_relative(kind):
+        return s * f[tb.OWN + 1] - c * f[tb.OWN], -s * f[tb.OWN] - c * f[tb.OWN + 1]
+    if kind == RANGE:
+        return -ax - c * f[tb.MEAN], -ay - s * f[tb.MEAN]
+    return f[tb.MEAN] - ax, f[tb.MEAN + 1] - ay
+
+
+@kernel(forceinline=True)
 def error(f, kind, dx, dy, c, s):  # type: ignore[no-untyped-def]
     """
     Return the error e_t, cosine and sine of its frame, and its arm a.
@@ -199,21 +282,21 @@ def error(f, kind, dx, dy, c, s):  # type: ignore[no-untyped-def]
     f : ndarray, row of the constraint
     kind : int, `EdgeKind` or OBSERVED
     dx, dy : float, `f_t t_j - t_i` [m]
-    c, s : float, cosine and sine of the heading of i plus `angle`
+    c, s : float, from `rotation`
 
     """
     if is_relative(kind):
         return (c * dx + s * dy - f[tb.OWN], c * dy - s * dx - f[tb.OWN + 1], c, s, dx, dy)
     ox, oy = f[tb.OFFSET], f[tb.OFFSET + 1]
     ax, ay = c * ox - s * oy, s * ox + c * oy
+    c, s = 1.0, 0.0
     if kind == RANGE:
         vx, vy = dx - ax, dy - ay
         length = math.sqrt(vx * vx + vy * vy)
-        if length == 0.0:
-            return -f[tb.MEAN], 0.0, 1.0, 0.0, ax, ay
-        return length - f[tb.MEAN], 0.0, vx / length, vy / length, ax, ay
-    ex, ey = dx + f[tb.MEAN] - ax, dy + f[tb.MEAN + 1] - ay
-    if kind == BIAS or f[tb.MEAN + 2] == 0.0:
-        return ex, ey, 1.0, 0.0, ax, ay
-    c, s = math.cos(f[tb.MEAN + 2]), math.sin(f[tb.MEAN + 2])
+        if length > 0.0:
+            c, s = vx / length, vy / length
+    elif kind == OBSERVED and f[tb.MEAN + 2] != 0.0:
+        c, s = math.cos(f[tb.MEAN + 2]), math.sin(f[tb.MEAN + 2])
+    kx, ky = constant(f, kind, c, s, ax, ay)
+    ex, ey = dx + kx, dy + ky
     return c * ex + s * ey, c * ey - s * ex, c, s, ax, ay

@@ -10,7 +10,7 @@ be linearized at a point of its own. Symbols are those of `factor_types`; a bar 
 linearization point. In map axes an error is
 
     e' = h + F delta_j - T delta_i,    T = ((1, 0, -a_y), (0, 1, a_x), (0, 0, 1)) at a_bar
-    h_t = f_t x_ref_j - x_ref_i + R_bar e_bar - d_bar + S a_bar delta_bar_th,   h_th constant
+    h_t = f_t x_ref_j - x_ref_i + constant + S a_bar delta_bar_th,   h_th constant
 
 (and delta_k enters e_th' by f_th if there is a third node), and its information is turned by
 R_bar likewise. The residual of the linear model,
@@ -31,16 +31,18 @@ import math
 from pose_graph_ros.core.compiled.jit import kernel, NUMBERS
 from pose_graph_ros.core.graph import tables as tb
 from pose_graph_ros.core.graph.factor_types import (
-    angle,
     BIAS,
+    constant,
     error,
     factors_of_end,
+    frame,
+    frame_moves,
     heading_offset,
     is_plain,
     is_relative,
     OBSERVED,
     ODOMETRY,
-    RANGE,
+    rotation,
 )
 
 # Smallest squared linearization error for which a constraint is linearized again, as a fraction of
@@ -82,11 +84,11 @@ def model(f, kind, start, end, third):  # type: ignore[no-untyped-def]
     third : float, first coordinate of the third node times its factor, 0 without one
 
     """
-    heading = start[tb.POSE + 2] + angle(f, kind)
     ft, fth = factors_of_end(f, kind)
+    c, s = rotation(f, kind, start[tb.POSE + 2])
     ex, ey, c, s, ax, ay = error(
         f, kind, ft * end[tb.POSE] - start[tb.POSE], ft * end[tb.POSE + 1] - start[tb.POSE + 1],
-        math.cos(heading), math.sin(heading))
+        c, s)
     eth = fth * end[tb.POSE + 2] - start[tb.POSE + 2] + heading_offset(f, kind) + third
     return ex, ey, wrap(eth), c, s, ax, ay
 
@@ -94,40 +96,27 @@ def model(f, kind, start, end, third):  # type: ignore[no-untyped-def]
 @kernel(forceinline=True)
 def _linearize(f, kind, start, end, pose_k, delta_k):  # type: ignore[no-untyped-def]
     """Linearize a constraint; the last two are f_th times POSE and DELTA of the third node."""
-    ex, ey, eth, c, s, ax, ay = model(f, kind, start, end, pose_k)
-    ft, fth = factors_of_end(f, kind)
-    heading = start[tb.POSE + 2] + angle(f, kind)
-    th = start[tb.DELTA + 2]
-    if is_relative(kind):
+    _, _, eth, c, s, ax, ay = model(f, kind, start, end, pose_k)
+    _, fth = factors_of_end(f, kind)
+    if frame_moves(kind):
         f[tb.LIN_COS], f[tb.LIN_SIN] = c, s
-    else:
-        f[tb.LIN_COS], f[tb.LIN_SIN] = math.cos(heading), math.sin(heading)
-    if kind == RANGE:
-        f[tb.DIRECTION], f[tb.DIRECTION + 1] = c, s
-    f[tb.LIN_ARM], f[tb.LIN_ARM + 1], f[tb.LIN_TH] = ax, ay, th
-    f[tb.LIN_H] = c * ex - s * ey - (ft * end[tb.POSE] - start[tb.POSE]) - ay * th
-    f[tb.LIN_H + 1] = s * ex + c * ey - (ft * end[tb.POSE + 1] - start[tb.POSE + 1]) + ax * th
-    f[tb.LIN_K] = eth - (fth * end[tb.DELTA + 2] - th + delta_k)
+    f[tb.LIN_ARM], f[tb.LIN_ARM + 1], f[tb.LIN_TH] = ax, ay, start[tb.DELTA + 2]
+    f[tb.LIN_K] = eth - (fth * end[tb.DELTA + 2] - start[tb.DELTA + 2] + delta_k)
 
 
 @kernel(forceinline=True)
-def frame(f, kind):  # type: ignore[no-untyped-def]
-    """
-    Return cosine and sine of the frame at the linearization.
-
-    Parameters
-    ----------
-    f : ndarray, row of the constraint
-    kind : int, `EdgeKind` or OBSERVED
-
-    """
-    if is_relative(kind):
-        return f[tb.LIN_COS], f[tb.LIN_SIN]
-    if kind == RANGE:
-        return f[tb.DIRECTION], f[tb.DIRECTION + 1]
-    if kind < OBSERVED or f[tb.MEAN + 2] == 0.0:
-        return 1.0, 0.0
-    return math.cos(f[tb.MEAN + 2]), math.sin(f[tb.MEAN + 2])
+def _turned_by(c, s, turn):  # type: ignore[no-untyped-def]
+    """Return cosine and sine of an angle plus a turn, which is small as a rule."""
+    if abs(turn) < 0.1:
+        # cos - 1 and sin by their series, exact to rounding
+        square = turn * turn
+        versine = -square * (0.5 - square * (1 / 24 - square * (1 / 720 - square * (
+            1 / 40320 - square / 3628800))))
+        sine = turn * (1.0 - square * (1 / 6 - square * (1 / 120 - square * (
+            1 / 5040 - square * (1 / 362880 - square / 39916800)))))
+    else:
+        versine, sine = math.cos(turn) - 1.0, math.sin(turn)
+    return c + (versine * c - sine * s), s + (versine * s + sine * c)
 
 
 @kernel(forceinline=True)
@@ -140,32 +129,25 @@ def _check(f, kind, start, end, delta_k, phi):  # type: ignore[no-untyped-def]
         dx, dy = c * dx + s * dy, c * dy - s * dx
     th = start[tb.DELTA + 2]
     turn = th - phi - f[tb.LIN_TH]
-    if abs(turn) < 0.1:
-        # cos - 1 and sin by their series, exact to rounding
-        square = turn * turn
-        versine = -square * (0.5 - square * (1 / 24 - square * (1 / 720 - square * (
-            1 / 40320 - square / 3628800))))
-        sine = turn * (1.0 - square * (1 / 6 - square * (1 / 120 - square * (
-            1 / 5040 - square * (1 / 362880 - square / 39916800)))))
-    else:
-        versine, sine = math.cos(turn) - 1.0, math.sin(turn)
-    c_bar, s_bar = f[tb.LIN_COS], f[tb.LIN_SIN]
-    c, s = c_bar + (versine * c_bar - sine * s_bar), s_bar + (versine * s_bar + sine * c_bar)
-    ex, ey, to_x, to_y, ax, ay = error(f, kind, dx, dy, c, s)
-    lx, ly, _, _, _, _ = error(f, kind, dx, dy, c_bar, s_bar)
-    # S a_bar turn, in the axes of the error
-    frame_c, frame_s = frame(f, kind)
+    # S a_bar turn, and the linear model, in the axes of the error
+    c_bar, s_bar = frame(f, kind)
     bx, by = f[tb.LIN_ARM], f[tb.LIN_ARM + 1]
-    gx, gy = frame_c * bx + frame_s * by, frame_c * by - frame_s * bx
+    gx, gy = c_bar * bx + s_bar * by, c_bar * by - s_bar * bx
+    turned = turn * turn
+    if is_relative(kind):
+        c, s = _turned_by(c_bar, s_bar, turn)
+        lx, ly, _, _, _, _ = error(f, kind, dx, dy, c_bar, s_bar)
+    else:   # its clique is anchored, so phi is zero
+        c, s = rotation(f, kind, start[tb.POSE + 2])
+        kx, ky = constant(f, kind, c_bar, s_bar, bx, by)
+        lx = c_bar * (dx + kx) + s_bar * (dy + ky)
+        ly = c_bar * (dy + ky) - s_bar * (dx + kx)
+        if bx == 0.0 and by == 0.0:
+            turned = 0.0
+    ex, ey, c, s, _, _ = error(f, kind, dx, dy, c, s)
     rx, ry = ex - lx - gy * turn, ey - ly + gx * turn
-    turned = 0.0
-    if is_relative(kind) or ax != 0.0 or ay != 0.0:
-        turned = turn * turn
-    if kind == RANGE:
-        hx = f[tb.LIN_H] + dx + by * f[tb.LIN_TH]
-        hy = f[tb.LIN_H + 1] + dy - bx * f[tb.LIN_TH]
-        rx += lx - (frame_c * hx + frame_s * hy)
-        turned += (to_x - frame_c) ** 2 + (to_y - frame_s) ** 2
+    if not is_relative(kind):
+        turned += (c - c_bar) ** 2 + (s - s_bar) ** 2
     linear = f[tb.LIN_K] + fth * end[tb.DELTA + 2] - th + delta_k
     eth = wrap(linear)
     if kind == BIAS:    # a factor times a heading that is wrapped

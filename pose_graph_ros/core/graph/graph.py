@@ -22,6 +22,7 @@ from pose_graph_ros.core.graph.edit_checks import (
     other_nodes,
     values,
 )
+from pose_graph_ros.core.graph.factor_types import type_of
 from pose_graph_ros.core.graph.graph_update import (
     Energies,
     FIRST_EDIT,
@@ -30,6 +31,7 @@ from pose_graph_ros.core.graph.graph_update import (
     Left,
     NextIds,
     NO_EDGES,
+    NO_POINTS,
     NO_POSES,
     NO_WEIGHTS,
     NOTHING_LEFT,
@@ -53,6 +55,18 @@ __all__ = [
 # Number of rows and next id of each table.
 _COUNTERS = {'node': (tb.N_NODES, tb.NEXT_NODE), 'edge': (tb.N_EDGES, tb.NEXT_EDGE),
              'observed': (tb.N_OBSERVED, tb.NEXT_OBSERVED)}
+# What updates have in place of parts that they do not have, to save a microsecond.
+_NO_EDITS = GraphUpdate()[FIRST_EDIT:]
+_NO_OTHERS = other_nodes(NO_POSES, (), NO_POINTS)
+_NO_EDGES, _NOTHING_OBSERVED = NO_EDGES.columns, NOTHING_OBSERVED.columns
+
+
+def _has_edits(update: GraphUpdate) -> bool:
+    """Tell whether an update may edit rows that there are."""
+    try:
+        return update[FIRST_EDIT:] != _NO_EDITS     # identical parts are equal at once
+    except ValueError:  # an array
+        return True
 
 
 class Graph(GraphContents):
@@ -84,12 +98,17 @@ class Graph(GraphContents):
         Between `begin` and `commit` or `rollback`, what leaves keeps its rows; `commit` takes them
         out. Otherwise they are taken out at once.
         """
-        edits = any(map(len, update[FIRST_EDIT:]))
+        edits = _has_edits(update)
         if edits:
             self._check_edits(update)
-        others = other_nodes(update.biases, update.dimensions, update.landmarks)
-        columns, checked = (update.hidden, *others, *update.edges.columns,
-                            *update.observed.columns), False
+        others = _NO_OTHERS
+        if (update.biases is not NO_POSES or update.landmarks is not NO_POINTS
+                or len(update.dimensions) > 0):
+            others = other_nodes(update.biases, update.dimensions, update.landmarks)
+        edges = _NO_EDGES if update.edges is NO_EDGES else update.edges.columns
+        observed = (_NOTHING_OBSERVED if update.observed is NOTHING_OBSERVED
+                    else update.observed.columns)
+        columns, checked = (update.hidden, *others, *edges, *observed), False
         try:
             code = editing.add_rows(self.memory.head, *columns, checked)
         except (TypeError, ValueError):
@@ -127,21 +146,21 @@ class Graph(GraphContents):
     def _edit(self, update: GraphUpdate) -> None:
         """Apply the edits of existing rows, which have been checked."""
         head = self.memory.head
-        for weigh, removed, weights in (
-                (editing.weigh_edges, update.remove_edges, update.weigh_edges),
-                (editing.weigh_observed, update.remove_observed, update.weigh_observed)):
+        for weigh, removed, weights, dropped in (
+                (editing.weigh_edges, update.remove_edges, update.weigh_edges, update.drop_edges),
+                (editing.weigh_observed, update.remove_observed, update.weigh_observed,
+                 update.drop_observed)):
             if len(removed) > 0:
                 weigh(head, integers(removed), np.zeros(len(removed)))
             if len(weights) > 0:
                 weigh(head, integers(weights), values(weights))
+            if len(dropped) > 0:
+                weigh(head, integers(dropped), np.full(len(dropped), editing.DROPPED))
         for nodes, fixed in ((update.fix, True), (update.free, False)):
             if len(nodes) > 0:
                 editing.set_fixed(head, integers(nodes), fixed)
-        for remove, ids in ((removal.drop_edges, update.drop_edges),
-                            (removal.drop_observed, update.drop_observed),
-                            (removal.remove_nodes, update.remove_nodes)):
-            if len(ids) > 0:
-                remove(head, integers(ids))
+        if len(update.remove_nodes) > 0:
+            removal.remove_nodes(head, integers(update.remove_nodes))
         if len(update.priors) > 0:
             self.ensure(self.n_nodes + len(update.priors), self.n_edges, self.n_observed)
             add_priors(self.memory, update.priors, [
@@ -163,8 +182,9 @@ class Graph(GraphContents):
         others = (checked_poses('biases', others[0]), *others[1:])
         edges, observed = update.edges, update.observed
         kind, dimension = (np.concatenate((present, np.full(len(hidden), usual), new))
-                           for present, usual, new in ((self.node_kind, 0, others[1]),
-                                                       (self.dimension, 3, others[2])))
+                           for present, usual, new in (
+                               (self.node_kind, 0, others[1] & 3),
+                               (self.dimension, 3, 3 - (others[1] >> 2))))
         nodes = self._nodes.extended(len(hidden) + len(others[0]))
         for table in (edges, observed):
             if len(table) > 0:
@@ -235,9 +255,9 @@ class Graph(GraphContents):
         self._append('node', GraphUpdate(hidden=rows.poses), rows.node_ids, rows.next_ids.node)
         memory, begin = self.memory, self.n_nodes - len(rows.poses)
         new = memory['node_i'][begin:self.n_nodes]
-        new[:, tb.NODE_KIND] = rows.node_kind
-        new[:, tb.DIMENSION] = rows.dimension if rows.dimension is not None else np.where(
-            rows.node_kind == NodeKind.LANDMARK, 2, 3)
+        new[:, tb.NODE_TYPE] = type_of(
+            rows.node_kind, rows.dimension if rows.dimension is not None else np.where(
+                rows.node_kind == NodeKind.LANDMARK, 2, 3))
         poses = np.flatnonzero(self.is_pose)
         memory.head[tb.NEWEST] = poses[-1] if len(poses) > 0 else -1
         self._append('edge', GraphUpdate(edges=rows.edges), rows.edge_ids, rows.next_ids.edge)
@@ -267,7 +287,8 @@ class Graph(GraphContents):
 
     def commit(self) -> Left:
         """End an update and keep its changes; return what has left, whose rows are taken out."""
-        transaction_log.commit(self.memory.head)
+        if self.memory.head[tb.LOG_I_END] > 0:  # else a step has done so
+            transaction_log.commit(self.memory.head)
         self._updating = False
         return self._compact()
 

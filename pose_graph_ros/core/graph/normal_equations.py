@@ -10,12 +10,14 @@ blocks of `J^T W J` and `-J^T W h`, with J = (-T, F, G) in map axes.
 from pose_graph_ros.core.compiled.jit import kernel
 from pose_graph_ros.core.graph import tables as tb
 from pose_graph_ros.core.graph.factor_types import (
+    constant,
     factors_of_end,
+    frame,
     is_plain,
     OBSERVED,
     ODOMETRY,
 )
-from pose_graph_ros.core.graph.factors import frame, model, third
+from pose_graph_ros.core.graph.factors import model, third
 
 
 @kernel
@@ -66,8 +68,9 @@ def _add(f, kind, start, end, a, b, k, front, ld):  # type: ignore[no-untyped-de
     xx, xy, xt, yy, yt, tt = _turned(f, c, s)
     ft, fth = factors_of_end(f, kind)
     px, py = -f[tb.LIN_ARM + 1], f[tb.LIN_ARM]  # S a
-    hx = f[tb.LIN_H] + (ft * end[tb.REF] - start[tb.REF])
-    hy = f[tb.LIN_H + 1] + (ft * end[tb.REF + 1] - start[tb.REF + 1])
+    kx, ky = constant(f, kind, c, s, py, -px)
+    hx = ft * end[tb.REF] - start[tb.REF] + kx + px * f[tb.LIN_TH]
+    hy = ft * end[tb.REF + 1] - start[tb.REF + 1] + ky + py * f[tb.LIN_TH]
     hth = f[tb.LIN_K]
     # W T: the third column is W (S a, 1)
     wx, wy, wt = xx * px + xy * py + xt, xy * px + yy * py + yt, xt * px + yt * py + tt

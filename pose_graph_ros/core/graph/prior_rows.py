@@ -51,7 +51,7 @@ def turns(head, c):  # type: ignore[no-untyped-def]
     if row[tb.ANCHORED] == 0:
         return True
     for k in range(row[tb.NODES], row[tb.NODES] + row[tb.N_SEPARATOR]):
-        if node_i[pool_i[k], tb.NODE_KIND] != _POSE:
+        if node_i[pool_i[k], tb.NODE_TYPE] != _POSE:
             return False
     return row[tb.N_SEPARATOR] > 1
 
@@ -324,7 +324,7 @@ def start(head, c, anchored):  # type: ignore[no-untyped-def]
     node_f, pool_i = tb.node_f(head), tb.pool_i(head)
     row, f = tb.clique_i(head)[c], tb.clique_f(head)[c]
     row[tb.ANCHORED] = 1 if anchored else 0
-    f[tb.TURN_ZERO] = f[tb.TURN_SEEN] = f[tb.DRIFT] = f[tb.PRIOR_ENERGY] = 0.0
+    f[tb.TURN_SEEN] = f[tb.DRIFT] = f[tb.PRIOR_ENERGY] = 0.0
     scale, first = 0.0, node_f[pool_i[row[tb.NODES]]]
     for k in range(1, row[tb.N_SEPARATOR]):
         node = node_f[pool_i[row[tb.NODES] + k]]
@@ -389,7 +389,7 @@ def remove_cliques(head):  # type: ignore[no-untyped-def]
             pool_f[row[tb.VALUES] + m] = values[n_values + m]
         n_values += size
         row[tb.ANCHORED] = anchored[k]
-        f[tb.TURN_ZERO] = f[tb.TURN_SEEN] = f[tb.DRIFT] = 0.0
+        f[tb.TURN_SEEN] = f[tb.DRIFT] = 0.0
         f[tb.PRIOR_ENERGY], f[tb.SLIP_SCALE] = energy[k], scale[k]
         make_loose(head, c)
     head[tb.LOG_I_END] = end    # nothing of this can be rolled back

@@ -1,11 +1,11 @@
 # Copyright 2026 The pose_graph_ros authors
 # SPDX-License-Identifier: Apache-2.0
 """
-Removal of nodes and constraints for good, in two steps.
+Removal of nodes for good, in two steps.
 
-Within an update they leave all lists, and with it the tree, but keep their rows, which are logged
-as any other edit; so a rollback brings them back. After the update `compaction` takes the rows
-out.
+Within an update they and their constraints leave all lists, and with it the tree, but keep their
+rows, which are logged as any other edit; so a rollback brings them back. After the update
+`compaction` takes the rows out.
 """
 
 from pose_graph_ros.core.compiled.jit import INTEGERS, kernel
@@ -58,7 +58,7 @@ def _forget_newest(head):  # type: ignore[no-untyped-def]
     """Let the newest pose be the last one that does not leave."""
     node_i = tb.node_i(head)
     v = head[tb.NEWEST]
-    while v >= 0 and (node_i[v, tb.NODE_LEAVES] != 0 or node_i[v, tb.NODE_KIND] != 0):
+    while v >= 0 and (node_i[v, tb.EDGE_LIST] == tb.LEAVES or node_i[v, tb.NODE_TYPE] != 0):
         v -= 1
     head[tb.NEWEST] = v
 
@@ -77,7 +77,7 @@ def remove_nodes(head, nodes):  # type: ignore[no-untyped-def]
     for node in nodes:
         v = identities.node_row(head, node)
         prior_edits.remove_of_node(head, v)
-        if node_i[v, tb.NODE_LEAVES] != 0:
+        if node_i[v, tb.EDGE_LIST] == tb.LEAVES:
             continue
         transaction_log.log_node(head, v)
         while node_i[v, tb.EDGE_LIST] >= 0:
@@ -86,47 +86,7 @@ def remove_nodes(head, nodes):  # type: ignore[no-untyped-def]
             weigh_one_observed(head, node_i[v, tb.OBSERVED_LIST], 0.0)
         _touch_cliques_with(head, v)
         touch(head, v)
-        node_i[v, tb.NODE_LEAVES] = 1
+        node_i[v, tb.EDGE_LIST] = tb.LEAVES
         head[tb.N_LEAVING] += 1
         head[tb.STRUCTURE] = 1
     _forget_newest(head)
-
-
-@kernel(signature=(tb.HEAD, INTEGERS))
-def drop_edges(head, edges):  # type: ignore[no-untyped-def]
-    """
-    Take edges out of the graph; their rows leave later.
-
-    Parameters
-    ----------
-    edges : ndarray of int, shape (M,), ids; none that has left
-
-    """
-    edge_i = tb.edge_i(head)
-    for edge in edges:
-        e = identities.edge_row(head, edge)
-        if edge_i[e, tb.EDGE_LEAVES] == 0:
-            weigh_edge(head, e, 0.0)
-            transaction_log.log_edge(head, e)
-            edge_i[e, tb.EDGE_LEAVES] = 1
-            head[tb.N_LEAVING] += 1
-
-
-@kernel(signature=(tb.HEAD, INTEGERS))
-def drop_observed(head, observed):  # type: ignore[no-untyped-def]
-    """
-    Take observed nodes out of the graph; their rows leave later.
-
-    Parameters
-    ----------
-    observed : ndarray of int, shape (K,), ids; none that has left
-
-    """
-    observed_i = tb.observed_i(head)
-    for number in observed:
-        k = identities.observed_row(head, number)
-        if observed_i[k, tb.OBS_LEAVES] == 0:
-            weigh_one_observed(head, k, 0.0)
-            transaction_log.log_observed(head, k)
-            observed_i[k, tb.OBS_LEAVES] = 1
-            head[tb.N_LEAVING] += 1

@@ -134,21 +134,19 @@ def write_nodes(head, first, poses):  # type: ignore[no-untyped-def]
 
 
 @kernel
-def _node(head, v, others):  # type: ignore[no-untyped-def]
+def _node(head, v, first_other, types):  # type: ignore[no-untyped-def]
     """
     Return kind and dimension of a node, _NO_NODE and 0 for -1.
 
-    `others` are the first of the new nodes that are no poses, their kinds and dimensions.
+    Parameters as for `write_edges`.
     """
-    first, kinds, dimensions = others
     if v < 0:
         return _NO_NODE, 0
     if v < head[tb.N_NODES]:
-        row = tb.node_i(head)[v]
-        return row[tb.NODE_KIND], row[tb.DIMENSION]
-    if v < first:
-        return 0, 3
-    return kinds[v - first], dimensions[v - first]
+        node = tb.node_i(head)[v, tb.NODE_TYPE]
+    else:
+        node = types[v - first_other] if v >= first_other else 0
+    return node & 3, 3 - (node >> 2)
 
 
 @kernel
@@ -163,8 +161,7 @@ def _has_rows_only(f, rows, of_mean):  # type: ignore[no-untyped-def]
 
 @kernel
 def write_edges(  # type: ignore[no-untyped-def]
-    head, n_nodes, first_other, kinds, dimensions, i, j, mean, information, kind, weight, bias,
-    third,
+    head, n_nodes, first_other, types, i, j, mean, information, kind, weight, bias, third,
 ):
     """
     Return whether new edges are all valid after writing them behind the last row.
@@ -173,7 +170,7 @@ def write_edges(  # type: ignore[no-untyped-def]
     ----------
     n_nodes : int, number of hidden nodes, with the new ones
     first_other : int, first row of the new nodes that are no poses
-    kinds, dimensions : ndarray, `NodeKind` of these and numbers of coordinates
+    types : ndarray, NODE_TYPE of these
     i, j, mean, information, kind, weight, bias, third : ndarray, columns of `Edges`
 
     """
@@ -196,8 +193,8 @@ def write_edges(  # type: ignore[no-untyped-def]
         valid = (valid and 0 <= a < n_nodes and 0 <= b < n_nodes and c < n_nodes
                  and kind[k] < len(_ROWS))
         if valid:
-            others = first_other, kinds, dimensions
-            ends = _node(head, a, others), _node(head, b, others), _node(head, c, others)
+            ends = (_node(head, a, first_other, types), _node(head, b, first_other, types),
+                    _node(head, c, first_other, types))
             for m in range(3):
                 valid = valid and (_ENDS[kind[k], m] >> ends[m][0]) & 1 == 1
             if kind[k] == BIAS:     # of the rows that both nodes have
@@ -210,14 +207,14 @@ def write_edges(  # type: ignore[no-untyped-def]
 
 @kernel
 def write_all_observed(  # type: ignore[no-untyped-def]
-    head, n_nodes, first_other, kinds, dimensions, node, offset, mean, information, kind, weight,
+    head, n_nodes, first_other, types, node, offset, mean, information, kind, weight,
 ):
     """
     Return whether new observed nodes are all valid after writing them behind the last row.
 
     Parameters
     ----------
-    n_nodes, first_other, kinds, dimensions : int or ndarray, as for `write_edges`
+    n_nodes, first_other, types : int or ndarray, as for `write_edges`
     node, offset, mean, information, kind, weight : ndarray, columns of `ObservedNodes`
 
     """
@@ -229,7 +226,7 @@ def write_all_observed(  # type: ignore[no-untyped-def]
                                weight[k]) and valid
         valid = valid and 0 <= v < n_nodes and kind[k] in _OBSERVED_KINDS
         if valid:
-            dimension = _node(head, v, (first_other, kinds, dimensions))[1]
+            dimension = _node(head, v, first_other, types)[1]
             valid = dimension == 3 or _has_rows_only(
                 tb.observed_f(head)[row], (1 << dimension) - 1, False)
     return valid

@@ -49,7 +49,7 @@ POSE, DELTA, SEEN, CHECKED_TURN, SCALE_T, SCALE_R, REF, NODE_F = 0, 3, 6, 9, 10,
 # node_i
 #   CLIQUE: row of the clique that the node is frontal in
 #   EDGE_LIST: head of the list of its edges with a weight above 0; an entry is 4 * edge + side
-#       (0: END_I, 1: END_J, 2: END_K)
+#       (0: END_I, 1: END_J, 2: END_K); LEAVES if `compaction` takes the node out after the update
 #   OBSERVED_LIST: head of the list of its observed nodes with a weight above 0
 #   FIXED: 1 if the node keeps its pose
 #   TOUCHED: 1 if the node is in the table `touched`
@@ -58,10 +58,10 @@ POSE, DELTA, SEEN, CHECKED_TURN, SCALE_T, SCALE_R, REF, NODE_F = 0, 3, 6, 9, 10,
 #   CHANGED: stamp (ITERATION) of the last move by more than alpha sigmas
 #   NODE_LOGGED, SOLUTION_LOGGED: stamps (UPDATE) of the last log of the row, and of the columns
 #       before SCALE_T alone
-#   NODE_KIND, DIMENSION: `NodeKind`, and number of coordinates (1 to 3); those behind stay 0
-#   NODE_LEAVES: 1 if `compaction` takes the node out after the update; it is in no list by then
+#   NODE_TYPE: `NodeKind` + 4 * number of coordinates less than three, which are and stay 0; so 0
+#       for a pose
 (CLIQUE, EDGE_LIST, OBSERVED_LIST, FIXED, TOUCHED, INDEX, FRONT, CHANGED, NODE_LOGGED,
- SOLUTION_LOGGED, NODE_KIND, DIMENSION, NODE_LEAVES, NODE_I) = range(14)
+ SOLUTION_LOGGED, NODE_TYPE, NODE_I) = range(12)
 
 # edge_f; th is the DELTA of a heading, and "linearized" means at the last linearization.
 #   MEAN (3): measured pose of j in i [m, m, rad]
@@ -69,41 +69,42 @@ POSE, DELTA, SEEN, CHECKED_TURN, SCALE_T, SCALE_R, REF, NODE_F = 0, 3, 6, 9, 10,
 #   WEIGHT: factor on the information, 0 for a removed edge
 #   OWN (2): translation of the mean in its own axes, R_z^T t_z [m], or the column OFFSET
 #   OFFSET: measured position in the frame of i [m], where an error has one
-#   FACTOR_T, FACTOR_TH: factors of a bias that is the end j; FACTOR_TH: of the third node
-#   DIRECTION (2): of a range, linearized; shares the columns of the factors
-#   LIN_COS, LIN_SIN: of the linearized direction of the measured frame, th_i + th_z, or of th_i
+#   LIN_COS, LIN_SIN: of the linearized frame of the error, where it moves with the nodes
+#   FACTOR_T, FACTOR_TH: factors of a bias that is the end j; FACTOR_TH: of the third node; share
+#       the columns of LIN_COS and LIN_SIN
 #   LIN_ARM (2): linearized arm of the Jacobian [m]
-#   LIN_H (2): linear error of the position without the nodes' differences, in map axes [m]
 #   LIN_TH: linearized th of i [rad]
 #   LIN_K: linearized heading error without th of the nodes [rad]
 #   ERROR2: squared linearization error, weighted [sigma^2]
 #   ENERGY: e^T information e, weighted [sigma^2]
-(MEAN, INFO, WEIGHT, OWN, FACTOR_T, FACTOR_TH, LIN_COS, LIN_SIN, LIN_ARM, LIN_H, LIN_TH, LIN_K,
- ERROR2, ENERGY, EDGE_F) = 0, 3, 9, 10, 12, 13, 14, 15, 16, 18, 20, 21, 22, 23, 24
-OFFSET, DIRECTION = OWN, FACTOR_T
+(MEAN, INFO, WEIGHT, OWN, LIN_COS, LIN_SIN, LIN_ARM, LIN_TH, LIN_K, ERROR2, ENERGY, EDGE_F) = (
+    0, 3, 9, 10, 12, 13, 14, 16, 17, 18, 19, 20)
+OFFSET, FACTOR_T, FACTOR_TH = OWN, LIN_COS, LIN_SIN
 # edge_i
 #   END_I, END_J: nodes that the edge starts from and leads to
 #   END_K: third node, or -1
-#   NEXT_I, NEXT_J, NEXT_K: next entries of the edge lists of END_I, END_J and END_K
+#   NEXT_I, NEXT_J, NEXT_K: next entries of the edge lists of END_I, END_J and END_K; NEXT_I:
+#       LEAVES if `compaction` takes the edge out, as it does all edges of nodes that leave
 #   EDGE_KIND: `EdgeKind`
 #   EDGE_CHECKED: stamp (ITERATION) of the last check of the linearization
 #   EDGE_WAITS: 1 if the edge is in the table `waiting`
 #   EDGE_LOGGED, ENERGY_LOGGED: stamps (UPDATE) of the last log of the row, and of ERROR2, ENERGY
 #       and EDGE_WAITS alone
 #   OWNER: row of the clique that the edge was assembled in
-#   EDGE_LEAVES: 1 if `compaction` takes the edge out, as it does all edges of nodes that leave
 (END_I, END_J, END_K, NEXT_I, NEXT_J, NEXT_K, EDGE_KIND, EDGE_CHECKED, EDGE_WAITS, EDGE_LOGGED,
- ENERGY_LOGGED, OWNER, EDGE_LEAVES, EDGE_I) = range(14)
+ ENERGY_LOGGED, OWNER, EDGE_I) = range(13)
 
 # observed_f has the columns of edge_f, with the observed pose in the map for a mean, and
-#   OFFSET (3): pose of the observed frame in the hidden node [m, m, rad]
+#   OFFSET (3): pose of the observed frame in the hidden node [m, m, rad]; it has no LIN_COS
 OBS_F = EDGE_F
 # observed_i
 #   OBS_NODE: hidden node that is observed
-#   OBS_NEXT: next entry of its list of observed nodes
+#   OBS_NEXT: next entry of its list of observed nodes; LEAVES if `compaction` takes it out
 #   OBS_KIND: `ObservedKind`
-#   OBS_WAITS, OBS_LOGGED, OBS_LEAVES: as EDGE_WAITS, EDGE_LOGGED and EDGE_LEAVES
-OBS_NODE, OBS_NEXT, OBS_KIND, OBS_WAITS, OBS_LOGGED, OBS_LEAVES, OBS_I = range(7)
+#   OBS_WAITS, OBS_LOGGED: as EDGE_WAITS and EDGE_LOGGED
+OBS_NODE, OBS_NEXT, OBS_KIND, OBS_WAITS, OBS_LOGGED, OBS_I = range(6)
+# In place of a list's head or next entry: the row leaves the graph, and is in no list.
+LEAVES = -2
 
 # clique_i
 #   PARENT, CHILD, SIBLING: rows of the parent, the first child and the next child of the parent;
@@ -130,9 +131,9 @@ OBS_NODE, OBS_NEXT, OBS_KIND, OBS_WAITS, OBS_LOGGED, OBS_LEAVES, OBS_I = range(7
 #   SLIP_SCALE: diagonal scale of the update matrix: the estimate of SLIP_ERROR2 is
 #       SLIP_SCALE * turn^4 plus a term in turn^2 [sigma^2/rad^4]
 #   DRIFT: upper bound of how far the separator has deformed since the clique was solved [sigma]
-#   PRIOR_ENERGY: of a prior, its energy [sigma^2]
-TURN_SEEN, TURN_ZERO, SLIP_ERROR2, SLIP_SCALE, DRIFT, PRIOR_ENERGY, CLIQUE_F = range(7)
-TURN = SLIP_ERROR2
+#   PRIOR_ENERGY: of a prior, its energy [sigma^2]; shares the column of TURN_ZERO
+TURN_SEEN, TURN_ZERO, SLIP_ERROR2, SLIP_SCALE, DRIFT, CLIQUE_F = range(6)
+TURN, PRIOR_ENERGY = SLIP_ERROR2, TURN_ZERO
 
 # Tables by name, with their numbers of columns. Those with one column are 1-D:
 #   node_id, edge_id, observed_id: ids of the rows, ascending

@@ -339,7 +339,7 @@ def largest_move(head):  # type: ignore[no-untyped-def]
         row, code = log_i[end_i - 2], log_i[end_i - 1]
         end_f -= _FLOATS[code]
         end_i -= 2 + _INTEGERS[code]
-        if code in (NODE, SOLUTION) and node_i[row, tb.NODE_KIND] == 0:
+        if code in (NODE, SOLUTION) and node_i[row, tb.NODE_TYPE] == 0:
             for k in range(2):
                 move = abs(node_f[row, tb.POSE + k] - log_f[end_f + tb.POSE + k])
                 largest = max(largest, move)

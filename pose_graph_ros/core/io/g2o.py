@@ -69,6 +69,11 @@ _UPPER = ((0, 0), (0, 1), (0, 2), (1, 1), (1, 2), (2, 2))
 _TORO = ((0, 0), (0, 1), (1, 1), (2, 2), (0, 2), (1, 2))
 # Tags with the format that the caller names.
 _AMBIGUOUS = ('EDGE2', 'ODOMETRY')
+# Kinds of edges to landmarks, that tell where the other end is, and with a tag of their own.
+_TO_LANDMARKS = [kind for kind, factor in FACTORS.items() if factor.j == (NodeKind.LANDMARK,)]
+_PLACING = [kind for kind, factor in FACTORS.items() if factor.places]
+_OWN_TAGS = {kind: factor.tag for kind, factor in FACTORS.items()
+             if factor.tag not in {'', 'EDGE_SE2'}}
 # Numbers of ids and of values behind each tag; FIX is followed by any number of ids.
 LAYOUT = {
     'VERTEX_SE2': (1, 3),
@@ -82,11 +87,9 @@ LAYOUT = {
     'EDGE_PRIOR_SE2_XY': (1, 5),
     'OBSERVED_SE2_OFFSET': (1, 12),
     'VERTEX_XY': (1, 2),
-    'EDGE_SE2_XY': (2, 5),
-    'EDGE_RANGE_SE2_XY': (2, 2),
+    **{tag: (2, len(FACTORS[kind].rows) * (len(FACTORS[kind].rows) + 3) // 2)
+       for kind, tag in _OWN_TAGS.items()},
 }
-# Kinds of edges to landmarks.
-_TO_LANDMARKS = (EdgeKind.POINT, EdgeKind.RANGE)
 
 
 @dataclass(frozen=True, slots=True)
@@ -274,8 +277,8 @@ def _edges(rows: dict[str, _Rows], ids: IntArray, edge2_order: str | None) -> Ed
         i, j = np.searchsorted(ids, ends).T
         parts.append(Edges(
             i, j, se2.wrapped(numbers[:, :3]), _information(numbers[:, 3:], order), kind))
-    for each in _TO_LANDMARKS:
-        tag, size = FACTORS[each].tag, len(FACTORS[each].rows)
+    for each, tag in _OWN_TAGS.items():
+        size = len(FACTORS[each].rows)
         numbers, ends = _numbers(rows[tag], LAYOUT[tag][1]), _ids(rows[tag])
         mean, information = np.zeros((len(ends), 3)), np.zeros((len(ends), 3, 3))
         mean[:, :size] = numbers[:, :size]
@@ -318,11 +321,11 @@ def _observed(rows: dict[str, _Rows], ids: IntArray) -> ObservedNodes:
 def _compose_missing(poses: FloatArray, known: BoolArray, edges: Edges) -> None:
     """Set the poses of the nodes that are not known by composing edges, breadth-first."""
     neighbours: dict[int, list[tuple[int, FloatArray]]] = {}
-    placing = edges.rows(edges.kind != EdgeKind.RANGE)
+    placing = edges.rows(np.isin(edges.kind, _PLACING))
     for i, j, mean, kind in zip(placing.i.tolist(), placing.j.tolist(), placing.mean,
                                 placing.kind.tolist(), strict=True):
         neighbours.setdefault(i, []).append((j, mean))
-        if kind != EdgeKind.POINT:
+        if kind not in _TO_LANDMARKS:
             neighbours.setdefault(j, []).append((i, se2.inverse(mean)))
     known = known.copy()
     for start in (*np.flatnonzero(known).tolist(), *range(len(known))):

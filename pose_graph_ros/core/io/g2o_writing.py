@@ -54,7 +54,7 @@ def g2o_text(rows: GraphRows, ids: IntArray | None = None) -> str:
     if not np.all(is_pose):
         used = used[~rows.is_bias[observed.node]]
         edges = edges.rows(np.isin(edges.kind, [kind for kind in FACTORS if FACTORS[kind].tag])
-                           & ((edges.kind != EdgeKind.RANGE) | ~np.any(edges.bias, axis=1)))
+                           & ~np.any(edges.bias, axis=1))
         observed = observed.rows(~rows.is_bias[observed.node])
     if len(edges) < len(rows.edges) or np.any(rows.is_bias):
         lines.append(f'# left out: {np.sum(rows.is_bias)} biases, {len(rows.edges) - len(edges)} '

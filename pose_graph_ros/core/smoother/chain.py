@@ -45,7 +45,7 @@ def _write_node(head, v, last, mean):  # type: ignore[no-untyped-def]
     f[tb.SCALE_T] = f[tb.SCALE_R] = 0.0
     i[:] = 0
     i[tb.CLIQUE] = i[tb.EDGE_LIST] = i[tb.OBSERVED_LIST] = -1
-    i[tb.NODE_LOGGED], i[tb.DIMENSION] = head[tb.UPDATE], 3
+    i[tb.NODE_LOGGED] = head[tb.UPDATE]
     tb.node_id(head)[v] = head[tb.NEXT_NODE]
 
 
@@ -146,7 +146,7 @@ def extend(head, mean, information, weight):  # type: ignore[no-untyped-def]
     f = edge_f[e]
     factor_types.prepare(f, 0)
     tb.edge_id(head)[e] = head[tb.NEXT_EDGE]
-    edge_i[e, tb.EDGE_CHECKED] = edge_i[e, tb.EDGE_WAITS] = edge_i[e, tb.EDGE_LEAVES] = 0
+    edge_i[e, tb.EDGE_CHECKED] = edge_i[e, tb.EDGE_WAITS] = 0
     edge_i[e, tb.OWNER] = c
     edge_i[e, tb.EDGE_LOGGED] = head[tb.UPDATE]
     factors.linearize_edge(head, e)

@@ -180,8 +180,8 @@ def _drop_constraints(head, v, leaves):  # type: ignore[no-untyped-def]
         energy += observed_f[entry, tb.ENERGY]
         observed_f[entry, tb.WEIGHT] = observed_f[entry, tb.ENERGY] = 0.0
         entry = observed_i[entry, tb.OBS_NEXT]
-    node_i[v, tb.CLIQUE] = node_i[v, tb.EDGE_LIST] = node_i[v, tb.OBSERVED_LIST] = -1
-    node_i[v, tb.NODE_LEAVES] = 1
+    node_i[v, tb.CLIQUE] = node_i[v, tb.OBSERVED_LIST] = -1
+    node_i[v, tb.EDGE_LIST] = tb.LEAVES
     head[tb.N_LEAVING] += 1
     return energy
 

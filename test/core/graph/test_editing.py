@@ -164,8 +164,7 @@ def test_a_weight_of_zero_removes_a_constraint_and_another_brings_it_back() -> N
 
 def columns(edges: Edges) -> tuple[np.ndarray, ...]:
     none = Graph().observed
-    no_bytes = np.empty(0, np.uint8)
-    return (np.empty((0, 3)), np.empty((0, 3)), no_bytes, no_bytes, *edges.columns,
+    return (np.empty((0, 3)), np.empty((0, 3)), np.empty(0, np.uint8), *edges.columns,
             *(np.ascontiguousarray(column) for column in (
                 none.node.astype(np.int64), none.offset, none.mean, none.information,
                 none.kind.astype(np.uint8), none.weight)))
