@@ -207,7 +207,7 @@ def _gradient(f, kind, nodes, node_f, third, right):  # type: ignore[no-untyped-
     return energy, abs(gx) + abs(gy), terms, gth
 
 
-@kernel
+@kernel(forceinline=True)
 def edge_gradient(head, e, right):  # type: ignore[no-untyped-def]
     """
     Return the energy of an edge and the sums of `_gradient` after adding -b to `right`, (N, 3).
@@ -230,7 +230,7 @@ def edge_gradient(head, e, right):  # type: ignore[no-untyped-def]
     return energy, total, terms
 
 
-@kernel
+@kernel(forceinline=True)
 def observed_gradient(head, k, right):  # type: ignore[no-untyped-def]
     """
     Return energy and sums of an observed node after adding -b to `right`, as `edge_gradient`.

@@ -221,7 +221,7 @@ def _extend(  # type: ignore[no-untyped-def]
     x, y, th = pose[0], pose[1], pose[2]
     noise = np.empty(6)
     for v in range(last + 1, head[tb.N_NODES]):
-        if node_i[v, tb.NODE_KIND] != NodeKind.POSE:
+        if node_i[v, tb.NODE_TYPE] != NodeKind.POSE:
             continue
         edge = -1
         while m < len(edges) and edge_i[edges[m], tb.END_J] <= v:
