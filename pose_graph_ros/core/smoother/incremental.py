@@ -269,11 +269,13 @@ class IncrementalSmoother:
     def _may_leave(self, nodes: Collection[int]) -> IntArray:
         """Return the rows of nodes, ascending; raise GraphUpdateError if one cannot leave."""
         self._require_solved()
-        ids = np.unique(np.fromiter(nodes, np.int64, len(nodes)))
+        ids = np.fromiter(nodes, np.int64, len(nodes))
+        if not (ids[1:] > ids[:-1]).all():
+            ids = np.unique(ids)    # takes 20 us
         rows = self.graph.node_rows(ids)
-        if np.any(rows < 0):
+        if (rows < 0).any():
             raise GraphUpdateError(f'forget: no hidden node has id {ids[np.argmin(rows)]}')
-        if self._memory.head[tb.NEWEST] in rows:
+        if (rows == self._memory.head[tb.NEWEST]).any():
             raise GraphUpdateError(f'forget: {self.graph.newest_pose} is the newest pose')
         return rows
 
