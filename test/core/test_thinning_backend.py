@@ -16,7 +16,12 @@ from pose_graph_ros.core.config import (
 )
 from pose_graph_ros.core.geometry import se2
 from pose_graph_ros.core.geometry.se2 import FloatArray
-from pose_graph_ros.core.measurements import AnswerStatus, LoopClosure, OdometrySample
+from pose_graph_ros.core.measurements import (
+    AnswerStatus,
+    LoopClosure,
+    OdometrySample,
+    Position,
+)
 
 PER_LAP, LAPS = 40, 6
 SIGMA = np.array((0.02, 0.02, 0.005))
@@ -27,13 +32,16 @@ def stamp(k: int) -> int:
 
 
 def driven(
-    config: BackendConfig, saved_at: int = -1,
+    config: BackendConfig, saved_at: int = -1, *, fixes: bool = False,
 ) -> tuple[PoseGraphBackend, FloatArray]:
     """
     Return a back end after laps on a circle, a closure each fifth node, and the true poses.
 
-    At a node it is replaced by what its saved state gives.
+    At a node it is replaced by what its saved state gives. With fixes there is one at each node,
+    whose error has a time constant of 10 s.
     """
+    bias = np.random.default_rng(4)
+    error = bias.standard_normal(2)
     rng, backend = np.random.default_rng(3), PoseGraphBackend(config)
     angle = 2.0 * np.pi / PER_LAP * np.arange(PER_LAP * LAPS)
     truth = se2.wrapped(np.column_stack((6.0 * np.cos(angle), 6.0 * np.sin(angle), angle)))
@@ -43,6 +51,11 @@ def driven(
             pose = se2.compose(pose, se2.compose(
                 se2.between(truth[k - 1], true), SIGMA * rng.standard_normal(3)))
         backend.add_odometry(OdometrySample(stamp(k), pose))
+        if fixes:
+            error = np.exp(-0.1) * error + np.sqrt(1.0 - np.exp(-0.2)) * bias.standard_normal(2)
+            backend.add_measurement(Position(
+                stamp(k), true[:2] + error + 0.05 * bias.standard_normal(2),
+                np.eye(2), np.zeros(2)), 'fix')
         if k > PER_LAP and k % 5 == 0:
             # half of the closures name a node, half a time
             other = k - PER_LAP * int(rng.integers(1, k // PER_LAP + 1))
@@ -62,7 +75,8 @@ def driven(
 
 def settings(cell: float) -> BackendConfig:
     return BackendConfig(
-        measurements={'loop': MeasurementSource(robust=Robust.NONE)},
+        measurements={'loop': MeasurementSource(robust=Robust.NONE),
+                      'fix': MeasurementSource(correlation_time=10.0)},
         thinning=ThinningConfig(cell=cell, newest=15))
 
 
@@ -114,3 +128,30 @@ def test_saved_halfway_a_thinned_graph_goes_on_as_without() -> None:
     assert two is not None
     assert abs(once.graph.n_nodes - other.graph.n_nodes) <= 10
     assert np.max(np.hypot(*(one.path.poses - two.path.poses)[:, :2].T)) < 0.1
+
+
+def test_fixes_with_correlated_errors_leave_with_their_biases() -> None:
+    whole, truth = driven(settings(0.0), fixes=True)
+    thinned, _ = driven(settings(2.0), 4 * PER_LAP, fixes=True)
+    errors = []
+    for backend in (whole, thinned):
+        graph, estimate = backend.graph, backend.estimate()
+        assert estimate is not None
+        n = len(truth) - 1
+        assert estimate.n_hidden == n
+        off = estimate.path.poses[:n] - truth[:n]
+        errors.append(float(np.sqrt(np.mean(off[:, :2]**2))))
+    assert whole.graph.n_nodes >= 2 * n
+    assert np.count_nonzero(~graph.is_pose) < 60
+    assert graph.n_nodes < 3 * PER_LAP
+    assert graph.n_observed < 3 * PER_LAP
+    assert graph.n_edges < 8 * PER_LAP
+    assert errors[1] < 1.5 * errors[0]
+    # samples behind what has left are gone; late fixes and closures there are taken all the same
+    assert len(thinned.saved().nodes.streams['odom'].stamps_ns) < 60
+    for late in (Position(stamp(50) + 300_000_000, truth[50, :2], np.eye(2), np.zeros(2)),
+                 LoopClosure(stamp(n - 1), se2.between(truth[55], truth[n - 1]),
+                             np.diag(SIGMA**2), reference_ns=stamp(55) + 1000)):
+        source = 'fix' if isinstance(late, Position) else 'loop'
+        assert thinned.add_measurement(late, source).status is not AnswerStatus.REJECTED
+    assert thinned.update().new_constraints == 2

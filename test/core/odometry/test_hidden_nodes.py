@@ -509,3 +509,28 @@ def test_a_jump_makes_the_estimate_stale_at_once() -> None:
     np.testing.assert_array_equal(after.T_odom_base, 0.0)
     assert np.hypot(*(after.T_map_base - before.T_map_base)[:2]) < 0.3
     assert after.covariance[0, 0] > before.covariance[0, 0] + 0.2
+
+
+def test_without_the_samples_behind_thinned_nodes_motions_are_interpolated_between_nodes() -> None:
+    nodes, _, _ = grown([('wheel', one) for one in samples(
+        np.arange(0.0, 30.0, 0.02).tolist(), FRAMES['wheel'])])
+    instants = [int(stamp) + 200_000_000 for stamp in nodes.stamps_ns[2:20:3]]
+    before = [nodes.attach(stamp_ns) for stamp_ns in instants]
+    nodes.drop_samples(5)   # nothing was thinned out
+    assert len(nodes.streams['wheel'].timeline) > 1000
+    nodes.table.thin(nodes.ids[[4]], nodes.ids[[3]], np.array([[2.0, 0.0, 0.0]]),
+                     0.01 * np.eye(3)[None])
+    nodes.drop_samples(5)
+    timeline = nodes.streams['wheel'].timeline
+    assert len(timeline) < 6 * 50
+    restored = HiddenNodes(CONFIG, Made())
+    restored.restore(nodes.saved())
+    for stamp_ns, one in zip(instants, before, strict=True):
+        for each in (nodes, restored):
+            other = each.attach(stamp_ns)
+            assert one is not None
+            assert other is not None
+            assert other.node == one.node
+            # the bend between two nodes is not known
+            np.testing.assert_allclose(other.motion, one.motion, atol=0.02)
+            assert np.min(np.linalg.eigvalsh(other.noise)) > 0.0
