@@ -50,6 +50,8 @@ class Course:
     """[s]; 0: there are none."""
     fix_sigma: float = 1.0
     """Of a coordinate [m]."""
+    fix_tau: float = 0.0
+    """Time constant of the errors of fixes, but for a white fifth of their sigma [s]; 0: white."""
     closure_period: float = 10.0
     """[s]; 0: there are none."""
     closure_sigma: tuple[float, float, float] = (0.1, 0.1, 0.02)
@@ -120,6 +122,18 @@ class Course:
                     + noise.sigma_heading_turn**2 * turn)))
         return np.asarray(se2.compose(moves, sigmas * rng.standard_normal(moves.shape)))
 
+    def _fix_errors(self, n: int, rng: np.random.Generator) -> FloatArray:
+        """Return the errors of the fixes of a piece, shape (n, 2) [m]."""
+        white = self.fix_sigma * rng.standard_normal((n, 2))
+        if self.fix_tau == 0.0:
+            return white
+        phi = np.exp(-self.fix_period / self.fix_tau)
+        errors = np.sqrt(1.0 - phi**2) * rng.standard_normal((n, 2))
+        errors[:1] /= np.sqrt(1.0 - phi**2)
+        for k in range(1, n):
+            errors[k] += phi * errors[k - 1]
+        return np.asarray(self.fix_sigma * np.sqrt(0.96) * errors + 0.2 * white)
+
     def _others(
         self, begin: float, end: float, rng: np.random.Generator,
     ) -> list[tuple[str, Measurement]]:
@@ -127,8 +141,7 @@ class Course:
         found: list[tuple[str, Measurement]] = []
         if self.fix_period > 0.0:
             times = _every(self.fix_period, begin, end)
-            places = self.truth(times)[:, :2] + self.fix_sigma * rng.standard_normal(
-                (len(times), 2))
+            places = self.truth(times)[:, :2] + self._fix_errors(len(times), rng)
             known, arm = self.fix_sigma**2 * np.eye(2), np.zeros(2)
             found += [(FIXES, Position(stamp, place, known, arm)) for stamp, place in zip(
                 self.stamps(times).tolist(), places, strict=True)]

@@ -29,7 +29,7 @@ ODOMETRY_SIGMA, CLOSURE_SIGMA = np.array((0.03, 0.02, 0.01)), np.array((0.05, 0.
 """Of a metre of odometry, and of a loop closure [m, m, rad]."""
 CLOSURE_EVERY, RECENT = 5, 60
 """Nodes from closure to closure, and nodes that none leads to as they are too new."""
-PASSES, SHARED, QUICK_PASSES, QUICK_SHARED = 500, 60, 40, 20
+PASSES, SHARED, QUICK_PASSES, QUICK_SHARED = 500, 30, 40, 20
 """Passes of the thinned graph, and of those that are driven with the whole graph as well."""
 CELLS = 1.0, 2.0
 PICTURE = 'hall.png'
@@ -186,7 +186,7 @@ def section(*, quick: bool, seeds: int | None, folder: Path) -> Section:
 
     """
     passes, shared = (QUICK_PASSES, QUICK_SHARED) if quick else (PASSES, SHARED)
-    n = seeds or (2 if quick else 6)
+    n = seeds or (2 if quick else 4)
     found = Section(
         'Does the graph grow with the area or with the time?',
         f'A robot drives along the walls of a hall of {LENGTH:.0f} x {WIDTH:.0f} m, every pass at '

@@ -21,7 +21,7 @@ from benchmark.window_settings import UNLIMITED
 HOURS = 24.0
 GROWN, SLOWER = 1.05, 1.25
 """Ratios of the last hour to the first up to which memory and time count as flat."""
-COLOURS = '#0072B2', '#E69F00', '#009E73', '#D55E00', '#CC79A7'
+COLOURS = '#0072B2', '#E69F00', '#009E73', '#D55E00', '#CC79A7', '#56B4E9'
 SIZE, DPI = (11.0, 3.4), 100
 """Of the picture [inch], and dots per inch."""
 FILE, PICTURE = 'hours.json', 'hours.png'
@@ -46,6 +46,10 @@ CASES = {
     'window of 10 minutes': Case('600 s', HOURS),
     'unlimited': Case(UNLIMITED, 2.0, limited=False),
     'hall, with thinning': Case('thinning 2 m', HOURS, HALL),
+    'hall, correlated fixes, with thinning': Case(
+        'thinning 2 m', 4.0, HALL | {'fix_tau': 20.0}),
+    'hall, correlated fixes, unlimited': Case(
+        UNLIMITED, 1.0, HALL | {'fix_tau': 20.0}, limited=False),
     'hall, unlimited': Case(UNLIMITED, 2.0, HALL, limited=False)}
 
 
@@ -66,8 +70,9 @@ def section(
     found = Section(
         'A day', f'Odometry at {rate:.0f} Hz, fixes at 5 Hz, a loop closure every 10 s (in the '
         'hall every 5 s, up to 100 laps back), an update every half second, with default '
-        'settings, each drive in a process of its own. Resident memory of the process after a '
-        'garbage collection, with Python, NumPy and compiled code; '
+        'settings, each drive in a process of its own; correlated fixes have a time constant of '
+        '20 s. Resident memory of the process after a garbage collection, with Python, NumPy and '
+        'compiled code; '
         f'mean times of calls. Flat means: the last hour at most {GROWN:g} times the memory and '
         f'{SLOWER:g} times the time of an update of the first.')
     file = folder / FILE

@@ -147,7 +147,7 @@ PARAMETERS: tuple[Parameter, ...] = (
     Parameter('thinning.poses', float(_THINNING.poses), '', 'Number of hidden nodes that stay in '
               'a sector of a cell.', 1.0, 1000.0),
     Parameter('thinning.newest', float(_THINNING.newest), '', 'Number of newest hidden nodes that '
-              'stay in any case.', 2.0, 1e6),
+              'stay in any case, with their fixes and odometry samples.', 2.0, 1e6),
     Parameter('alignment.sigma_heading', _ALIGNMENT.sigma_heading, 'rad', 'The map is aligned '
               'with the odometry from positions alone once the standard deviation of the angle '
               'between them is at most this.', 1e-3, 1.0),

@@ -30,8 +30,9 @@ from pose_graph_ros.core.geometry.se2 import FloatArray, IntArray
 from pose_graph_ros.core.graph.constraints import EdgeKind, Edges, ObservedKind, ObservedNodes
 from pose_graph_ros.core.marginalization import conservative
 
-# Eigenvalues of the scaled information below this part of the largest one are rounding.
-_RANK = 1e-12
+# Eigenvalues of the scaled information below this part of the largest one are rounding. The second
+# one is for priors whose covariances are singular in double precision with the first one.
+_RANK, _SURER_RANK = 1e-12, 1e-8
 # A measurement sees an undetermined direction if it is above this part of its size.
 _SEEN = 1e-6
 # What an undetermined direction counts in the weight of a tree: more than any covariance.
@@ -68,6 +69,8 @@ def sparsify(
     """
     Return edges and observed nodes that approximate a prior and tell no more than it.
 
+    Raises LinAlgError if the prior is too stiff for double precision.
+
     They have their minimum where the prior has it, in the linear model at the reference poses.
 
     Parameters
@@ -82,8 +85,12 @@ def sparsify(
 
     """
     basis, free = _basis(poses, information, anchored)
+    try:
+        found = _candidates(poses, basis, free, anchored)
+    except np.linalg.LinAlgError:
+        basis, free = _basis(poses, information, anchored, _SURER_RANK)
+        found = _candidates(poses, basis, free, anchored)
     delta = basis @ (basis.T @ vector)
-    found = _candidates(poses, basis, free, anchored)
     chosen = _spanning_tree(found, len(nodes) + (1 if anchored else 0))
     chosen = chosen[np.any(found.rows[chosen] != 0.0, axis=(1, 2))]
     if len(chosen) == 0:
@@ -108,7 +115,7 @@ def sparsify(
 
 
 def _basis(
-    poses: FloatArray, information: FloatArray, anchored: bool,
+    poses: FloatArray, information: FloatArray, anchored: bool, rank: float = _RANK,
 ) -> tuple[FloatArray, FloatArray]:
     """
     Return T, (3 k, r), with `T^T information T = I`, and a basis of the null space, (3 k, n).
@@ -129,7 +136,7 @@ def _basis(
         scaled = scaled + 2.0 * np.trace(scaled) * gauge @ gauge.T
     values, vectors = np.linalg.eigh(scaled)
     values, vectors = values[:len(values) - n_gauge], vectors[:, :len(values) - n_gauge]
-    kept = values > _RANK * values[-1] if len(values) > 0 else np.zeros(0, dtype=bool)
+    kept = values > rank * values[-1] if len(values) > 0 else np.zeros(0, dtype=bool)
     return (scale[:, None] * vectors[:, kept] / np.sqrt(values[kept]),
             scale[:, None] * vectors[:, ~kept])
 

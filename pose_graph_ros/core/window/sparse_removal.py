@@ -39,7 +39,8 @@ def sparse_removal(
     """
     Return the update by which nodes leave, and edges and observed nodes take their place.
 
-    No covariance becomes smaller by it. None if something else than poses is connected with them.
+    No covariance becomes smaller by it. None if something else than poses is connected with them,
+    or what they tell is too stiff for double precision.
 
     Parameters
     ----------
@@ -67,6 +68,8 @@ def sparse_removal(
     more_observed = np.union1d(observed, graph.observed_ids[earlier_observed])
     sparse = _approximation(
         marginal(graph, nodes, more.tolist(), more_observed.tolist(), cuts.cuts).prior)
+    if sparse is None:
+        return None
     return GraphUpdate(
         edges=sparse.edges, observed=ObservedNodes.joined([sparse.observed, cuts.observed]),
         remove_nodes=nodes.tolist(),
@@ -92,8 +95,9 @@ def sparse_marginalization(graph: Graph, nodes: IntArray) -> GraphUpdate:
     update = marginalize(graph, nodes.tolist())
     edges, observed, dense = [update.edges], [update.observed], []
     for prior in update.priors:
-        if len(prior.nodes) <= MOST_POSES and _is_on_poses(graph, prior):
-            sparse = _approximation(prior)
+        few = len(prior.nodes) <= MOST_POSES and _is_on_poses(graph, prior)
+        sparse = _approximation(prior) if few else None
+        if sparse is not None:
             edges.append(sparse.edges)
             observed.append(sparse.observed)
         else:
@@ -102,12 +106,15 @@ def sparse_marginalization(graph: Graph, nodes: IntArray) -> GraphUpdate:
         edges=Edges.joined(edges), observed=ObservedNodes.joined(observed), priors=dense)
 
 
-def _approximation(prior: Prior | None) -> SparsePrior:
-    """Return what stands for a prior on poses."""
+def _approximation(prior: Prior | None) -> SparsePrior | None:
+    """Return what stands for a prior on poses; None if it is too stiff for double precision."""
     if prior is None:
         return SparsePrior(Edges(), ObservedNodes(), 0.0)
-    return sparsify(prior.nodes, prior.reference, prior.information, prior.vector,
-                    anchored=prior.anchored, n_extra=round(EXTRA * len(prior.nodes)))
+    try:
+        return sparsify(prior.nodes, prior.reference, prior.information, prior.vector,
+                        anchored=prior.anchored, n_extra=round(EXTRA * len(prior.nodes)))
+    except np.linalg.LinAlgError:
+        return None
 
 
 def with_fewer_edges(graph: Graph, most: float) -> GraphUpdate | None:
@@ -135,8 +142,9 @@ def with_fewer_edges(graph: Graph, most: float) -> GraphUpdate | None:
         inside = prior[np.isin(edges.i[prior], group) & np.isin(edges.j[prior], group)]
         if len(inside) > len(group) - 1 + round(EXTRA * len(group)):
             ids = graph.edge_ids[inside].tolist()
-            return GraphUpdate(
-                edges=_approximation(marginal(graph, (), ids).prior).edges, drop_edges=ids)
+            sparse = _approximation(marginal(graph, (), ids).prior)
+            if sparse is not None:
+                return GraphUpdate(edges=sparse.edges, drop_edges=ids)
     return None
 
 
