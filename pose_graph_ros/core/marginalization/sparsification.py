@@ -32,7 +32,7 @@ from pose_graph_ros.core.marginalization import conservative
 
 # Eigenvalues of the scaled information below this part of the largest one are rounding. The second
 # one is for priors whose covariances are singular in double precision with the first one.
-_RANK, _SURER_RANK = 1e-12, 1e-8
+_RANK, _SURER_RANK = 1e-10, 1e-7
 # A measurement sees an undetermined direction if it is above this part of its size.
 _SEEN = 1e-6
 # What an undetermined direction counts in the weight of a tree: more than any covariance.
