@@ -90,7 +90,8 @@ def marginalize(graph: Graph, nodes: Collection[int]) -> GraphUpdate:
         else:
             priors.append(prior)
     return GraphUpdate(
-        edges=Edges.joined(edges), observed=ObservedNodes.joined(observed),
+        edges=Edges.joined([each for each in edges if np.any(each.information)]),
+        observed=ObservedNodes.joined([each for each in observed if np.any(each.information)]),
         remove_nodes=leaving.tolist(), priors=tuple(priors))
 
 
@@ -164,7 +165,7 @@ def as_edge(prior: Prior) -> Edges:
     first, second = np.argsort(prior.nodes)
     start, end = prior.reference[first], prior.reference[second]
     at = slice(3 * second, 3 * second + 3)
-    information = prior.information[at, at]
+    information = _semidefinite(prior.information[at, at])
     # the error in map axes at the reference
     h = -_pseudo_inverse(information) @ prior.vector[at]
     turn = se2.wrap(end[2] - start[2] - h[2])
@@ -178,12 +179,13 @@ def as_edge(prior: Prior) -> Edges:
 
 def as_observed(prior: Prior) -> ObservedNodes:
     """Return an observed node on the single pose of a prior, with its gradient and Hessian."""
-    mean = prior.reference[0] + _pseudo_inverse(prior.information) @ prior.vector
+    information = _semidefinite(prior.information)
+    mean = prior.reference[0] + _pseudo_inverse(information) @ prior.vector
     # without information on the heading the error is in map axes, as that of a position
-    mean[2] = se2.wrap(mean[2]) if np.any(prior.information[2]) else 0.0
+    mean[2] = se2.wrap(mean[2]) if np.any(information[2]) else 0.0
     R = _rotation(mean[2])
     return ObservedNodes(prior.nodes, mean=mean[None],
-                         information=_symmetric(R.T @ prior.information @ R)[None],
+                         information=_symmetric(R.T @ information @ R)[None],
                          kind=[ObservedKind.PRIOR])
 
 
@@ -342,6 +344,18 @@ def _pseudo_inverse(matrix: FloatArray, scale: FloatArray | None = None) -> Floa
     values, vectors = np.linalg.eigh(_symmetric(matrix / np.outer(root, root)))
     good = values > LEAST_PIVOT
     half = vectors[:, good] / np.sqrt(values[good]) / root[:, None]
+    return np.asarray(half @ half.T)
+
+
+def _semidefinite(matrix: FloatArray) -> FloatArray:
+    """Return a matrix whose eigenvalues are below 0 by rounding alone, with 0 for these."""
+    root = np.sqrt(np.maximum(np.diagonal(matrix), 0.0))
+    root[root == 0.0] = np.inf
+    values, vectors = np.linalg.eigh(_symmetric(matrix / np.outer(root, root)))
+    if values[0] >= 0.0:
+        return matrix
+    root[np.isinf(root)] = 0.0
+    half = vectors * np.sqrt(np.maximum(values, 0.0)) * root[:, None]
     return np.asarray(half @ half.T)
 
 
