@@ -32,6 +32,8 @@ from pose_graph_ros.core.window.thinning import (
 
 # A measurement that comes twice is refused the second time, if it is not older than that [ns].
 REPEATED_NS = 3600 * 1_000_000_000
+# In each step one group leaves for each new node, but not more than this.
+MOST_PIECES = 20
 
 
 class Thinner:
@@ -50,15 +52,21 @@ class Thinner:
         self._smoother, self._tuner, self._parts = smoother, tuner, parts
         self._thinning = Thinning()
         self._work: Iterator[None] = iter(())
+        self._newest = 0
 
     def step(self, config: ThinningConfig) -> None:
-        """Let a group of nodes leave, or of old measurements in the map, if one is due."""
+        """Let groups of nodes leave, or of old measurements in the map, if some are due."""
         if config.cell == 0.0:
             self._work = iter(())
             return
-        if next(self._work, self) is self:
-            self._work = self._steps(config)
-            next(self._work, None)
+        # a bag is replayed with many new nodes from step to step
+        newest = self._parts.graph.newest_pose
+        new, self._newest = max(newest - self._newest, 1), newest
+        for _ in range(min(new, MOST_PIECES)):
+            if next(self._work, self) is self:
+                self._work = self._steps(config)
+                if next(self._work, self) is self:
+                    return
 
     def _steps(self, config: ThinningConfig) -> Iterator[None]:
         """Yield after each change of the graph; others may have changed it before the next."""

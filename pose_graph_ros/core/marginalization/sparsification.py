@@ -33,8 +33,13 @@ from pose_graph_ros.core.marginalization import conservative
 # Eigenvalues of the scaled information below this part of the largest one are rounding. The second
 # one is for priors whose covariances are singular in double precision with the first one.
 _RANK, _SURER_RANK = 1e-10, 1e-7
+# What is known no better than that is in these units: its own ones would make much of rounding.
+_LEAST_KNOWN = np.array((1e4, 1e4, 10.0))
 # A measurement sees an undetermined direction if it is above this part of its size.
 _SEEN = 1e-6
+# The minimum of a prior has headings at most so far from the reference [rad]. A direction that is
+# next to unknown may have it turns away, where the linear model is meaningless.
+_MOST_TURNED = 0.5
 # What an undetermined direction counts in the weight of a tree: more than any covariance.
 _UNDETERMINED = 1e3
 
@@ -71,7 +76,8 @@ def sparsify(
 
     Raises LinAlgError if the prior is too stiff for double precision.
 
-    They have their minimum where the prior has it, in the linear model at the reference poses.
+    They have their minimum where the prior has it, in the linear model at the reference poses, or
+    nearer where that is out of its reach (`_minimum`).
 
     Parameters
     ----------
@@ -90,7 +96,7 @@ def sparsify(
     except np.linalg.LinAlgError:
         basis, free = _basis(poses, information, anchored, _SURER_RANK)
         found = _candidates(poses, basis, free, anchored)
-    delta = basis @ (basis.T @ vector)
+    delta = _minimum(basis, vector)
     chosen = _spanning_tree(found, len(nodes) + (1 if anchored else 0))
     chosen = chosen[np.any(found.rows[chosen] != 0.0, axis=(1, 2))]
     if len(chosen) == 0:
@@ -123,8 +129,8 @@ def _basis(
     The null space of a prior that is not anchored is known, and is kept to rounding; of that basis
     it is left out, as no relative pose sees it.
     """
-    diagonal = np.diagonal(information)
-    scale = np.where(diagonal > 0.0, 1.0 / np.sqrt(np.where(diagonal > 0.0, diagonal, 1.0)), 1.0)
+    units = np.tile(_LEAST_KNOWN, len(poses))
+    scale = 1.0 / np.sqrt(np.maximum(np.diagonal(information), units**-2.0))
     scaled = 0.5 * (information + information.T) * scale[:, None] * scale
     n_gauge = 0
     if not anchored:
@@ -139,6 +145,32 @@ def _basis(
     kept = values > rank * values[-1] if len(values) > 0 else np.zeros(0, dtype=bool)
     return (scale[:, None] * vectors[:, kept] / np.sqrt(values[kept]),
             scale[:, None] * vectors[:, ~kept])
+
+
+def _minimum(basis: FloatArray, vector: FloatArray) -> FloatArray:
+    """
+    Return the displacements of the minimum of a prior, shape (3 k,).
+
+    Where they turn a pose by more than the linear model bears, the headings are damped as in
+    D. Marquardt ("An algorithm for least-squares estimation of nonlinear parameters", J. SIAM 11,
+    1963), just so much that they do not. That concerns directions that are next to unknown first.
+
+    Parameters
+    ----------
+    basis : ndarray, shape (3 k, r), as returned by `_basis`
+    vector : ndarray, shape (3 k,)
+
+    """
+    wanted = basis.T @ vector
+    delta, headings = basis @ wanted, basis[2::3]
+    left, sigmas, _ = np.linalg.svd(headings.T, full_matrices=False)
+    damping = 1.0 / max(float(np.max(sigmas, initial=0.0))**2, 1e-300)
+    while np.max(np.abs(delta[2::3]), initial=0.0) > _MOST_TURNED:
+        # (I + damping H^T H)^-1, with the rows H of the headings
+        gain = damping * sigmas**2 / (1.0 + damping * sigmas**2)
+        delta = basis @ (wanted - left @ (gain * (left.T @ wanted)))
+        damping *= 4.0
+    return np.asarray(delta)
 
 
 def _rigid_motions(poses: FloatArray) -> FloatArray:

@@ -246,3 +246,23 @@ def test_a_single_pose_without_an_anchor_tells_nothing() -> None:
     sparse = sparsify(np.array([4]), np.zeros((1, 3)), np.zeros((3, 3)), np.zeros(3),
                       anchored=False)
     assert len(sparse.edges) == len(sparse.observed) == 0
+
+
+@pytest.mark.parametrize('known', [1e-35, 1e-13, 1e-6])
+def test_headings_that_are_next_to_unknown_do_not_turn(known: float) -> None:
+    prior = prior_of(7, 3, 'positions')
+    information, vector = prior.information.copy(), prior.vector.copy()
+    whole = prior.sparsified(3)
+    # one more pose of which the position is measured, and the heading next to not at all
+    k = prior.k
+    prior.k, prior.poses = k + 1, np.vstack((prior.poses, (1.0, 2.0, 0.3)))
+    prior.information, prior.vector = np.zeros((3 * k + 3, 3 * k + 3)), np.zeros(3 * k + 3)
+    prior.information[:3 * k, :3 * k], prior.vector[:3 * k] = information, vector
+    prior.information[3 * k:, 3 * k:] = np.diag((1.0, 1.0, known))
+    prior.vector[3 * k:] = 0.4, -0.3, 1e3 * known
+    sparse = prior.sparsified(3)
+    moved = sparse.observed.mean[sparse.observed.node == k] - prior.poses[-1]
+    np.testing.assert_allclose(moved[:, :2], [(0.4, -0.3)], atol=1e-6)
+    assert np.all(np.abs(se2.wrap(moved[:, 2])) <= 0.5 + ROUNDING)
+    others = sparse.edges.rows(np.flatnonzero(sparse.edges.j < k))
+    np.testing.assert_allclose(others.mean, whole.edges.mean, atol=1e-6)
