@@ -33,7 +33,15 @@ LIMIT = 400.0
 """Resident memory that is asked for [MB]."""
 WINDOW = 600
 """[s]"""
-COMMAND = 'import sys; from pose_graph_ros.cli.main import main; sys.exit(main(sys.argv[1:]))'
+COMMAND = '''
+import sys
+from pose_graph_ros.cli.main import main
+code = main(sys.argv[2:])
+with open('/proc/self/status') as status, open(sys.argv[1], 'w') as largest:
+    largest.write(next(line.split()[1] for line in status if line.startswith('VmHWM:')))
+sys.exit(code)
+'''
+"""Runs a tool, and writes its largest resident memory [KiB] into a file."""
 POSE, LINEAR, ANGULAR = 44, 388, 412
 """Where in a message with the frames odom and base_link the pose begins, and the twist."""
 ODOMETRY, FIX = 'nav_msgs/msg/Odometry', 'sensor_msgs/msg/NavSatFix'
@@ -121,23 +129,19 @@ def replay(bag: Path, out: Path, *arguments: str) -> tuple[float, float, FloatAr
     arguments : str, further ones of `pose-graph replay`
 
     """
-    begin = time.monotonic()
+    # `ru_maxrss` of a child counts the memory of this process as well, of before its exec
+    begin, largest = time.monotonic(), out.with_name('largest')
     child = subprocess.Popen(
-        [sys.executable, '-c', COMMAND, 'replay', str(bag), '-o', str(out), *arguments],
-        stdout=subprocess.DEVNULL)
+        [sys.executable, '-c', COMMAND, str(largest), 'replay', str(bag), '-o', str(out),
+         *arguments], stdout=subprocess.DEVNULL)
     curve: list[tuple[float, float]] = []
-    while True:
-        pid, status, usage = os.wait4(child.pid, os.WNOHANG)
-        if pid != 0:
-            break
-        with open(f'/proc/{child.pid}/statm', encoding='ascii') as file:
-            pages = int(file.read().split()[1])
+    while child.poll() is None:
+        pages = int(Path(f'/proc/{child.pid}/statm').read_text(encoding='ascii').split()[1])
         curve.append((time.monotonic() - begin, pages * os.sysconf('SC_PAGE_SIZE') * 1e-6))
         time.sleep(LOOK_EVERY)
-    child.returncode = os.waitstatus_to_exitcode(status)
     if child.returncode not in (0, 1):
         raise RuntimeError(f'replay ended with {child.returncode}')
-    return time.monotonic() - begin, usage.ru_maxrss * 1.024e-3, np.array(curve)
+    return time.monotonic() - begin, int(largest.read_text()) * 1.024e-3, np.array(curve)
 
 
 def section(samples: list[int], bags: Path | None = None) -> Section:

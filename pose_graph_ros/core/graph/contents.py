@@ -146,17 +146,19 @@ class GraphContents:
     @property
     def is_bias(self) -> BoolArray:
         """Whether hidden nodes are biases, shape (N,)."""
-        return self.node_kind == NodeKind.BIAS
+        return self.node_kind == int(NodeKind.BIAS)
 
     @property
     def is_pose(self) -> BoolArray:
         """Whether hidden nodes are poses, shape (N,)."""
-        return self.node_kind == NodeKind.POSE
+        return self.node_kind == int(NodeKind.POSE)
 
     @property
     def node_kind(self) -> npt.NDArray[Any]:
         """`NodeKind` of hidden nodes, shape (N,)."""
-        return self.memory['node_i'][:self.n_nodes, tb.NODE_TYPE] & 3
+        types = self.memory['node_i'][:self.n_nodes, tb.NODE_TYPE]
+        # an eighth of the memory that the table takes
+        return np.asarray(types.astype(np.uint8) & np.uint8(3))
 
     @property
     def dimension(self) -> npt.NDArray[Any]:
