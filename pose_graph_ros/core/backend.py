@@ -361,14 +361,14 @@ class PoseGraphBackend:
         poses = self._alignment.recheck(self.graph, self._nodes)
         if poses is None:
             return
-        before, oldest = self.graph.poses.copy(), int(self._nodes.ids[self._nodes.n_frozen])
-        left = self.graph.poses_of(oldest)
-        self.graph.set_poses(poses)
+        graph, before = self.graph, self.graph.poses.copy()
+        oldest = int(graph.node_ids[np.argmax(graph.is_pose)])  # that thinning has left
+        left = graph.poses_of(oldest)
+        graph.set_poses(poses)
         if self._optimize_whole().status is not Status.FAILED:
             self.counts['alignment', 'done_over'] += 1
             # the frozen part of the path stays in front of the rest
-            self._nodes.table.move_frozen(
-                se2.compose(self.graph.poses_of(oldest), se2.inverse(left)))
+            self._nodes.table.move_frozen(se2.compose(graph.poses_of(oldest), se2.inverse(left)))
             return
         self.graph.set_poses(before)
         with self._transaction():

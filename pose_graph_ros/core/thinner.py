@@ -19,7 +19,7 @@ from pose_graph_ros.core.smoother.incremental import IncrementalSmoother
 from pose_graph_ros.core.smoother.results import Forgotten
 from pose_graph_ros.core.window.bias_cuts import cut_chains
 from pose_graph_ros.core.window.segments import carriers, first_of, next_segment, Segment
-from pose_graph_ros.core.window.sparse_removal import sparse_removal
+from pose_graph_ros.core.window.sparse_removal import NONE, old_closures, sparse_removal
 from pose_graph_ros.core.window.thinning import (
     certain,
     Crowd,
@@ -34,6 +34,8 @@ from pose_graph_ros.core.window.thinning import (
 REPEATED_NS = 3600 * 1_000_000_000
 # In each step one group leaves for each new node, but not more than this.
 MOST_PIECES = 20
+# Loop closures between nodes that stay, for each pose, above which the oldest ones become priors.
+MOST_OLD_CLOSURES = 0.5
 
 
 class Thinner:
@@ -95,6 +97,12 @@ class Thinner:
                 continue
             parts.judge.decide_leaving(*constraints_on(parts.graph, group.nodes))
             self._leave(group, sparse_removal(parts.graph, group.nodes))
+            yield
+        nobody = places.rows(np.zeros(len(places.nodes), dtype=bool))
+        while len(closures := old_closures(parts.graph, config.newest, MOST_OLD_CLOSURES)) > 0:
+            parts.judge.decide_leaving(closures, NONE)
+            if not self._leave(nobody, sparse_removal(parts.graph, NONE, closures)):
+                break
             yield
         for gone in simplify(smoother):
             forget(gone, parts, self._tuner)

@@ -16,6 +16,7 @@ from pose_graph_ros.core.config import (
 )
 from pose_graph_ros.core.geometry import se2
 from pose_graph_ros.core.geometry.se2 import FloatArray
+from pose_graph_ros.core.graph.constraints import EdgeKind
 from pose_graph_ros.core.measurements import (
     AnswerStatus,
     LoopClosure,
@@ -155,3 +156,34 @@ def test_fixes_with_correlated_errors_leave_with_their_biases() -> None:
         source = 'fix' if isinstance(late, Position) else 'loop'
         assert thinned.add_measurement(late, source).status is not AnswerStatus.REJECTED
     assert thinned.update().new_constraints == 2
+
+
+def test_neither_nodes_nor_edges_grow_with_the_laps() -> None:
+    rng, backend = np.random.default_rng(6), PoseGraphBackend(settings(2.0))
+    angle = 2.0 * np.pi / PER_LAP * np.arange(20 * PER_LAP)
+    truth = se2.wrapped(np.column_stack((6.0 * np.cos(angle), 6.0 * np.sin(angle), angle)))
+    pose, late, sizes = truth[0], PER_LAP + 7, []
+    for k, true in enumerate(truth):
+        if k > 0:
+            pose = se2.compose(pose, se2.compose(
+                se2.between(truth[k - 1], true), SIGMA * rng.standard_normal(3)))
+        backend.add_odometry(OdometrySample(stamp(k), pose))
+        # half of the closures come when both of their nodes are old
+        now = k - late * int(k % 2 == 0)
+        if now > PER_LAP and k % 5 < 2:
+            other = now - PER_LAP * int(rng.integers(1, now // PER_LAP + 1)) + int(
+                rng.integers(0, 4))
+            backend.add_measurement(LoopClosure(
+                stamp(now), pose=se2.compose(
+                    se2.between(truth[other], truth[now]), SIGMA * rng.standard_normal(3)),
+                covariance=np.diag(SIGMA**2), reference_ns=stamp(other)), 'loop')
+        if k % 3 == 0:
+            backend.update()
+        if k % PER_LAP == PER_LAP - 1:
+            kinds = backend.graph.edges.kind
+            sizes.append((backend.graph.n_nodes, len(kinds),
+                          np.count_nonzero(kinds == EdgeKind.LOOP_CLOSURE)))
+    earlier, later = np.max(sizes[5:10], axis=0), np.max(sizes[15:], axis=0)
+    assert np.all(later <= 1.1 * earlier)
+    off = se2.between(backend.graph.poses[-1], truth[len(truth) - 2])
+    assert np.hypot(*off[:2]) < 0.3

@@ -20,6 +20,8 @@ from pose_graph_ros.core.marginalization.marginalize import marginal, marginaliz
 from pose_graph_ros.core.marginalization.sparsification import SparsePrior, sparsify
 from pose_graph_ros.core.window.bias_cuts import Cuts, NO_CUTS
 
+# So many loop closures leave at once.
+MOST_CLOSURES = 5
 NONE: IntArray = np.empty(0, dtype=np.int64)
 # Edges beyond the tree, for each of its nodes. A tree alone costs 8 % in rms where a hall is
 # driven 30 times, this 1 %.
@@ -146,6 +148,27 @@ def with_fewer_edges(graph: Graph, most: float) -> GraphUpdate | None:
             if sparse is not None:
                 return GraphUpdate(edges=sparse.edges, drop_edges=ids)
     return None
+
+
+def old_closures(graph: Graph, newest: int, most: float) -> IntArray:
+    """
+    Return ids of loop closures that nothing else lets go, some of the oldest, if there are many.
+
+    They are between poses that stay, and were there before the newest poses.
+
+    Parameters
+    ----------
+    graph : Graph
+    newest : int, number of poses that are not old
+    most : float, number of such closures for each pose up to which they stay
+
+    """
+    edges, older = graph.edges, graph.node_ids[graph.is_pose][:-newest]
+    old = np.isin(edges.i, older) & np.isin(edges.j, older)
+    first = int(np.min(np.flatnonzero(~old & (edges.kind == EdgeKind.ODOMETRY)), initial=len(old)))
+    closures = np.flatnonzero(old[:first] & (edges.kind[:first] == EdgeKind.LOOP_CLOSURE))
+    many = len(closures) > most * np.count_nonzero(graph.is_pose)
+    return graph.edge_ids[closures[:MOST_CLOSURES]] if many else NONE
 
 
 def _dense_group(near: dict[int, set[int]], first: int, size: int = 10) -> IntArray:
