@@ -3,9 +3,12 @@
 """
 Drives of any length round and round a course, made piece by piece from a seed.
 
-The noise is exactly what the engine is told: odometry has that of its default model, fixes and
-closures have white errors with the covariances that come with them. The truth goes along a closed
-course, each lap a little to one side of the last.
+The noise is what the engine is told: odometry has that of its default model, fixes and closures
+have white errors with the covariances that come with them. But the engine sums up the turns that
+odometry shows, whose noise lengthens the sum the more the shorter the steps are: at 1 m/s on a
+course of 60 m or 120 m its variance of the heading is 2 % too small or 4 % too large at 10 Hz,
+14 % or 29 % too large at 50 Hz. The truth goes along a closed course, each lap a little to one
+side of the last.
 """
 
 from collections.abc import Iterator
@@ -114,12 +117,7 @@ class Course:
 
     def _noisy(self, moves: FloatArray, rng: np.random.Generator) -> FloatArray:
         """Return motions with the noise of the model."""
-        noise = OdometryNoise()
-        distance, turn = np.hypot(moves[:, 0], moves[:, 1]), np.abs(moves[:, 2])
-        sigmas = np.column_stack((
-            noise.sigma_distance * np.sqrt(distance), noise.sigma_lateral * np.sqrt(distance),
-            np.sqrt(noise.sigma_heading_distance**2 * distance
-                    + noise.sigma_heading_turn**2 * turn)))
+        sigmas = np.sqrt(odometry_variances(moves))
         return np.asarray(se2.compose(moves, sigmas * rng.standard_normal(moves.shape)))
 
     def _fix_errors(self, n: int, rng: np.random.Generator) -> FloatArray:
@@ -163,6 +161,15 @@ class Course:
                 covariance[:2, :2] = turn @ covariance[:2, :2] @ turn.T
                 found.append((CLOSURES, LoopClosure(new, pose, covariance, reference_ns=old)))
         return sorted(found, key=lambda item: item[1].stamp_ns)
+
+
+def odometry_variances(moves: FloatArray) -> FloatArray:
+    """Return the variances of (x, y, theta) of short motions by odometry, shape (N, 3)."""
+    noise = OdometryNoise()
+    distance, turn = np.hypot(moves[:, 0], moves[:, 1]), np.abs(moves[:, 2])
+    return np.column_stack((
+        noise.sigma_distance**2 * distance, noise.sigma_lateral**2 * distance,
+        noise.sigma_heading_distance**2 * distance + noise.sigma_heading_turn**2 * turn))
 
 
 def _every(period: float, begin: float, end: float) -> FloatArray:
