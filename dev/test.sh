@@ -27,7 +27,7 @@ coverage() { "$PYTHON" -m coverage "$@"; }
 
 with_coverage() { # files in parallel: many of their tests wait for other processes
     coverage erase
-    coverage run -m pytest -ra --durations=20 -n "${PYTEST_WORKERS:-4}" --dist loadfile \
+    coverage run -m pytest -ra --durations=20 -n "${PYTEST_WORKERS:-3}" --dist loadfile \
         --no-loadscope-reorder
     local status=$?
     coverage combine --quiet
