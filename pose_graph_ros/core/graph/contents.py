@@ -146,19 +146,22 @@ class GraphContents:
     @property
     def is_bias(self) -> BoolArray:
         """Whether hidden nodes are biases, shape (N,)."""
-        return self.node_kind == int(NodeKind.BIAS)
+        return self._is(NodeKind.BIAS)
 
     @property
     def is_pose(self) -> BoolArray:
         """Whether hidden nodes are poses, shape (N,)."""
-        return self.node_kind == int(NodeKind.POSE)
+        return self._is(NodeKind.POSE)
+
+    def _is(self, kind: NodeKind) -> BoolArray:
+        # a byte for each node, as an estimate asks for it
+        types = self.memory['node_i'][:self.n_nodes, tb.NODE_TYPE].astype(np.uint8)
+        return np.asarray(types & np.uint8(3) == np.uint8(kind))
 
     @property
     def node_kind(self) -> npt.NDArray[Any]:
         """`NodeKind` of hidden nodes, shape (N,)."""
-        types = self.memory['node_i'][:self.n_nodes, tb.NODE_TYPE]
-        # an eighth of the memory that the table takes
-        return np.asarray(types.astype(np.uint8) & np.uint8(3))
+        return self.memory['node_i'][:self.n_nodes, tb.NODE_TYPE] & 3
 
     @property
     def dimension(self) -> npt.NDArray[Any]:
