@@ -22,6 +22,7 @@ import numpy.typing as npt
 
 from pose_graph_ros.core.batch.optimizer import Status
 from pose_graph_ros.core.config import ThinningConfig
+from pose_graph_ros.core.exceptions import GraphUpdateError
 from pose_graph_ros.core.geometry import se2
 from pose_graph_ros.core.geometry.se2 import BoolArray, FloatArray, IntArray
 from pose_graph_ros.core.graph.constraints import EdgeKind
@@ -193,7 +194,11 @@ def removed(smoother: IncrementalSmoother, update: GraphUpdate | None) -> Left |
     if update is None:
         return None
     gone = leaving(smoother.graph, update)
-    return None if smoother.update(update).status is Status.FAILED else gone
+    try:
+        result = smoother.update(update)
+    except GraphUpdateError:    # an approximation that rounding has made invalid
+        return None
+    return None if result.status is Status.FAILED else gone
 
 
 def simplify(smoother: IncrementalSmoother) -> Iterator[Left]:
