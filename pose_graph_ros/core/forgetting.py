@@ -25,7 +25,7 @@ from pose_graph_ros.core.smoother.results import Forgotten
 from pose_graph_ros.core.thinner import forget, Thinner
 from pose_graph_ros.core.window.policy import n_leaving
 from pose_graph_ros.core.window.sparse_removal import sparse_marginalization
-from pose_graph_ros.core.window.thinning import relative_noise, removed
+from pose_graph_ros.core.window.thinning import Places, relative_noise, removed
 
 # After a failure of the solver no node leaves before so many new ones have come.
 REST = 20
@@ -98,12 +98,14 @@ class Forgetting:
         parts.judge.decide_leaving(*constraints_on(graph, leaving))
         self._smoother.linearize(leaving)
         poses = nodes.recent_poses(graph)
-        self._pass_on_anchors(first)
+        anchors = self._other_anchors(first)
         gone = self._gone(leaving, prior)
         if gone is None:
             self._tuner.stay()
             return
         forget(gone, parts, self._tuner)
+        if anchors is not None:
+            nodes.table.thin(*anchors)
         nodes.forget(poses[:n])
         if not parts.alignment.is_aligned:
             self._joint = se2.between(poses[n - 1], poses[n])
@@ -124,19 +126,23 @@ class Forgetting:
             self._rest = len(self._parts.nodes) + REST
             return None
 
-    def _pass_on_anchors(self, first: int) -> None:
-        """Attach nodes that were thinned out to others if theirs leave, those before a number."""
+    def _other_anchors(self, first: int) -> Places | None:
+        """
+        Return the places of anchors of thinned nodes that leave, those before a number, in others.
+
+        None if there are none.
+        """
         table, graph = self._parts.nodes.table, self._parts.graph
         thinned = table.thinned
         leave = np.unique(thinned.anchors[(thinned.anchors < first) & (thinned.numbers >= first)])
         if len(leave) == 0:
-            return
+            return None
         kept = np.setdiff1d(np.arange(first, len(table)), thinned.numbers)
         ends, starts = graph.poses_of(table.ids[leave]), graph.poses_of(table.ids[kept])
         nearest = np.array([np.argmin(np.hypot(*(starts[:, :2] - end[:2]).T)) for end in ends])
         ids, anchors = table.ids[leave], table.ids[kept[nearest]]
-        table.thin(ids, anchors, se2.between(starts[nearest], ends),
-                   relative_noise(self._smoother, anchors, ids))
+        return Places(ids, anchors, se2.between(starts[nearest], ends),
+                      relative_noise(self._smoother, anchors, ids))
 
     def _follow_alignment(self) -> None:
         """
