@@ -101,6 +101,7 @@ class Forgetting:
         anchors = self._other_anchors(first)
         gone = self._gone(leaving, prior)
         if gone is None:
+            parts.judge.stay()
             self._tuner.stay()
             return
         forget(gone, parts, self._tuner)

@@ -138,10 +138,7 @@ class Thinner:
         update = None if cuts is None else sparse_removal(
             graph, np.sort(np.concatenate((group.nodes, biases))), segment.edges,
             segment.observed, cuts)
-        left = self._leave(group, update)
-        if not left:
-            self._tuner.stay()
-        return left
+        return self._leave(group, update)
 
     def _leave(self, group: Places, update: GraphUpdate | None) -> bool:
         """
@@ -155,6 +152,8 @@ class Thinner:
         """
         gone = removed(self._smoother, update)
         if gone is None:
+            self._parts.judge.stay()
+            self._tuner.stay()
             return False
         forget(gone, self._parts, self._tuner)
         self._parts.nodes.table.thin(*group)

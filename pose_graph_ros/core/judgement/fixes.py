@@ -334,6 +334,10 @@ class FixJudge:
             cut = stamp_ns, track.updated(track.innovation(one))
         return cut
 
+    def stay(self) -> None:
+        """Forget about the last `decide_leaving`, as nothing has left the graph."""
+        self._leaving = self._cut
+
     def forget(self, nodes: IntArray, edges: IntArray, observed: IntArray) -> None:
         """
         Forget measurements that have left the graph, and the path there.

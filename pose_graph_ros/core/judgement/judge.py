@@ -221,6 +221,11 @@ class Judge:
         self._leaving = [replace(each, left=True, since_ns=self._nodes.newest_ns)
                          for each in unused]
 
+    def stay(self) -> None:
+        """Forget about the last `decide_leaving`, as nothing has left the graph."""
+        self._leaving = []
+        self._fixes.stay()
+
     def forget(self, nodes: IntArray, edges: IntArray, observed: IntArray) -> None:
         """
         Forget what has left the graph after `decide_leaving`.
