@@ -19,6 +19,7 @@ from pose_graph_ros.core.config import (
 )
 from pose_graph_ros.core.geometry import se2
 from pose_graph_ros.core.geometry.se2 import FloatArray
+from pose_graph_ros.core.judgement.verdicts import State
 from pose_graph_ros.core.measurements import (
     AnswerStatus,
     GlobalPose,
@@ -244,3 +245,17 @@ def test_a_closure_that_waits_holds_its_node_but_not_for_ever() -> None:
     assert max(held) >= 75
     assert max(held) <= 85
     assert held[-1] <= 45
+
+
+def test_what_stays_after_all_is_not_on_record_as_having_left() -> None:
+    events, _ = drive(600)
+    wrong = LoopClosure(stamp_of(590), np.array([9.0, 4.0, 2.0]), np.diag([0.01, 0.01, 4e-4]),
+                        reference_ns=stamp_of(100))
+    backend = run([*events[:-20], ('loop_closure', wrong), *events[-20:]], WindowConfig())
+    judge, graph = backend._judge, backend.graph
+    none = np.empty(0, dtype=np.int64)
+    assert backend.verdict_totals()['loop_closure'].counts[State.DOUBTED] == 1
+    judge.decide_leaving(graph.edge_ids, graph.observed_ids)
+    judge.stay()
+    judge.forget(none, none, none)
+    assert not any(each.left for each in backend.verdicts())
