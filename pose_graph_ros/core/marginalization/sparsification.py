@@ -69,7 +69,7 @@ class _Candidates(NamedTuple):
 
 def sparsify(
     nodes: IntArray, poses: FloatArray, information: FloatArray, vector: FloatArray, *,
-    anchored: bool, n_extra: int = 0,
+    anchored: bool, n_extra: int = 0, enough: float = 1e-9,
 ) -> SparsePrior:
     """
     Return edges and observed nodes that approximate a prior and tell no more than it.
@@ -87,7 +87,8 @@ def sparsify(
     vector : ndarray, shape (3 k,), b: the prior's minimum is at `information @ delta = b`
     anchored : bool, whether the prior tells of the map; if not, its null space is that of motions
         of all poses as one body
-    n_extra : int, number of edges beyond the tree
+    n_extra : int, most edges beyond the tree; they are added as many as there are nodes at a time
+    enough : float, divergence from which on none is added [nats]
 
     """
     basis, free = _basis(poses, information, anchored)
@@ -102,11 +103,15 @@ def sparsify(
     if len(chosen) == 0:
         return SparsePrior(Edges(), ObservedNodes(), 0.0)
     blocks = conservative.nearest_below(found.rows[chosen])
-    extra = _overestimated(found, chosen, blocks)[:n_extra] if n_extra > 0 else chosen[:0]
-    if len(extra) > 0:
+    distance = conservative.divergence(found.rows[chosen], blocks)
+    most = len(chosen) + n_extra
+    while len(chosen) < most and distance > enough:
+        extra = _overestimated(found, chosen, blocks)[:min(len(nodes), most - len(chosen))]
+        if len(extra) == 0:
+            break
         chosen = np.append(chosen, extra)
         blocks = conservative.nearest_below(found.rows[chosen])
-    distance = conservative.divergence(found.rows[chosen], blocks)
+        distance = conservative.divergence(found.rows[chosen], blocks)
     roots = found.roots[chosen]
     in_map = np.matmul(np.matmul(roots, blocks), np.swapaxes(roots, 1, 2))
     i, j = found.i[chosen], found.j[chosen]

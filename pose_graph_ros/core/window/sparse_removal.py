@@ -26,6 +26,10 @@ NONE: IntArray = np.empty(0, dtype=np.int64)
 # Edges beyond the tree, for each of its nodes. A tree alone costs 8 % in rms where a hall is
 # driven 30 times, this 1 %.
 EXTRA = 0.5
+# The same for the prior that a window leaves: every group that leaves is approximated again, and
+# the losses of all of them add up. No more are added where the divergence is small [nats], or
+# where there are so many measurements that the convex problem takes too long.
+MOST_EXTRA, ENOUGH, MOST = 3.0, 0.1, 50
 # Priors on more poses stay dense: the convex problem takes 0.3 s of a processor for so many.
 MOST_POSES = 20
 
@@ -97,8 +101,9 @@ def sparse_marginalization(graph: Graph, nodes: IntArray) -> GraphUpdate:
     update = marginalize(graph, nodes.tolist())
     edges, observed, dense = [update.edges], [update.observed], []
     for prior in update.priors:
-        few = len(prior.nodes) <= MOST_POSES and _is_on_poses(graph, prior)
-        sparse = _approximation(prior) if few else None
+        n = len(prior.nodes)
+        few = n <= MOST_POSES and _is_on_poses(graph, prior)
+        sparse = _approximation(prior, min(MOST_EXTRA, MOST / n - 1.0), ENOUGH) if few else None
         if sparse is not None:
             edges.append(sparse.edges)
             observed.append(sparse.observed)
@@ -108,13 +113,25 @@ def sparse_marginalization(graph: Graph, nodes: IntArray) -> GraphUpdate:
         edges=Edges.joined(edges), observed=ObservedNodes.joined(observed), priors=dense)
 
 
-def _approximation(prior: Prior | None) -> SparsePrior | None:
-    """Return what stands for a prior on poses; None if it is too stiff for double precision."""
+def _approximation(
+    prior: Prior | None, extra: float = EXTRA, enough: float = 1e-9,
+) -> SparsePrior | None:
+    """
+    Return what stands for a prior on poses; None if it is too stiff for double precision.
+
+    Parameters
+    ----------
+    prior : Prior, optional
+    extra : float, most edges beyond the tree, for each of its nodes
+    enough : float, divergence from which on none is added [nats]
+
+    """
     if prior is None:
         return SparsePrior(Edges(), ObservedNodes(), 0.0)
     try:
         return sparsify(prior.nodes, prior.reference, prior.information, prior.vector,
-                        anchored=prior.anchored, n_extra=round(EXTRA * len(prior.nodes)))
+                        anchored=prior.anchored, n_extra=round(extra * len(prior.nodes)),
+                        enough=enough)
     except np.linalg.LinAlgError:
         return None
 
