@@ -2,7 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Is memory flat, is time: the sections on drives of hours, with their picture."""
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import asdict, dataclass, field
 import json
 from pathlib import Path
@@ -81,8 +81,11 @@ def section(
     for name, case in CASES.items():
         if len(cases) > 0 and not any(part in name for part in cases):
             continue
-        kept[name] = _drive(name, case, hours or case.hours, rate)
-        file.write_text(json.dumps(kept, indent=1) + '\n', encoding='utf-8')
+        # written hour by hour, so that a drive may be cut short
+        rows = kept[name] = []
+        for hour in _drive(name, case, hours or case.hours, rate):
+            rows.append(asdict(hour))
+            file.write_text(json.dumps(kept, indent=1) + '\n', encoding='utf-8')
     made = {name: [Hour(**values) for values in rows]   # type: ignore[arg-type]
             for name, rows in kept.items() if name in CASES}
     _fill(found, made)
@@ -91,14 +94,12 @@ def section(
     return found
 
 
-def _drive(name: str, case: Case, hours: float, rate: float) -> list[dict[str, object]]:
+def _drive(name: str, case: Case, hours: float, rate: float) -> Iterator[Hour]:
     course = Course(3600.0 * hours, odometry_rate=rate, **case.course)  # type: ignore[arg-type]
-    rows = []
     for hour in in_process(course, case.window, min(1.0, hours / 4.0)):
         say(f'  {name}: {hour.hours:.2f} h, {hour.resident:.1f} MB, {hour.nodes} nodes, update '
             f'{1e-3 * hour.mean["update"]:.2f} ms, rms {hour.rms:.2f} m')
-        rows.append(asdict(hour))
-    return rows
+        yield hour
 
 
 def _fill(found: Section, made: dict[str, list[Hour]]) -> None:

@@ -206,7 +206,7 @@ def _report(
     table = write_results(drive, options.out, options.bag.stem, {
         'seconds': seconds, 'alignment': estimate.alignment.value,
         'hidden_nodes': estimate.n_hidden, 'frozen_nodes': estimate.n_frozen,
-        'edges': estimate.n_edges,
+        'thinned_nodes': estimate.n_thinned, 'edges': estimate.n_edges,
         'observed_nodes': estimate.n_observed, 'biases': estimate.n_biases,
         'chi2': estimate.chi2, 'odometry_scale': estimate.odometry_scale,
         'status': report.status.value, 'counts': counts,

@@ -75,8 +75,10 @@ class Estimate:
     """Factor on the sigmas of the primary odometry."""
     n_frozen: int = 0
     """How many of the hidden nodes have left the graph; their poses do not change any more."""
+    n_thinned: int = 0
+    """How many of the others have left it; their poses move with those of nodes that stay."""
     n_priors: int = 0
-    """Priors that stand for them in the graph."""
+    """Priors that stand for frozen nodes in the graph."""
     trajectory: Trajectory | None = None
     """The value of `path`; None if the estimate was made without it."""
 

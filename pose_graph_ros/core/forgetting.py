@@ -134,7 +134,7 @@ class Forgetting:
         None if there are none.
         """
         table, graph = self._parts.nodes.table, self._parts.graph
-        thinned = table.thinned
+        thinned = table.thinned.places()
         leave = np.unique(thinned.anchors[(thinned.anchors < first) & (thinned.numbers >= first)])
         if len(leave) == 0:
             return None

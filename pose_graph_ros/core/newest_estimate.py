@@ -56,7 +56,8 @@ def estimate(
         T_map_odom=se2.compose(newest, se2.inverse(odometry)), covariance=cov,
         alignment=state, chi2=chi2, alignment_sigma=(
             math.sqrt(cov[2, 2]) if state is AlignmentState.ALIGNED else sigma),
-        n_hidden=len(nodes), n_frozen=nodes.n_frozen, n_priors=graph.n_priors,
+        n_hidden=len(nodes), n_frozen=nodes.n_frozen, n_thinned=len(nodes.table.thinned),
+        n_priors=graph.n_priors,
         n_edges=graph.n_edges - factors.n_bias_edges,
         n_observed=factors.n_measurements, n_biases=int(np.count_nonzero(graph.is_bias)),
         primary=nodes.primary, noise=noise if scale == 1.0 else noise.scaled(scale),

@@ -73,7 +73,9 @@ class Thinner:
     def _steps(self, config: ThinningConfig) -> Iterator[None]:
         """Yield after each change of the graph; others may have changed it before the next."""
         parts, smoother = self._parts, self._smoother
-        places = self._thinning.places(smoother, config, self._held())
+        # a fixed node that is frozen stays in the graph, but stands for no others
+        first = int(parts.nodes.ids[parts.nodes.n_frozen])
+        places = self._thinning.places(smoother, config, self._held(), first)
         if places is None:
             return
         older = parts.graph.node_ids[parts.graph.is_pose][:-config.newest]

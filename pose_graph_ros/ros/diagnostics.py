@@ -67,9 +67,9 @@ def _state(session: 'Session') -> dict[str, object]:
             'alignment_yaw_deg': f'{math.degrees(estimate.T_map_odom[2]):.3f}',
             'alignment_sigma_deg': f'{math.degrees(estimate.alignment_sigma):.3f}',
             'hidden_nodes': estimate.n_hidden, 'frozen_nodes': estimate.n_frozen,
-            'priors': estimate.n_priors, 'edges': estimate.n_edges,
-            'observed_nodes': estimate.n_observed, 'biases': estimate.n_biases,
-            'chi2': f'{estimate.chi2:.6g}'})
+            'thinned_nodes': estimate.n_thinned, 'priors': estimate.n_priors,
+            'edges': estimate.n_edges, 'observed_nodes': estimate.n_observed,
+            'biases': estimate.n_biases, 'chi2': f'{estimate.chi2:.6g}'})
     for rank, largest in enumerate(session.energies.found, 1):
         found[f'largest_energy.{rank}'] = f'{largest.name}: {largest.energy:.4g}' + (
             '' if largest.unweighted == largest.energy else

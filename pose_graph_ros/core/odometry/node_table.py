@@ -103,10 +103,10 @@ class NodeTable:
 
         They are given, but overwritten where a node was thinned out.
         """
-        thinned, first = self.thinned, self.n_frozen
-        if len(thinned) > 0:
+        if len(self.thinned) > 0:
+            thinned, first = self.thinned.places(), self.n_frozen
             present[thinned.numbers - first] = se2.compose(
-                present[thinned.anchors - first], thinned.relative)
+                present[thinned.anchors - first], thinned.relative.astype(np.float64))
         return present
 
     def attachment(self, number: int, mean: FloatArray, noise: FloatArray) -> Attachment:

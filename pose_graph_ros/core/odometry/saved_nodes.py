@@ -73,4 +73,4 @@ class SavedNodes:
     def fill(self, table: NodeTable) -> None:
         """Fill an empty table."""
         table.restore(self.stamps_ns, self.ids, self.odometry, self.frozen, self.travelled)
-        table.thinned.restore(self.thinned)
+        table.thinned.restore(self.thinned, table.n_frozen)

@@ -3,11 +3,12 @@
 """
 Thinning: which hidden nodes leave a graph of a place that is driven again and again.
 
-The plane is divided into square cells, and the circle of headings into sectors. In each sector of
-each cell only some poses stay: those that a believed fix or loop closure tells of, and then the
-oldest ones. So the number of nodes grows with the area and not with the time. A node that leaves
-has a kept one in its cell, its *anchor*: the node keeps its pose relative to the anchor, and what
-concerns the node later is attached to the anchor.
+Of poses that are near each other and have about the same heading only some stay, the oldest ones.
+So those that stay are apart from each other, and their number grows with the area and not with
+the time; how a place is divided does not matter, as it would with the cells of a grid, whose
+borders the errors of each pass cross anew. A node that leaves has a kept one beside it, its
+*anchor*: the node keeps its pose relative to the anchor, and what concerns the node later is
+attached to the anchor.
 
 Nodes leave in groups of connected ones. The prior of a group becomes a tree of edges at once
 (`marginalization.sparsification`), with the edges that earlier groups have left between the same
@@ -18,14 +19,13 @@ from collections.abc import Collection, Iterator
 from typing import NamedTuple, Self
 
 import numpy as np
-import numpy.typing as npt
+from scipy.spatial import KDTree
 
 from pose_graph_ros.core.batch.optimizer import Status
 from pose_graph_ros.core.config import ThinningConfig
 from pose_graph_ros.core.exceptions import GraphUpdateError
 from pose_graph_ros.core.geometry import se2
 from pose_graph_ros.core.geometry.se2 import BoolArray, FloatArray, IntArray
-from pose_graph_ros.core.graph.constraints import EdgeKind
 from pose_graph_ros.core.graph.graph import Graph
 from pose_graph_ros.core.graph.graph_update import GraphUpdate, Left
 from pose_graph_ros.core.smoother.incremental import IncrementalSmoother
@@ -38,6 +38,9 @@ EVERY, MOST_AT_ONCE = 10, 40
 MOST_EDGES, MOST_REPLACED = 2.5, 3
 # A group has at most this many nodes, and about this many neighbours in all.
 MOST_IN_GROUP, MOST_NEIGHBOURS = 10, 12
+# So many poses are compared at once, or as many as stay: the pairs of all would need too much
+# memory where a place has been driven often before it is thinned.
+PART = 256
 
 
 class Crowd(NamedTuple):
@@ -50,7 +53,7 @@ class Crowd(NamedTuple):
 
 
 def crowded(
-    poses: FloatArray, preferred: npt.NDArray[np.generic], config: ThinningConfig,
+    poses: FloatArray, preferred: BoolArray, config: ThinningConfig, part: int = PART,
 ) -> Crowd:
     """
     Return rows of poses that leave.
@@ -58,38 +61,39 @@ def crowded(
     Parameters
     ----------
     poses : ndarray, shape (N, 3), in the order of time, without the newest ones [m, m, rad]
-    preferred : ndarray of numbers, shape (N,), those with higher numbers stay before others
+    preferred : ndarray of bool, shape (N,), those that stay before others
     config : ThinningConfig
+    part : int, see `PART`
 
     """
-    cell = _cells(poses, config)
-    # by cell, then the preferred ones, then the oldest
-    order = np.lexsort((np.arange(len(poses)), -preferred.astype(np.int64), cell))
-    begins = np.flatnonzero(np.diff(cell[order], prepend=-1))
-    first = np.repeat(begins, np.diff(np.append(begins, len(order))))
-    rank = np.arange(len(order)) - first
-    out = rank >= config.poses
-    leaving, first = order[out], first[out]
-    # the nearest one of those that stay in the cell
-    kept = order[first[:, None] + np.arange(config.poses)]
-    distance = np.hypot(*np.moveaxis(poses[kept, :2] - poses[leaving, None, :2], 2, 0))
-    anchors = kept[np.arange(len(leaving)), np.argmin(distance, axis=1)]
+    order = np.argsort(~preferred, kind='stable')
+    place, heading = poses[order, :2], poses[order, 2]
+    anchor = np.full(len(poses), -1, dtype=np.int64)
+    end = 0
+    while end < len(poses):
+        begin, stay = end, np.flatnonzero(anchor[:end] < 0)
+        end = min(begin + max(part, len(stay)), len(poses))
+        index = np.concatenate((stay, np.arange(begin, end)))
+        pairs = index[KDTree(place[index]).query_pairs(config.cell, output_type='ndarray')]
+        pairs = np.sort(pairs[pairs.max(axis=1) >= begin], axis=1)
+        turn = np.abs(se2.wrap(heading[pairs[:, 1]] - heading[pairs[:, 0]]))
+        pairs = pairs[turn < config.angle]
+        pairs = pairs[np.argsort(pairs[:, 1], kind='stable')]
+        later, begins = np.unique(pairs[:, 1], return_index=True)
+        ends = np.append(begins[1:], len(pairs))
+        for row, first, after in zip(*map(np.ndarray.tolist, (later, begins, ends)), strict=False):
+            near = pairs[first:after, 0]
+            near = near[anchor[near] < 0]
+            if len(near) >= config.poses:
+                distance = np.hypot(*(place[near] - place[row]).T)
+                anchor[row] = near[np.argmin(distance)]
+    leaving = np.flatnonzero(anchor >= 0)
+    leaving, anchors = order[leaving], order[anchor[leaving]]
     ascending = np.argsort(leaving)
     return Crowd(leaving[ascending], anchors[ascending])
 
 
-def _cells(poses: FloatArray, config: ThinningConfig) -> IntArray:
-    """Return a number of the cell and the sector of each pose, shape (N,), not negative."""
-    sectors = max(round(se2.TWO_PI / config.angle), 1)
-    sector = np.floor((poses[:, 2] + np.pi) / se2.TWO_PI * sectors).astype(np.int64) % sectors
-    x, y = np.floor(poses[:, :2] / config.cell).astype(np.int64).T
-    if len(poses) == 0:
-        return sector
-    x, y = x - np.min(x), y - np.min(y)
-    return np.asarray((x * (np.max(y) + 1) + y) * sectors + sector)
-
-
-def crowd(graph: Graph, config: ThinningConfig) -> Crowd:
+def crowd(graph: Graph, config: ThinningConfig, first: int = 0) -> Crowd:
     """
     Return ids of the hidden nodes of a graph that leave it, and of their anchors.
 
@@ -99,12 +103,12 @@ def crowd(graph: Graph, config: ThinningConfig) -> Crowd:
     ----------
     graph : Graph
     config : ThinningConfig
+    first : int, id of the first node that is not frozen
 
     """
-    rows = np.flatnonzero(graph.is_pose)[:-config.newest]
+    rows = np.flatnonzero(graph.is_pose & (graph.node_ids >= first))[:-config.newest]
     fixed = graph.fixed
-    preferred = np.where(fixed, 2, informed(graph))
-    found = crowded(graph.poses[rows], preferred[rows], config)
+    found = crowded(graph.poses[rows], fixed[rows], config)
     leaving, anchors = rows[found.leaving], rows[found.anchors]
     free = ~fixed[leaving]
     ids = graph.node_ids
@@ -137,6 +141,7 @@ class Thinning:
 
     def places(
         self, smoother: IncrementalSmoother, config: ThinningConfig, keep: Collection[int] = (),
+        first: int = 0,
     ) -> Places | None:
         """
         Return the nodes that leave now, maybe none; None most times.
@@ -146,13 +151,14 @@ class Thinning:
         smoother : IncrementalSmoother, without edits that wait
         config : ThinningConfig
         keep : collection of int, ids of nodes that do not leave
+        first : int, id of the first node that is not frozen
 
         """
         newest = smoother.graph.newest_pose
         if config.cell == 0.0 or newest < self._newest + EVERY:
             return None
         self._newest = newest
-        found = crowd(smoother.graph, config)
+        found = crowd(smoother.graph, config, first)
         found = Crowd(*(ids[~np.isin(found.leaving, list(keep))] for ids in found))
         # those that are not sure enough to leave must not keep others from being looked at
         order = np.argsort(found.leaving < self._next, kind='stable')[:MOST_AT_ONCE]
@@ -215,10 +221,10 @@ def simplify(smoother: IncrementalSmoother) -> Iterator[Left]:
 
 def certain(smoother: IncrementalSmoother, found: Crowd, config: ThinningConfig) -> Places:
     """
-    Return those nodes that leave which are in one cell with their anchors for sure.
+    Return those nodes that leave which are beside their anchors for sure.
 
     The standard deviation of the position relative to the anchor is at most half of a cell, that
-    of the heading half of a sector. So what odometry alone brings together is not thinned.
+    of the heading half of `ThinningConfig.angle`. So what odometry alone brings together is not thinned.
 
     Parameters
     ----------
@@ -261,18 +267,6 @@ def relative_noise(
         jacobian = axes @ jacobian
         noise[k] = jacobian @ smoother.joint_covariance(anchor, node) @ jacobian.T
     return noise
-
-
-def informed(graph: Graph) -> BoolArray:
-    """Return which nodes a fix or a loop closure with a weight tells of, by row, shape (N,)."""
-    told = np.zeros(graph.n_nodes, dtype=bool)
-    edges, observed = graph.edges, graph.observed
-    closures = (edges.kind == EdgeKind.LOOP_CLOSURE) & (edges.weight > 0.0)
-    biased = (edges.kind == EdgeKind.BIAS) & (edges.weight > 0.0)
-    for ids in (edges.i[closures], edges.j[closures], edges.i[biased],
-                observed.node[observed.weight > 0.0]):
-        told[graph.node_rows(ids)] = True
-    return told
 
 
 def group(leaving: IntArray, ends: IntArray) -> IntArray:

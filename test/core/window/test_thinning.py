@@ -17,34 +17,37 @@ from pose_graph_ros.core.window import thinning
 
 
 def slowly_crowded(
-    poses: list[list[float]], preferred: list[int], config: ThinningConfig,
-) -> dict[int, list[int]]:
-    """Return what leaves, each with those that stay in its cell."""
-    sectors = max(round(2.0 * math.pi / config.angle), 1)
-    cells: dict[tuple[int, int, int], list[int]] = {}
+    poses: list[list[float]], preferred: list[bool], config: ThinningConfig,
+) -> dict[int, int]:
+    """Return what leaves, each with the nearest of those around it that stay."""
+    stay: list[int] = []
+    anchors = {}
     for row in sorted(range(len(poses)), key=lambda row: (-preferred[row], row)):
         x, y, theta = poses[row]
-        sector = math.floor((theta + math.pi) / (2.0 * math.pi) * sectors) % sectors
-        cells.setdefault(
-            (math.floor(x / config.cell), math.floor(y / config.cell), sector), []).append(row)
-    return {row: rows[:config.poses] for rows in cells.values() for row in rows[config.poses:]}
+        near = {k: math.dist(poses[k][:2], (x, y)) for k in stay
+                if abs(math.remainder(poses[k][2] - theta, 2.0 * math.pi)) < config.angle}
+        near = {k: distance for k, distance in near.items() if distance <= config.cell}
+        if len(near) >= config.poses:
+            anchors[row] = min(near, key=near.__getitem__)
+        else:
+            stay.append(row)
+    return anchors
 
 
 @given(st.integers(0, 2**32 - 1), st.integers(0, 80), st.sampled_from((0.7, 2.0, 30.0)),
        st.sampled_from((0.5, math.pi / 2.0, 7.0)), st.integers(1, 3))
 @settings(max_examples=60)
-def test_each_sector_of_a_cell_keeps_its_first_poses(
+def test_those_leave_that_have_enough_others_around_them(
     seed: int, n: int, cell: float, angle: float, kept: int,
 ) -> None:
     rng = np.random.default_rng(seed)
-    poses, preferred = random_poses(rng, n), rng.integers(0, 3, n)
+    poses, preferred = random_poses(rng, n), rng.random(n) < 0.2
     config = ThinningConfig(cell=cell, angle=angle, poses=kept)
-    found = thinning.crowded(poses, preferred, config)
     expected = slowly_crowded(poses.tolist(), preferred.tolist(), config)
-    assert found.leaving.tolist() == sorted(expected)
-    for row, anchor in zip(found.leaving.tolist(), found.anchors.tolist(), strict=True):
-        nearest = min(expected[row], key=lambda k: math.dist(poses[k, :2], poses[row, :2]))
-        assert anchor == nearest
+    for part in (3, 1000):
+        found = thinning.crowded(poses, preferred, config, part)
+        assert dict(zip(*(rows.tolist() for rows in found), strict=True)) == expected
+        assert found.leaving.tolist() == sorted(expected)
 
 
 def laps(n: int, per_lap: int) -> Graph:
@@ -65,19 +68,14 @@ def laps(n: int, per_lap: int) -> Graph:
     return graph
 
 
-def test_the_newest_nodes_and_those_that_something_tells_of_stay() -> None:
+def test_the_newest_nodes_and_the_fixed_one_stay_and_then_the_oldest() -> None:
     graph = laps(60, 20)
-    # sectors of 36 degrees, of which each has two nodes of a lap
-    config = ThinningConfig(cell=100.0, angle=np.pi / 5.0, poses=1, newest=15)
-    found = thinning.crowd(graph, config)
+    # two nodes of a lap are as near to each other as that
+    found = thinning.crowd(graph, ThinningConfig(cell=2.0, newest=15))
     leaving = set(found.leaving.tolist())
-    assert found.anchors.tolist() == [
-        anchor for anchor in found.anchors.tolist() if anchor not in leaving]
-    assert not leaving & {0, 23, *range(45, 60)}
-    # 20 and 40 have closures, but in their sector the fixed node is before them
-    assert {1, 20, 40, 3, 43} <= leaving
-    told = thinning.informed(graph)
-    assert np.flatnonzero(told).tolist() == [0, 20, 23, 40]
+    assert leaving == {*range(1, 19, 2), 19, *range(20, 45)}
+    assert not leaving & set(found.anchors.tolist())
+    assert dict(zip(*map(np.ndarray.tolist, found), strict=True))[40] == 0
 
 
 def test_nothing_leaves_a_graph_of_the_newest_nodes_alone() -> None:
