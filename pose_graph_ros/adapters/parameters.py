@@ -137,15 +137,13 @@ PARAMETERS: tuple[Parameter, ...] = (
               'of them, which are cheaper and less certain; priors with '
               'modelled errors stay dense.', choices=_values(config.Prior)),
     Parameter('thinning.cell', _THINNING.cell, 'm', 'Where a place is driven again and again, few '
-              'hidden nodes stay in the graph: the oldest ones, and rather those with fixes or '
-              'loop closures, in each square cell with sides of this length. The others leave it '
-              'once their positions relative to those are certain. If 0, all stay. Twice the '
+              'hidden nodes stay in the graph: one leaves it if an older one stays within this '
+              'distance and its position relative to that is certain. If 0, all stay. Twice the '
               'distance between hidden nodes is a good value.', 0.0, 1000.0),
-    Parameter('thinning.angle', _THINNING.angle, 'rad', 'Hidden nodes of one cell are only left '
-              'out for others whose heading is in the same sector of this size.', 0.01,
-              2.0 * math.pi),
-    Parameter('thinning.poses', float(_THINNING.poses), '', 'Number of hidden nodes that stay in '
-              'a sector of a cell.', 1.0, 1000.0),
+    Parameter('thinning.angle', _THINNING.angle, 'rad', 'A hidden node only leaves for others '
+              'whose heading differs from its own by less than this.', 0.01, 2.0 * math.pi),
+    Parameter('thinning.poses', float(_THINNING.poses), '', 'So many others must stay near a '
+              'hidden node that leaves.', 1.0, 1000.0),
     Parameter('thinning.newest', float(_THINNING.newest), '', 'Number of newest hidden nodes that '
               'stay in any case, with their fixes and odometry samples.', 2.0, 1e6),
     Parameter('alignment.sigma_heading', _ALIGNMENT.sigma_heading, 'rad', 'The map is aligned '

@@ -360,11 +360,11 @@ class ThinningConfig:
     """Which hidden nodes leave where a place is driven often; see `window.thinning`."""
 
     cell: float = 0.0
-    """Side of the cells [m]; 0 for no thinning."""
+    """Distance within which a node stands for others [m]; 0 for no thinning."""
     angle: float = math.pi / 2.0
-    """Sector of headings [rad]."""
+    """Difference of headings below which it does [rad]."""
     poses: int = 1
-    """Number of poses that stay in a sector of a cell."""
+    """So many must stay near one that leaves."""
     newest: int = 50
     """Number of newest hidden nodes that stay in any case."""
 

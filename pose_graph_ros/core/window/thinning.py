@@ -223,8 +223,8 @@ def certain(smoother: IncrementalSmoother, found: Crowd, config: ThinningConfig)
     """
     Return those nodes that leave which are beside their anchors for sure.
 
-    The standard deviation of the position relative to the anchor is at most half of a cell, that
-    of the heading half of `ThinningConfig.angle`. So what odometry alone brings together is not thinned.
+    The standard deviation of the position relative to the anchor is at most half of `cell`, that
+    of the heading half of `angle`. So what odometry alone brings together is not thinned.
 
     Parameters
     ----------
