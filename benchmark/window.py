@@ -38,10 +38,10 @@ SECTIONS: dict[str, Callable[[argparse.Namespace], Section]] = {
         hours=chosen.hours or (0.4 if chosen.quick else None), cases=chosen.case,
         folder=chosen.out),
     'hall': lambda chosen: window_hall.section(
-        quick=chosen.quick, seeds=chosen.seeds, folder=chosen.out),
+        quick=chosen.quick, seeds=chosen.seeds, folder=chosen.out, cases=chosen.case),
     'samples': lambda chosen: window_samples.section(
         chosen.samples or ([100_000] if chosen.quick else [1_000_000, 10_000_000]), chosen.bags)}
-ROWS = ('consistency',)
+ROWS = 'consistency', 'hall'
 """Sections of which rows that are not made again are kept."""
 
 
@@ -65,8 +65,8 @@ def main(arguments: list[str]) -> int:
                         help='samples: keep the bags there, and use them again (default: they '
                         'are removed)')
     parser.add_argument('--case', action='append', default=[], metavar='TEXT',
-                        help='consistency, day: only what has one of these in its name; other '
-                        'rows of the page stay')
+                        help='consistency, day, hall: only what has one of these in its name; '
+                        'other rows of the page stay')
     parser.add_argument('--out', type=Path, default=Path('build/benchmark/window'), metavar='DIR')
     chosen = parser.parse_args(arguments)
     chosen.out.mkdir(parents=True, exist_ok=True)

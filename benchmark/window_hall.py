@@ -2,6 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Thinning: a robot that drives in one hall for ever, with a graph that does not grow."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 import time
@@ -12,6 +13,7 @@ import numpy as np
 
 from benchmark.metrics import ACCURACY, Metric
 from benchmark.section import say, Section, Table
+from benchmark.window_day import resident
 from pose_graph_ros.cli.picture import BLUE, GREY, INK, VERMILION
 from pose_graph_ros.core.config import ThinningConfig
 from pose_graph_ros.core.geometry import se2
@@ -32,6 +34,12 @@ CLOSURE_EVERY, RECENT = 5, 60
 PASSES, SHARED, QUICK_PASSES, QUICK_SHARED = 500, 30, 40, 20
 """Passes of the thinned graph, and of those that are driven with the whole graph as well."""
 CELLS = 1.0, 2.0
+"""`ThinningConfig.cell` [m]."""
+COMPARISON, LONG = 'comparison', 'long'
+"""Cases."""
+TENTHS = 10
+GROWN, SLOWER = 1.05, 1.25
+"""Ratios of the last tenth of the passes to the second up to which the graph counts as flat."""
 PICTURE = 'hall.png'
 
 
@@ -52,6 +60,8 @@ class Record:
 
     nodes: list[int] = field(default_factory=list)
     edges: list[int] = field(default_factory=list)
+    resident: list[float] = field(default_factory=list)
+    """Memory of the process [MB]."""
     mean_ms: list[float] = field(default_factory=list)
     squared: list[float] = field(default_factory=list)
     nees: list[float] = field(default_factory=list)
@@ -150,6 +160,7 @@ def run(course: Drive, passes: int, config: ThinningConfig) -> Record:
         if k == end:
             record.nodes.append(smoother.graph.n_nodes)
             record.edges.append(smoother.graph.n_edges)
+            record.resident.append(resident())
             record.mean_ms.append(float(np.mean(times)))
             record.squared.append(float(np.mean(squared)))
             record.nees.append(float(np.mean(nees)))
@@ -174,7 +185,9 @@ def _closure(node: int, other: int, mean: FloatArray, thinned: ThinnedNodes) -> 
                  [EdgeKind.LOOP_CLOSURE])
 
 
-def section(*, quick: bool, seeds: int | None, folder: Path) -> Section:
+def section(
+    *, quick: bool, seeds: int | None, folder: Path, cases: Sequence[str] = (),
+) -> Section:
     """
     Compare the thinned graph with the whole one.
 
@@ -183,6 +196,7 @@ def section(*, quick: bool, seeds: int | None, folder: Path) -> Section:
     quick : bool
     seeds : int, optional, drives of the comparison
     folder : Path, where the picture goes
+    cases : sequence of str, only cases that hold one of these; all if empty
 
     """
     passes, shared = (QUICK_PASSES, QUICK_SHARED) if quick else (PASSES, SHARED)
@@ -192,38 +206,61 @@ def section(*, quick: bool, seeds: int | None, folder: Path) -> Section:
         f'A robot drives along the walls of a hall of {LENGTH:.0f} x {WIDTH:.0f} m, every pass at '
         'another distance from them and some the other way round. A hidden node each metre, a '
         f'closure to an older pass each {CLOSURE_EVERY} m, no fixes. Errors are those of the '
-        'newest pose, the first node being fixed at the truth.')
-    table = Table(f'The first {shared} passes, {n} drives', (
-        'graph', 'nodes', 'edges', 'rms [m]', 'over whole', 'NEES', 'step, last passes [ms]'))
-    courses = [drive(shared, seed) for seed in range(n)]
+        'newest pose, the first node being fixed at the truth. `thinning.cell` is '
+        f'{" or ".join(f"{cell:g} m" for cell in CELLS)}.')
+    found.tables = [
+        Table(f'The first {shared} passes, {n} drives', (
+            'graph', 'nodes', 'edges', 'rms [m]', 'over whole', 'NEES',
+            'step, last passes [ms]')),
+        Table(f'One drive of {passes} passes, {CELLS[-1]:g} m', (
+            'passes', 'nodes', 'edges', 'rms [m]', 'NEES', 'mean step [ms]', 'memory [MB]'))]
+    wanted = [case for case in (COMPARISON, LONG)
+              if len(cases) == 0 or any(part in case for part in cases)]
+    if COMPARISON in wanted:
+        _compare(found, [drive(shared, seed) for seed in range(n)], shared)
+    if LONG in wanted:
+        record = run(drive(passes, 0), passes, ThinningConfig(cell=CELLS[-1], newest=30))
+        _fill_long(found, record)
+        draw(record, run(drive(shared, 0), shared, ThinningConfig()), folder / PICTURE)
+        found.notes.append(f'![Nodes and time of a step over the passes]({PICTURE})')
+    return found
+
+
+def _compare(found: Section, courses: Sequence[Drive], shared: int) -> None:
+    """Add the rows of the first passes, with the whole graph and with thinned ones."""
     whole: list[Record] = []
     for name, config in (('whole', ThinningConfig()), *(
-            (f'cells of {cell:g} m', ThinningConfig(cell=cell, newest=30)) for cell in CELLS)):
+            (f'{cell:g} m', ThinningConfig(cell=cell, newest=30)) for cell in CELLS)):
         say(f'hall: {name}')
         records = [run(course, shared, config) for course in courses]
         whole = whole or records
         rms, reference = (float(np.sqrt(np.mean([each.squared for each in some])))
                           for some in (records, whole))
         nees = float(np.mean([each.nees for each in records]))
-        table.add(name, f'{records[0].nodes[-1]}', f'{records[0].edges[-1]}', f'{rms:.3f}',
-                  f'{rms / reference:.3f}', f'{nees:.2f}',
-                  f'{np.mean([each.mean_ms[-5:] for each in records]):.2f}')
+        found.tables[0].add(
+            name, f'{records[0].nodes[-1]}', f'{records[0].edges[-1]}', f'{rms:.3f}',
+            f'{rms / reference:.3f}', f'{nees:.2f}',
+            f'{np.mean([each.mean_ms[-5:] for each in records]):.2f}')
         found.metrics.append(Metric(f'hall, {name}: rms', rms, 'm', ACCURACY))
-    long = Table(f'One drive of {passes} passes, cells of {CELLS[-1]:g} m', (
-        'passes', 'nodes', 'edges', 'rms [m]', 'NEES', 'mean step [ms]'))
-    record = run(drive(passes, 0), passes, ThinningConfig(cell=CELLS[-1], newest=30))
-    for part in np.array_split(np.arange(passes), 10):
-        long.add(f'{part[-1] + 1}', f'{record.nodes[part[-1]]}', f'{record.edges[part[-1]]}',
-                 f'{np.sqrt(np.mean(np.take(record.squared, part))):.3f}',
-                 f'{np.mean(np.take(record.nees, part)):.2f}',
-                 f'{np.mean(np.take(record.mean_ms, part)):.2f}')
-    found.metrics.append(Metric('hall, nodes at the end', record.nodes[-1], '', ACCURACY))
-    found.metrics.append(Metric('hall, mean step of the last tenth',
-                                float(np.mean(record.mean_ms[-passes // 10:])), 'ms'))
-    found.tables += [table, long]
-    draw(record, whole[0], folder / PICTURE)
-    found.notes.append(f'![Nodes and time of a step over the passes]({PICTURE})')
-    return found
+
+
+def _fill_long(found: Section, record: Record) -> None:
+    """Add the rows of many passes, and whether nodes, edges, times and memory are flat."""
+    parts = np.array_split(np.arange(len(record.nodes)), TENTHS)
+    for part in parts:
+        last = part[-1]
+        found.tables[1].add(
+            f'{last + 1}', f'{record.nodes[last]}', f'{record.edges[last]}',
+            f'{np.sqrt(np.mean(np.take(record.squared, part))):.3f}',
+            f'{np.mean(np.take(record.nees, part)):.2f}',
+            f'{np.mean(np.take(record.mean_ms, part)):.2f}', f'{record.resident[last]:.1f}')
+    for name, values, most in (
+            ('nodes', record.nodes, GROWN), ('edges', record.edges, GROWN),
+            ('mean step', record.mean_ms, SLOWER), ('memory', record.resident, GROWN)):
+        early, late = (float(np.mean(np.take(values, part))) for part in (parts[1], parts[-1]))
+        found.metrics.append(Metric(
+            f'hall, {name}, last tenth of {len(record.nodes)} passes over the second',
+            late / early, '', ACCURACY, most))
 
 
 def draw(record: Record, whole: Record, file: Path) -> None:
