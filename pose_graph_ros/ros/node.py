@@ -227,7 +227,9 @@ class PoseGraphNode(LifecycleNode):
     def _on_set_parameters(self, parameters: list[RosParameter]) -> SetParametersResult:
         """Return whether all of some changes can be made now, and why not."""
         try:
-            self._changed(parameters)
+            # rclpy declares dozens of its own, of qualities of service, at each start
+            if any(parameter.name in self._own for parameter in parameters):
+                self._changed(parameters)
         except ConfigError as error:
             return SetParametersResult(successful=False, reason=str(error))
         return SetParametersResult(successful=True)

@@ -10,6 +10,16 @@ from typing import Any
 
 import pytest
 
+from pose_graph_ros.core.compiled import jit
+from pose_graph_ros.core.warm_up import warm_up
+
+
+def pytest_collection_finish(session: pytest.Session) -> None:
+    """Compile what is not in the cache before a test, whose time is limited, starts a node."""
+    here = any(item.path.parent == Path(__file__).parent for item in session.items)
+    if here and not session.config.option.collectonly and not jit.is_cached():
+        warm_up()
+
 
 @pytest.fixture(autouse=True, scope='session')
 def _on_this_machine_alone(tmp_path_factory: pytest.TempPathFactory) -> Iterator[None]:
