@@ -26,7 +26,7 @@ import pose_graph_ros
 
 OTHERS = ('numba', 'scipy.optimize', 'hypothesis', 'matplotlib', 'rosbags.highlevel', 'rclpy.node')
 """Modules whose imports take long."""
-TRACED, TRACED_THREADS = 0.2, 6.0
+TRACED, TRACED_THREADS = 0.1, 6.0
 """Time of the processor for which a function is traced, and the threads of a file [s]."""
 
 _left: dict[object, float] = {}
@@ -37,10 +37,11 @@ if 'PYTEST_XDIST_WORKER' in os.environ:
 
 
 @pytest.hookimpl(hookwrapper=True)
-def pytest_collection() -> Iterator[None]:
+def pytest_collection(session: pytest.Session) -> Iterator[None]:
     """Trace the imports of our modules, and not those of others nor what pytest does."""
-    tracer = sys.gettrace()
-    if tracer is not None:
+    tracer, config = sys.gettrace(), session.config
+    distributes = config.getoption('numprocesses', None) and not hasattr(config, 'workerinput')
+    if tracer is not None and not distributes:
         sys.settrace(None)
         for name in OTHERS:
             _import(name)

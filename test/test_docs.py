@@ -3,6 +3,7 @@
 """The documentation names only what there is: files, links, modules, classes and functions."""
 
 import ast
+import functools
 from pathlib import Path
 import re
 
@@ -17,6 +18,7 @@ PAGES = [page for page in (
 README_LINES = 110
 
 
+@functools.cache
 def definitions() -> set[str]:
     """Return the names of modules, classes, functions and `Class.member`s of the package."""
     names = set()
@@ -31,9 +33,6 @@ def definitions() -> set[str]:
                 names |= {f'{node.name}.{item.name}' for item in node.body
                           if isinstance(item, ast.FunctionDef | ast.AsyncFunctionDef)}
     return names
-
-
-NAMES = definitions()
 
 
 def quoted(page: Path) -> list[str]:
@@ -60,9 +59,10 @@ def test_links_lead_somewhere(page: Path) -> None:
 
 @pytest.mark.parametrize('page', PAGES, ids=lambda page: page.name)
 def test_classes_and_their_members_that_are_named_exist(page: Path) -> None:
+    names = definitions()
     for name in (quoted_name.removesuffix('()') for quoted_name in quoted(page)):
-        if re.fullmatch(r'[A-Z][a-zA-Z]+\.[a-z_]+', name) and name.partition('.')[0] in NAMES:
-            assert name in NAMES, f'{page.name}: {name}'
+        if re.fullmatch(r'[A-Z][a-zA-Z]+\.[a-z_]+', name) and name.partition('.')[0] in names:
+            assert name in names, f'{page.name}: {name}'
 
 
 def test_the_stories_of_the_design_name_only_what_there_is() -> None:
@@ -70,7 +70,7 @@ def test_the_stories_of_the_design_name_only_what_there_is() -> None:
     stories = text[text.index('### One odometry message'):text.index('## Saved graphs')]
     for name in re.findall(r'`([A-Za-z_.]+)(?:\(\))?`', stories):
         if not name.endswith('.py') and '/' not in name:
-            assert name in NAMES, name
+            assert name in definitions(), name
 
 
 def test_the_readme_fits_on_two_screens() -> None:

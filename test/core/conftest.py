@@ -6,7 +6,7 @@ from hypothesis import settings
 
 from pose_graph_ros.core.graph import tables
 
-settings.register_profile('core', deadline=None, derandomize=True, max_examples=60)
+settings.register_profile('core', deadline=None, derandomize=True, max_examples=40)
 settings.load_profile('core')
 
 tables.FIRST_ROWS = 16  # type: ignore[misc]  # small graphs would never grow out of real ones

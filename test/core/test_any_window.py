@@ -73,7 +73,7 @@ def through_files(backend: PoseGraphBackend, config: BackendConfig, path: Path) 
 
 
 @given(st.integers(0, 2**32 - 1), configs(), st.sampled_from((0.0, 1.0, 30.0)))
-@settings(max_examples=8, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@settings(max_examples=5, suppress_health_check=[HealthCheck.function_scoped_fixture])
 def test_no_drive_ends(
     tmp_path: Path, seed: int, config: BackendConfig, delay: float,
 ) -> None:

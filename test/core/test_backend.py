@@ -184,7 +184,7 @@ def test_a_quick_robot_makes_no_more_nodes_than_the_interval_allows() -> None:
 
 # --- Order of arrival ------------------------------------------------------------------------
 
-@settings(max_examples=15)
+@settings(max_examples=8)
 @given(st.data())
 def test_any_interleaving_of_the_topics_gives_the_same_path(data: st.DataObject) -> None:
     sources: list[list[Event]] = [
@@ -197,7 +197,7 @@ def test_any_interleaving_of_the_topics_gives_the_same_path(data: st.DataObject)
     assert_same_path(run(events, data.draw(st.sampled_from((0, 11, 40)))), REFERENCE_PATH)
 
 
-@settings(max_examples=15)
+@settings(max_examples=8)
 @given(st.randoms(use_true_random=False), st.integers(0, 141), st.sampled_from((0, 7, 50)))
 def test_shuffled_measurements_give_the_same_path(
     random: object, known: int, update_every: int,
@@ -210,7 +210,7 @@ def test_shuffled_measurements_give_the_same_path(
     assert_same_path(run(events, update_every), REFERENCE_PATH)
 
 
-@settings(max_examples=10)
+@settings(max_examples=5)
 @given(st.randoms(use_true_random=False), st.sampled_from((0, 1, 9)))
 def test_with_positions_alone_any_order_gives_the_same_path(
     random: object, update_every: int,
@@ -944,7 +944,7 @@ def covariances(draw: st.DrawFn) -> FloatArray:
         return correlation * deviation * deviation[:, None]
 
 
-@settings(max_examples=150)
+@settings(max_examples=80)
 @given(st.lists(st.tuples(triples, covariances(), st.integers(0, 3), st.integers(0, 40)),
                 min_size=1, max_size=4))
 def test_no_numbers_bring_the_backend_down(
@@ -1007,7 +1007,7 @@ def drive_with_outage(
 
 # with seed 1 a step is only 8 % shorter than the one before
 @pytest.mark.parametrize(
-    ('drift', 'seed'), [(-2.0, 5), (-1.0, 5), (0.5, 5), (1.0, 5), (2.0, 5), (2.0, 1)])
+    ('drift', 'seed'), [(-2.0, 5), (0.5, 5), (2.0, 1)])
 def test_a_heading_that_drifts_far_in_a_long_outage_is_wound_the_right_way(
     drift: float, seed: int,
 ) -> None:

@@ -297,7 +297,7 @@ def test_without_fixes_there_is_no_latitude(client: Client) -> None:
 
 
 @pytest.mark.parametrize('node', [
-    (), ('-p', 'fix.correlation_time:=0.0'), ('-p', 'fix.correlation_time:=20.0')], indirect=True)
+    (), ('-p', 'fix.correlation_time:=0.0')], indirect=True)
 def test_errors_that_live_on_show_in_the_diagnostics(
     node: NodeProcess, client: Client, request: pytest.FixtureRequest,
 ) -> None:

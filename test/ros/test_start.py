@@ -19,8 +19,8 @@ pytestmark = pytest.mark.untraced
 def test_nothing_is_lost_while_kernels_are_compiled(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    # what the elimination needs is compiled: some eight seconds
-    copy_kernels(tmp_path / 'kernels', without='elimination')
+    # what judging needs is compiled: some three seconds
+    copy_kernels(tmp_path / 'kernels', without='judgement')
     monkeypatch.setenv('NUMBA_CACHE_DIR', str(tmp_path / 'kernels'))
     with NodeProcess(tmp_path, program=AS_A_USER) as node:
         client = Client(int(node.env['ROS_DOMAIN_ID']))
@@ -29,21 +29,21 @@ def test_nothing_is_lost_while_kernels_are_compiled(
                           and client.fix.get_subscription_count() > 0, 'it listens')
         client.spin_for(0.3)
         assert client.values['prepared'] == '0'
-        for step in range(200):
+        for step in range(100):
             client.odom.publish(odometry_at(step / 10.0))
             if step % 5 == 0:
                 client.fix.publish(fix_at(step / 10.0))
             client.spin_for(0.005)
-        client.spin_until(lambda: client.values['received'] == '240', 'all are heard')
+        client.spin_until(lambda: client.values['received'] == '120', 'all are heard')
         assert client.values['prepared'] == '0'
         assert client.values['processed'] == '0'
         client.spin_until(lambda: client.diagnostics[-1].status[0].message == (
-            'Compiling kernels, as at every first start: 240 measurements wait until then.'),
+            'Compiling kernels, as at every first start: 120 measurements wait until then.'),
             'it says what it waits for')
         client.spin_until(lambda: client.values['prepared'] == '1', 'it has compiled',
                           PREPARE_PATIENCE)
-        client.wait_processed(240)
-        assert client.values['odom.accepted'] == '200'
+        client.wait_processed(120)
+        assert client.values['odom.accepted'] == '100'
         assert client.optimize().success
         assert path_error(client) < 1e-3
         client.close()

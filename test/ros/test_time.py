@@ -9,7 +9,7 @@ import pytest
 from rosgraph_msgs.msg import Clock
 
 pytestmark = pytest.mark.untraced
-LOOPS = 10
+LOOPS = 5
 DATUM = ('-p', 'datum:=[48.1, 11.6]')
 
 
@@ -41,7 +41,7 @@ def check_one_lap(client: Client, path_begins_at: float = 0.0) -> None:
 
 
 @pytest.mark.parametrize('node', [('-p', 'use_sim_time:=true', *DATUM)], indirect=True)
-def test_ten_loops_of_a_bag_with_its_clock(node: NodeProcess, client: Client) -> None:
+def test_loops_of_a_bag_with_its_clock(node: NodeProcess, client: Client) -> None:
     clock = client.node.create_publisher(Clock, '/clock', RELIABLE)
     client.spin_until(lambda: clock.get_subscription_count() > 0, 'the clock is heard')
     datum = client.values['datum']
@@ -68,7 +68,7 @@ def test_ten_loops_of_a_bag_with_its_clock(node: NodeProcess, client: Client) ->
     assert client.values['resets'] == str(LOOPS - 1)
 
 
-def test_ten_loops_of_a_bag_without_a_clock(node: NodeProcess, client: Client) -> None:
+def test_loops_of_a_bag_without_a_clock(node: NodeProcess, client: Client) -> None:
     for loop in range(LOOPS):
         publish_lap(client)
         if loop > 0:

@@ -205,18 +205,18 @@ def normalised_errors(
 
 
 @pytest.mark.parametrize(('n', 'gap', 'arguments'), [
-    (20, 1.0, {}), (60, 1.0, {}), (200, 1.0, {}),
+    (20, 1.0, {}), (200, 1.0, {}),
     (10, 15.0, {'speed': 15.0}), (60, 15.0, {'speed': 15.0, 'curvature': 0.01}),
     (20, 30.0, {'speed': 30.0, 'sigma': 2.0, 'curvature': 0.002}),
-    (12, 1.0, {'sigma': 0.02}), (60, 1.0, {'sigma': 0.02}),
-], ids=['robot_20', 'robot_60', 'robot_200', 'car_10', 'car_60', 'fast_car', 'rtk_12', 'rtk_60'])
+    (12, 1.0, {'sigma': 0.02}),
+], ids=['robot_20', 'robot_200', 'car_10', 'car_60', 'fast_car', 'rtk_12'])
 def test_the_sigma_is_honest_for_white_errors(n: int, gap: float, arguments: dict) -> None:
     # 150 draws of chi2: 0.12 one sigma
     assert 0.7 < np.mean(normalised_errors(n, gap, **arguments)) < 1.4
 
 
 @pytest.mark.parametrize(('n', 'gap', 'arguments'), [
-    (20, 1.0, {}), (60, 1.0, {}), (300, 1.0, {}), (60, 15.0, {'speed': 15.0, 'curvature': 0.01})])
+    (20, 1.0, {}), (300, 1.0, {}), (60, 15.0, {'speed': 15.0, 'curvature': 0.01})])
 def test_the_sigma_is_no_smaller_than_errors_with_a_correlation_time_of_a_minute(
     n: int, gap: float, arguments: dict,
 ) -> None:

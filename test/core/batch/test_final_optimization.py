@@ -105,7 +105,7 @@ def robust_cost(backend: PoseGraphBackend, loss: Loss, threshold: float,
 
 
 @pytest.mark.parametrize(('loss', 'seed'), [
-    *((loss, 0) for loss in ROBUST), *((Loss.HUBER, k) for k in (1, 2)), (Loss.CAUCHY, 1)])
+    *((loss, 0) for loss in ROBUST), (Loss.HUBER, 1)])
 def test_the_minimum_is_that_of_the_robust_cost(loss: Loss, seed: int) -> None:
     threshold = 1.5
     odometry, measurements, _ = drive(seed, outliers=(3, 7), off=3.0, n=11)
@@ -136,7 +136,7 @@ def error_without_outliers(seed: int) -> float:
     return rms(backend, truth)
 
 
-@pytest.mark.parametrize('seed', range(4))
+@pytest.mark.parametrize('seed', range(2))
 @pytest.mark.parametrize('off', [5.0, 20.0, 1000.0])
 def test_a_fifth_of_outliers_hardly_shows_with_cauchy(seed: int, off: float) -> None:
     rng = np.random.default_rng(100 + seed)

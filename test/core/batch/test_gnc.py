@@ -107,7 +107,7 @@ def small(seed: int) -> TruncatedProblem:
 
 
 def test_the_set_is_that_of_dense_graduated_non_convexity() -> None:
-    problem = small(0)
+    problem = problem_of(laps(0, n_laps=2, n=5, every=2, n_wrong=2))
     dense = Dense(problem, problem.graph.poses.copy())
     choice = gnc.select(problem, Surrogate.TRUNCATED)
     np.testing.assert_array_equal(choice.believed, dense.gnc())

@@ -351,7 +351,7 @@ def members_of_a_drive() -> tuple[dict[str, Any], list[tuple[Any, ...]]]:
 
 
 @given(st.data())
-@settings(max_examples=150)
+@settings(max_examples=80)
 def test_with_any_value_of_a_member_a_file_is_refused_or_usable(data: st.DataObject) -> None:
     members, places = members_of_a_drive()
     place = data.draw(st.sampled_from(places))

@@ -97,7 +97,7 @@ def assert_same_estimate(actual: Estimate, expected: Estimate, tolerance: float 
 # --- continuation --------------------------------------------------------------------------------
 
 @given(st.sampled_from(list(CONFIGS)), st.integers(60, 900))
-@settings(max_examples=8)
+@settings(max_examples=5)
 def test_a_graph_comes_back_to_the_bit_and_grows_on_as_without_saving(kind: str, cut: int) -> None:
     stream = events(kind)
     before = PoseGraphBackend(CONFIGS[kind])

@@ -106,7 +106,7 @@ class Drive:
 
 
 @given(seeds, st.integers(3, 12))
-@settings(max_examples=20)
+@settings(max_examples=8)
 def test_distances_are_those_by_composing_everything(seed: int, n: int) -> None:
     drive, chain = Drive(seed, n), OdometryChain()
     chain.extend(drive.smoother.graph)

@@ -98,8 +98,7 @@ def assert_weights_are_as_decided(backend: PoseGraphBackend) -> None:
     assert np.all(observed[as_edges] == 0.0)
 
 
-@pytest.mark.parametrize('correlation', Correlation)
-@pytest.mark.parametrize('seed', [1, 2])
+@pytest.mark.parametrize(('seed', 'correlation'), enumerate(Correlation, 1))
 def test_the_end_does_not_depend_on_the_order_of_arrival(
     seed: int, correlation: Correlation,
 ) -> None:

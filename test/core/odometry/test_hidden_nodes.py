@@ -136,7 +136,7 @@ def slow_nodes(
     return result
 
 
-@settings(max_examples=40)
+@settings(max_examples=15)
 @given(st.integers(0, 10**6))
 def test_nodes_are_where_a_slow_walk_puts_them(seed: int) -> None:
     rng = np.random.default_rng(seed)
@@ -163,12 +163,12 @@ def test_nodes_are_where_a_slow_walk_puts_them(seed: int) -> None:
 
 
 @pytest.mark.parametrize('rate', [1, 10])
-def test_an_hour_at_rest_leaves_the_heartbeat(rate: int) -> None:
+def test_a_long_rest_leaves_the_heartbeat(rate: int) -> None:
     nodes, made, _ = grown([
         ('wheel', OdometrySample(EPOCH + k * SECOND // rate, np.ones(3)))
-        for k in range(3600 * rate)])
-    assert len(nodes) == 360
-    assert len(nodes.streams['wheel'].timeline) <= 2 if rate > 1 else 3600
+        for k in range(1200 * rate)])
+    assert len(nodes) == 120
+    assert len(nodes.streams['wheel'].timeline) <= 2 if rate > 1 else 1200
     np.testing.assert_array_equal(np.array(made.means[1:]), 0.0)
 
 
@@ -183,7 +183,7 @@ def test_a_node_that_cannot_be_made_is_made_at_the_next_sample() -> None:
 
 # --- Several sources -------------------------------------------------------------------------
 
-@settings(max_examples=30)
+@settings(max_examples=15)
 @given(st.floats(0.02, 0.4), st.floats(0.02, 0.4), st.floats(-3.0, 3.0), st.floats(-3.0, 3.0))
 def test_another_source_adds_edges_between_the_nodes_that_it_covers(
     period: float, phase: float, late: float, early: float,
@@ -357,7 +357,7 @@ SILENCES = st.lists(st.tuples(
     st.sampled_from(list(FRAMES)), st.floats(0.0, 25.0), st.floats(1.7, 9.0)), max_size=5)
 
 
-@settings(max_examples=60)
+@settings(max_examples=25)
 @given(SILENCES, st.data(), st.sampled_from((0.0, 0.02, 0.24)))
 def test_nodes_and_edges_do_not_depend_on_the_order_of_arrival(
     silences: list[tuple[str, float, float]], data: st.DataObject, spread: float,
@@ -396,7 +396,7 @@ def test_nodes_and_edges_do_not_depend_on_the_order_of_arrival(
                 np.testing.assert_array_equal(one.noise, other.noise)
 
 
-@settings(max_examples=30)
+@settings(max_examples=12)
 @given(SILENCES, st.integers(0, 10**6))
 def test_the_attachment_of_a_stamp_does_not_depend_on_later_samples(
     silences: list[tuple[str, float, float]], seed: int,

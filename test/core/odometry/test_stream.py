@@ -380,10 +380,10 @@ def test_without_a_variance_the_noise_is_that_of_the_model() -> None:
 
 # --- Memory ----------------------------------------------------------------------------------
 
-def test_an_hour_of_standing_still_leaves_nothing() -> None:
+def test_standing_still_leaves_nothing() -> None:
     stream = OdometryStream(OdometrySource(noise_from=NoiseFrom.TWIST))
     pose, variance = np.array([1.0, 2.0, 0.3]), np.array([0.1, 0.1, 0.1])
-    for k in range(0, 180_000):
+    for k in range(0, 60_000):
         stream.add(OdometrySample(EPOCH + k * SECOND // 50, pose, 0.0, variance))
         for _ in stream.settle():
             pass
@@ -393,7 +393,7 @@ def test_an_hour_of_standing_still_leaves_nothing() -> None:
     motion = stream.timeline.motion(EPOCH, stream.settled_ns)
     np.testing.assert_array_equal(motion.increment, 0.0)
     # every instant of it is covered closely
-    assert stream.timeline.covers(EPOCH + 1234 * SECOND + 77, closely=True)
+    assert stream.timeline.covers(EPOCH + 1134 * SECOND + 77, closely=True)
 
 
 @settings(max_examples=20)
