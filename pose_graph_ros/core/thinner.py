@@ -79,7 +79,7 @@ class Thinner:
         if places is None:
             return
         older = parts.graph.node_ids[parts.graph.is_pose][:-config.newest]
-        while True:
+        while self._thinning.measurements_are_due(parts.graph):
             older = older[parts.graph.node_rows(older) >= 0]
             segment = next_segment(parts.graph, older, places.nodes)
             if segment is None:

@@ -249,8 +249,9 @@ class RunSet:
         if len(stay) > 0 and len(stay) < len(self.chain):
             first = int(stay[0])
             self._runs = without_old(self._runs, first, self._main, self.chain)
+            kept = {run.number: run.carry(self.chain, nodes) for run in self._runs}
             for run in self._runs:
-                run.carry(self.chain, nodes)
+                run.states_left(kept)
                 run.jumps_before = tuple(jump for jump in run.jumps_before if jump[1] >= first)
         self.chain.forget(nodes)
 

@@ -17,7 +17,7 @@ price in units of chi2:
 `run_choice` finds the set of runs with the lowest price.
 """
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 import copy
 import math
 from typing import NamedTuple
@@ -293,9 +293,11 @@ class Run:
         variance = 0.5 * float(cov[0, 0] + cov[1, 1]) + way**2
         return max(2.0 * math.log(FAR**2 / variance) - float(moved @ moved) / variance, 0.0)
 
-    def carry(self, chain: OdometryChain, nodes: IntArray) -> None:
+    def carry(self, chain: OdometryChain, nodes: IntArray) -> dict[int, int]:
         """
         Take poses at nodes that leave the graph to the next ones that stay.
+
+        The states there are lost: returned are the new indices of the others by the old ones.
 
         Parameters
         ----------
@@ -304,13 +306,22 @@ class Run:
 
         """
         gone = {*nodes.tolist()}
-        self.states = [state for state in self.states if state[1].node not in gone]
+        kept = [k for k, state in enumerate(self.states) if state[1].node not in gone]
+        self.states = [self.states[k] for k in kept]
         if any(member.node in gone for member in self.members):
             self.members = ()
         if self.first.node in gone:
             self._turned = self.turned
             self.first = self.first.carried(chain, nodes)
         self.track = self.track.carried(chain, nodes)
+        return {old: new for new, old in enumerate(kept)}
+
+    def states_left(self, kept: Mapping[int, Mapping[int, int]]) -> None:
+        """Adapt the ways from other runs, by their numbers, to what `carry` has returned."""
+        for number in kept.keys() & self.prices.keys():
+            self.prices[number] = [
+                way._replace(cut=kept[number].get(way.cut, -1)) for way in self.prices[number]
+                if way.cut < 0 or way.cut in kept[number]]
 
     def cut_after(self, state: int, number: int) -> 'Run':
         """

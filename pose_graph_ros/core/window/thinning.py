@@ -29,6 +29,7 @@ from pose_graph_ros.core.geometry.se2 import BoolArray, FloatArray, IntArray
 from pose_graph_ros.core.graph.graph import Graph
 from pose_graph_ros.core.graph.graph_update import GraphUpdate, Left
 from pose_graph_ros.core.smoother.incremental import IncrementalSmoother
+from pose_graph_ros.core.window.segments import carriers, first_of
 from pose_graph_ros.core.window.sparse_removal import leaving, with_fewer_edges
 
 # Nodes leave whenever so many new ones have been made; so many are looked at each time.
@@ -36,6 +37,10 @@ EVERY, MOST_AT_ONCE = 10, 40
 # Edges of the kind PRIOR for each pose, above which some of them are replaced by fewer ones, and
 # how often in one step.
 MOST_EDGES, MOST_REPLACED = 2.5, 3
+# Fixes, poses and rotations for each pose that stays, up to which they stay as well, with their
+# nodes: what they tell of the errors they have in common is exact only as long as they are in the
+# graph. A small area counts as so many times the newest nodes.
+MOST_MEASUREMENTS, LEAST = 2.0, 4
 # A group has at most this many nodes, and about this many neighbours in all.
 MOST_IN_GROUP, MOST_NEIGHBOURS = 10, 12
 # So many poses are compared at once, or as many as stay: the pairs of all would need too much
@@ -138,6 +143,13 @@ class Thinning:
 
     def __init__(self) -> None:
         self._newest, self._next = -EVERY, 0
+        self._n_stay = 0
+        """Number of poses that stay, when it was last looked, or what stands for it."""
+
+    def measurements_are_due(self, graph: Graph) -> bool:
+        """Return whether there are so many measurements in the map that the oldest are to go."""
+        n_measured = sum(np.count_nonzero(held >= 0) for held in carriers(graph))
+        return n_measured > MOST_MEASUREMENTS * self._n_stay
 
     def places(
         self, smoother: IncrementalSmoother, config: ThinningConfig, keep: Collection[int] = (),
@@ -158,7 +170,13 @@ class Thinning:
         if config.cell == 0.0 or newest < self._newest + EVERY:
             return None
         self._newest = newest
-        found = crowd(smoother.graph, config, first)
+        graph = smoother.graph
+        found = crowd(graph, config, first)
+        n_stay = np.count_nonzero(graph.is_pose) - len(found.leaving)
+        self._n_stay = max(n_stay, LEAST * config.newest)
+        if not self.measurements_are_due(graph):
+            before = found.leaving < first_of(*carriers(graph))
+            found = Crowd(*(ids[before] for ids in found))
         found = Crowd(*(ids[~np.isin(found.leaving, list(keep))] for ids in found))
         # those that are not sure enough to leave must not keep others from being looked at
         order = np.argsort(found.leaving < self._next, kind='stable')[:MOST_AT_ONCE]

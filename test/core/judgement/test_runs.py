@@ -8,7 +8,7 @@ import pytest
 from pose_graph_ros.core.graph.constraints import EdgeKind, Edges
 from pose_graph_ros.core.graph.graph import Graph, GraphUpdate
 from pose_graph_ros.core.judgement.odometry_chain import OdometryChain
-from pose_graph_ros.core.judgement.runs import EVENT, LEAST_MEMBERS, Run
+from pose_graph_ros.core.judgement.runs import EVENT, LEAST_MEMBERS, Run, Transition
 from pose_graph_ros.core.judgement.tracks import Track
 
 SECOND = 1_000_000_000
@@ -49,3 +49,21 @@ def test_a_jump_costs_more_the_farther_it_is_and_less_the_longer_the_way() -> No
     run = Run(1, 0, Track(0, np.zeros(3), np.eye(3)), believed=False)
     run.seconds = 30.0
     assert run.price < long[-1]
+
+
+def test_ways_after_a_part_of_a_run_follow_the_states_that_stay() -> None:
+    graph = Graph()
+    graph.apply(GraphUpdate(hidden=np.zeros((6, 3)), fix=[0], edges=Edges(
+        np.arange(5), np.arange(1, 6), np.zeros((5, 3)), np.tile(np.eye(3), (5, 1, 1)),
+        np.full(5, EdgeKind.ODOMETRY))))
+    chain = OdometryChain()
+    chain.extend(graph)
+    tracks = [Track(node, np.zeros(3), np.eye(3)) for node in range(6)]
+    before = Run(1, 0, tracks[4], believed=True)
+    before.states = [(node * SECOND, tracks[node]) for node in range(4)]
+    after = Run(2, 5 * SECOND, tracks[5], believed=False)
+    ways = [Transition(1.0), Transition(2.0, 1.0, 1), Transition(3.0, 1.0, 3)]
+    after.prices[1] = ways
+    after.states_left({1: before.carry(chain, np.array([1, 2]))})
+    assert [track.node for _, track in before.states] == [0, 3]
+    assert after.prices[1] == [ways[0], ways[2]._replace(cut=1)]
