@@ -148,7 +148,7 @@ class Thinning:
 
     def measurements_are_due(self, graph: Graph) -> bool:
         """Return whether there are so many measurements in the map that the oldest are to go."""
-        n_measured = sum(np.count_nonzero(held >= 0) for held in carriers(graph))
+        n_measured = sum(int(np.count_nonzero(held >= 0)) for held in carriers(graph))
         return n_measured > MOST_MEASUREMENTS * self._n_stay
 
     def places(
@@ -172,7 +172,7 @@ class Thinning:
         self._newest = newest
         graph = smoother.graph
         found = crowd(graph, config, first)
-        n_stay = np.count_nonzero(graph.is_pose) - len(found.leaving)
+        n_stay = int(np.count_nonzero(graph.is_pose)) - len(found.leaving)
         self._n_stay = max(n_stay, LEAST * config.newest)
         if not self.measurements_are_due(graph):
             before = found.leaving < first_of(*carriers(graph))
