@@ -134,8 +134,7 @@ PARAMETERS: tuple[Parameter, ...] = (
               'keeps. If 0, there is no limit.', 0.0, 1e9),
     Parameter('window.prior', _WINDOW.prior.value, '', 'What stays of those that leave: `dense`, '
               'one constraint of all their neighbours, or `sparse`, a few constraints of pairs '
-              'of them, which are cheaper and less certain; priors with '
-              'modelled errors stay dense.', choices=_values(config.Prior)),
+              'of them, which are cheaper and less certain.', choices=_values(config.Prior)),
     Parameter('thinning.cell', _THINNING.cell, 'm', 'Where a place is driven again and again, few '
               'hidden nodes stay in the graph: one leaves it if an older one stays within this '
               'distance and its position relative to that is certain. If 0, all stay. Twice the '

@@ -68,6 +68,7 @@ def nearest_below(rows: FloatArray) -> FloatArray:
     kept = values > _RANK * largest
     # coordinates in which the measurements determine everything
     stacked = vectors[:, kept] * np.sqrt(values[kept])
+    stacked[~used] = 0.0    # padding is known by that, and rounding is not
     redundant = np.count_nonzero(kept) < np.count_nonzero(used)
     blocks = _START * start
     descend(np.ascontiguousarray(stacked), blocks, int(redundant))

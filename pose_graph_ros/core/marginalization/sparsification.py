@@ -17,7 +17,7 @@ All is linear in map axes at the reference poses. With d = t_j - t_i, an edge me
 
 for displacements h of the poses, and an observed node measures h_i. Directions that the prior
 tells nothing of (rounding apart) get no information: a prior without absolute information becomes
-edges alone. docs/solver.md has the derivation.
+edges alone. A bias becomes a prior on it and one pose. docs/solver.md has the derivation.
 """
 
 from dataclasses import replace
@@ -28,15 +28,15 @@ import numpy as np
 from pose_graph_ros.core.geometry import se2
 from pose_graph_ros.core.geometry.se2 import FloatArray, IntArray
 from pose_graph_ros.core.graph.constraints import EdgeKind, Edges, ObservedKind, ObservedNodes
+from pose_graph_ros.core.graph.priors import Prior
 from pose_graph_ros.core.marginalization import conservative
+from pose_graph_ros.core.marginalization.sparse_biases import of_bias, OfBias, on_bias, SEEN
 
 # Eigenvalues of the scaled information below this part of the largest one are rounding. The second
 # one is for priors whose covariances are singular in double precision with the first one.
 _RANK, _SURER_RANK = 1e-10, 1e-7
 # What is known no better than that is in these units: its own ones would make much of rounding.
 _LEAST_KNOWN = np.array((1e4, 1e4, 10.0))
-# A measurement sees an undetermined direction if it is above this part of its size.
-_SEEN = 1e-6
 # The minimum of a prior has headings at most so far from the reference [rad]. A direction that is
 # next to unknown may have it turns away, where the linear model is meaningless.
 _MOST_TURNED = 0.5
@@ -51,6 +51,8 @@ class SparsePrior(NamedTuple):
     observed: ObservedNodes
     divergence: float
     """Kullback-Leibler divergence of the constraints from the prior [nats]."""
+    priors: tuple[Prior, ...] = ()
+    """Of each bias, on it and a pose."""
 
 
 class _Candidates(NamedTuple):
@@ -69,12 +71,13 @@ class _Candidates(NamedTuple):
 
 def sparsify(
     nodes: IntArray, poses: FloatArray, information: FloatArray, vector: FloatArray, *,
-    anchored: bool, n_extra: int = 0, enough: float = 1e-9,
+    anchored: bool, n_extra: int = 0, enough: float = 1e-9, n_biases: int = 0,
 ) -> SparsePrior:
     """
     Return edges and observed nodes that approximate a prior and tell no more than it.
 
-    Raises LinAlgError if the prior is too stiff for double precision.
+    Raises LinAlgError if the prior is too stiff for double precision, or if what it does not tell
+    of a bias is not that of a pose.
 
     They have their minimum where the prior has it, in the linear model at the reference poses, or
     nearer where that is out of its reach (`_minimum`).
@@ -89,16 +92,22 @@ def sparsify(
         of all poses as one body
     n_extra : int, most edges beyond the tree; they are added as many as there are nodes at a time
     enough : float, divergence from which on none is added [nats]
+    n_biases : int, how many of the nodes, the last ones, are biases; then the prior is anchored
 
     """
+    k = len(nodes) - n_biases
     basis, free = _basis(poses, information, anchored)
     try:
-        found = _candidates(poses, basis, free, anchored)
+        found = _candidates(poses[:k], basis[:3 * k], free[:3 * k], anchored)
     except np.linalg.LinAlgError:
         basis, free = _basis(poses, information, anchored, _SURER_RANK)
-        found = _candidates(poses, basis, free, anchored)
-    delta = _minimum(basis, vector)
-    chosen = _spanning_tree(found, len(nodes) + (1 if anchored else 0))
+        found = _candidates(poses[:k], basis[:3 * k], free[:3 * k], anchored)
+    delta = _minimum(basis, vector, k)
+    # a bias of less than three coordinates is padded, which rounding is not to tell of
+    basis[3 * k:][np.diagonal(information)[3 * k:] == 0.0] = 0.0
+    of_biases = [of_bias(basis, free, k, row) for row in range(k, k + n_biases)]
+    found = _with_biases(found, of_biases, k)
+    chosen = _spanning_tree(found, k + n_biases + (1 if anchored else 0))
     chosen = chosen[np.any(found.rows[chosen] != 0.0, axis=(1, 2))]
     if len(chosen) == 0:
         return SparsePrior(Edges(), ObservedNodes(), 0.0)
@@ -106,7 +115,7 @@ def sparsify(
     distance = conservative.divergence(found.rows[chosen], blocks)
     most = len(chosen) + n_extra
     while len(chosen) < most and distance > enough:
-        extra = _overestimated(found, chosen, blocks)[:min(len(nodes), most - len(chosen))]
+        extra = _overestimated(found, chosen, blocks)[:min(k, most - len(chosen))]
         if len(extra) == 0:
             break
         chosen = np.append(chosen, extra)
@@ -115,14 +124,17 @@ def sparsify(
     roots = found.roots[chosen]
     in_map = np.matmul(np.matmul(roots, blocks), np.swapaxes(roots, 1, 2))
     i, j = found.i[chosen], found.j[chosen]
-    is_edge = i < len(nodes)
+    is_edge, is_seen = (i < k) & (j < k), i == k
     displaced = poses, delta.reshape(-1, 3)
     edges = _edges(*displaced, (i[is_edge], j[is_edge]), in_map[is_edge])
-    seen = _observed(*displaced, j[~is_edge], in_map[~is_edge])
+    seen = _observed(*displaced, j[is_seen], in_map[is_seen])
+    priors = tuple(
+        on_bias(nodes, displaced, (of.pose, int(row) - 1), of.gain, in_map[at])
+        for at, row in enumerate(j) if row > k for of in (of_biases[row - k - 1],))
     kinds = np.full(len(edges), EdgeKind.PRIOR, dtype=np.uint8)
     return SparsePrior(
         replace(edges, i=nodes[edges.i], j=nodes[edges.j], kind=kinds),
-        replace(seen, node=nodes[seen.node]), distance)
+        replace(seen, node=nodes[seen.node]), distance, priors)
 
 
 def _basis(
@@ -152,7 +164,7 @@ def _basis(
             scale[:, None] * vectors[:, ~kept])
 
 
-def _minimum(basis: FloatArray, vector: FloatArray) -> FloatArray:
+def _minimum(basis: FloatArray, vector: FloatArray, n_poses: int) -> FloatArray:
     """
     Return the displacements of the minimum of a prior, shape (3 k,).
 
@@ -164,13 +176,15 @@ def _minimum(basis: FloatArray, vector: FloatArray) -> FloatArray:
     ----------
     basis : ndarray, shape (3 k, r), as returned by `_basis`
     vector : ndarray, shape (3 k,)
+    n_poses : int, number of the first nodes, which are poses
 
     """
     wanted = basis.T @ vector
-    delta, headings = basis @ wanted, basis[2::3]
+    at = slice(2, 3 * n_poses, 3)
+    delta, headings = basis @ wanted, basis[at]
     left, sigmas, _ = np.linalg.svd(headings.T, full_matrices=False)
     damping = 1.0 / max(float(np.max(sigmas, initial=0.0))**2, 1e-300)
-    while np.max(np.abs(delta[2::3]), initial=0.0) > _MOST_TURNED:
+    while np.max(np.abs(delta[at]), initial=0.0) > _MOST_TURNED:
         # (I + damping H^T H)^-1, with the rows H of the headings
         gain = damping * sigmas**2 / (1.0 + damping * sigmas**2)
         delta = basis @ (wanted - left @ (gain * (left.T @ wanted)))
@@ -229,7 +243,7 @@ def _partly_determined(
         size = np.sqrt(np.sum(row**2, axis=1) + np.sum(undetermined**2, axis=1))
         size[size == 0.0] = 1.0
         left, values, _ = np.linalg.svd(undetermined / size[:, None])
-        n_seen = np.count_nonzero(values > _SEEN)
+        n_seen = np.count_nonzero(values > SEEN)
         weights[m] = n_seen * _UNDETERMINED + 2.0 * np.sum(np.log(size))
         if n_seen < 3:
             known = left[:, n_seen:] / size[:, None]    # (3, d)
@@ -240,6 +254,27 @@ def _partly_determined(
             roots[m, :, :3 - n_seen] = known @ inverse.T
             weights[m] += 2.0 * np.sum(np.log(np.diagonal(factor)))
     return _Candidates(i, j, whitened, roots, weights)
+
+
+def _with_biases(found: _Candidates, of_biases: list[OfBias], n_poses: int) -> _Candidates:
+    """
+    Return candidates with one for each bias, whose ends are a pose and n_poses + 1 and so on.
+
+    Parameters
+    ----------
+    found : _Candidates, of poses and, as node n_poses, the map
+    of_biases : list of OfBias
+    n_poses : int
+
+    """
+    if not of_biases:
+        return found
+    return _Candidates(
+        np.append(found.i, [of.pose for of in of_biases]),
+        np.append(found.j, n_poses + 1 + np.arange(len(of_biases))),
+        np.concatenate((found.rows, [of.rows for of in of_biases])),
+        np.concatenate((found.roots, [of.root for of in of_biases])),
+        np.append(found.weights, np.zeros(len(of_biases))))
 
 
 def _spanning_tree(found: _Candidates, n: int) -> IntArray:

@@ -8,6 +8,8 @@ are between the same neighbours already go into the same approximation, so that 
 in proportion to the number of nodes however often nodes leave.
 """
 
+from dataclasses import replace
+
 import numpy as np
 
 from pose_graph_ros.core.geometry.se2 import IntArray
@@ -32,10 +34,6 @@ EXTRA = 0.5
 MOST_EXTRA, ENOUGH, MOST = 3.0, 0.1, 50
 # Priors on more poses stay dense: the convex problem takes 0.3 s of a processor for so many.
 MOST_POSES = 20
-
-
-def _is_on_poses(graph: Graph, prior: Prior) -> bool:
-    return bool(np.all(graph.is_pose[graph.node_rows(prior.nodes)]))
 
 
 def sparse_removal(
@@ -89,8 +87,8 @@ def sparse_marginalization(graph: Graph, nodes: IntArray) -> GraphUpdate:
     Return the update by which nodes of any kind leave, with as few dense priors as possible.
 
     As `marginalize`, but priors on poses become edges and observed nodes, by which no covariance
-    becomes smaller. Those with biases or landmarks stay dense: they are small, as only the newest
-    biases outlive their nodes. So do those on more than `MOST_POSES` poses.
+    becomes smaller, and those with biases small priors of each bias and a pose as well. Those with
+    landmarks stay dense, and so do those on more than `MOST_POSES` nodes.
 
     Parameters
     ----------
@@ -99,12 +97,11 @@ def sparse_marginalization(graph: Graph, nodes: IntArray) -> GraphUpdate:
 
     """
     update = marginalize(graph, nodes.tolist())
-    edges, observed, dense = [update.edges], [update.observed], []
+    edges, observed, dense = [update.edges], [update.observed], list[Prior]()
     for prior in update.priors:
-        n = len(prior.nodes)
-        few = n <= MOST_POSES and _is_on_poses(graph, prior)
-        sparse = _approximation(prior, min(MOST_EXTRA, MOST / n - 1.0), ENOUGH) if few else None
+        sparse = _of_window(graph, prior) if len(prior.nodes) <= MOST_POSES else None
         if sparse is not None:
+            dense += sparse.priors
             edges.append(sparse.edges)
             observed.append(sparse.observed)
         else:
@@ -113,25 +110,46 @@ def sparse_marginalization(graph: Graph, nodes: IntArray) -> GraphUpdate:
         edges=Edges.joined(edges), observed=ObservedNodes.joined(observed), priors=dense)
 
 
+def _of_window(graph: Graph, prior: Prior) -> SparsePrior | None:
+    """Return what stands for a prior that a window leaves; None if it has to stay dense."""
+    rows = graph.node_rows(prior.nodes)
+    order = np.argsort(~graph.is_pose[rows], kind='stable')
+    n = int(np.count_nonzero(graph.is_pose[rows]))
+    n_biases = len(rows) - n
+    if n == 0 or np.count_nonzero(graph.is_bias[rows]) < n_biases:
+        return None
+    if n_biases > 0:
+        # alone they are as sparse as they can be
+        if n <= 1 or not prior.anchored:
+            return None
+        at = (3 * order[:, None] + np.arange(3)).ravel()
+        prior = replace(
+            prior, nodes=prior.nodes[order], reference=prior.reference[order],
+            information=prior.information[np.ix_(at, at)], vector=prior.vector[at])
+    return _approximation(prior, min(MOST_EXTRA, MOST / n - 1.0), ENOUGH, n_biases)
+
+
 def _approximation(
-    prior: Prior | None, extra: float = EXTRA, enough: float = 1e-9,
+    prior: Prior | None, extra: float = EXTRA, enough: float = 1e-9, n_biases: int = 0,
 ) -> SparsePrior | None:
     """
-    Return what stands for a prior on poses; None if it is too stiff for double precision.
+    Return what stands for a prior; None if it is too stiff for double precision.
 
     Parameters
     ----------
     prior : Prior, optional
     extra : float, most edges beyond the tree, for each of its nodes
     enough : float, divergence from which on none is added [nats]
+    n_biases : int, how many of its nodes, the last ones, are biases
 
     """
     if prior is None:
         return SparsePrior(Edges(), ObservedNodes(), 0.0)
     try:
-        return sparsify(prior.nodes, prior.reference, prior.information, prior.vector,
-                        anchored=prior.anchored, n_extra=round(extra * len(prior.nodes)),
-                        enough=enough)
+        return sparsify(
+            prior.nodes, prior.reference, prior.information, prior.vector, enough=enough,
+            anchored=prior.anchored, n_extra=round(extra * (len(prior.nodes) - n_biases)),
+            n_biases=n_biases)
     except np.linalg.LinAlgError:
         return None
 

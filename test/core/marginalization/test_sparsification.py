@@ -233,6 +233,50 @@ def test_no_edge_is_added_where_the_divergence_is_small() -> None:
     assert len(prior.tree(found[0])) < len(prior.tree(found[1])) <= len(prior.tree(found[2])) <= 32
 
 
+@given(seeds, st.integers(2, 7), st.lists(st.integers(1, 3), min_size=1, max_size=2),
+       st.sampled_from((0, 20)), st.booleans())
+@settings(max_examples=20)
+def test_biases_have_priors_with_one_pose_each(
+    seed: int, k: int, dimensions: list[int], n_extra: int, loose: bool,
+) -> None:
+    rng = np.random.default_rng(seed)
+    n = k + len(dimensions)
+    used = np.concatenate((np.ones(3 * k, dtype=np.bool_),
+                           *(np.arange(3) < size for size in dimensions)))
+    roots = rng.standard_normal((2 * n, 3 * n, 3))
+    if loose:   # only the sums of positions and biases are known
+        shift = np.vstack((np.tile(np.eye(3, 2), (k, 1)),
+                           np.tile(-np.eye(3, 2), (n - k, 1)))) * used[:, None]
+        roots -= np.einsum('ij,mjk->mik', shift @ np.linalg.pinv(shift), roots)
+    information = np.einsum('mik,mjk->ij', roots, roots) * used * used[:, None]
+    vector = information @ rng.standard_normal(3 * n)
+    poses = np.vstack((random_poses(rng, k), np.zeros((len(dimensions), 3))))
+    sparse = sparsify(np.arange(n), poses, information, vector, anchored=True, n_extra=n_extra,
+                      n_biases=len(dimensions))
+    assert [prior.nodes[1] for prior in sparse.priors] == list(range(k, n))
+    assert all(prior.nodes[0] < k for prior in sparse.priors)
+    graph = Graph()
+    graph.apply(GraphUpdate(hidden=poses[:k], edges=sparse.edges, observed=sparse.observed))
+    H, b = dense_system(graph)
+    approximation, right = np.zeros_like(information), np.zeros(3 * n)
+    approximation[:3 * k, :3 * k], right[:3 * k] = H, -b
+    for prior in sparse.priors:
+        at = (3 * prior.nodes[:, None] + np.arange(3)).ravel()
+        approximation[np.ix_(at, at)] += prior.information
+        right[at] += prior.vector
+    part = np.ix_(used, used)
+    scale = 1.0 / np.sqrt(np.diagonal(information[part]))
+    difference = (information - approximation)[part] * scale * scale[:, None]
+    assert np.linalg.eigvalsh(difference)[0] > -ROUNDING
+    assert rank((approximation[part]) * scale * scale[:, None]) == (
+        np.count_nonzero(used) - (2 if loose else 0))
+    assert np.all(approximation[~used] == 0.0)
+    minimum = np.linalg.pinv(information, rcond=1e-10, hermitian=True) @ vector
+    if np.max(np.abs(minimum[2:3 * k:3])) < 0.5:
+        np.testing.assert_allclose(
+            (right - approximation @ minimum)[used] * scale, 0.0, atol=1e-6)
+
+
 def test_a_single_pose_becomes_an_observed_node() -> None:
     prior = prior_of(1, 1, 'pose')
     sparse = prior.sparsified()
