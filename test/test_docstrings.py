@@ -16,6 +16,8 @@ PACKAGE = Path(pose_graph_ros.__file__).parent
 MODULES = sorted(path.relative_to(PACKAGE) for path in PACKAGE.rglob('*.py'))
 # So many arguments, without self, need a section on them.
 DOCUMENTED_FROM = 2
+# Annotations that do not tell shape, unit or frame. Classes and texts are told by their names.
+NUMBERS = re.compile(r'Array|\b(int|float|tuple|Pose|Matrix|Variances)\b')
 # Callbacks of frameworks, whose arguments are theirs.
 FRAMEWORK = re.compile(r'on_(configure|activate|deactivate|cleanup|shutdown|error)$')
 
@@ -46,11 +48,19 @@ def is_overload(function: Function) -> bool:
     return any('overload' in ast.unparse(decorator) for decorator in function.decorator_list)
 
 
-def arguments(function: Function) -> list[str]:
+def arguments(function: Function) -> list[ast.arg]:
     given = function.args
-    names = [each.arg for each in (*given.posonlyargs, *given.args, *given.kwonlyargs)]
     # the head of the tables is the first argument of every kernel, and said in graph.tables
-    return [name for name in names if name not in ('self', 'cls', 'head') and name[0] != '_']
+    return [each for each in (*given.posonlyargs, *given.args, *given.kwonlyargs)
+            if each.arg not in ('self', 'cls', 'head') and each.arg[0] != '_']
+
+
+def says_all(argument: ast.arg) -> bool:
+    """Tell whether the name and the annotation of an argument leave nothing to be said."""
+    if argument.annotation is None:
+        return False
+    kind = ast.unparse(argument.annotation)
+    return (kind == 'int' and argument.arg.endswith('_ns')) or NUMBERS.search(kind) is None
 
 
 def section(docstring: str, title: str) -> str:
@@ -76,15 +86,16 @@ def returns_something(function: Function) -> bool:
 
 
 def missing(function: Function, docstring: str | None) -> Iterator[str]:
-    names = arguments(function)
+    given = arguments(function)
     if docstring is None:
         yield 'a docstring'
         return
-    if len(names) >= DOCUMENTED_FROM:
+    if len(given) >= DOCUMENTED_FROM:
         described = section(docstring, 'Parameters')
         headings = re.findall(r'^(\S.*?)(?: :|$)', described, re.M)
         said = {name.strip().lstrip('*') for line in headings for name in line.split(',')}
-        yield from (f'parameter {name}' for name in names if name not in said)
+        yield from (f'parameter {each.arg}' for each in given
+                    if each.arg not in said and not says_all(each))
         first_line = docstring.strip().splitlines()[0]
         if (returns_something(function) and section(docstring, 'Returns') == ''
                 and not re.match(r'(Return|Tell|Say|Yield|Evaluate|Make|Iterate)\b', first_line)):

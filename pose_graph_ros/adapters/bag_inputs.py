@@ -56,13 +56,9 @@ def choose_inputs(
 
     Parameters
     ----------
-    reader : BagReader
-    sources : sequence of Source
-        All sources of the node.
-    wanted : mapping
-        Topic by name of the source; None leaves the choice open.
-    hold_out : int
-        As in `Inputs`.
+    sources : sequence of Source, all sources of the node
+    wanted : mapping, topic by name of the source; None leaves the choice open
+    hold_out : int, as in `Inputs`
 
     Raises
     ------
@@ -142,11 +138,6 @@ def _guess(
 def read_inputs(reader: BagReader, inputs: Inputs) -> Iterator[InputMessage]:
     """
     Iterate over the messages of the inputs in the order in which they were recorded.
-
-    Parameters
-    ----------
-    reader : BagReader
-    inputs : Inputs
 
     Raises
     ------

@@ -38,9 +38,7 @@ class BagWriter:
 
     Parameters
     ----------
-    folder : str or Path
-    storage : str
-        `mcap` or `sqlite3`.
+    storage : str, `mcap` or `sqlite3`
     overwrite : bool
         Whether to replace an existing rosbag2 folder; other folders are never replaced.
     latched : collection of str
@@ -102,13 +100,9 @@ class BagWriter:
 
         Parameters
         ----------
-        topic : str
-        type_name : str
-            A message type of ROS 2 Jazzy, such as `nav_msgs/msg/Path`.
-        recorded_ns : int
-            When the message was received [ns].
-        message : bytes or object
-            Serialised CDR bytes, or an object with the fields of the type.
+        type_name : str, a message type of ROS 2 Jazzy, such as `nav_msgs/msg/Path`
+        recorded_ns : int, when the message was received [ns]
+        message : bytes or object, serialised CDR bytes, or an object with the fields of the type
 
         Raises
         ------

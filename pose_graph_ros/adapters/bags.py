@@ -74,9 +74,7 @@ class BagReader:
 
     Parameters
     ----------
-    path : Path
-    reader : Reader
-        Opened reader of rosbags.
+    reader : Reader, opened reader of rosbags
 
     """
 

@@ -46,9 +46,7 @@ def stamp_ns(message: Message, offset_ns: int = 0) -> int:
 
     Parameters
     ----------
-    message : Message
-    offset_ns : int
-        Added to stamps above 0 [ns].
+    offset_ns : int, added to stamps above 0 [ns]
 
     """
     stamp = message.header.stamp
@@ -88,10 +86,8 @@ def odometry_sample(
     Parameters
     ----------
     message : nav_msgs/Odometry
-    offset_ns : int
-        Added to the stamp [ns].
-    with_twist : bool
-        Whether its twist is needed, and must be finite.
+    offset_ns : int, added to the stamp [ns]
+    with_twist : bool, whether its twist is needed, and must be finite
 
     """
     pose = planar_pose(message.pose.pose)
@@ -133,10 +129,8 @@ def global_pose(message: Message, map_frame: str, offset_ns: int = 0) -> GlobalP
     Parameters
     ----------
     message : geometry_msgs/PoseWithCovarianceStamped
-    map_frame : str
-        Frame that the header must name, unless it names none.
-    offset_ns : int
-        Added to the stamp [ns].
+    map_frame : str, frame that the header must name, unless it names none
+    offset_ns : int, added to the stamp [ns]
 
     """
     named = frame(message.header.frame_id)
@@ -157,12 +151,9 @@ def heading(
     Parameters
     ----------
     message : sensor_msgs/Imu
-    map_yaw : float
-        Angle of the map's x axis from east [rad].
-    yaw_offset : float
-        Added to the yaw, such as the declination or the mounting angle [rad].
-    offset_ns : int
-        Added to the stamp [ns].
+    map_yaw : float, angle of the map's x axis from east [rad]
+    yaw_offset : float, added to the yaw, such as the declination or the mounting angle [rad]
+    offset_ns : int, added to the stamp [ns]
 
     """
     if message.orientation_covariance[0] == NO_ORIENTATION:
@@ -185,8 +176,7 @@ def loop_closure(message: Message, offset_ns: int = 0) -> LoopClosure | Answer:
     Parameters
     ----------
     message : geometry_msgs/PoseWithCovarianceStamped
-    offset_ns : int
-        Added to both stamps [ns].
+    offset_ns : int, added to both stamps [ns]
 
     """
     pose = planar_pose(message.pose.pose)

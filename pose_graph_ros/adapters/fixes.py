@@ -33,8 +33,7 @@ class Datum:
     given : sequence of float
         Latitude and longitude [degrees] and, if there are three numbers, the angle of the map's x
         axis from east [rad]; empty to use the first fix that the engine attaches to the graph.
-    wait : bool
-        Whether to wait for a call of `renew` before a fix is used, if `given` is empty.
+    wait : bool, whether to wait for a call of `renew` before a fix is used, if `given` is empty
 
     Raises
     ------
@@ -82,10 +81,8 @@ class Datum:
 
         Parameters
         ----------
-        latitude, longitude : float
-            Of the fix [degrees].
-        altitude : float
-            Of the fix [m]; NaN if unknown.
+        latitude, longitude : float, of the fix [degrees]
+        altitude : float, of the fix [m]; NaN if unknown
 
         """
         with self._lock:
@@ -108,8 +105,7 @@ class Datum:
 
         Parameters
         ----------
-        latitude, longitude, altitude : float
-            As for `plane_for`.
+        latitude, longitude, altitude : float, as for `plane_for`
 
         """
         plane = self.plane_for(latitude, longitude, altitude)
@@ -138,13 +134,9 @@ class FixReader:
 
     Parameters
     ----------
-    source : Source
-    datum : Datum
-        Datum of the map, shared by all sources.
-    frames : StaticFrames
-        Used if the source has no lever arm.
-    base_frame : str
-        Frame of the robot.
+    datum : Datum, datum of the map, shared by all sources
+    frames : StaticFrames, used if the source has no lever arm
+    base_frame : str, frame of the robot
 
     """
 

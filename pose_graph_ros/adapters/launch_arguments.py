@@ -52,9 +52,7 @@ def switch(given: Mapping[str, str], name: str) -> bool:
 
     Parameters
     ----------
-    given : mapping
-        Arguments by name.
-    name : str
+    given : mapping, arguments by name
 
     Raises
     ------

@@ -46,10 +46,7 @@ def markers_cdr(view: GraphView, stamp_ns: int, frame_id: str) -> bytes:
 
     Parameters
     ----------
-    view : GraphView
-    stamp_ns : int
-    frame_id : str
-        Frame of the map.
+    frame_id : str, frame of the map
 
     """
     plain = np.empty((0, 4), dtype='<f4')

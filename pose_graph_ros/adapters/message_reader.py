@@ -27,10 +27,8 @@ class MessageReader:
 
     Parameters
     ----------
-    values : mapping
-        All checked parameters.
-    frames : StaticFrames, optional
-        Static transforms that are known already.
+    values : mapping, all checked parameters
+    frames : StaticFrames, optional, static transforms that are known already
 
     Raises
     ------
@@ -75,10 +73,8 @@ class MessageReader:
 
         Parameters
         ----------
-        name : str
-            Name of the source.
-        message : Message
-            Of the type of the source.
+        name : str, name of the source
+        message : Message, of the type of the source
 
         """
         source = self.sources[name]

@@ -30,14 +30,7 @@ def plain(value: Any) -> Any:
 
 
 def is_same(one: Any, other: Any) -> bool:
-    """
-    Tell whether two plain values are equal as parameters: 5 and 5.0 are, 1 and True are not.
-
-    Parameters
-    ----------
-    one, other : object
-
-    """
+    """Tell whether two plain values are equal as parameters: 5 and 5.0 are, 1 and True are not."""
     return bool(one == other) and isinstance(one, bool) == isinstance(other, bool)
 
 
@@ -49,13 +42,11 @@ def changed(
 
     Parameters
     ----------
-    values : mapping
-        Present parameters; a missing one has its default.
+    values : mapping, present parameters; a missing one has its default
     wanted : mapping
         Changes by name. None and an empty list unset a parameter that can be unset. Setting the
         present value is always allowed.
-    configured : bool
-        Whether the node is configured (active or not).
+    configured : bool, whether the node is configured (active or not)
 
     Raises
     ------

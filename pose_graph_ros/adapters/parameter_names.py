@@ -14,9 +14,7 @@ def explanation(name: str, known: Collection[str], of_sources: Collection[str]) 
 
     Parameters
     ----------
-    name : str
-    known : collection of str
-        Names of all parameters.
+    known : collection of str, names of all parameters
     of_sources : collection of str
         Names of the parameters that sources can have, without the name of a source.
 
@@ -41,9 +39,7 @@ def is_own(name: str, known: Collection[str], of_sources: Collection[str]) -> bo
 
     Parameters
     ----------
-    name : str
-    known, of_sources : collection of str
-        As for `explanation`.
+    known, of_sources : collection of str, as for `explanation`
 
     """
     group, dot, _ = name.partition('.')

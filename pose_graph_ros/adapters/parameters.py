@@ -132,9 +132,10 @@ PARAMETERS: tuple[Parameter, ...] = (
               'back. If 0, there is no limit.', 0.0, 1e9),
     Parameter('window.nodes', float(_WINDOW.nodes), '', 'Number of hidden nodes that the graph '
               'keeps. If 0, there is no limit.', 0.0, 1e9),
-    Parameter('window.prior', _WINDOW.prior.value, '', 'What stays of those that leave: `dense`, '
-              'one constraint of all their neighbours, or `sparse`, a few constraints of pairs '
-              'of them, which are cheaper and less certain.', choices=_values(config.Prior)),
+    Parameter('window.prior', _WINDOW.prior.value, '', 'What replaces the hidden nodes that '
+              'leave: `dense`, one constraint on all their neighbours, or `sparse`, a few '
+              'constraints between pairs of these, which is cheaper and less certain.',
+              choices=_values(config.Prior)),
     Parameter('thinning.cell', _THINNING.cell, 'm', 'Where a place is driven again and again, few '
               'hidden nodes stay in the graph: one leaves it if an older one stays within this '
               'distance and its position relative to that is certain. If 0, all stay. Twice the '
@@ -307,10 +308,8 @@ def source_parameters(source: str, kind: str) -> tuple[Parameter, ...]:
 
     Parameters
     ----------
-    source : str
-        Name of the source.
-    kind : str
-        Value of a `Kind`.
+    source : str, name of the source
+    kind : str, value of a `Kind`
 
     Raises
     ------
@@ -375,9 +374,7 @@ def unknown(name: str, known: Collection[str]) -> ConfigError:
 
     Parameters
     ----------
-    name : str
-    known : collection of str
-        Names of all parameters.
+    known : collection of str, names of all parameters
 
     """
     hint = explanation(name, known, OF_SOURCES)
@@ -390,9 +387,7 @@ def checked_value(parameter: Parameter, value: Any) -> Any:
 
     Parameters
     ----------
-    parameter : Parameter
-    value : object
-        Lists of numbers may be any sequence of numbers.
+    value : object, lists of numbers may be any sequence of numbers
 
     Raises
     ------

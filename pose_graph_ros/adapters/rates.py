@@ -28,11 +28,8 @@ class GyroReader:
 
     Parameters
     ----------
-    source : Source
-    frames : StaticFrames
-        Used if the parameter `mounting` of the source says so.
-    base_frame : str
-        Frame of the robot.
+    frames : StaticFrames, used if the parameter `mounting` of the source says so
+    base_frame : str, frame of the robot
 
     """
 
@@ -74,11 +71,8 @@ class TwistReader:
 
     Parameters
     ----------
-    source : Source
-    frames : StaticFrames
-        Gives the place of the sensor, if that is not the frame of the robot.
-    base_frame : str
-        Frame of the robot.
+    frames : StaticFrames, gives the place of the sensor, if that is not the frame of the robot
+    base_frame : str, frame of the robot
 
     """
 

@@ -35,44 +35,17 @@ class StaticFrames:
             self._frames[child] = parent, rotation, translation
 
     def position(self, name: str, base: str) -> FloatArray | None:
-        """
-        Return the origin of a frame in another one, shape (3,) [m]; None if it is unknown.
-
-        Parameters
-        ----------
-        name : str
-            Frame of the origin.
-        base : str
-            Frame of the coordinates.
-
-        """
+        """Return the origin of a frame in a base frame, shape (3,) [m]; None if it is unknown."""
         found = self._transform(name, base)
         return None if found is None else found[1]
 
     def rotation(self, name: str, base: str) -> FloatArray | None:
-        """
-        Return the rotation from a frame to another one, shape (3, 3); None if it is unknown.
-
-        Parameters
-        ----------
-        name : str
-            Frame of a vector that is to be rotated.
-        base : str
-            Frame of the rotated vector.
-
-        """
+        """Return the rotation from a frame to a base frame, shape (3, 3); None if unknown."""
         found = self._transform(name, base)
         return None if found is None else found[0]
 
     def planar(self, name: str, base: str) -> Pose | None:
-        """
-        Return the pose of a frame in the plane of another one [m, m, rad]; None if unknown.
-
-        Parameters
-        ----------
-        name, base : str
-
-        """
+        """Return the pose of a frame in the plane of another one [m, m, rad]; None if unknown."""
         found = self._transform(name, base)
         if found is None:
             return None

@@ -39,14 +39,10 @@ def verdicts_cdr(
 
     Parameters
     ----------
-    verdicts : sequence of Verdict
-        Those that are listed.
-    totals : mapping
-        What is believed of each source, as a whole.
-    stamp_ns : int
-        [ns].
-    frame_id : str
-        Frame of the map.
+    verdicts : sequence of Verdict, those that are listed
+    totals : mapping, what is believed of each source, as a whole
+    stamp_ns : int, [ns]
+    frame_id : str, frame of the map
 
     """
     stream = CdrStream()

@@ -31,10 +31,7 @@ def write_bag(
 
     Parameters
     ----------
-    folder : str or Path
-    messages : iterable of Message
-    overwrite : bool
-        Whether to replace an existing bag; otherwise one raises `BagError`.
+    overwrite : bool, whether to replace an existing bag; otherwise one raises `BagError`
 
     """
     with BagWriter(folder, overwrite=overwrite) as bag:
@@ -50,9 +47,7 @@ def odometry_messages(
 
     Parameters
     ----------
-    topic, frame : str
-    path : Trajectory
-        Poses of base_link in the frame.
+    path : Trajectory, poses of base_link in the frame
     variances : sequence of float, length 6
         Of the pose and of the twist.
 
@@ -79,7 +74,6 @@ def fix_messages(
 
     Parameters
     ----------
-    topic : str
     stamps_ns : ndarray, shape (M,)
     geodetic : ndarray, shape (M, 3)
         Latitude, longitude and ellipsoidal height [deg, deg, m].
@@ -103,12 +97,10 @@ def rate_messages(
 
     Parameters
     ----------
-    topic : str
     stamps_ns : ndarray, shape (M,)
     rates : ndarray, shape (M,)
         Yaw rates [rad/s].
-    sigma : float
-        Standard deviation of each rate [rad/s].
+    sigma : float, standard deviation of each rate [rad/s]
 
     """
     vector, quaternion = (
@@ -128,7 +120,6 @@ def loop_closure_messages(
 
     Parameters
     ----------
-    topic : str
     stamps_ns : ndarray, shape (L, 2)
         Stamps of the earlier and of the later pose [ns].
     poses : ndarray, shape (L, 3)

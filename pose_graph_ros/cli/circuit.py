@@ -48,8 +48,7 @@ def drive_circuit(generator: np.random.Generator, duration_s: float) -> Motion:
     ----------
     generator : numpy.random.Generator
         Source of the random position within the lane and of the random waits at lights.
-    duration_s : float
-        Length of the drive [s].
+    duration_s : float, length of the drive [s]
 
     """
     heading, stops, lap_length = _circuit(duration_s)

@@ -133,7 +133,6 @@ def distances(
 
     Parameters
     ----------
-    path : Trajectory
     stamps_ns : ndarray, shape (N,)
     positions : ndarray, shape (N, 2)
         In the frame of the path [m].
@@ -155,10 +154,8 @@ def error_rows(name: str, errors: FloatArray, unit: str = 'm') -> list[ErrorRow]
 
     Parameters
     ----------
-    name : str
     errors : ndarray, shape (N,)
         Absolute values.
-    unit : str
 
     """
     return [] if len(errors) == 0 else [ErrorRow(
@@ -210,11 +207,8 @@ def summary(
 
     Parameters
     ----------
-    drive : Drive
-    rows : sequence of ErrorRow
-        Result of `evaluate`.
-    extra : mapping
-        Further figures, which replace figures with the same name.
+    rows : sequence of ErrorRow, result of `evaluate`
+    extra : mapping, further figures, which replace figures with the same name
 
     """
     stamps, positions = drive.corrected.stamps_ns, drive.corrected.poses[:, :2]

@@ -33,11 +33,8 @@ def read_measurements(
 
     Parameters
     ----------
-    path : Path
-    stamps : Path, optional
-        Text file with a line for each vertex that begins with its stamp [s].
-    edge2 : str, optional
-        Format of the tag EDGE2; see `read_g2o`.
+    stamps : Path, optional, text file with a line for each vertex that begins with its stamp [s]
+    edge2 : str, optional, format of the tag EDGE2; see `read_g2o`
 
     """
     file = read_g2o(path, edge2)

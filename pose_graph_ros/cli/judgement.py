@@ -24,7 +24,6 @@ def judgement(
     Parameters
     ----------
     totals : mapping, what is believed of each source
-    verdicts : sequence of Verdict
 
     """
     return {
@@ -45,7 +44,6 @@ def judgement_lines(
     Parameters
     ----------
     totals : mapping, what is believed of each source
-    verdicts : sequence of Verdict
 
     """
     for source, each in totals.items():

@@ -60,9 +60,7 @@ def parameter_values(
 
     Parameters
     ----------
-    options : argparse.Namespace
-    usual : mapping
-        Values that replace the node's defaults.
+    usual : mapping, values that replace the node's defaults
 
     """
     given = {**usual, **({} if options.params_file is None else _read_file(options.params_file))}

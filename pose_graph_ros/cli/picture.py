@@ -53,10 +53,7 @@ def draw_drive(drive: Drive, file: Path, title: str) -> None:
 
     Parameters
     ----------
-    drive : Drive
-    file : Path
-        Its suffix (`.png`, `.svg`, `.pdf`) determines the format.
-    title : str
+    file : Path, its suffix (`.png`, `.svg`, `.pdf`) determines the format
 
     """
     odometry = place_odometry(drive)

@@ -66,10 +66,7 @@ def run(bag: BagReader, inputs: Inputs, values: Mapping[str, Any]) -> Replayed:
 
     Parameters
     ----------
-    bag : BagReader
-    inputs : Inputs
-    values : mapping
-        All parameters of the node.
+    values : mapping, all parameters of the node
 
     """
     reader = MessageReader(values)
@@ -107,10 +104,8 @@ def run_measurements(
 
     Parameters
     ----------
-    measurements : iterable
-        Sources and measurements, in the order of their arrival.
-    values : mapping
-        All parameters of the node.
+    measurements : iterable, sources and measurements, in the order of their arrival
+    values : mapping, all parameters of the node
 
     """
     backend = PoseGraphBackend(backend_config(values))

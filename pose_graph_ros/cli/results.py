@@ -49,7 +49,6 @@ class PathCollector:
 
         Parameters
         ----------
-        stamp_ns : int
         pose : ndarray, shape (3,)
 
         """
@@ -87,10 +86,8 @@ class _Positions:
 
         Parameters
         ----------
-        stamp_ns : int
         position : ndarray, shape (2,), or a fix that is not in the map yet
         arm : ndarray, shape (2,), of the antenna
-        held_out : bool
 
         """
         if isinstance(position, Fix):
@@ -118,18 +115,11 @@ def collect_drive(
 
     Parameters
     ----------
-    bag : BagReader
-    inputs : Inputs
-    values : mapping
-        All parameters of the node.
-    corrected : Trajectory
-        Result, `T_map_base`.
-    truth_topic : str or None
-        Topic of true poses in the map.
-    origin : MapOrigin, optional
-        Datum of the graph.
-    states : mapping, optional
-        What is believed; all that is missing is.
+    values : mapping, all parameters of the node
+    corrected : Trajectory, result, `T_map_base`
+    truth_topic : str or None, topic of true poses in the map
+    origin : MapOrigin, optional, datum of the graph
+    states : mapping, optional, what is believed; all that is missing is
 
     Raises
     ------
@@ -188,11 +178,6 @@ def read_truth(bag: BagReader, topic: str) -> Trajectory:
     """
     Return the true poses in a bag; invalid messages are ignored.
 
-    Parameters
-    ----------
-    bag : BagReader
-    topic : str
-
     Raises
     ------
     BagError
@@ -220,13 +205,9 @@ def write_results(drive: Drive, folder: Path, title: str, facts: Mapping[str, An
 
     Parameters
     ----------
-    drive : Drive
-    folder : Path
-        Created if it does not exist.
-    title : str
-        Of the picture.
-    facts : mapping
-        Further entries of the summary.
+    folder : Path, created if it does not exist
+    title : str, of the picture
+    facts : mapping, further entries of the summary
 
     """
     folder.mkdir(parents=True, exist_ok=True)

@@ -124,10 +124,8 @@ def simulate_drive(
         Seed of the sensor errors, the position within the lane and the waits at traffic lights.
     duration_s : float
         Length of the recording, 10 s or more [s]; the second lap begins after about 310 s.
-    gyro : bool
-        Whether with a gyroscope; all else is the same without.
-    heading_drift : float
-        What the heading by the wheels drifts by, per distance [rad/m].
+    gyro : bool, whether with a gyroscope; all else is the same without
+    heading_drift : float, what the heading by the wheels drifts by, per distance [rad/m]
 
     """
     generator = np.random.default_rng(seed)
@@ -165,10 +163,7 @@ def write_drive(drive: SimulatedDrive, folder: str | Path, *, overwrite: bool = 
 
     Parameters
     ----------
-    drive : SimulatedDrive
-    folder : str or Path
-    overwrite : bool
-        Whether to replace an existing bag; otherwise one raises `BagError`.
+    overwrite : bool, whether to replace an existing bag; otherwise one raises `BagError`
 
     """
     messages = (

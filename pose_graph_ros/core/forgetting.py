@@ -95,16 +95,15 @@ class Forgetting:
             *constraints_on(graph, leaving), int(graph.node_ids[np.argmax(stays)])),
             dtype=np.int64)
         leaving = np.sort(np.concatenate((leaving, biases)))
-        parts.judge.decide_leaving(*constraints_on(graph, leaving))
+        decided = parts.judge.decide_leaving(*constraints_on(graph, leaving))
         self._smoother.linearize(leaving)
         poses = nodes.recent_poses(graph)
         anchors = self._other_anchors(first)
         gone = self._gone(leaving, prior)
         if gone is None:
-            parts.judge.stay()
             self._tuner.stay()
             return
-        forget(gone, parts, self._tuner)
+        forget(gone, parts, self._tuner, decided)
         if anchors is not None:
             nodes.table.thin(*anchors)
         nodes.forget(poses[:n])

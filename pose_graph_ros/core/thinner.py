@@ -15,6 +15,7 @@ from pose_graph_ros.core.error_tuner import ErrorTuner
 from pose_graph_ros.core.graph.graph_update import GraphUpdate, Left
 from pose_graph_ros.core.graph.incidence import constraints_on
 from pose_graph_ros.core.io.capture import Parts
+from pose_graph_ros.core.judgement.judge import Leaving
 from pose_graph_ros.core.smoother.incremental import IncrementalSmoother
 from pose_graph_ros.core.smoother.results import Forgotten
 from pose_graph_ros.core.window.bias_cuts import cut_chains
@@ -97,17 +98,18 @@ class Thinner:
             group = self._present(chosen, config)
             if len(group.nodes) == 0:
                 continue
-            parts.judge.decide_leaving(*constraints_on(parts.graph, group.nodes))
-            self._leave(group, sparse_removal(parts.graph, group.nodes))
+            decided = parts.judge.decide_leaving(*constraints_on(parts.graph, group.nodes))
+            self._leave(group, sparse_removal(parts.graph, group.nodes), decided)
             yield
         nobody = places.rows(np.zeros(len(places.nodes), dtype=bool))
         while len(closures := old_closures(parts.graph, config.newest, MOST_OLD_CLOSURES)) > 0:
-            parts.judge.decide_leaving(closures, NONE)
-            if not self._leave(nobody, sparse_removal(parts.graph, NONE, closures)):
+            decided = parts.judge.decide_leaving(closures, NONE)
+            if not self._leave(
+                    nobody, sparse_removal(parts.graph, NONE, closures), decided):
                 break
             yield
         for gone in simplify(smoother):
-            forget(gone, parts, self._tuner)
+            forget(gone, parts, self._tuner, None)
             yield
         parts.nodes.drop_samples(config.newest)
         parts.pipeline.seen.forget(parts.nodes.newest_ns - REPEATED_NS)
@@ -134,15 +136,15 @@ class Thinner:
         edges = np.union1d(edges, segment.edges)
         observed = np.union1d(observed, segment.observed)
         # what is decided may have another weight
-        self._parts.judge.decide_leaving(edges, observed)
+        decided = self._parts.judge.decide_leaving(edges, observed)
         biases = np.array(self._tuner.leave(edges, observed, segment.after), dtype=np.int64)
         cuts = cut_chains(graph, biases)
         update = None if cuts is None else sparse_removal(
             graph, np.sort(np.concatenate((group.nodes, biases))), segment.edges,
             segment.observed, cuts)
-        return self._leave(group, update)
+        return self._leave(group, update, decided)
 
-    def _leave(self, group: Places, update: GraphUpdate | None) -> bool:
+    def _leave(self, group: Places, update: GraphUpdate | None, decided: Leaving) -> bool:
         """
         Let nodes leave with an update; tell whether they did.
 
@@ -150,14 +152,14 @@ class Thinner:
         ----------
         group : Places
         update : GraphUpdate, optional; None if they cannot leave
+        decided : Leaving, on their constraints
 
         """
         gone = removed(self._smoother, update)
         if gone is None:
-            self._parts.judge.stay()
             self._tuner.stay()
             return False
-        forget(gone, self._parts, self._tuner)
+        forget(gone, self._parts, self._tuner, decided)
         self._parts.nodes.table.thin(*group)
         return True
 
@@ -170,7 +172,9 @@ class Thinner:
         return found
 
 
-def forget(gone: Left | Forgotten, parts: Parts, tuner: ErrorTuner) -> None:
+def forget(
+    gone: Left | Forgotten, parts: Parts, tuner: ErrorTuner, decided: Leaving | None,
+) -> None:
     """
     Let judge, reweighting, tuner and factors forget what has left the graph.
 
@@ -179,8 +183,9 @@ def forget(gone: Left | Forgotten, parts: Parts, tuner: ErrorTuner) -> None:
     gone : Left or Forgotten, ids
     parts : Parts
     tuner : ErrorTuner
+    decided : Leaving, optional, on the constraints; None if none of them is judged
 
     """
-    parts.judge.forget(gone.nodes, gone.edges, gone.observed)
+    parts.judge.forget(gone.nodes, gone.edges, gone.observed, decided)
     parts.reweighting.forget(gone.edges, gone.observed)
     tuner.forget(gone.nodes, gone.edges, gone.observed)

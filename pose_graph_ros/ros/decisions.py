@@ -21,9 +21,7 @@ def decide(message: Message, worker: Worker) -> None:
 
     Parameters
     ----------
-    message : diagnostic_msgs/KeyValue
-        The id of a constraint, and `in`, `out` or `auto`.
-    worker : Worker
+    message : diagnostic_msgs/KeyValue, the id of a constraint, and `in`, `out` or `auto`
 
     """
     worker.call(partial(_hand_over, message, worker), 'a decision')

@@ -57,8 +57,7 @@ def initial_graph(values: Mapping[str, Any]) -> InitialGraph | None:
 
     Parameters
     ----------
-    values : mapping
-        All checked parameters.
+    values : mapping, all checked parameters
 
     Raises
     ------
@@ -81,15 +80,7 @@ def initial_graph(values: Mapping[str, Any]) -> InitialGraph | None:
 
 
 def restored(path: Path, config: BackendConfig) -> tuple[SavedGraph, PoseGraphBackend]:
-    """
-    Return a saved graph and an engine that continues it; raises `FileFormatError`.
-
-    Parameters
-    ----------
-    path : Path
-    config : BackendConfig
-
-    """
+    """Return a saved graph and an engine that continues it; raises `FileFormatError`."""
     saved = read_graph(path)
     backend = PoseGraphBackend.restored(config, saved)
     backend.update()

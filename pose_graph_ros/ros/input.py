@@ -26,10 +26,8 @@ class Input:
 
     Parameters
     ----------
-    values : mapping
-        All checked parameters; raises `ConfigError` if they contradict each other.
-    warn : callable
-        Logs a sentence.
+    values : mapping, all checked parameters; raises `ConfigError` if they contradict each other
+    warn : callable, logs a sentence
 
     """
 
@@ -72,8 +70,6 @@ class Input:
 
         Parameters
         ----------
-        source : Source
-        message : Message
         primary : str
             Name of the primary odometry, by whose stamps time is judged; empty for any odometry.
 
@@ -115,10 +111,8 @@ class Input:
 
         Parameters
         ----------
-        source : str
         measurement : OdometrySample or Measurement
-        post : callable
-            `Worker.post`.
+        post : callable, `Worker.post`
 
         """
         if self.paused:
@@ -140,10 +134,8 @@ class Input:
         ----------
         counts : Counter
             Number of measurements by source and 'accepted' or a reason, of the engine.
-        details : mapping
-            Of its newest refusal by source and reason.
-        active : bool
-            Whether messages can be received.
+        details : mapping, of its newest refusal by source and reason
+        active : bool, whether messages can be received
 
         """
         now, silent, quiet = time.monotonic(), self.silent, self.quiet
@@ -157,29 +149,13 @@ class Input:
             self.received, counts + self.rejected, {**details, **self._details}, now)
 
     def refuse(self, source: str, error: Exception) -> None:
-        """
-        Count a message that cannot be deserialised.
-
-        Parameters
-        ----------
-        source : str
-        error : Exception
-
-        """
+        """Count a message that cannot be deserialised."""
         self.received[source] += 1
         self.liveness.receive(source, time.monotonic())
         self.reject(source, rejected('malformed', str(error)))
 
     def reject(self, source: str, answer: Answer) -> None:
-        """
-        Count a message that cannot be used; log the first for each source and reason.
-
-        Parameters
-        ----------
-        source : str
-        answer : Answer
-
-        """
+        """Count a message that cannot be used; log the first for each source and reason."""
         self.rejected[source, answer.reason] += 1
         self._details[source, answer.reason] = answer.detail
         self.warn_once(source, answer.reason, f'{source}: {answer.reason}: {answer.detail} '

@@ -66,9 +66,7 @@ class Liveness:
 
         Parameters
         ----------
-        source : str
-        now : float
-            By a monotonic clock, here and below [s].
+        now : float, by a monotonic clock, here and below [s]
 
         """
         arrivals = self._arrivals.get(source)
@@ -88,7 +86,6 @@ class Liveness:
 
         Parameters
         ----------
-        source : str
         now : float
 
         """

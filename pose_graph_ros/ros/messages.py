@@ -69,12 +69,7 @@ def fix_message(
 
     Parameters
     ----------
-    stamp_ns : int
-    prediction : Prediction
-    plane : TangentPlane
-    altitude : float
-        Above the ellipsoid [m]; NaN if unknown.
-    base_frame : str
+    altitude : float, above the ellipsoid [m]; NaN if unknown
 
     """
     latitude, longitude, _ = plane.to_geodetic(
@@ -109,11 +104,7 @@ def odometry_cdr(
 
     Parameters
     ----------
-    stamp_ns : int
-    prediction : Prediction
-    source : nav_msgs.msg.Odometry
-        Its twist is replaced by an unknown one if it is not finite.
-    map_frame, base_frame : str
+    source : nav_msgs.msg.Odometry, its twist is replaced by an unknown one if it is not finite
 
     """
     twist = source.twist
@@ -128,16 +119,7 @@ def odometry_cdr(
 
 
 def stamped_pose_cdr(stamp_ns: int, prediction: Prediction, map_frame: str) -> bytes:
-    """
-    Return a serialised geometry_msgs/PoseWithCovarianceStamped in the map.
-
-    Parameters
-    ----------
-    stamp_ns : int
-    prediction : Prediction
-    map_frame : str
-
-    """
+    """Return a serialised geometry_msgs/PoseWithCovarianceStamped in the map."""
     return b''.join((CDR, _STAMP.pack(*divmod(stamp_ns, NANOSECONDS)), _names(8, map_frame),
                      _pose_with_covariance_cdr(prediction, PLANAR_VARIANCE)))
 
@@ -169,9 +151,7 @@ def transform_cdr(
 
     Parameters
     ----------
-    stamp_ns : int
     T_map_odom : ndarray, shape (3,)
-    map_frame, odom_frame : str
 
     """
     return b''.join((CDR, _LENGTH.pack(1), _STAMP.pack(*divmod(stamp_ns, NANOSECONDS)),
@@ -188,10 +168,7 @@ def path_cdr(path: Trajectory, stamp_ns: int, frame_id: str) -> bytes:
 
     Parameters
     ----------
-    path : Trajectory
-    stamp_ns : int
-        Stamp of the path; each pose has its own [ns].
-    frame_id : str
+    stamp_ns : int, stamp of the path; each pose has its own [ns]
 
     """
     name = frame_id.encode() + b'\0'

@@ -193,11 +193,6 @@ class PoseGraphNode(LifecycleNode):
 
         A parameter, also a read-only one, can be set to the value that it has, and one that is
         not set to nothing, so that a node takes what `ros2 param dump` has written of it.
-
-        Parameters
-        ----------
-        parameter_list : list of rclpy.parameter.Parameter
-
         """
         changes = []
         for parameter in parameter_list:

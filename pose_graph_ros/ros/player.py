@@ -61,9 +61,7 @@ class Player(Node):
 
     Parameters
     ----------
-    inputs : Inputs
-    topics : mapping
-        Of the node, by source.
+    topics : mapping, of the node, by source
 
     """
 
@@ -132,9 +130,7 @@ class Player(Node):
 
         Parameters
         ----------
-        bag : Path
-        rate : float
-            Speed relative to the recorded one; 0 for as fast as the node can process.
+        rate : float, speed relative to the recorded one; 0 for as fast as the node can process
 
         Returns
         -------

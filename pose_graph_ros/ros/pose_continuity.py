@@ -21,8 +21,7 @@ class PoseContinuity:
 
     Parameters
     ----------
-    maximum_speed : float
-        Greatest possible speed of the robot [m/s].
+    maximum_speed : float, greatest possible speed of the robot [m/s]
     resumes : bool
         Whether there is an estimate from before the first sample: the engine then decides whether
         the odometry continues from there.
@@ -43,10 +42,8 @@ class PoseContinuity:
 
         Parameters
         ----------
-        estimate : Estimate or None
-            The newest estimate, a little older than the sample.
-        sample : OdometrySample
-            Newest sample of the primary odometry, in order of arrival.
+        estimate : Estimate or None, the newest estimate, a little older than the sample
+        sample : OdometrySample, newest sample of the primary odometry, in order of arrival
 
         """
         if sample.stamp_ns > self._stamp_ns:

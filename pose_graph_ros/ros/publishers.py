@@ -65,11 +65,8 @@ class Publishers:
 
     Parameters
     ----------
-    node : rclpy.node.Node
-    values : mapping
-        All checked parameters.
-    on_other : callable
-        Called with a sentence if another node publishes the same transform.
+    values : mapping, all checked parameters
+    on_other : callable, called with a sentence if another node publishes the same transform
 
     """
 
@@ -133,13 +130,9 @@ class Publishers:
 
         Parameters
         ----------
-        estimate : Estimate
-            The newest estimate, with the same primary odometry.
-        odometry : Message
-            With the fields of nav_msgs/Odometry.
-        sample : OdometrySample
-            The same message, as it was read.
-        datum : Datum
+        estimate : Estimate, the newest estimate, with the same primary odometry
+        odometry : Message, with the fields of nav_msgs/Odometry
+        sample : OdometrySample, the same message, as it was read
 
         """
         stamp, plane = sample.stamp_ns, datum.plane
@@ -188,10 +181,7 @@ class Publishers:
 
         Parameters
         ----------
-        estimate : Estimate
-        path : Trajectory
-        graph : int
-            Number of its graph.
+        graph : int, number of its graph
         n_frozen : int
             Number of its first poses that have left the graph: of more than `MOST_FROZEN` only
             every second one is published, or every third, and so on.
@@ -217,9 +207,7 @@ class Publishers:
 
         Parameters
         ----------
-        view : GraphView
-        stamp_ns, graph : int
-            Stamp of the newest odometry in it [ns], and number of the graph.
+        stamp_ns, graph : int, stamp of the newest odometry in it [ns], and number of the graph
 
         """
         with self._lock:
@@ -235,10 +223,8 @@ class Publishers:
 
         Parameters
         ----------
-        state : object
-            Equal to that of the verdicts published last if they have not changed.
-        at_once : bool
-            Whether it cannot be too soon.
+        state : object, equal to that of the verdicts published last if they have not changed
+        at_once : bool, whether it cannot be too soon
 
         """
         return (state != self._verdicts_shown
@@ -254,13 +240,9 @@ class Publishers:
 
         Parameters
         ----------
-        verdicts : sequence of Verdict
-        totals : mapping
-            What is believed of each source.
-        stamp_ns, graph : int
-            Stamp of the newest odometry in it [ns], and number of the graph.
-        state : object
-            What `verdicts_are_due` was asked for.
+        totals : mapping, what is believed of each source
+        stamp_ns, graph : int, stamp of the newest odometry in it [ns], and number of the graph
+        state : object, what `verdicts_are_due` was asked for
 
         """
         with self._lock:
@@ -299,10 +281,7 @@ class Publishers:
 
         Parameters
         ----------
-        level : bytes
-            As in DiagnosticStatus.
-        text : str
-        values : mapping
+        level : bytes, as in DiagnosticStatus
 
         """
         status = DiagnosticStatus(
@@ -331,7 +310,6 @@ def thinned(path: Trajectory, n_frozen: int) -> Trajectory:
 
     Parameters
     ----------
-    path : Trajectory
     n_frozen : int, how many of its first poses are frozen
 
     """

@@ -35,14 +35,10 @@ class Refusals:
 
         Parameters
         ----------
-        received : mapping
-            Number of messages by source.
-        counts : Counter
-            Number of messages by source and 'accepted' or a reason.
-        details : mapping
-            Of the newest refusal by source and reason.
-        now : float
-            By a monotonic clock [s].
+        received : mapping, number of messages by source
+        counts : Counter, number of messages by source and 'accepted' or a reason
+        details : mapping, of the newest refusal by source and reason
+        now : float, by a monotonic clock [s]
 
         """
         said = {}

@@ -47,15 +47,7 @@ class _Done:
 
 
 class Services:
-    """
-    Offers the services of a configured node.
-
-    Parameters
-    ----------
-    node : rclpy.node.Node
-    session : Session
-
-    """
+    """Offers the services of a configured node."""
 
     def __init__(self, node: Node, session: Session) -> None:
         self._node, self._session = node, session

@@ -67,9 +67,7 @@ class Session:
 
     Parameters
     ----------
-    node : rclpy.node.Node
-    values : mapping
-        All checked parameters; raises `ConfigError` if they contradict each other.
+    values : mapping, all checked parameters; raises `ConfigError` if they contradict each other
 
     """
 
@@ -345,11 +343,8 @@ class Session:
 
         Parameters
         ----------
-        saved : SavedGraph
-        backend : PoseGraphBackend
-            Restored from it.
-        name : str
-            For the log.
+        backend : PoseGraphBackend, restored from it
+        name : str, for the log
 
         """
         self.input.time_jumps.forget()

@@ -22,8 +22,7 @@ class SetPoseInput:
 
     Parameters
     ----------
-    map_frame, odom_frame, base_frame : str
-        Those in which a pose may be given.
+    map_frame, odom_frame, base_frame : str, those in which a pose may be given
 
     """
 
@@ -39,8 +38,7 @@ class SetPoseInput:
         Parameters
         ----------
         message : geometry_msgs/PoseWithCovarianceStamped
-        early : bool
-            Whether there is no odometry yet: the pose then applies to the first odometry.
+        early : bool, whether there is no odometry yet: the pose then applies to the first odometry
 
         """
         named = frame(message.header.frame_id)

@@ -35,8 +35,7 @@ class Slew:
 
         Parameters
         ----------
-        stamp_ns : int
-            Newer than in the call before [ns].
+        stamp_ns : int, newer than in the call before [ns]
         T_map_odom : ndarray, shape (3,)
             The estimate.
         T_odom_base : ndarray, shape (3,)

@@ -25,14 +25,7 @@ CLOSE_TIMEOUT = 1.0  # longest wait for a callback at the end [s]
 
 
 class Spinner:
-    """
-    Runs the callbacks of a node, in one thread, until it is told to stop.
-
-    Parameters
-    ----------
-    node : rclpy.node.Node
-
-    """
+    """Runs the callbacks of a node, in one thread, until it is told to stop."""
 
     def __init__(self, node: Node) -> None:
         self._node = node
@@ -71,12 +64,6 @@ def guarded(callback: Callable[..., None], is_due: Callable[[], bool]) -> Callab
 
     Of messages that came together, the executor would leave those behind an error for later; and
     events that were under way when subscriptions and timers were destroyed still come.
-
-    Parameters
-    ----------
-    callback : callable
-    is_due : callable
-
     """
     def call(*arguments: object) -> None:
         try:

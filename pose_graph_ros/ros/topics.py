@@ -56,10 +56,7 @@ def check_topics(node: Node, sources: Iterable[Source], overrides: Mapping[str, 
 
     Parameters
     ----------
-    node : rclpy.node.Node
-    sources : iterable of Source
-    overrides : mapping
-        Values of the parameters given to the node, by name.
+    overrides : mapping, values of the parameters given to the node, by name
 
     """
     used: dict[str, tuple[str, str, bool]] = {}

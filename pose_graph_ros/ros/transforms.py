@@ -37,11 +37,8 @@ class TransformPublisher:
 
     Parameters
     ----------
-    node : rclpy.node.Node
     publisher : rclpy.publisher.Publisher
-    map_frame, odom_frame : str
-    on_other : callable
-        Called once with a sentence if another node publishes the same transform.
+    on_other : callable, called once with a sentence if another node publishes the same transform
 
     """
 
@@ -64,7 +61,6 @@ class TransformPublisher:
 
         Parameters
         ----------
-        at_ns : int
         T_map_odom : ndarray, shape (3,)
 
         """

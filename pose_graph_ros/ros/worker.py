@@ -73,9 +73,7 @@ class Worker:
 
     Parameters
     ----------
-    backend : PoseGraphBackend
-    on_estimate : callable
-        Called in the thread after each new estimate, with the backend.
+    on_estimate : callable, called in the thread after each new estimate, with the backend
     prepare : callable
         Called in the thread before its first work, with a function that returns whether to end.
 
@@ -129,7 +127,6 @@ class Worker:
 
         Parameters
         ----------
-        source : str
         measurement : OdometrySample or Measurement
 
         """
@@ -160,9 +157,7 @@ class Worker:
 
         Parameters
         ----------
-        job : callable
-        what : str
-            For the log.
+        what : str, for the log
 
         """
         future: Future[Result] = Future()

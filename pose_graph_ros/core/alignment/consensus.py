@@ -117,7 +117,6 @@ def positions_along(
     ----------
     poses : ndarray, shape (N, 3), poses of the hidden nodes by odometry [m, m, rad]
     observed : ObservedNodes, K >= 1 positions or global poses, whose headings are not used
-    noise : OdometryNoise
     correlation : TimeCorrelation, optional, correlation of the errors; None for white noise
 
     """
@@ -178,15 +177,7 @@ class Consensus:
 
 
 def consensus(positions: Positions, noise: OdometryNoise) -> Consensus | None:
-    """
-    Return the motion that most positions agree on; None if there is no angle that two agree on.
-
-    Parameters
-    ----------
-    positions : Positions
-    noise : OdometryNoise
-
-    """
+    """Return the motion that most positions agree on; None if no two agree on an angle."""
     variance = positions.variance + _drift(positions, noise)
     inlier, cost = _inliers(positions.odometry, positions.observed, variance)
     n = int(np.count_nonzero(inlier))
@@ -227,9 +218,7 @@ def mirrored(positions: Positions, found: Consensus, noise: OdometryNoise) -> bo
 
     Parameters
     ----------
-    positions : Positions
     found : Consensus, result of `consensus` for the same positions
-    noise : OdometryNoise
 
     """
     variance = positions.variance + _drift(positions, noise)

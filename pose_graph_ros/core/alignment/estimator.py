@@ -74,7 +74,6 @@ def find_alignment(
     poses : ndarray, shape (N, 3), hidden nodes in the frame of the graph [m, m, rad]
     observed : ObservedNodes
         Positions and global poses on these hidden nodes, in any order; K >= 1.
-    policy : AlignmentPolicy
     noise : OdometryNoise, noise of the odometry between the nodes
     correlation : TimeCorrelation, optional, that of the errors; None for white noise
 

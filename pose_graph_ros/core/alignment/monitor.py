@@ -107,7 +107,6 @@ class AlignmentMonitor:
 
         Parameters
         ----------
-        graph : Graph
         waiting : list of AttachedMeasurement, on its hidden nodes, but not in it yet
         primary : str, name of the primary odometry source
 
@@ -156,7 +155,6 @@ class AlignmentMonitor:
         Parameters
         ----------
         graph : Graph, in the map
-        nodes : HiddenNodes
 
         """
         if self.state is not AlignmentState.ALIGNED or len(self._evidence) < self._next_recheck:
@@ -244,7 +242,6 @@ def in_rows(graph: Graph, measurements: Sequence[AttachedMeasurement]) -> Observ
     Parameters
     ----------
     graph : Graph, with the hidden nodes
-    measurements : sequence of AttachedMeasurement
 
     """
     table = _table(measurements)

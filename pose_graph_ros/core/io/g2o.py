@@ -131,7 +131,6 @@ def read_g2o(path: Path, edge2_order: str | None = None) -> GraphFile:
 
     Parameters
     ----------
-    path : Path
     edge2_order : {'toro', 'isam'}, optional, format of `EDGE2` in this file, else ValueError
 
     """

@@ -26,8 +26,6 @@ def write_g2o(graph: Graph, path: Path, ids: IntArray | None = None) -> None:
 
     Parameters
     ----------
-    graph : Graph
-    path : Path
     ids : ndarray, shape (N,), optional, number of each hidden node; by default its id
 
     """
@@ -42,7 +40,6 @@ def g2o_text(rows: GraphRows, ids: IntArray | None = None) -> str:
 
     Parameters
     ----------
-    rows : GraphRows
     ids : ndarray, shape (N,), optional, number of each hidden node; by default its id
 
     """

@@ -115,7 +115,6 @@ def write_graph(saved: SavedGraph, path: Path) -> tuple[Path, Path, Path]:
 
     Parameters
     ----------
-    saved : SavedGraph
     path : Path, path of the g2o file, with or without suffix; the other files are beside it
 
     """

@@ -28,7 +28,6 @@ def encoded(value: Any, kind: Any = None) -> Any:
 
     Parameters
     ----------
-    value : object
     kind : type, optional, annotation of the value
 
     """

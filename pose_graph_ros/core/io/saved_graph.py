@@ -238,6 +238,7 @@ class SavedGraph:
     def _check_doubts(self, odometry: SavedOdometry) -> None:
         where = 'judgement.odometry'
         _same_length(where, odometry, 'rows', 'ends', 'weights', 'since_ns')
+        _same_length(where, odometry, 'left_sources', 'left')
         _in_graph(where, odometry.rows, self.rows.edge_ids)
         _require(self._kinds(odometry.rows) == EdgeKind.ODOMETRY,
                  f'{where}: expected rows of odometry')
@@ -302,7 +303,6 @@ def site_refusal(
 
     Parameters
     ----------
-    saved : SavedGraph
     datum : MapOrigin, optional
         The current datum, if the user has set it. It must equal that of the saved graph, except
         for the altitude.
@@ -328,8 +328,7 @@ def datum_refusal(saved: MapOrigin, datum: MapOrigin) -> str | None:
 
     Parameters
     ----------
-    saved, datum : MapOrigin
-        They must be equal except for the altitude.
+    saved, datum : MapOrigin, they must be equal except for the altitude
 
     """
     metres = float(distances(saved, datum.latitude, datum.longitude)[0])

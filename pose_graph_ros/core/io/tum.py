@@ -14,15 +14,7 @@ PART = 10_000
 
 
 def write_tum(trajectory: Trajectory, path: Path) -> None:
-    """
-    Write a trajectory; stamps and positions read back bit for bit, headings to rounding.
-
-    Parameters
-    ----------
-    trajectory : Trajectory
-    path : Path
-
-    """
+    """Write a trajectory; stamps and positions read back bit for bit, headings to rounding."""
     with path.open('w', encoding='ascii') as file:
         file.writelines(f'{line}\n' for line in _lines(trajectory))
 

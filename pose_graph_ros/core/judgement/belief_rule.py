@@ -28,16 +28,7 @@ NARROW = 1e-3
 
 
 class BeliefRule:
-    """
-    Chooses what is believed; it changes nothing.
-
-    Parameters
-    ----------
-    states : ClosureStates
-    table : ClosureTable
-    retests : Retests
-
-    """
+    """Chooses what is believed; it changes nothing."""
 
     def __init__(self, states: ClosureStates, table: ClosureTable, retests: Retests) -> None:
         self._states, self._table, self._retests = states, table, retests

@@ -33,11 +33,7 @@ class Beliefs:
 
     Parameters
     ----------
-    smoother : IncrementalSmoother
     reweighting : Reweighting, of its constraints with a robust loss
-    states : ClosureStates
-    table : ClosureTable
-    odometry : OdometryStates
 
     """
 
@@ -81,7 +77,6 @@ class Beliefs:
         Parameters
         ----------
         changes : mapping, new states by the numbers of closures
-        at_once : bool
         doubts : mapping, optional, the doubted odometry edges by id, if they change as well
 
         """

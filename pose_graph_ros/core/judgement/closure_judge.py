@@ -16,7 +16,7 @@ import numpy as np
 from pose_graph_ros.core.compiled.growing_array import GrowingArray
 from pose_graph_ros.core.config import BackendConfig
 from pose_graph_ros.core.geometry.se2 import FloatArray, IntArray
-from pose_graph_ros.core.graph.constraints import EdgeKind, Edges
+from pose_graph_ros.core.graph.constraints import Edges
 from pose_graph_ros.core.graph.reweighting import Reweighting
 from pose_graph_ros.core.judgement import decisions, final, relative
 from pose_graph_ros.core.judgement.belief_rule import BeliefRule
@@ -54,9 +54,8 @@ MOST_NEW, IN_UPDATE, IN_PART, NODES_IN_PART = 32, 16, 32, 160_000
 # Number of nodes above which an update adds closures with weight 0 and leaves all tests to the
 # work after it, so that it has nothing to solve for but what is new.
 LARGE = 500
-# Of closures that leave the graph: rounds of tests, and how many stay in the tables at least
-# until these are compacted.
-MOST_ROUNDS, MOST_LEFT = 4, 64
+# Rounds of tests of closures that leave the graph.
+MOST_ROUNDS = 4
 
 
 class ClosureJudge:
@@ -174,9 +173,7 @@ class ClosureJudge:
     def _test(self, numbers: IntArray) -> tuple[IntArray, FloatArray]:
         """Test closures that are not in the graph; return those that pass, and their chances."""
         some, n = self._table.rows(numbers), len(numbers)
-        errors, spread = self._smoother.edge_innovations(Edges(
-            some.i, some.j, some.mean, some.noise,
-            np.full(n, int(EdgeKind.LOOP_CLOSURE))))
+        errors, spread = self._smoother.edge_innovations(relative.as_edges(some))
         total, distance = spread + some.noise, np.empty(n)
         relative.distances(errors, total, distance)
         self._table.set_spread(numbers, spread)
@@ -304,7 +301,7 @@ class ClosureJudge:
         """
         states, graph = self._states, self._smoother.graph
         self._chain.extend(graph)
-        leaving = np.flatnonzero(np.isin(states.edge, edges) & ~states.left)
+        leaving = states.numbers(edges)
         if len(leaving) == 0:
             return []
         judged = leaving[states.judged[leaving]]
@@ -313,9 +310,9 @@ class ClosureJudge:
             for _ in range(MOST_ROUNDS):
                 due = self._retests.due(self._beliefs.round, graph.next_ids.node)
                 waiting = judged[~states.in_graph[judged] & due[judged]]
-                if len(waiting) == 0 or graph.has_touched or not self._change(
-                        self._rule.choose(*self._test(waiting[:IN_UPDATE]))):
+                if len(waiting) == 0 or graph.has_touched:
                     break
+                self._change(self._rule.choose(*self._test(waiting[:IN_UPDATE])))
         return self.reports.of(graph, leaving[~states.in_graph[leaving]][-MOST_OTHERS:].tolist())
 
     def forget(self, nodes: IntArray, edges: IntArray) -> IntArray:
@@ -327,30 +324,20 @@ class ClosureJudge:
         nodes, edges : ndarray of int, ids
 
         """
-        states, ends = self._states, np.empty((0, 2), np.int64)
-        used = states.in_graph
-        gone = states.leave(edges)
+        states, gone = self._states, self._states.numbers(edges)
+        used = self._table.rows(gone[states.in_graph[gone]])
+        self._beliefs.forget(set(edges.tolist()), set(gone.tolist()))
         if len(gone) > 0:
-            left = self._table.rows(gone[used[gone]])
-            ends = np.column_stack((left.i, left.j))
             self._table.forget(gone[~states.forgotten[gone]])
             self._beliefs.closures_left(gone)
-        self._beliefs.forget(set(edges.tolist()), set(gone.tolist()))
+            # all others get other numbers
+            kept = np.setdiff1d(np.arange(len(states)), gone)
+            self._beliefs.trial.renumber(np.searchsorted(kept, np.arange(len(states))))
+            for table in (states, self._table, self._retests, self._corroborated):
+                table.select(kept)
+            self.reports.forget()
         self._chain.forget(nodes)
-        n_left = int(np.count_nonzero(self._states.left))
-        if n_left > MOST_LEFT and 2 * n_left > len(self._states):
-            self._select(np.flatnonzero(~self._states.left))
-        return ends
-
-    def _select(self, kept: IntArray) -> None:
-        """Keep some closures, which get other numbers."""
-        new = np.full(len(self._states), -1)
-        new[kept] = np.arange(len(kept))
-        for table in (self._states, self._table, self._retests, self._corroborated):
-            table.select(kept)
-        self._beliefs.trial.renumber(new)
-        self._search = SetSearch(self._states, self._table)
-        self.reports.forget()
+        return np.column_stack((used.i, used.j))
 
     def decide_finally(self) -> None:
         """
@@ -415,7 +402,6 @@ class ClosureJudge:
 
         Parameters
         ----------
-        saved : SavedClosures
         now_ns : int, stamp of the newest hidden node
 
         """
@@ -442,7 +428,6 @@ class ClosureJudge:
         Parameters
         ----------
         name : str, `Verdict.id`
-        decision : Decision
 
         """
         return decisions.decide(name, decision, (self._states, self._table, self._beliefs),

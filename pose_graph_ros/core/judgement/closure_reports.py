@@ -16,6 +16,7 @@ from pose_graph_ros.core.judgement.closure_states import (
     DECISIONS,
     DOUBTED,
     STATES,
+    USED,
     WAITING,
 )
 from pose_graph_ros.core.judgement.closures import ClosureTable, GATE
@@ -32,15 +33,7 @@ WEAK, BELIEVED = STATES.index(State.WEAKLY_BELIEVED), STATES.index(State.BELIEVE
 
 
 class ClosureReports:
-    """
-    Tells what is decided on closures, and why.
-
-    Parameters
-    ----------
-    states : ClosureStates
-    table : ClosureTable
-
-    """
+    """Tells what is decided on closures, and why."""
 
     def __init__(self, states: ClosureStates, table: ClosureTable) -> None:
         self._states, self._table = states, table
@@ -57,15 +50,13 @@ class ClosureReports:
 
         Parameters
         ----------
-        graph : Graph
         most_believed : int or None
 
         """
-        states, here = self._states, np.flatnonzero(~self._states.left)
-        numbers = here[listed(
-            states.source[here], states.state[here] == BELIEVED, states.decision[here] != AUTO,
-            most_believed)]
-        return self.of(graph, numbers.tolist())
+        states = self._states
+        return self.of(graph, listed(
+            states.source, states.state == BELIEVED, states.decision != AUTO,
+            most_believed).tolist())
 
     def of(self, graph: Graph, numbers: Sequence[int]) -> list[Verdict]:
         """
@@ -73,7 +64,6 @@ class ClosureReports:
 
         Parameters
         ----------
-        graph : Graph
         numbers : sequence of int
 
         """
@@ -84,7 +74,7 @@ class ClosureReports:
     def _verdict(self, number: int, residual: FloatArray) -> Verdict:
         states = self._states
         agree, against = self._neighbours(number)
-        contradicted = [states.name(other) for other in against if states.in_graph_at(other)]
+        contradicted = [states.name(other) for other in against if USED[states.state[other]]]
         # a person may force out what fits, and force in what does not
         if (states.state[number] == DOUBTED if states.decision[number] == AUTO
                 else states.distance[number] > GATE):
@@ -113,7 +103,7 @@ class ClosureReports:
         """Return what is believed of each source, given the factors on their sigmas."""
         totals = {}
         for k, source in enumerate(self._states.sources):
-            own = (self._states.source == k) & ~self._states.left
+            own = self._states.source == k
             n_left, n_unused = self._states.n_left(k)
             counts = np.bincount(self._states.state[own], minlength=len(STATES))
             # wrong closures among right ones are what place recognition is like
@@ -125,6 +115,5 @@ class ClosureReports:
 
     def drawn_ids(self) -> DrawnRows:
         """Return the ids of edges that are drawn in another way than believed ones."""
-        here = ~self._states.left
-        edge, state = self._states.edge[here], self._states.state[here]
+        edge, state = self._states.edge, self._states.state
         return DrawnRows(*(edge[state == each].tolist() for each in (WEAK, WAITING, DOUBTED)))

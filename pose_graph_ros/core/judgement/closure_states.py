@@ -71,12 +71,12 @@ class ClosureStates:
             GrowingArray((), np.int64) for _ in range(6))
         self._stamps_ns = GrowingArray((2,), np.int64)
         self._distance = GrowingArray((), np.float64)
-        self._forgotten, self._left = (GrowingArray((), np.bool_) for _ in range(2))
+        self._forgotten = GrowingArray((), np.bool_)
         self._gone: list[Tally] = []
-        """Of each source, its closures that have left the graph, and the table."""
+        """Of each source, its closures that have left the graph."""
         self._columns = (
             self._edge, self._source, self._number, self._state, self._since_ns, self._decision,
-            self._stamps_ns, self._distance, self._forgotten, self._left)
+            self._stamps_ns, self._distance, self._forgotten)
         self._changes: deque[Change] = deque(maxlen=MOST_CHANGES)
 
     def __len__(self) -> int:
@@ -120,16 +120,7 @@ class ClosureStates:
     @property
     def in_graph(self) -> BoolArray:
         """Whether they are in the graph with a weight above 0."""
-        return USED[self.state] & ~self.left
-
-    def in_graph_at(self, number: int) -> bool:
-        """Return whether one of them is in the graph with a weight above 0."""
-        return bool(USED[self.state[number]] and not self.left[number])
-
-    @property
-    def left(self) -> BoolArray:
-        """Whether they have left the graph, with their nodes."""
-        return self._left.values
+        return np.asarray(USED[self.state])
 
     @property
     def forgotten(self) -> BoolArray:
@@ -138,13 +129,8 @@ class ClosureStates:
 
     @property
     def judged(self) -> BoolArray:
-        """Whether they are judged: no person has decided on them, and they are known."""
-        return (self.decision == AUTO) & self.known
-
-    @property
-    def known(self) -> BoolArray:
-        """Whether they are in the graph and not forgotten."""
-        return ~(self.forgotten | self.left)
+        """Whether they are judged: no person has decided on them, and they are not forgotten."""
+        return (self.decision == AUTO) & ~self.forgotten
 
     def record(self, source: int) -> tuple[int, int]:
         """Return how many closures of a source, by its index, are or were used, and doubted."""
@@ -155,16 +141,12 @@ class ClosureStates:
 
     def n_left(self, source: int) -> tuple[int, int]:
         """Return how many closures of a source have left the graph, and how many unused."""
-        own, gone = (self.source == source) & self.left, self._gone[source]
-        unused = own & ~USED[self.state]
-        return (gone.n + int(np.count_nonzero(own)),
-                gone.n - gone.n_used + int(np.count_nonzero(unused)))
+        gone = self._gone[source]
+        return gone.n, gone.n - gone.n_used
 
-    def leave(self, edges: IntArray) -> IntArray:
-        """Note that edges, by their ids, have left the graph; return the numbers of closures."""
-        numbers = np.flatnonzero(np.isin(self.edge, edges) & ~self.left)
-        self.left[numbers] = True
-        return numbers
+    def numbers(self, edges: IntArray) -> IntArray:
+        """Return the numbers of those of some edges, given by their ids, that are closures."""
+        return np.flatnonzero(np.isin(self.edge, edges))
 
     def select(self, kept: IntArray) -> None:
         """Keep some closures; all others have left the graph, and are only counted."""
@@ -201,7 +183,7 @@ class ClosureStates:
 
     def changes_to(self, inside: BoolArray) -> dict[int, State]:
         """Return the states of another set of believed ones, also of those that stay in it."""
-        now, inside = self.in_graph[:len(inside)], inside & ~self.left[:len(inside)]
+        now = self.in_graph[:len(inside)]
         return {
             k: (STATES[self.state[k]] if now[k] else State.BELIEVED) if inside[k]
             else State.DOUBTED for k in np.flatnonzero(inside | now).tolist()}
@@ -216,7 +198,7 @@ class ClosureStates:
         if source not in self.sources or not text.isdecimal():
             return -1
         found = np.flatnonzero((self.source == self.sources.index(source))
-                               & (self._number.values == int(text)) & ~self.left)
+                               & (self._number.values == int(text)))
         return int(found[0]) if len(found) > 0 else -1
 
     def has_left(self, name: str) -> bool:
@@ -233,15 +215,7 @@ class ClosureStates:
         self._gone.append(Tally())
 
     def append(self, new: Sequence[NewConstraint], now_ns: int) -> None:
-        """
-        Append closures that wait.
-
-        Parameters
-        ----------
-        new : sequence of NewConstraint
-        now_ns : int
-
-        """
+        """Append closures that wait."""
         for one in new:
             if one.source not in self.sources:
                 self._add_source(one.source)
@@ -255,7 +229,6 @@ class ClosureStates:
             self._decision.append_one(AUTO)
             self._distance.append_one(np.nan)
             self._forgotten.append_one(False)
-            self._left.append_one(False)
 
     def drop(self, count: int) -> None:
         """Remove the newest closures again."""
@@ -271,7 +244,6 @@ class ClosureStates:
         ----------
         number : int
         before : int, index of the state before; -1 for a new closure
-        now_ns : int
 
         """
         after = int(self.state[number])
@@ -304,7 +276,6 @@ class ClosureStates:
         ----------
         state, since_ns : ndarray of int, shape (M,)
         distance : ndarray, shape (M,)
-        changes : list of Change
 
         """
         self.state[:], self.since_ns[:], self.distance[:] = state, since_ns, distance
@@ -313,19 +284,13 @@ class ClosureStates:
 
     def saved(self, scales: Sequence[float]) -> SavedClosures:
         """Return those that are in the graph, with the scales of the sources."""
-        distance, kept = np.sqrt(self.distance), np.flatnonzero(~self.left)
-        distance = np.where(np.isnan(distance), -1.0, distance)
-        gone = []
-        for source in range(len(self.sources)):
-            n, n_unused = self.n_left(source)
-            doubted = (self.source == source) & self.left & (self.state == DOUBTED)
-            gone.append((n, n - n_unused,
-                         self._gone[source].n_doubted + int(np.count_nonzero(doubted))))
+        distance = np.sqrt(self.distance)
+        left = [(gone.n, gone.n_used, gone.n_doubted) for gone in self._gone]
         return SavedClosures(
-            tuple(self.sources), np.array(scales, dtype=np.float64), self.edge[kept],
-            self.source[kept], self.stamps_ns[kept], self.state[kept], self.since_ns[kept],
-            self.decision[kept], distance[kept], self._number.values[kept],
-            np.array(gone, dtype=np.int64).reshape(-1, 3))
+            tuple(self.sources), np.array(scales, dtype=np.float64), self.edge.copy(),
+            self.source.copy(), self.stamps_ns.copy(), self.state.copy(), self.since_ns.copy(),
+            self.decision.copy(), np.where(np.isnan(distance), -1.0, distance),
+            self._number.values.copy(), np.array(left, dtype=np.int64).reshape(-1, 3))
 
     def restore(self, saved: SavedClosures) -> None:
         """Fill an empty table with saved columns."""
@@ -341,7 +306,6 @@ class ClosureStates:
         self._distance.append(np.where(
             saved.distance < 0.0, np.nan, np.square(saved.distance)))
         self._forgotten.append(np.zeros(len(saved.source), dtype=bool))
-        self._left.append(np.zeros(len(saved.source), dtype=bool))
         order = np.zeros(len(saved.source), dtype=np.int64)
         for source in range(len(self.sources)):
             chosen = np.flatnonzero(saved.source == source)

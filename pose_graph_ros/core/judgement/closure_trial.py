@@ -30,14 +30,7 @@ WITHOUT_PAUSE, PAUSE, MOST_DOUBLINGS, MAKE_UP = 3, 0.01, 4, 3
 
 
 class ClosureTrial:
-    """
-    One trial at a time, and the closures that have to wait for its end.
-
-    Parameters
-    ----------
-    smoother : IncrementalSmoother
-
-    """
+    """One trial at a time, and the closures that have to wait for its end."""
 
     def __init__(self, smoother: IncrementalSmoother) -> None:
         self._smoother = smoother

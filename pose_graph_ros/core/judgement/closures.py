@@ -43,7 +43,6 @@ def claims(edges: Edges, floors: FloatArray = FLOORS) -> Closures:
 
     Parameters
     ----------
-    edges : Edges
     floors : ndarray, shape (3,), least sigmas [m, m, rad]
 
     """
@@ -223,7 +222,6 @@ class ClosureTable:
 
         Parameters
         ----------
-        closures : Closures
         first, second : ndarray of int, shape (P,), rows of `closures`
 
         """

@@ -48,8 +48,6 @@ def squared_distances(
 
     Parameters
     ----------
-    chain : OdometryChain
-    closures : Closures
     first, second : ndarray of int, shape (P,), rows of `closures`
 
     """
@@ -95,7 +93,7 @@ def _sum_between(sums, low, high, out):  # type: ignore[no-untyped-def]
 
 
 @kernel
-def _solved_form(m, e):  # type: ignore[no-untyped-def]
+def solved_form(m, e):  # type: ignore[no-untyped-def]
     """Return `e^T M^-1 e` of a positive definite matrix, shape (3, 3)."""
     a = m[0, 0]
     l1, l2 = m[1, 0] / a, m[2, 0] / a
@@ -196,4 +194,4 @@ def _squared_distance(  # type: ignore[no-untyped-def]
         for n in range(3):
             part[m, n] = noise_a[m, n]
     _add_product(part, 1.0, turn, total, turn)
-    return _solved_form(part, error)
+    return solved_form(part, error)

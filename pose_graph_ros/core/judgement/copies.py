@@ -36,7 +36,6 @@ def in_rows(graph: Graph, edges: Edges) -> Edges:
     Parameters
     ----------
     graph : Graph, that has the nodes
-    edges : Edges
 
     """
     return edges.renumbered(graph.node_rows)
@@ -48,7 +47,6 @@ def weights_in_rows(graph: Graph, weights: Mapping[int, float]) -> dict[int, flo
 
     Parameters
     ----------
-    graph : Graph
     weights : mapping
 
     """
@@ -61,7 +59,6 @@ def losses_in_rows(graph: Graph, reweighting: Reweighting) -> Reweighting:
 
     Parameters
     ----------
-    graph : Graph
     reweighting : Reweighting, of its constraints
 
     """

@@ -24,10 +24,7 @@ def decide(
     Parameters
     ----------
     name : str, `Verdict.id`
-    decision : Decision
     closures : tuple, what is known and believed of all closures
-    reports : ClosureReports
-    graph : Graph
 
     """
     states, table, beliefs = closures

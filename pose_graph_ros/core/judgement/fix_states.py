@@ -123,9 +123,7 @@ class FixStates:
 
         Parameters
         ----------
-        one : NewConstraint
         run : int, number of its run
-        believed : bool
         distance : float, Mahalanobis distance [sigma]
         now_ns : int, newest stamp of odometry
 
@@ -216,7 +214,6 @@ class FixStates:
         Parameters
         ----------
         which : ndarray of int
-        believed : bool
         now_ns : int, newest stamp of odometry
 
         """
@@ -238,7 +235,6 @@ class FixStates:
         Parameters
         ----------
         first : int, number of the first new record
-        reweighting : Reweighting
 
         """
         weights: tuple[dict[int, float], dict[int, float]] = {}, {}
@@ -366,7 +362,6 @@ class FixStates:
         Parameters
         ----------
         records : ndarray of int, shape (M, 10)
-        changes : list of Change
 
         """
         self.records[:] = records

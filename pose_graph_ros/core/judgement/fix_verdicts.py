@@ -32,8 +32,6 @@ def verdicts(states: FixStates, graph: Graph, most_believed: int | None) -> list
 
     Parameters
     ----------
-    states : FixStates
-    graph : Graph
     most_believed : int or None
 
     """
@@ -48,7 +46,6 @@ def drawn_ids(states: FixStates, others: DrawnRows) -> DrawnRows:
 
     Parameters
     ----------
-    states : FixStates
     others : DrawnRows, of loop closures
 
     """
@@ -59,15 +56,7 @@ def drawn_ids(states: FixStates, others: DrawnRows) -> DrawnRows:
 
 
 def believed_after(states: FixStates, stamp_ns: int) -> tuple[str, ...]:
-    """
-    Return the ids of the first believed measurements from a stamp on.
-
-    Parameters
-    ----------
-    states : FixStates
-    stamp_ns : int
-
-    """
+    """Return the ids of the first believed measurements from a stamp on."""
     after = np.flatnonzero(states.believed & (states.records[:, STAMP] >= stamp_ns))
     first = after[np.argsort(states.records[after, STAMP], kind='stable')][:MOST_NAMED]
     return tuple(map(states.name, first.tolist()))
@@ -79,8 +68,6 @@ def verdicts_on(states: FixStates, graph: Graph, numbers: IntArray) -> list[Verd
 
     Parameters
     ----------
-    states : FixStates
-    graph : Graph
     numbers : ndarray of int, shape (K,)
 
     """

@@ -85,8 +85,6 @@ class FixJudge:
         self._decided: _Decided | None = None
         self._cut: tuple[int, Track] | None = None
         """Stamp [ns] of the newest believed measurement that has left, and where the robot was."""
-        self._leaving: tuple[int, Track] | None = None
-        """The same after those that are about to leave."""
         self._now_ns, self._again = -1, -1
         """Newest stamp of odometry, and the record that is judged again, -1 for a new one."""
 
@@ -301,9 +299,13 @@ class FixJudge:
             self._judge(stamp_ns, one, None)
         self._again = -1
 
-    def decide_leaving(self, edges: IntArray, observed: IntArray) -> list[Verdict]:
+    def decide_leaving(
+        self, edges: IntArray, observed: IntArray,
+    ) -> tuple[list[Verdict], tuple[int, Track] | None]:
         """
         Return the verdicts on measurements that are about to leave the graph unused.
+
+        With them comes where the robot was at the newest one that is believed, for `forget`.
 
         Parameters
         ----------
@@ -313,9 +315,9 @@ class FixJudge:
         graph, states = self._smoother.graph, self._states
         self._runs.chain.extend(graph)
         leaving = states.leaving(edges, observed)
-        self._leaving = self._after(np.flatnonzero(leaving & states.believed))
         unused = np.flatnonzero(leaving & ~states.believed)
-        return fix_verdicts.verdicts_on(states, graph, unused[-MOST_OTHERS:])
+        return (fix_verdicts.verdicts_on(states, graph, unused[-MOST_OTHERS:]),
+                self._after(np.flatnonzero(leaving & states.believed)))
 
     def _after(self, numbers: IntArray) -> tuple[int, Track] | None:
         """Return where the robot was after some believed measurements, by what was before."""
@@ -334,21 +336,21 @@ class FixJudge:
             cut = stamp_ns, track.updated(track.innovation(one))
         return cut
 
-    def stay(self) -> None:
-        """Forget about the last `decide_leaving`, as nothing has left the graph."""
-        self._leaving = self._cut
-
-    def forget(self, nodes: IntArray, edges: IntArray, observed: IntArray) -> None:
+    def forget(
+        self, nodes: IntArray, edges: IntArray, observed: IntArray,
+        last: tuple[int, Track] | None,
+    ) -> None:
         """
         Forget measurements that have left the graph, and the path there.
 
         Parameters
         ----------
         nodes, edges, observed : ndarray of int, ids
+        last : tuple, optional, the second result of `decide_leaving`, if a measurement has left
 
         """
         self._states.leave(self._states.leaving(edges, observed))
-        self._cut, self._decided = self._leaving, None
+        self._cut, self._decided = last or self._cut, None
         if self._cut is not None:
             self._cut = self._cut[0], self._cut[1].carried(self._runs.chain, nodes)
         self._runs.forget(nodes)
@@ -364,7 +366,6 @@ class FixJudge:
         Parameters
         ----------
         name : str, `Verdict.id`
-        decision : Decision
 
         """
         number = self._states.find(name)
@@ -399,7 +400,6 @@ class FixJudge:
 
         Parameters
         ----------
-        saved : SavedFixes
         now_ns : int, stamp of the newest hidden node
 
         """

@@ -29,7 +29,6 @@ def floored(edges: Edges, sigmas: FloatArray = FLOORS) -> Edges:
 
     Parameters
     ----------
-    edges : Edges
     sigmas : ndarray, shape (3,), in the frames of the measured poses [m, m, rad]
 
     """

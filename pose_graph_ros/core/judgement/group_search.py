@@ -28,15 +28,7 @@ LEAST_GAIN = GATE
 
 
 def improved(problem: TruncatedProblem, choice: Choice) -> Choice:
-    """
-    Return a set that no group taken in or out lowers the truncated cost of.
-
-    Parameters
-    ----------
-    problem : TruncatedProblem
-    choice : Choice
-
-    """
+    """Return a set that no group taken in or out lowers the truncated cost of."""
     all_groups, given = groups(problem), choice
     left = WORK // max(problem.graph.n_nodes, 1)
     tried: set[int] = set()     # first members of groups, in or out of the present choice

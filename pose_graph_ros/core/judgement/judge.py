@@ -12,6 +12,7 @@ changed. It does a bounded part of that; `work` does the rest, part by part, bet
 from collections import deque
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
+from typing import NamedTuple
 
 import numpy as np
 
@@ -29,6 +30,7 @@ from pose_graph_ros.core.judgement.fix_states import SavedFixes
 from pose_graph_ros.core.judgement.fixes import FixJudge
 from pose_graph_ros.core.judgement.listing import MOST_OTHERS
 from pose_graph_ros.core.judgement.odometry_states import OdometryStates, SavedOdometry
+from pose_graph_ros.core.judgement.tracks import Track
 from pose_graph_ros.core.judgement.verdicts import Change, Decision, SourceVerdicts, Verdict
 from pose_graph_ros.core.measurements import Answer, LoopClosure
 from pose_graph_ros.core.odometry.hidden_nodes import HiddenNodes
@@ -47,15 +49,22 @@ class SavedJudgement:
     odometry: SavedOdometry
 
 
+class Leaving(NamedTuple):
+    """What is decided on constraints that are about to leave the graph."""
+
+    unused: list[Verdict]
+    """On those that are not believed."""
+    last: tuple[int, Track] | None
+    """Stamp [ns] of the newest believed measurement in the map, and where the robot was."""
+
+
 class Judge:
     """
     Judges the constraints of a graph; it knows no clock, and nothing of how they arrived.
 
     Parameters
     ----------
-    smoother : IncrementalSmoother
     reweighting : Reweighting, of its constraints with a robust loss
-    config : BackendConfig
     nodes : HiddenNodes, with the stamps and the sources of the odometry
 
     """
@@ -71,10 +80,8 @@ class Judge:
         self._closures = ClosureJudge(smoother, reweighting, config, self._odometry)
         self._staged = np.empty(0, dtype=np.int64)
         """The judged closures of the last `before`, by their numbers among its edges."""
-        self._leaving: list[Verdict] = []
-        """On what is about to leave the graph unused."""
         self._left: deque[Verdict] = deque(maxlen=MOST_OTHERS)
-        """On the newest of what has."""
+        """On the newest constraints that have left the graph unused."""
 
     def configure(self, config: BackendConfig) -> None:
         """Set the settings for later constraints."""
@@ -194,7 +201,6 @@ class Judge:
         Parameters
         ----------
         name : str, `Verdict.id`
-        decision : Decision
 
         """
         fixes = self._fixes.states
@@ -202,12 +208,12 @@ class Judge:
         judge = self._fixes if is_fix else self._closures
         return judge.decide(name, decision)
 
-    def decide_leaving(self, edges: IntArray, observed: IntArray) -> None:
+    def decide_leaving(self, edges: IntArray, observed: IntArray) -> Leaving:
         """
-        Decide on all constraints that are about to leave the graph.
+        Return what is decided on constraints that are about to leave the graph, for `forget`.
 
-        What is believed then stays as it is weighted. All else leaves unused, for which `verdicts`
-        has it after `forget`.
+        What is believed then stays as it is weighted; all else leaves unused. Nothing is on record
+        before they have left.
 
         Parameters
         ----------
@@ -215,31 +221,30 @@ class Judge:
 
         """
         graph = self._smoother.graph
-        unused = [
-            *self._closures.decide_leaving(edges), *self._fixes.decide_leaving(edges, observed),
-            *self._odometry.decide_leaving(graph, edges, self._believed_after)]
-        self._leaving = [replace(each, left=True, since_ns=self._nodes.newest_ns)
-                         for each in unused]
+        closures = self._closures.decide_leaving(edges)
+        fixes, last = self._fixes.decide_leaving(edges, observed)
+        unused = [*closures, *fixes,
+                  *self._odometry.decide_leaving(graph, edges, self._believed_after)]
+        return Leaving([replace(each, left=True, since_ns=self._nodes.newest_ns)
+                        for each in unused], last)
 
-    def stay(self) -> None:
-        """Forget about the last `decide_leaving`, as nothing has left the graph."""
-        self._leaving = []
-        self._fixes.stay()
-
-    def forget(self, nodes: IntArray, edges: IntArray, observed: IntArray) -> None:
+    def forget(
+        self, nodes: IntArray, edges: IntArray, observed: IntArray, leaving: Leaving | None,
+    ) -> None:
         """
-        Forget what has left the graph after `decide_leaving`.
+        Forget what has left the graph.
 
         Parameters
         ----------
         nodes, edges, observed : ndarray of int, ids
+        leaving : Leaving, optional, what was decided on it; None if nothing of it is judged
 
         """
         closures = self._closures.forget(nodes, edges)
-        self._fixes.forget(nodes, edges, observed)
+        self._fixes.forget(nodes, edges, observed, leaving and leaving.last)
         self._odometry.forget(self._smoother.graph, edges, closures, self._fixes.loosened)
-        self._left.extend(self._leaving)
-        self._leaving = []
+        if leaving is not None:
+            self._left.extend(leaving.unused)
 
     def _believed_after(self, stamp_ns: int) -> tuple[str, ...]:
         return fix_verdicts.believed_after(self._fixes.states, stamp_ns)
@@ -255,7 +260,6 @@ class Judge:
 
         Parameters
         ----------
-        saved : SavedJudgement
         now_ns : int, stamp of the newest hidden node
 
         """

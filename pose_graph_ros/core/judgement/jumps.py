@@ -222,7 +222,6 @@ def with_motion(
 
     Parameters
     ----------
-    problem : TruncatedProblem
     odometry : Odometry, of its graph
     at : int, place in the chain that the edge begins at
     motion, sigmas : ndarray, shape (3,), and its sigmas, at least
@@ -242,7 +241,6 @@ def rows_with_motion(
 
     Parameters
     ----------
-    rows : GraphRows
     odometry, at, motion, sigmas : as in `with_motion`
 
     """
@@ -268,7 +266,6 @@ def places(
     edges : Edges, M closures, from earlier to later nodes
     believed : ndarray of bool, shape (M,)
     poses : ndarray, shape (N, 3), with what is believed
-    odometry : Odometry
     groups : sequence of ndarray of int, closures that agree along the path
     most_seeds : int, number of closures that all others are compared with
 

@@ -17,14 +17,7 @@ SIGMAS = 2.0 * np.array(CLOSURE_FLOORS)
 
 
 class Odometry:
-    """
-    The chain of odometry of a graph, with its edges; nodes and edges are given by row.
-
-    Parameters
-    ----------
-    graph : Graph
-
-    """
+    """The chain of odometry of a graph, with its edges; nodes and edges are given by row."""
 
     def __init__(self, graph: Graph) -> None:
         self.chain = OdometryChain(by_row=True)

@@ -50,6 +50,9 @@ class SavedOdometry:
     since_ns: Integers
     final: Integers = field(default_factory=lambda: np.empty(0, dtype=np.int64))
     """1 for doubts that stay, whatever closures show; empty if there is none."""
+    left_sources: tuple[str, ...] = ()
+    left: Integers = field(default_factory=lambda: np.empty(0, dtype=np.int64))
+    """Number of edges of each of these sources that have left the graph doubted."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -114,8 +117,6 @@ class OdometryStates:
 
         Parameters
         ----------
-        graph : Graph
-        jumps : iterable of Jump
         now_ns : int, stamp of the newest odometry
         name : callable, returns the id of a closure by its number among those of the jumps
 
@@ -151,7 +152,6 @@ class OdometryStates:
 
         Parameters
         ----------
-        graph : Graph
         edges : ndarray of int, ids of what leaves
         fixes : callable, as in `verdicts`
 
@@ -181,13 +181,7 @@ class OdometryStates:
         self.doubts = {
             edge: replace(doubt, is_final=doubt.is_final or doubt.is_under(closures))
             for edge, doubt in self.doubts.items() if edge not in gone}
-        gaps, self._gaps = self._gaps, {}
-        for doubt in gaps.values():
-            left = tuple(edge for edge in doubt.edges if edge not in gone)
-            if len(left) > 0:
-                first = int(graph.edges_at(np.array(left[:1])).i[0])
-                ends = doubt.ends if left == doubt.edges else (first, doubt.ends[1])
-                self._gaps[left[0]] = replace(doubt, edges=left, ends=ends)
+        self._gaps = self._found_gaps(graph, self._nodes.newest_ns)
 
     def keep(self, doubts: Mapping[int, Doubt], graph: Graph) -> None:
         """
@@ -196,7 +190,6 @@ class OdometryStates:
         Parameters
         ----------
         doubts : mapping, by the ids of edges
-        graph : Graph
 
         """
         before, self.doubts = self.doubts, dict(doubts)
@@ -209,23 +202,29 @@ class OdometryStates:
         Parameters
         ----------
         loosened : mapping, factors on weights by id; another one after each change
-        graph : Graph
         now_ns : int, stamp of the newest odometry
 
         """
         if loosened is self._loosened:
             return
-        before, self._gaps, self._loosened = self._gaps, {}, loosened
-        ids = np.array(sorted(edge for edge, factor in loosened.items() if factor < MUCH_LESS),
-                       dtype=np.int64)
+        before, self._loosened = self._gaps, loosened
+        self._gaps = self._found_gaps(graph, now_ns)
+        self._note(before, self._gaps, graph)
+
+    def _found_gaps(self, graph: Graph, now_ns: int) -> dict[int, Doubt]:
+        """Return the stretches of odometry that is believed much less, by their first edges."""
+        since_ns = {edge: doubt.since_ns for doubt in self._gaps.values() for edge in doubt.edges}
+        ids = np.array(sorted(edge for edge, factor in self._loosened.items()
+                              if factor < MUCH_LESS), dtype=np.int64)
         edges = graph.edges_at(ids)
         cuts = np.flatnonzero(edges.i[1:] != edges.j[:-1]) + 1
+        gaps = {}
         for part in np.split(np.arange(len(ids)), cuts) if len(ids) > 0 else ():
             first = int(ids[part[0]])
-            self._gaps[first] = Doubt(
+            gaps[first] = Doubt(
                 tuple(ids[part].tolist()), (int(edges.i[part[0]]), int(edges.j[part[-1]])),
-                loosened[first], before[first].since_ns if first in before else now_ns)
-        self._note(before, self._gaps, graph)
+                self._loosened[first], since_ns.get(first, now_ns))
+        return gaps
 
     def _note(
         self, before: Mapping[int, Doubt], after: Mapping[int, Doubt], graph: Graph,
@@ -259,7 +258,6 @@ class OdometryStates:
 
         Parameters
         ----------
-        graph : Graph
         edge : int, id
 
         """
@@ -281,7 +279,6 @@ class OdometryStates:
 
         Parameters
         ----------
-        graph : Graph
         fixes : callable, returns the ids of the first fixes that are believed after a stamp
 
         """
@@ -317,7 +314,7 @@ class OdometryStates:
         counts = Counter[str]()
         for doubt in self._every():
             counts[self._source(doubt.ends[1])] += len(doubt.edges)
-        n, n_left = len(self._nodes) - 1, self._nodes.n_frozen
+        n, n_left = len(self._nodes) - 1, self._nodes.n_frozen + len(self._nodes.table.thinned)
         return {source: SourceVerdicts(
             {State.BELIEVED: n - n_left - counts[source], State.DOUBTED: counts[source]}, 1.0,
             doubting=False, n_left=n_left, n_left_unused=self._left[source])
@@ -331,10 +328,12 @@ class OdometryStates:
             np.array([each.ends for each in every], dtype=np.int64).reshape(-1, 2),
             np.array([each.weight for each in every], dtype=np.float64),
             np.array([each.since_ns for each in every], dtype=np.int64),
-            np.array([int(each.is_final) for each in every], dtype=np.int64))
+            np.array([int(each.is_final) for each in every], dtype=np.int64),
+            tuple(self._left), np.array([*self._left.values()], dtype=np.int64))
 
     def restore(self, saved: SavedOdometry) -> None:
         """Restore what `saved` has returned, for the same graph."""
+        self._left.update(dict(zip(saved.left_sources, saved.left.tolist(), strict=True)))
         final = saved.final if len(saved.final) > 0 else np.zeros(len(saved.rows), np.int64)
         self.doubts = {edge: Doubt((edge,), (ends[0], ends[1]), weight, since_ns,
                                    is_final=bool(is_final))

@@ -197,7 +197,6 @@ def agreement_scale(
 
     Parameters
     ----------
-    table : ClosureTable
     numbers : ndarray of int, shape (K,), believed closures
     inside : ndarray of bool, shape (M,), which closures of the source are believed
     edges : Edges, those of `inside` with the claimed information
@@ -234,7 +233,6 @@ def together(shown: float, n: float, left: ScaleLeft) -> float:
     ----------
     shown : float, by those in the graph
     n : float, their number
-    left : ScaleLeft
 
     """
     n_left = min(left.n, MOST_COUNTED)

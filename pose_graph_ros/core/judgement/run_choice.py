@@ -26,7 +26,6 @@ def best_runs(runs: list[Run], chain: OdometryChain) -> list[tuple[Run, Transiti
     Parameters
     ----------
     runs : list of Run, at least one
-    chain : OdometryChain
 
     """
     ordered = sorted(runs, key=lambda run: (run.begin_ns, run.number))
@@ -59,7 +58,6 @@ def remembered(runs: list[Run], stamp_ns: int) -> list[Run]:
 
     Parameters
     ----------
-    runs : list of Run
     stamp_ns : int, of the newest measurement
 
     """
@@ -82,10 +80,8 @@ def without_old(runs: list[Run], node: int, kept: Run | None, chain: OdometryCha
 
     Parameters
     ----------
-    runs : list of Run
     node : int, id of the first node that stays in the graph
     kept : Run, optional, that stays
-    chain : OdometryChain
 
     """
     left = sorted(runs, key=lambda run: (run.begin_ns, run.number))

@@ -108,9 +108,7 @@ class RunSet:
 
         Parameters
         ----------
-        stamp_ns : int
         seen : Observation, with the covariance that is stated
-        source : str
         of_graph : Track, pose of its node in the graph
         solved : bool, whether the graph is solved, so that the covariance of that is known
         begun : bool, whether what is in the graph before the first measurement counts as a run
@@ -262,7 +260,6 @@ class RunSet:
         Parameters
         ----------
         stamp_ns : int, of the newest of these
-        track : Track
 
         """
         self._main = Run(self._next_number(), stamp_ns, track, believed=True)

@@ -88,7 +88,6 @@ class Run:
     number : int, counts the runs
     stamp_ns : int, of the first member [ns]
     track : Track, with the first member
-    believed : bool
 
     """
 
@@ -139,10 +138,7 @@ class Run:
 
         Parameters
         ----------
-        stamp_ns : int
-        seen : Observation
         track : Track, with the measurement
-        chain : OdometryChain
 
         """
         if len(self.members) == self.n < FITTED_MEMBERS:
@@ -159,12 +155,6 @@ class Run:
 
         After an outage or a turn of the wheels on the spot the heading of odometry may be far
         off. So where the first positions lie as odometry says, but turned, they tell the heading.
-
-        Parameters
-        ----------
-        seen : Observation
-        chain : OdometryChain
-
         """
         end = self.track.moved(chain, seen.node)
         if (len(self.members) != self.n or self.expected is None or seen.size == 3
@@ -225,7 +215,6 @@ class Run:
 
         Parameters
         ----------
-        stamp_ns : int
         track : Track, by the members before
 
         """
@@ -233,15 +222,7 @@ class Run:
             self.states = [*_thinned(self.states, stamp_ns)[1 - NOTED:], (stamp_ns, track)]
 
     def ways_after(self, other: 'Run', chain: OdometryChain) -> Sequence[Transition]:
-        """
-        Return the ways to believe this run after an earlier one.
-
-        Parameters
-        ----------
-        other : Run
-        chain : OdometryChain
-
-        """
+        """Return the ways to believe this run after an earlier one."""
         if other.end_ns > self.begin_ns or (
                 other.number not in self.prices and self.first.node < other.track.node):
             return ()
@@ -372,7 +353,6 @@ def fitted(seen: Sequence[Observation], chain: OdometryChain) -> Track | None:
     Parameters
     ----------
     seen : sequence of Observation, at least two positions
-    chain : OdometryChain
 
     """
     begin = Track(seen[0].node, np.zeros(3), np.zeros((3, 3)))
@@ -406,7 +386,6 @@ def odometry_between(graph: Graph, begin: int, end: int) -> IntArray:
 
     Parameters
     ----------
-    graph : Graph
     begin, end : int, ids of the nodes, `end` not before `begin`; either may have left the graph
 
     """

@@ -34,11 +34,7 @@ class ScaleLearner:
 
     Parameters
     ----------
-    smoother : IncrementalSmoother
-    states : ClosureStates
-    table : ClosureTable
     beliefs : Beliefs, which has the factors
-    config : BackendConfig
 
     """
 

@@ -21,15 +21,7 @@ MOST_SEEDS = 50
 
 
 class SetSearch:
-    """
-    Tries other sets, one bounded part at each call.
-
-    Parameters
-    ----------
-    states : ClosureStates
-    table : ClosureTable
-
-    """
+    """Tries other sets, one bounded part at each call."""
 
     def __init__(self, states: ClosureStates, table: ClosureTable) -> None:
         self._states, self._table = states, table
@@ -48,7 +40,6 @@ class SetSearch:
 
         Parameters
         ----------
-        graph : Graph
         corroborated : ndarray of bool, shape (M,), which are supported by doubted ones
         now : int, a number that changes with what is believed, so that a trial is given up
 
@@ -76,15 +67,18 @@ class SetSearch:
             other = self._table.support(number, ~states.in_graph & states.judged).clique
             clique = other if len(other) > len(clique) else clique
             yield
-        known, n = np.flatnonzero(states.known), len(states)
-        swap = Swap(graph, self._table.rows(known), states.edge[known], states.in_graph[known],
+        known = np.flatnonzero(~states.forgotten)
+        edges, clique = states.edge[known], np.searchsorted(known, clique)
+        swap = Swap(graph, self._table.rows(known), edges, states.in_graph[known],
                     states.judged[known])
-        while swap.step(np.searchsorted(known, clique)):
+        while swap.step(clique):
             yield
         found = swap.found or (yield from jump_search.search(swap, graph))
         if found is None:
             return None
-        inside = np.zeros(n, dtype=bool)
-        inside[known] = found.inside
-        jump = found.jump and found.jump._replace(seen_by=known[found.jump.seen_by])
+        # some may have left the graph since; edges are in the order of their addition
+        inside = np.zeros(len(states), dtype=bool)
+        inside[states.numbers(edges)] = found.inside[np.isin(edges, states.edge)]
+        jump = found.jump and found.jump._replace(
+            seen_by=states.numbers(edges[found.jump.seen_by]))
         return Found(inside, found.nodes, found.poses, jump)

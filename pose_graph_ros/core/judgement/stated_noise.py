@@ -32,7 +32,6 @@ class StatedNoise:
 
         Parameters
         ----------
-        source : str
         d2 : float, by the covariance with the factor
         size : int, 2 of a position, 3 of a pose
 

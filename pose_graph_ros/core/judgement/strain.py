@@ -50,9 +50,7 @@ def strained(
 
     Parameters
     ----------
-    problem : TruncatedProblem
     choice : Choice, what is believed
-    odometry : Odometry
 
     """
     gains, without = gains_of(problem, choice, odometry)
@@ -142,7 +140,6 @@ def n_places(poses: FloatArray, edges: Edges) -> int:
     Parameters
     ----------
     poses : ndarray, shape (N, 3)
-    edges : Edges
 
     """
     size = min(PLACE, PLACE_SHARE * float(np.max(np.ptp(poses[:, :2], axis=0))))

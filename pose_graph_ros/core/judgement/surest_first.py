@@ -70,7 +70,6 @@ def select(problem: TruncatedProblem, *, insured: bool = False) -> BoolArray | N
 
     Parameters
     ----------
-    problem : TruncatedProblem
     insured : bool
         Whether more is asked: a constraint with fewer than two neighbours that agree is believed
         only if a wrong one would hardly pass its gate, and none if chance explains all that fit

@@ -57,7 +57,6 @@ class Swap:
 
     Parameters
     ----------
-    graph : Graph
     closures : Closures, M judged ones, with floored covariances
     ids : ndarray of int, shape (M,), of their edges
     inside, free : ndarray of bool, shape (M,), which are believed, and which may change
@@ -135,7 +134,6 @@ class Swap:
 
         Parameters
         ----------
-        graph : Graph
         rows : ndarray of int, shape (M,), of the closures in it
         residual : ndarray, shape (M,), of `residuals`
 
@@ -154,7 +152,6 @@ def residuals(graph: Graph, edges: Edges) -> FloatArray:
 
     Parameters
     ----------
-    graph : Graph
     edges : Edges, M of them
 
     """

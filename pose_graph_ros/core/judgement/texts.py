@@ -29,7 +29,6 @@ def seconds(stamp_ns: int, digits: int = 3) -> str:
 
     Parameters
     ----------
-    stamp_ns : int
     digits : int, after the point; all are 9
 
     """
@@ -50,7 +49,6 @@ def number_of(n: int, kind: Judged) -> str:
     Parameters
     ----------
     n : int
-    kind : Judged
 
     """
     return f'{n} {NOUNS[kind] if n == 1 else PLURALS[kind]}'

@@ -74,7 +74,6 @@ class Track(NamedTuple):
 
         Parameters
         ----------
-        chain : OdometryChain
         node : int, id of the node
 
         """

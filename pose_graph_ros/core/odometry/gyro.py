@@ -213,7 +213,6 @@ class RateIntegral:
     ----------
     stamps_ns : ndarray of int64, shape (S,), ascending, S >= 2 [ns]
     rates : ndarray, shape (S, 2), rates and their variances, 0 for unknown [rad/s, rad^2/s^2]
-    source : GyroSource
 
     """
 

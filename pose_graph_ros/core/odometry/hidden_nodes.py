@@ -41,7 +41,6 @@ class HiddenNodes:
 
     Parameters
     ----------
-    config : BackendConfig
     make_node : callable
         Takes the mean of the edge to a new node, shape (3,), its information, shape (3, 3), and
         the name of the source; for the first node its pose and None. Returns the id of the node
@@ -155,7 +154,6 @@ class HiddenNodes:
 
         Parameters
         ----------
-        sample : OdometrySample
         source : str, name of the odometry source
 
         """
@@ -337,11 +335,11 @@ class HiddenNodes:
         """
         Return the last hidden node before a stamp and the motion from there to the stamp.
 
-        If that node has left the graph, it is the one that stands for it, or the next one, from
-        which the motion leads back. The motion
-        is that of the source that was the primary one then, so the result does not depend on later
-        samples; None if that source does not cover the node and the stamp. The stamp is not before
-        the first node or `last_frozen_ns`, and not after `covered_ns` [ns].
+        If that node has left the graph, it is its anchor, or the next node, from which the motion
+        leads back. The motion is that of the source that was the primary one then, so the result
+        does not depend on later samples; None if that source does not cover the node and the
+        stamp. The stamp is not before the first node or `last_frozen_ns`, and not after
+        `covered_ns` [ns].
         """
         node = int(np.searchsorted(self.stamps_ns, stamp_ns, side='right')) - 1
         node = max(node, self.n_frozen)
@@ -367,7 +365,6 @@ class HiddenNodes:
         Parameters
         ----------
         node : int, its number
-        stamp_ns : int [ns]
 
         """
         ends, row = OdometryTimeline(), None

@@ -60,7 +60,6 @@ def odometry_covariance(
     Parameters
     ----------
     noise : OdometryNoise, noise per path length and turn; it is added to `motion.variance`
-    motion : Motion
     floor : bool, whether to add the floors of the noise, which every increment has once
 
     """

@@ -71,7 +71,6 @@ class NodeTable:
 
         Parameters
         ----------
-        stamp_ns : int
         node : int, its id in the graph
         odometry : ndarray, shape (3,), its pose by odometry alone [m, m, rad]
 

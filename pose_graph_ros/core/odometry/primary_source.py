@@ -34,7 +34,6 @@ def in_order_of_preference(streams: Streams, configured: Iterable[str]) -> list[
 
     Parameters
     ----------
-    streams : mapping of str to OdometryStream
     configured : iterable of str
         Names in the order of preference; other sources follow in the order of `streams`.
 
@@ -51,7 +50,6 @@ def choose_first(
 
     Parameters
     ----------
-    streams : mapping of str to OdometryStream
     names : sequence of str, sources in the order of preference
     preferred : str, source that need not wait to become it; it may have no samples yet
     settled_ns : int, stamp up to which the samples of all sources are known [ns]
@@ -76,7 +74,6 @@ def first_with_sample(
 
     Parameters
     ----------
-    streams : mapping of str to OdometryStream
     names : sequence of str, sources in the order of preference
     after_ns, until_ns : int, stamps [ns]
 
@@ -94,7 +91,6 @@ def find_silence(
 
     Parameters
     ----------
-    streams : mapping of str to OdometryStream
     names : sequence of str, the primary source, then the others in the order of preference
     last_ns : int, stamp of the sample of the primary source from which the search starts [ns]
     settled : tuple, source and stamp [ns] of a settled sample; the samples before it are known

@@ -28,7 +28,6 @@ class SecondaryEdges:
 
         Parameters
         ----------
-        source : str
         node : int, number of the hidden node, in the order of stamps
         reached : bool
             True if the next edge begins at this node; False if it begins at the first node, from
@@ -45,7 +44,6 @@ class SecondaryEdges:
 
         Parameters
         ----------
-        source : str
         stream : OdometryStream, samples of the source
         stamps_ns, ids : ndarray of int64, shape (N,)
             Stamps [ns] of all hidden nodes, and their ids in the graph.

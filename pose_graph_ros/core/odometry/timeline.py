@@ -63,7 +63,6 @@ def next_row(
     Parameters
     ----------
     before : Row, optional, row of the sample before; None for the first sample
-    stamp_ns : int
     pose : tuple, `T_odom_base` [m, m, rad]
     variance : tuple
         Variance of (x, y, theta) of the motion since the sample before, in the robot's frame; it
@@ -151,7 +150,6 @@ class OdometryTimeline:
 
         Parameters
         ----------
-        stamp_ns : int
         closely : bool
             Whether the two samples must be at most `LARGEST_GAP_NS` apart, or equal samples
             between them must have been left out.

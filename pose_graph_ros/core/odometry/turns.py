@@ -70,12 +70,6 @@ class Gyros:
     Rates are integrated over gaps no longer than a limit; a longer one leaves the rotation out.
     While the wheels stand, the robot does not turn but for what the wheels say: the rotation has
     no part of that, and the mean rate measures the bias instead.
-
-    Parameters
-    ----------
-    nodes : HiddenNodes
-    config : BackendConfig
-
     """
 
     def __init__(self, nodes: HiddenNodes, config: BackendConfig) -> None:
@@ -101,15 +95,7 @@ class Gyros:
             stream.configure(config.gyro(name))
 
     def add(self, sample: YawRate, source: str) -> Answer:
-        """
-        Return the answer to a sample, after adding it.
-
-        Parameters
-        ----------
-        sample : YawRate
-        source : str
-
-        """
+        """Return the answer to a sample, after adding it."""
         return self._stream(source).add(sample)
 
     def finish(self) -> None:
@@ -243,15 +229,7 @@ class Gyros:
         return result
 
     def restore(self, source: str, saved: SavedGyro) -> list[Turn]:
-        """
-        Return the rotations that wait, after restoring the saved state of a gyroscope.
-
-        Parameters
-        ----------
-        source : str
-        saved : SavedGyro
-
-        """
+        """Return the rotations that wait, after restoring the saved state of a gyroscope."""
         self._stream(source).restore(saved.rates)
         self._next[source] = saved.next_node
         return [Turn(source, i, j, stamp_ns, *numbers)

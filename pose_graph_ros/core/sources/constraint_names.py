@@ -42,8 +42,6 @@ def largest(
 
     Parameters
     ----------
-    graph : Graph
-    nodes : HiddenNodes
     factors : FactorBuilder, knows the sources of the constraints
     n : int, number of constraints at most; those without energy are left out
 
@@ -66,15 +64,7 @@ def largest(
 
 
 def queued(queue: Queue, nodes: HiddenNodes) -> list[str]:
-    """
-    Return the names of constraints that are not in the graph, as in `ConstraintEnergy`.
-
-    Parameters
-    ----------
-    queue : Queue
-    nodes : HiddenNodes
-
-    """
+    """Return the names of constraints that are not in the graph, as in `ConstraintEnergy`."""
     ends = [(source, np.searchsorted(nodes.ids, (edge.i[0], edge.j[0])).tolist())
             for source, edge, *_ in queue.edges]
     ends += [(turn.source, np.searchsorted(nodes.ids, (turn.i, turn.j)).tolist())

@@ -100,7 +100,6 @@ class InflatedWeights:
 
         Parameters
         ----------
-        stamp_ns : int
         observed : ObservedNodes, one row
         additions : Additions, receives the node, its weight and some weights of older measurements
 
@@ -152,14 +151,6 @@ ErrorModel = GaussMarkovBias | InflatedWeights
 
 
 def new_error_model(errors: CorrelatedErrors, correlation: Correlation) -> ErrorModel:
-    """
-    Return a model of correlated errors, without measurements.
-
-    Parameters
-    ----------
-    errors : CorrelatedErrors
-    correlation : Correlation
-
-    """
+    """Return a model of correlated errors, without measurements."""
     inflates = correlation is Correlation.INFLATE
     return InflatedWeights(errors) if inflates else GaussMarkovBias(errors)

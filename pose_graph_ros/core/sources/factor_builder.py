@@ -59,7 +59,6 @@ class FactorBuilder:
 
     Parameters
     ----------
-    config : BackendConfig
     reweighting : Reweighting, where constraints with a robust loss are registered
 
     """
@@ -97,7 +96,6 @@ class FactorBuilder:
 
         Parameters
         ----------
-        queue : Queue
         graph : Graph, it is not changed
         settle : bool, whether to set all weights that older measurements wait for
 
@@ -202,7 +200,6 @@ class FactorBuilder:
 
         Parameters
         ----------
-        source : str
         model : GaussMarkovBias or InflatedWeights, optional, with all measurements of the source
 
         """
@@ -273,10 +270,8 @@ class FactorBuilder:
             elif model is not None and np.any(left):
                 model.forget(constraints.rows.values[left])
             kept[source] = constraints.forget(left)
-        for ties in self._pose_edges.values():
-            here = ~np.isin(ties.values, edges)
-            if not np.all(here):
-                ties.select(np.flatnonzero(here))
+        for known in self._pose_edges.values():
+            known.select(np.flatnonzero(~np.isin(known.values, edges)))
         return kept
 
     def inflate(self, source: str, errors: CorrelatedErrors | None) -> None:
@@ -285,7 +280,6 @@ class FactorBuilder:
 
         Parameters
         ----------
-        source : str
         errors : CorrelatedErrors, optional, None for white errors
 
         """
@@ -383,12 +377,6 @@ class FactorBuilder:
 
         If its settings now ask for another error model, its constraints stay in the graph as they
         are, and new measurements start a model of their own.
-
-        Parameters
-        ----------
-        source : str
-        saved : SavedSource
-
         """
         if len(saved.ties) > 0:
             self._pose_edges[source] = GrowingArray((), np.int64)

@@ -216,7 +216,6 @@ class GaussMarkovBias:
 
         Parameters
         ----------
-        stamp_ns : int
         observed : ObservedNodes
             One row, the measurement if its error were white; the edge gets its weight.
         noise : array_like, shape (2,)

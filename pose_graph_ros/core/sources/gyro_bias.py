@@ -49,14 +49,7 @@ class SavedGyroBias:
 
 
 class GyroBias:
-    """
-    The bias of one gyroscope.
-
-    Parameters
-    ----------
-    source : GyroSource
-
-    """
+    """The bias of one gyroscope."""
 
     def __init__(self, source: GyroSource) -> None:
         self._source = source
@@ -85,7 +78,6 @@ class GyroBias:
 
         Parameters
         ----------
-        turn : Turn
         graph : Graph, gives the present estimate of the bias; it is not changed
         additions : Additions, receives the edge, a state if it is new, and what rest tells of it
 
@@ -169,7 +161,6 @@ def turn_edge(turn: Turn, state: int) -> Edges:
 
     Parameters
     ----------
-    turn : Turn
     state : int, id of the bias
 
     """
@@ -181,14 +172,7 @@ def turn_edge(turn: Turn, state: int) -> Edges:
 
 
 class GyroBiases:
-    """
-    The biases of all gyroscopes.
-
-    Parameters
-    ----------
-    config : BackendConfig
-
-    """
+    """The biases of all gyroscopes."""
 
     def __init__(self, config: BackendConfig) -> None:
         self._config = config
@@ -227,9 +211,7 @@ class GyroBiases:
 
         Parameters
         ----------
-        turns : sequence of Turn
         graph : Graph, it is not changed
-        additions : Additions
 
         """
         for turn in sorted(turns, key=lambda turn: turn.stamp_ns):
@@ -294,14 +276,6 @@ class GyroBiases:
                 for source, bias in self._biases.items()}
 
     def restore(self, source: str, saved: SavedGyroBias) -> None:
-        """
-        Restore the states of a source.
-
-        Parameters
-        ----------
-        source : str
-        saved : SavedGyroBias
-
-        """
+        """Restore the states of a source."""
         self._bias(source).restore(saved)
         self._edges_of(source).append(saved.edges)

@@ -59,7 +59,6 @@ def attach_reference(nodes: HiddenNodes, closure: LoopClosure) -> Attachment | A
 
     Parameters
     ----------
-    nodes : HiddenNodes
     closure : LoopClosure, names its reference by stamp or by number of the hidden node
 
     """
@@ -82,7 +81,6 @@ def absolute_constraint(measurement: Absolute, attachment: Attachment) -> Observ
 
     Parameters
     ----------
-    measurement : GlobalPose, Position or HeadingOnly
     attachment : Attachment, its motion is the offset of the observed node
 
     """
@@ -109,12 +107,6 @@ def swept_variance(measurement: Position, attachment: Attachment) -> float:
     The noise of the motion, including the effect of its heading on the end of the lever arm, is
     given in the frame of the robot, whose heading in the map is unknown. The largest eigenvalue of
     its covariance is therefore used in all directions.
-
-    Parameters
-    ----------
-    measurement : Position
-    attachment : Attachment
-
     """
     jacobian = np.eye(2, 3)
     jacobian[:, 2] = -measurement.lever_arm[1], measurement.lever_arm[0]
@@ -126,12 +118,6 @@ def motion_noise(measurement: Absolute, attachment: Attachment) -> FloatArray:
     Return what the motion since the node adds to the variances of a measurement, shape (2,).
 
     These are the variances of a coordinate of the position and of the heading [m^2, rad^2].
-
-    Parameters
-    ----------
-    measurement : GlobalPose, Position or HeadingOnly
-    attachment : Attachment
-
     """
     noise = attachment.noise
     if isinstance(measurement, Position):
@@ -154,7 +140,6 @@ def loop_closure_constraint(
 
     Parameters
     ----------
-    measurement : LoopClosure
     reference, attachment : Attachment, of the reference pose and of the later pose
 
     """

@@ -56,7 +56,6 @@ class MeasurementPipeline:
     Parameters
     ----------
     nodes : HiddenNodes, what measurements are attached to
-    config : BackendConfig
 
     """
 
@@ -84,15 +83,7 @@ class MeasurementPipeline:
         self.gyros.configure(config)
 
     def add(self, measurement: Measurement, source: str) -> Answer:
-        """
-        Return the answer to a measurement that is added, after counting it.
-
-        Parameters
-        ----------
-        measurement : Measurement
-        source : str
-
-        """
+        """Return the answer to a measurement that is added, after counting it."""
         if isinstance(measurement, YawRate):
             answer = self.count(source, self.gyros.add(measurement, source))
             self._take_turns()
@@ -196,9 +187,7 @@ class MeasurementPipeline:
 
         Parameters
         ----------
-        measurement : GlobalPose, Position or HeadingOnly
-        source : str
-        node : int, row of the node in the graph
+        node : int, id of the node in the graph
 
         """
         self._enqueue(measurement, source, Attachment(node, np.zeros(3), np.zeros((3, 3))))
@@ -257,7 +246,6 @@ class MeasurementPipeline:
 
         Parameters
         ----------
-        source : str
         answer : Answer, one that is pending is not counted
 
         """

@@ -124,7 +124,6 @@ class SourceConstraints:
 
         Parameters
         ----------
-        stamp_ns : int
         number : int, id of what it was added as
         noise : ndarray, shape (2,), see `motion_noise`
         edge : int, id of the edge that holds it instead, or -1
@@ -145,7 +144,6 @@ class SourceConstraints:
 
         Parameters
         ----------
-        graph : Graph
         added_as_edges : bool, whether the measurements were first added as edges
 
         """

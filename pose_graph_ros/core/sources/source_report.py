@@ -53,7 +53,6 @@ def report(
 
     Parameters
     ----------
-    graph : Graph
     rows : ndarray of int64, shape (K, 2)
         Stamp [ns] and id of each measurement that is used, in the order of their addition.
     biased : bool, whether the constraints are edges to a bias; else they are observed nodes

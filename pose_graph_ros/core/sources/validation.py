@@ -47,12 +47,6 @@ def validate(measurement: PoseMeasurement, policy: CovariancePolicy) -> Validate
 
     A pose without information on the heading becomes a position; one without information on the
     position becomes a heading.
-
-    Parameters
-    ----------
-    measurement : PoseMeasurement
-    policy : CovariancePolicy
-
     """
     kind = type(measurement).__name__
     numbers = _numbers(measurement)
@@ -100,7 +94,6 @@ def repaired(cov: FloatArray, policy: CovariancePolicy) -> FloatArray:
     Parameters
     ----------
     cov : ndarray, shape (d, d), of x, y and, for d = 3, yaw
-    policy : CovariancePolicy
 
     """
     diagonal, uninformative = np.diagonal(cov).copy(), _is_uninformative(cov)

@@ -44,12 +44,6 @@ class WaitingMeasurements:
 
         Of more than `MAX_WAITING` it is the one due last. A sender whose clock is ahead thus does
         not displace the measurements of others.
-
-        Parameters
-        ----------
-        source : str
-        measurement : PoseMeasurement
-
         """
         waiting = WaitingMeasurement(due_ns(measurement), next(self._arrival), source, measurement)
         bisect.insort(self._waiting, waiting, key=_last_first)
@@ -84,57 +78,25 @@ class SeenStamps:
         self._references: dict[str, array[int]] = {}
 
     def has(self, source: str, measurement: PoseMeasurement) -> bool:
-        """
-        Tell whether a measurement with the same stamp and reference was added.
-
-        Parameters
-        ----------
-        source : str
-        measurement : PoseMeasurement
-
-        """
+        """Tell whether a measurement with the same stamp and reference was added."""
         return self._find(source, measurement) >= 0
 
     def near(self, source: str, stamp_ns: int, period_ns: int) -> bool:
-        """
-        Tell whether the source has a stamp closer than a period to a given one.
-
-        Parameters
-        ----------
-        source : str
-        stamp_ns, period_ns : int [ns]
-
-        """
+        """Tell whether the source has a stamp closer than a period to a given one."""
         stamps = self._stamps.get(source, _NO_STAMPS)
         at = bisect.bisect_left(stamps, stamp_ns)
         return ((at > 0 and stamp_ns - stamps[at - 1] < period_ns)
                 or (at < len(stamps) and stamps[at] - stamp_ns < period_ns))
 
     def add(self, source: str, measurement: PoseMeasurement) -> None:
-        """
-        Add a measurement, which is cheap if stamps come in order.
-
-        Parameters
-        ----------
-        source : str
-        measurement : PoseMeasurement
-
-        """
+        """Add a measurement, which is cheap if stamps come in order."""
         stamps = self._stamps.setdefault(source, array('q'))
         at = bisect.bisect_right(stamps, measurement.stamp_ns)
         stamps.insert(at, measurement.stamp_ns)
         self._references.setdefault(source, array('q')).insert(at, _reference(measurement))
 
     def remove(self, source: str, measurement: PoseMeasurement) -> None:
-        """
-        Remove a measurement, if it was added.
-
-        Parameters
-        ----------
-        source : str
-        measurement : PoseMeasurement
-
-        """
+        """Remove a measurement, if it was added."""
         at = self._find(source, measurement)
         if at >= 0:
             del self._stamps[source][at], self._references[source][at]
@@ -165,7 +127,6 @@ class SeenStamps:
 
         Parameters
         ----------
-        source : str
         stamps_ns, references : ndarray of int64, shape (M,)
 
         """

@@ -208,11 +208,11 @@ def test_a_closure_that_fits_outside_of_the_graph_only_does_not_keep_the_judge_b
     while judge.work():
         rounds += 1
         assert rounds < 100
-    assert not judge.states.in_graph_at(7)
+    assert not judge.states.in_graph[7]
     # what comes next may have changed that
     monkeypatch.undo()
     run([true_one(121, 201, rng)], begin=backend, first=200, last=202)
-    assert judge.states.in_graph_at(7)
+    assert judge.states.in_graph[7]
 
 
 def wrong_ones(rng: np.random.Generator) -> list[LoopClosure]:

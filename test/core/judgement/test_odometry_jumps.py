@@ -3,6 +3,7 @@
 """Jumps of odometry in drives with loop closures alone: found where they are, and nowhere else."""
 
 from collections.abc import Sequence
+from dataclasses import replace
 from functools import cache
 
 import numpy as np
@@ -10,7 +11,7 @@ import pytest
 
 from pose_graph_ros.core.backend import PoseGraphBackend
 from pose_graph_ros.core.batch.optimizer import Status
-from pose_graph_ros.core.config import BackendConfig, OdometrySource
+from pose_graph_ros.core.config import BackendConfig, OdometrySource, WindowConfig
 from pose_graph_ros.core.geometry import se2
 from pose_graph_ros.core.geometry.se2 import FloatArray
 from pose_graph_ros.core.judgement.verdicts import Decision, Judged, State, Verdict
@@ -65,8 +66,8 @@ def drive(
     return np.array(truth), sorted(events, key=lambda event: event.stamp_ns)
 
 
-def run(events: Events) -> PoseGraphBackend:
-    backend = PoseGraphBackend(CONFIG)
+def run(events: Events, config: BackendConfig = CONFIG) -> PoseGraphBackend:
+    backend = PoseGraphBackend(config)
     for k, event in enumerate(events):
         if isinstance(event, OdometrySample):
             backend.add_odometry(event)
@@ -191,7 +192,7 @@ def test_a_jump_is_told_once_saved_and_goes_when_the_evidence_turns() -> None:
     assert (change.before, change.after) == (State.DOUBTED, State.BELIEVED)
 
 
-def test_odometry_that_fixes_have_won_over_is_told() -> None:
+def jump_between_fixes() -> tuple[FloatArray, Events]:
     truth, events = drive(0, {140: (10.0, 0.0, 0.0)})
     rng = np.random.default_rng(1)
     with_fixes: list[OdometrySample | Position] = []
@@ -203,10 +204,36 @@ def test_odometry_that_fixes_have_won_over_is_told() -> None:
                 with_fixes.append(Position(
                     event.stamp_ns, truth[k, :2] + rng.normal(0.0, 0.3, 2), 0.09 * np.eye(2),
                     np.zeros(2)))
-    backend = run(with_fixes)
+    return truth, with_fixes
+
+
+def test_odometry_that_fixes_have_won_over_is_told() -> None:
+    backend = run(jump_between_fixes()[1])
     verdict, = jumps_in(backend)
     assert verdict.reference_ns is not None
     assert verdict.reference_ns <= (3 * 140 + 1) * SECOND < verdict.stamp_ns
     assert 8.0 < float(np.hypot(*verdict.residual[:2])) < 12.0
     assert all(name.startswith('fix/') for name in verdict.contradicted_by)
     assert len(verdict.contradicted_by) == 5
+    # where a node is thinned out in the middle, two stretches are left
+    odometry, graph = backend._judge._odometry, backend.graph
+    (gap,) = odometry._gaps.values()
+    gone = np.array(gap.edges[3:5])
+    loosened = {edge: gap.weight for edge in gap.edges if edge not in gone}
+    odometry.forget(graph, gone, np.empty((0, 2), dtype=np.int64), loosened)
+    for each, edges in zip(jumps_in(backend), (gap.edges[:3], gap.edges[5:]), strict=True):
+        ends = graph.edges_at(np.array((edges[0], edges[-1])))
+        stamps_ns = backend._nodes.stamps_ns[np.searchsorted(
+            backend._nodes.ids, (ends.i[0], ends.j[1]))]
+        assert (each.reference_ns, each.stamp_ns) == tuple(stamps_ns.tolist())
+        assert each.since_ns == verdict.since_ns
+
+
+def test_odometry_that_left_doubted_is_counted_also_by_a_loaded_graph() -> None:
+    config = replace(CONFIG, window=WindowConfig(nodes=40))
+    backend = run(jump_between_fixes()[1], config)
+    totals = backend.verdict_totals()['odom']
+    assert 0 < totals.n_left_unused < totals.n_left
+    saved = backend.saved()
+    saved.check()
+    assert PoseGraphBackend.restored(config, saved).verdict_totals()['odom'] == totals
