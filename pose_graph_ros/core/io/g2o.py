@@ -65,7 +65,7 @@ SWITCHES = ('VERTEX_SWITCH', 'EDGE_SWITCH_PRIOR')
 # Formats of EDGE2.
 EDGE2_ORDERS = ('toro', 'isam')
 # Row and column of each of six numbers: of an upper triangle, and of the information in TORO.
-_UPPER = ((0, 0), (0, 1), (0, 2), (1, 1), (1, 2), (2, 2))
+UPPER = ((0, 0), (0, 1), (0, 2), (1, 1), (1, 2), (2, 2))
 _TORO = ((0, 0), (0, 1), (1, 1), (2, 2), (0, 2), (1, 2))
 # Tags with the format that the caller names.
 _AMBIGUOUS = ('EDGE2', 'ODOMETRY')
@@ -291,7 +291,7 @@ def _edges(rows: dict[str, _Rows], ids: IntArray, edge2_order: str | None) -> Ed
 def _information(numbers: FloatArray, order: str | None) -> FloatArray:
     """Return information matrices, shape (M, 3, 3), from six numbers each."""
     matrix = np.zeros((len(numbers), 3, 3))
-    for column, (row, col) in enumerate(_TORO if order == 'toro' else _UPPER):
+    for column, (row, col) in enumerate(_TORO if order == 'toro' else UPPER):
         matrix[:, row, col] = numbers[:, column]
         if order != 'isam':
             matrix[:, col, row] = numbers[:, column]

@@ -10,14 +10,13 @@ from pose_graph_ros.core.geometry.se2 import BoolArray, FloatArray, IntArray
 from pose_graph_ros.core.graph.constraints import EdgeKind, Edges, ObservedNodes, upper
 from pose_graph_ros.core.graph.factor_types import FACTORS
 from pose_graph_ros.core.graph.graph import Graph, GraphRows
+from pose_graph_ros.core.io.g2o import UPPER
 from pose_graph_ros.core.io.saved_priors import standing_for
 
 NOT_USED = '# not used '
 """Begin of the line of a constraint with weight 0."""
 STANDING_FOR_PRIORS = '# instead of dense priors, which g2o does not have, '
 """Begin of the line behind which there is nothing but edges and observed nodes for priors."""
-# Row and column of each number of an upper triangle.
-_UPPER = ((0, 0), (0, 1), (0, 2), (1, 1), (1, 2), (2, 2))
 
 
 def write_g2o(graph: Graph, path: Path, ids: IntArray | None = None) -> None:
@@ -95,7 +94,7 @@ def _edge_lines(edges: Edges, ids: IntArray) -> list[str]:
     lines, triangles = np.empty(len(edges), dtype=object), upper(edges.information)
     for kind, factor in FACTORS.items():
         chosen = np.flatnonzero(edges.kind == kind)
-        measured = [column for column, pair in enumerate(_UPPER) if set(pair) <= set(factor.rows)]
+        measured = [column for column, pair in enumerate(UPPER) if set(pair) <= set(factor.rows)]
         some = edges.rows(chosen)
         lines[chosen] = [f'{begin}{factor.tag} {i} {j} {numbers}' for begin, i, j, numbers in zip(
             _begins(some.weight > 0.0), ids[some.i].tolist(), ids[some.j].tolist(),

@@ -7,9 +7,8 @@ import math
 
 import numpy as np
 
-from pose_graph_ros.core.geometry.se2 import FloatArray
+from pose_graph_ros.core.geometry.se2 import FloatArray, IntArray
 from pose_graph_ros.core.graph.graph import Graph
-from pose_graph_ros.core.graph.graph_view import DrawnRows
 from pose_graph_ros.core.judgement.closure_states import (
     AUTO,
     ClosureStates,
@@ -113,7 +112,7 @@ class ClosureReports:
                 n_left=n_left, n_left_unused=n_unused)
         return totals
 
-    def drawn_ids(self) -> DrawnRows:
-        """Return the ids of edges that are drawn in another way than believed ones."""
+    def drawn_ids(self) -> list[IntArray]:
+        """Return the ids of edges that are believed weakly, wait, and are doubted."""
         edge, state = self._states.edge, self._states.state
-        return DrawnRows(*(edge[state == each].tolist() for each in (WEAK, WAITING, DOUBTED)))
+        return [edge[state == each] for each in (WEAK, WAITING, DOUBTED)]

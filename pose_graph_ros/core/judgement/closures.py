@@ -33,8 +33,6 @@ class Support(NamedTuple):
     """It and others, all of which agree with one another, by number."""
     travel: float
     """Distance that the robot has travelled between the first and the last of the clique [m]."""
-    against: IntArray
-    """Those that contradict it, by number."""
 
 
 def claims(edges: Edges, floors: FloatArray = FLOORS) -> Closures:
@@ -77,7 +75,7 @@ class ClosureTable:
     """
 
     def __init__(self, chain: OdometryChain) -> None:
-        self._chain = chain
+        self.chain = chain
         self._slot = GrowingArray((), np.int64)
         """Of each number, its row in the arrays below; -1 if it is forgotten."""
         self._i, self._j = (GrowingArray((), np.int64) for _ in range(2))
@@ -98,10 +96,6 @@ class ClosureTable:
         """Return some of them, none of which is forgotten."""
         slots = self._slots(numbers)
         return Closures(*(column.values[slots] for column in self._columns[:4]))
-
-    def travel(self, nodes: IntArray) -> FloatArray:
-        """Return the lengths of the path to nodes by odometry, shape (K,) [m]."""
-        return self._chain.travel(nodes)
 
     def _slots(self, numbers: IntArray) -> IntArray:
         slots: IntArray = self._slot.values[numbers]
@@ -144,7 +138,7 @@ class ClosureTable:
         closures : Closures, M of them, between nodes of the chain
 
         """
-        travel = np.column_stack((self._chain.travel(closures.i), self._chain.travel(closures.j)))
+        travel = np.column_stack((self.chain.travel(closures.i), self.chain.travel(closures.j)))
         for number, cell in zip(numbers.tolist(), _cells(travel), strict=True):
             self._cells[cell].append(number)
         begin = len(self._i)
@@ -214,19 +208,6 @@ class ClosureTable:
         distance = self._distances(np.full(len(near), number), near)
         return near[distance < GATE], near[distance >= GATE]
 
-    def squared_distances(
-        self, closures: Closures, first: IntArray, second: IntArray,
-    ) -> FloatArray:
-        """
-        Return the squared Mahalanobis distances of pairs, as `OdometryChain` does, shape (P,).
-
-        Parameters
-        ----------
-        first, second : ndarray of int, shape (P,), rows of `closures`
-
-        """
-        return squared_distances(self._chain, closures, first, second)
-
     def support(self, number: int, usable: BoolArray) -> Support:
         """
         Return a clique that a closure belongs to, grown greedily from the nearest ones.
@@ -240,7 +221,7 @@ class ClosureTable:
         near = self.near(number)
         near = near[usable[near]]
         distance = self._distances(np.full(len(near), number), near)
-        agree, against = near[distance < GATE], near[distance >= GATE]
+        agree = near[distance < GATE]
         m = len(agree)
         pairs = self._distances(np.repeat(agree, m), np.tile(agree, m)).reshape(m, m) < GATE
         # those that agree with most are taken first
@@ -250,12 +231,12 @@ class ClosureTable:
                 clique.append(k)
         members = np.append(agree[clique], number)
         travel = self._travel.values[self._slots(members), 1]
-        return Support(members, float(np.ptp(travel)), against)
+        return Support(members, float(np.ptp(travel)))
 
     def _distances(self, a: IntArray, b: IntArray) -> FloatArray:
         """Return squared Mahalanobis distances between closures, by number."""
         every = Closures(*(column.values for column in self._columns[:4]))
-        return squared_distances(self._chain, every, self._slot.values[a], self._slot.values[b])
+        return squared_distances(self.chain, every, self._slot.values[a], self._slot.values[b])
 
 
 def _cells(travel: FloatArray) -> list[tuple[int, int]]:

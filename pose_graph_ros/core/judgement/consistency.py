@@ -94,16 +94,22 @@ def _sum_between(sums, low, high, out):  # type: ignore[no-untyped-def]
 
 @kernel
 def solved_form(m, e):  # type: ignore[no-untyped-def]
-    """Return `e^T M^-1 e` of a positive definite matrix, shape (3, 3)."""
-    a = m[0, 0]
-    l1, l2 = m[1, 0] / a, m[2, 0] / a
-    b = m[1, 1] - l1 * m[1, 0]
-    c = m[2, 1] - l1 * m[2, 0]
-    l3 = c / b
-    d = m[2, 2] - l2 * m[2, 0] - l3 * c
-    y = e[1] - l1 * e[0]
-    z = e[2] - l2 * e[0] - l3 * y
-    return e[0] * e[0] / a + y * y / b + z * z / d
+    """
+    Return `e^T M^-1 e`.
+
+    Parameters
+    ----------
+    m, e : ndarray, shapes (3, 3) and (3,), the matrix positive definite
+
+    """
+    l00 = math.sqrt(m[0, 0])
+    l10, l20 = m[1, 0] / l00, m[2, 0] / l00
+    l11 = math.sqrt(m[1, 1] - l10 * l10)
+    l21 = (m[2, 1] - l20 * l10) / l11
+    x = e[0] / l00
+    y = (e[1] - l10 * x) / l11
+    z = e[2] - l20 * x - l21 * y
+    return x * x + y * y + z * z / (m[2, 2] - l20 * l20 - l21 * l21)
 
 
 @kernel(signature=(

@@ -115,6 +115,12 @@ class FixStates:
         """Whether they have a weight above 0, shape (M,)."""
         return np.asarray(self._records.values[:, BELIEVED] != 0)
 
+    @property
+    def unused(self) -> Held:
+        """What holds the measurements that are not believed."""
+        unused = self.records[~self.believed]
+        return Held(unused[:, HELD], unused[:, EDGE] != 0)
+
     def append(
         self, one: NewConstraint, *, run: int, believed: bool, distance: float, now_ns: int,
     ) -> None:

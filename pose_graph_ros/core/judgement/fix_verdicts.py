@@ -6,7 +6,6 @@ import numpy as np
 
 from pose_graph_ros.core.geometry.se2 import FloatArray, IntArray
 from pose_graph_ros.core.graph.graph import Graph
-from pose_graph_ros.core.graph.graph_view import DrawnRows
 from pose_graph_ros.core.judgement.fix_states import (
     AUTO,
     BELIEVED,
@@ -38,21 +37,6 @@ def verdicts(states: FixStates, graph: Graph, most_believed: int | None) -> list
     numbers = listed(states.records[:, SOURCE], states.believed,
                      states.records[:, DECISION] != AUTO, most_believed)
     return verdicts_on(states, graph, numbers)
-
-
-def drawn_ids(states: FixStates, others: DrawnRows) -> DrawnRows:
-    """
-    Return ids of what is drawn apart, with those of measurements that are not used.
-
-    Parameters
-    ----------
-    others : DrawnRows, of loop closures
-
-    """
-    unused = states.records[~states.believed]
-    edge = unused[:, EDGE] != 0
-    return others._replace(unused_edges=unused[edge, HELD].tolist(),
-                           unused_observed=unused[~edge, HELD].tolist())
 
 
 def believed_after(states: FixStates, stamp_ns: int) -> tuple[str, ...]:

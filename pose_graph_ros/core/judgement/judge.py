@@ -177,12 +177,13 @@ class Judge:
 
     def drawn_rows(self) -> DrawnRows:
         """Return the rows of constraints that are drawn in another way than believed ones."""
-        graph = self._smoother.graph
-        ids = fix_verdicts.drawn_ids(
-            self._fixes.states, self._odometry.drawn_ids(self._closures.reports.drawn_ids()))
-        weak, waiting, doubted, unused = (graph.edge_rows(each).tolist() for each in ids[:-1])
-        return DrawnRows(weak, waiting, doubted, unused,
-                         graph.observed_rows(ids.unused_observed).tolist())
+        graph, (unused, is_edge) = self._smoother.graph, self._fixes.states.unused
+        weak, waiting, doubted = self._closures.reports.drawn_ids()
+        doubted = np.append(doubted, self._odometry.doubted_edges).astype(np.int64)
+        weak, waiting, doubted, edges = (graph.edge_rows(each).tolist() for each in (
+            weak, waiting, doubted, unused[is_edge]))
+        return DrawnRows(
+            weak, waiting, doubted, edges, graph.observed_rows(unused[~is_edge]).tolist())
 
     def changes(self) -> list[Change]:
         """Return the changes of verdicts since the last call."""

@@ -18,7 +18,6 @@ from pose_graph_ros.core.geometry.se2 import IntArray
 from pose_graph_ros.core.graph.constraints import Edges
 from pose_graph_ros.core.graph.error_functions import energies
 from pose_graph_ros.core.graph.graph import Graph
-from pose_graph_ros.core.graph.graph_view import DrawnRows
 from pose_graph_ros.core.judgement.jumps import Jump
 from pose_graph_ros.core.judgement.odometry_motions import integrated
 from pose_graph_ros.core.judgement.verdicts import (
@@ -304,10 +303,10 @@ class OdometryStates:
     def _every(self) -> list[Doubt]:
         return [doubt for _, doubt in sorted({**self._gaps, **self.doubts}.items())]
 
-    def drawn_ids(self, others: DrawnRows) -> DrawnRows:
-        """Return ids of what is drawn apart, with the doubted edges of odometry."""
-        return others._replace(doubted=[*others.doubted, *(
-            edge for doubt in self._every() for edge in doubt.edges)])
+    @property
+    def doubted_edges(self) -> list[int]:
+        """Ids of all edges that are doubted."""
+        return [edge for doubt in self._every() for edge in doubt.edges]
 
     def totals(self) -> dict[str, SourceVerdicts]:
         """Return how many edges of each source are doubted."""

@@ -37,6 +37,7 @@ from pose_graph_ros.core.geometry.se2 import BoolArray, FloatArray, IntArray
 from pose_graph_ros.core.graph.constraints import Edges
 from pose_graph_ros.core.graph.graph import Graph, GraphUpdate
 from pose_graph_ros.core.judgement.closures import claims, ClosureTable, GATE
+from pose_graph_ros.core.judgement.consistency import squared_distances
 from pose_graph_ros.core.judgement.odometry_chain import OdometryChain
 from pose_graph_ros.core.smoother import innovations
 
@@ -134,7 +135,7 @@ def places(table: ClosureTable, edges: Edges) -> IntArray:
 
     """
     stretch = np.floor(np.column_stack(
-        [table.travel(nodes) for nodes in (edges.j, edges.i)]) / STRETCH)
+        [table.chain.travel(nodes) for nodes in (edges.j, edges.i)]) / STRETCH)
     _, place = np.unique(stretch, axis=0, return_inverse=True)
     return np.asarray(place.ravel())
 
@@ -213,8 +214,8 @@ def agreement_scale(
         return 1.0
     claimed, pairs = claims(edges, np.zeros(3)), (np.array(first), np.array(second))
     scale = 1.0
-    while scale < LARGEST and np.median(table.squared_distances(
-            claimed._replace(noise=scale**2 * claimed.noise), *pairs)) > MEDIAN:
+    while scale < LARGEST and np.median(squared_distances(
+            table.chain, claimed._replace(noise=scale**2 * claimed.noise), *pairs)) > MEDIAN:
         scale *= RATIO
     return _believed(scale, len(set(first)))
 

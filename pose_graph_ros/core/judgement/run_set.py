@@ -10,6 +10,7 @@ begins one. `runs` has the prices by which it is decided which of them to believ
 
 from collections.abc import Iterator
 from itertools import pairwise
+import math
 from typing import NamedTuple
 
 import numpy as np
@@ -19,7 +20,6 @@ from pose_graph_ros.core.judgement.fix_states import LONE
 from pose_graph_ros.core.judgement.odometry_chain import OdometryChain
 from pose_graph_ros.core.judgement.run_choice import best_runs, remembered, without_old
 from pose_graph_ros.core.judgement.runs import EVENT, Run
-from pose_graph_ros.core.judgement.stated_noise import StatedNoise
 from pose_graph_ros.core.judgement.tracks import Innovation, Observation, Track
 
 # More of the squared distance for a pose than for a position, so that as few are in doubt.
@@ -33,6 +33,11 @@ NOWHERE = 1e6
 # Factor on the sigmas of odometry while fixes are judged, as those that are stated are often too
 # small. What sources show of them is not used: it depends on the fixes that are believed.
 ODOMETRY_SCALE = 2.0
+# Change of the logarithm of the factor of a source by one measurement, and the largest factor. Its
+# memory is about a hundred measurements, so that a fault of a minute hardly changes it.
+STEP, MOST = 0.03, 4.0
+# Median of chi2 with 2 and 3 degrees of freedom.
+MEDIAN = {2: 1.386, 3: 2.366}
 # How long what is in the graph before the first measurement counts as a run [s].
 KNOWN_BEFORE = 100.0
 
@@ -62,6 +67,40 @@ class Given(NamedTuple):
     """Squared Mahalanobis distance from what is believed."""
     turn: Turn | None = None
     """What is decided anew by the measurement."""
+
+
+class StatedNoise:
+    """
+    Factors on the covariances that sources state, at least 1, while measurements are judged.
+
+    Each follows the median of the squared distances of those that are believed.
+    """
+
+    def __init__(self) -> None:
+        self._factors: dict[str, float] = {}
+
+    def factor(self, source: str) -> float:
+        """Return the factor of a source."""
+        return self._factors.get(source, 1.0)
+
+    def note(self, source: str, d2: float, size: int) -> None:
+        """
+        Note the squared distance of a measurement that is believed.
+
+        Parameters
+        ----------
+        d2 : float, by the covariance with the factor
+        size : int, 2 of a position, 3 of a pose
+
+        """
+        factor = self.factor(source) * math.exp(STEP if d2 > MEDIAN[size] else -STEP)
+        self._factors[source] = min(max(factor, 1.0), MOST)
+
+    def copy(self) -> 'StatedNoise':
+        """Return a copy that does not change with this one."""
+        other = StatedNoise()
+        other._factors = self._factors.copy()
+        return other
 
 
 class RunSet:

@@ -54,7 +54,8 @@ class SetSearch:
             if len(against) < self._next:
                 return False
             self._next = max(len(against) + MORE_CORROBORATED, math.ceil(1.5 * len(against)))
-            self._parts, self._began = self._trial(graph, against[-MOST_SEEDS:]), now
+            self._parts = self._trial(graph, self._states.edge[against[-MOST_SEEDS:]])
+            self._began = now
         try:
             next(self._parts)
         except StopIteration as end:
@@ -62,13 +63,17 @@ class SetSearch:
         return True
 
     def _trial(self, graph: Graph, seeds: IntArray) -> Generator[None, None, Found | None]:
+        """Return a better set, part by part; closures are ids of edges, as some may leave."""
         states, clique = self._states, seeds[:0]
-        for number in seeds.tolist():
-            other = self._table.support(number, ~states.in_graph & states.judged).clique
-            clique = other if len(other) > len(clique) else clique
+        for edge in seeds.tolist():
+            for number in states.numbers(np.array([edge])).tolist():
+                if states.judged[number]:
+                    other = self._table.support(number, ~states.in_graph & states.judged).clique
+                    clique = states.edge[other] if len(other) > len(clique) else clique
             yield
         known = np.flatnonzero(~states.forgotten)
-        edges, clique = states.edge[known], np.searchsorted(known, clique)
+        edges = states.edge[known]
+        clique = np.flatnonzero(np.isin(edges, clique))
         swap = Swap(graph, self._table.rows(known), edges, states.in_graph[known],
                     states.judged[known])
         while swap.step(clique):
@@ -76,7 +81,7 @@ class SetSearch:
         found = swap.found or (yield from jump_search.search(swap, graph))
         if found is None:
             return None
-        # some may have left the graph since; edges are in the order of their addition
+        # edges are in the order of their addition
         inside = np.zeros(len(states), dtype=bool)
         inside[states.numbers(edges)] = found.inside[np.isin(edges, states.edge)]
         jump = found.jump and found.jump._replace(

@@ -22,16 +22,13 @@ from pose_graph_ros.core.measurements import (
     rejected,
     YawRate,
 )
+from pose_graph_ros.core.odometry.stream import FAR_AHEAD_NS, MANY_BEHIND
 from pose_graph_ros.core.saved_columns import Integers, Rows2
 
 # A faster rotation is a faulty number [rad/s]; sensors of robots saturate at 35 rad/s.
 LARGEST_RATE = 1000.0
 # Samples that wait for odometry; beyond, the oldest are dropped.
 MOST_SAMPLES = 100_000
-# A sample is dropped if its stamp is farther ahead, by this and the reorder window [ns], than the
-# stamps of this number of consecutive samples that came after it.
-FAR_AHEAD_NS = 10_000_000_000
-MANY_BEHIND = 5
 # Change of the rate that the polygon must allow for [rad/s^2]: an acceleration that is not uniform
 # during a step h leaves an error of h^2 / 12 times its change.
 UNIFORM_WITHIN = 0.5

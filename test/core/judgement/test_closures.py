@@ -24,6 +24,7 @@ from pose_graph_ros.core.io.graph_files import read_graph, write_graph
 from pose_graph_ros.core.judgement import relative
 from pose_graph_ros.core.judgement.closures import claims, GATE
 from pose_graph_ros.core.judgement.floors import forward
+from pose_graph_ros.core.judgement.set_search import SetSearch
 from pose_graph_ros.core.judgement.verdicts import Decision, State, Verdict
 from pose_graph_ros.core.measurements import AnswerStatus, LoopClosure, OdometrySample
 
@@ -213,6 +214,17 @@ def test_a_closure_that_fits_outside_of_the_graph_only_does_not_keep_the_judge_b
     monkeypatch.undo()
     run([true_one(121, 201, rng)], begin=backend, first=200, last=202)
     assert judge.states.in_graph[7]
+
+
+def test_a_search_for_another_set_goes_on_while_closures_leave() -> None:
+    backend = run(true_ones(np.random.default_rng(3)), last=200)
+    judge = backend._judge._closures
+    edges = judge.states.edge.copy()
+    search = SetSearch(judge.states, judge._table)._trial(backend.graph, edges[:5])
+    next(search)
+    judge.forget(np.empty(0, dtype=np.int64), edges[1:3])
+    assert len(list(search)) > 4
+    assert judge.states.edge.tolist() == [edges[0], *edges[3:]]
 
 
 def wrong_ones(rng: np.random.Generator) -> list[LoopClosure]:
