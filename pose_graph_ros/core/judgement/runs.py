@@ -276,9 +276,9 @@ class Run:
 
     def carry(self, chain: OdometryChain, nodes: IntArray) -> dict[int, int]:
         """
-        Take poses at nodes that leave the graph to the next ones that stay.
+        Return the new indices of states by the old ones, after nodes have left the graph.
 
-        The states there are lost: returned are the new indices of the others by the old ones.
+        Poses there are taken to the next nodes that stay; the states there are lost.
 
         Parameters
         ----------
