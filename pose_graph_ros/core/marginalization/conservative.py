@@ -107,30 +107,23 @@ def descend(stacked, blocks, redundant):  # type: ignore[no-untyped-def]
     redundant : int, whether the W must be kept positive definite: a basis needs no barrier for it
 
     """
-    n_rows, r = stacked.shape
+    n_rows = len(stacked)
     # J A^-1 J^T and J (I - A)^-1 J^T
     inside, gap = np.empty((n_rows, n_rows)), np.empty((n_rows, n_rows))
-    step, trial = np.zeros_like(blocks), np.empty_like(blocks)
+    step, trial = np.zeros(blocks.shape), np.empty(blocks.shape)
     mu = _FIRST_BARRIER
     while True:
         for _ in range(_MAX_STEPS):
             A = _information(stacked, blocks)
             _products(stacked, A, inside)
-            for k in range(r):
-                for m in range(r):
-                    A[k, m] = -A[k, m]
-                A[k, k] += 1.0
-            _products(stacked, A, gap)
+            _products(stacked, _below_one(A), gap)
             decrement = _newton(stacked, blocks, inside, gap, mu, redundant, step)
             before, length = _value(stacked, blocks, mu, redundant), 1.0
             while length > 1e-9:
-                for m in range(len(blocks)):
-                    for p in range(3):
-                        for q in range(3):
-                            trial[m, p, q] = blocks[m, p, q] + length * step[m, p, q]
+                _add_scaled(blocks, length, step, trial)
                 if (_value(stacked, trial, mu, redundant)
                         <= before - _DESCENT * length * decrement):
-                    blocks[:] = trial
+                    _add_scaled(blocks, length, step, blocks)
                     break
                 length *= 0.5
             if decrement < _CENTRED * mu:
@@ -138,6 +131,25 @@ def descend(stacked, blocks, redundant):  # type: ignore[no-untyped-def]
         if mu <= _LAST_BARRIER:
             return
         mu = max(0.1 * mu, _LAST_BARRIER)
+
+
+@kernel
+def _add_scaled(blocks, length, step, out):  # type: ignore[no-untyped-def]
+    for m in range(len(blocks)):
+        for p in range(3):
+            for q in range(3):
+                out[m, p, q] = blocks[m, p, q] + length * step[m, p, q]
+
+
+@kernel(allocates=True)
+def _below_one(A):  # type: ignore[no-untyped-def]
+    """Return I - A; loops, as an expression of arrays takes seconds to compile."""
+    r = len(A)
+    out = np.empty((r, r))
+    for k in range(r):
+        for m in range(r):
+            out[k, m] = (1.0 if k == m else 0.0) - A[k, m]
+    return out
 
 
 @kernel(allocates=True, fastmath=_FAST)
@@ -189,7 +201,10 @@ def _log_det(L):  # type: ignore[no-untyped-def]
 def _products(stacked, A, out):  # type: ignore[no-untyped-def]
     """Write `J A^-1 J^T`, shape (3 M, 3 M)."""
     n_rows, r = stacked.shape
-    L, y = A.copy(), np.empty((n_rows, r))
+    L, y = np.empty((r, r)), np.empty((n_rows, r))
+    for k in range(r):
+        for m in range(k + 1):
+            L[k, m] = A[k, m]
     _factorize(L)
     for m in range(n_rows):
         for k in range(r):
@@ -210,9 +225,8 @@ def _value(stacked, blocks, mu, redundant):  # type: ignore[no-untyped-def]
     """Return what is minimised; infinite where A or W are not inside."""
     A = _information(stacked, blocks)
     r = len(A)
-    other, total = -A, 0.0
+    other, total = _below_one(A), 0.0
     for k in range(r):
-        other[k, k] += 1.0
         total += A[k, k]
     if not _factorize(A) or not _factorize(other):
         return np.inf
@@ -229,8 +243,10 @@ def _value(stacked, blocks, mu, redundant):  # type: ignore[no-untyped-def]
 @kernel(allocates=True)
 def _padded(block):  # type: ignore[no-untyped-def]
     """Return a block with ones on the diagonal of its padding."""
-    W = block.copy()
+    W = np.empty((3, 3))
     for k in range(3):
+        for m in range(3):
+            W[k, m] = block[k, m]
         if W[k, k] == 0.0:
             W[k, k] = 1.0
     return W
@@ -247,10 +263,12 @@ def _newton(stacked, blocks, inside, gap, mu, redundant, step):  # type: ignore[
     """Write Newton's step of all blocks, and return its squared decrement."""
     n, r = len(blocks), stacked.shape[1]
     gradient, hessian = np.zeros(6 * n), np.zeros((6 * n, 6 * n))
-    inverse = np.zeros((n, 3, 3))
+    inverse, unit = np.zeros((n, 3, 3)), np.zeros((3, 3))
+    for k in range(3):
+        unit[k, k] = 1.0
     if redundant != 0:
         for m in range(n):
-            _products(np.eye(3), _padded(blocks[m]), inverse[m])
+            _products(unit, _padded(blocks[m]), inverse[m])
     for m in range(n):
         for a in range(6):
             p, q = 3 * m + _P[a], 3 * m + _Q[a]
