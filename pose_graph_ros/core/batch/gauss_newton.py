@@ -279,7 +279,7 @@ def settle(head):  # type: ignore[no-untyped-def]
     for e in range(head[tb.N_EDGES]):
         edge_i[e, tb.EDGE_WAITS] = 0
         if edge_f[e, tb.WEIGHT] > 0.0:
-            factors.check_edge(head, e, 0.0)
+            factors.check_edge(head, e, factors.NO_TURN)
             chi2 += edge_f[e, tb.ENERGY]
             error2 += edge_f[e, tb.ERROR2]
     for k in range(head[tb.N_OBSERVED]):

@@ -74,21 +74,29 @@ def _eliminate(head, c, relinearize, by_weakest):  # type: ignore[no-untyped-def
         entry = node_i[v, tb.EDGE_LIST]
         while entry >= 0:
             e, side = entry >> 2, entry & 3
-            entry = edge_i[e, tb.NEXT_I + side]
+            ends = edge_i[e]
+            entry = ends[tb.NEXT_I + side]
             # an edge between frontal nodes is in all their lists: added from the first of its ends
-            at_i, at_j = _place(head, edge_i[e, tb.END_I]), _place(head, edge_i[e, tb.END_J])
-            if at_i < 0 or at_j < 0 or (side > 0 and at_i < rows):
-                continue
-            at_k, third = -1, edge_i[e, tb.END_K]
-            if third >= 0:
-                at_k = _place(head, third)
-                if at_k < 0 or (side == 2 and at_j < rows):
+            at_i, at_j, at_k = 3 * k, 3 * k, -1
+            if ends[tb.END_K] < 0:
+                at = _place(head, ends[1 - side])
+                if at < 0 or (side == 1 and at < rows):
+                    continue
+                if side == 0:
+                    at_j = at
+                else:
+                    at_i = at
+            else:
+                at_i, at_j = _place(head, ends[tb.END_I]), _place(head, ends[tb.END_J])
+                at_k = _place(head, ends[tb.END_K])
+                if (min(at_i, at_j, at_k) < 0 or (side > 0 and at_i < rows)
+                        or (side == 2 and at_j < rows)):
                     continue
             if relinearize:
                 transaction_log.log_edge(head, e)
                 factors.linearize_edge(head, e)
-            edge_i[e, tb.OWNER] = c
-            anchored |= anchors(edge_i[e, tb.EDGE_KIND])
+            ends[tb.OWNER] = c
+            anchored |= anchors(ends[tb.EDGE_KIND])
             normal_equations.add_edge(head, e, at_i, at_j, at_k, front, ld)
         entry = node_i[v, tb.OBSERVED_LIST]
         while entry >= 0:

@@ -184,7 +184,7 @@ def weigh_edge(head, e, weight):  # type: ignore[no-untyped-def]
     if before == 0.0:
         _link_edge(head, e)
     factors.linearize_edge(head, e)
-    factors.check_edge(head, e, 0.0)
+    factors.check_edge(head, e, factors.NO_TURN)
     scalars[tb.CHI2] += f[tb.ENERGY]
 
 
@@ -400,7 +400,7 @@ def restart(head):  # type: ignore[no-untyped-def]
         edge_i[e, tb.EDGE_WAITS] = 0
         if edge_f[e, tb.WEIGHT] > 0.0:
             factors.linearize_edge(head, e)
-            factors.check_edge(head, e, 0.0)
+            factors.check_edge(head, e, factors.NO_TURN)
             scalars[tb.CHI2] += edge_f[e, tb.ENERGY]
     for k in range(head[tb.N_OBSERVED]):
         observed_i[k, tb.OBS_WAITS] = 0

@@ -273,6 +273,20 @@ def constant(f, kind, c, s, ax, ay):  # type: ignore[no-untyped-def]
 
 
 @kernel(forceinline=True)
+def relative_error(f, x, y):  # type: ignore[no-untyped-def]
+    """
+    Return e_t of a relative error.
+
+    Parameters
+    ----------
+    f : ndarray, row of the constraint
+    x, y : float, d in the axes of its frame [m]
+
+    """
+    return x - f[tb.OWN], y - f[tb.OWN + 1]
+
+
+@kernel(forceinline=True)
 def error(f, kind, dx, dy, c, s):  # type: ignore[no-untyped-def]
     """
     Return the error e_t, cosine and sine of its frame, and its arm a.
@@ -286,7 +300,8 @@ def error(f, kind, dx, dy, c, s):  # type: ignore[no-untyped-def]
 
     """
     if is_relative(kind):
-        return (c * dx + s * dy - f[tb.OWN], c * dy - s * dx - f[tb.OWN + 1], c, s, dx, dy)
+        ex, ey = relative_error(f, c * dx + s * dy, c * dy - s * dx)
+        return ex, ey, c, s, dx, dy
     ox, oy = f[tb.OFFSET], f[tb.OFFSET + 1]
     ax, ay = c * ox - s * oy, s * ox + c * oy
     c, s = 1.0, 0.0

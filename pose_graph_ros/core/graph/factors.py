@@ -42,6 +42,7 @@ from pose_graph_ros.core.graph.factor_types import (
     is_relative,
     OBSERVED,
     ODOMETRY,
+    relative_error,
     rotation,
 )
 
@@ -51,6 +52,8 @@ LEAST_FRACTION = 0.01
 # Squared relative change of the arm of a Jacobian above which it is added to the squared
 # linearization error whatever the energy.
 MUCH_LONGER = 1e-4
+# Angle of a clique's frame, with its cosine and sine.
+NO_TURN = (0.0, 1.0, 0.0)
 
 
 @kernel
@@ -105,8 +108,8 @@ def _linearize(f, kind, start, end, pose_k, delta_k):  # type: ignore[no-untyped
 
 
 @kernel(forceinline=True)
-def _turned_by(c, s, turn):  # type: ignore[no-untyped-def]
-    """Return cosine and sine of an angle plus a turn, which is small as a rule."""
+def _versine_and_sine(turn):  # type: ignore[no-untyped-def]
+    """Return cosine minus 1 and sine of an angle, which is small as a rule."""
     if abs(turn) < 0.1:
         # cos - 1 and sin by their series, exact to rounding
         square = turn * turn
@@ -114,19 +117,18 @@ def _turned_by(c, s, turn):  # type: ignore[no-untyped-def]
             1 / 40320 - square / 3628800))))
         sine = turn * (1.0 - square * (1 / 6 - square * (1 / 120 - square * (
             1 / 5040 - square * (1 / 362880 - square / 39916800)))))
-    else:
-        versine, sine = math.cos(turn) - 1.0, math.sin(turn)
-    return c + (versine * c - sine * s), s + (versine * s + sine * c)
+        return versine, sine
+    return math.cos(turn) - 1.0, math.sin(turn)
 
 
 @kernel(forceinline=True)
-def _check(f, kind, start, end, delta_k, phi):  # type: ignore[no-untyped-def]
+def _check(f, kind, start, end, delta_k, clique_turn):  # type: ignore[no-untyped-def]
     """Set the squared linearization error and the energy, as for `check_edge`."""
+    phi, cos, sin = clique_turn
     ft, fth = factors_of_end(f, kind)
     dx, dy = ft * end[tb.POSE] - start[tb.POSE], ft * end[tb.POSE + 1] - start[tb.POSE + 1]
     if phi != 0.0:
-        c, s = math.cos(phi), math.sin(phi)
-        dx, dy = c * dx + s * dy, c * dy - s * dx
+        dx, dy = cos * dx + sin * dy, cos * dy - sin * dx
     th = start[tb.DELTA + 2]
     turn = th - phi - f[tb.LIN_TH]
     # S a_bar turn, and the linear model, in the axes of the error
@@ -135,8 +137,12 @@ def _check(f, kind, start, end, delta_k, phi):  # type: ignore[no-untyped-def]
     gx, gy = c_bar * bx + s_bar * by, c_bar * by - s_bar * bx
     turned = turn * turn
     if is_relative(kind):
-        c, s = _turned_by(c_bar, s_bar, turn)
-        lx, ly, _, _, _, _ = error(f, kind, dx, dy, c_bar, s_bar)
+        # d in the axes of the linearized frame, and by how much the turn changes it
+        qx, qy = c_bar * dx + s_bar * dy, c_bar * dy - s_bar * dx
+        versine, sine = _versine_and_sine(turn)
+        px, py = versine * qx + sine * qy, versine * qy - sine * qx
+        ex, ey = relative_error(f, qx + px, qy + py)
+        rx, ry = px - gy * turn, py + gx * turn
     else:   # its clique is anchored, so phi is zero
         c, s = rotation(f, kind, start[tb.POSE + 2])
         kx, ky = constant(f, kind, c_bar, s_bar, bx, by)
@@ -144,9 +150,8 @@ def _check(f, kind, start, end, delta_k, phi):  # type: ignore[no-untyped-def]
         ly = c_bar * (dy + ky) - s_bar * (dx + kx)
         if bx == 0.0 and by == 0.0:
             turned = 0.0
-    ex, ey, c, s, _, _ = error(f, kind, dx, dy, c, s)
-    rx, ry = ex - lx - gy * turn, ey - ly + gx * turn
-    if not is_relative(kind):
+        ex, ey, c, s, _, _ = error(f, kind, dx, dy, c, s)
+        rx, ry = ex - lx - gy * turn, ey - ly + gx * turn
         turned += (c - c_bar) ** 2 + (s - s_bar) ** 2
     linear = f[tb.LIN_K] + fth * end[tb.DELTA + 2] - th + delta_k
     eth = wrap(linear)
@@ -197,22 +202,24 @@ def linearize_edge(head, e):  # type: ignore[no-untyped-def]
 
 
 @kernel
-def check_edge(head, e, phi):  # type: ignore[no-untyped-def]
+def check_edge(head, e, clique_turn):  # type: ignore[no-untyped-def]
     """
     Set the squared linearization error and the energy of an edge; the caller has logged them.
 
     Parameters
     ----------
     e : int
-    phi : float, turn of its clique's frame since the linearization [rad]; see `clique_frames`
+    clique_turn : tuple of float
+        Turn of its clique's frame since the linearization [rad], see `clique_frames`, with its
+        cosine and sine; `NO_TURN` at the linearization and in anchored cliques.
 
     """
     node_f, row, f = tb.node_f(head), tb.edge_i(head)[e], tb.edge_f(head)[e]
     kind, start, end = row[tb.EDGE_KIND], node_f[row[tb.END_I]], node_f[row[tb.END_J]]
     if is_plain(row):
-        _check(f, ODOMETRY, start, end, 0.0, phi)
+        _check(f, ODOMETRY, start, end, 0.0, clique_turn)
     else:
-        _check(f, kind, start, end, third(head, e, tb.DELTA), phi)
+        _check(f, kind, start, end, third(head, e, tb.DELTA), clique_turn)
 
 
 @kernel
@@ -226,7 +233,7 @@ def linearize_observed(head, k):  # type: ignore[no-untyped-def]
 def check_observed(head, k):  # type: ignore[no-untyped-def]
     """Set squared linearization error and energy of an observed node; the caller has logged it."""
     node = tb.node_f(head)[tb.observed_i(head)[k, tb.OBS_NODE]]
-    _check(tb.observed_f(head)[k], OBSERVED, node, node, 0.0, 0.0)
+    _check(tb.observed_f(head)[k], OBSERVED, node, node, 0.0, NO_TURN)
 
 
 @kernel(forceinline=True)

@@ -141,7 +141,7 @@ def extend(head, mean, information, weight):  # type: ignore[no-untyped-def]
         return NOT_A_CHAIN
     if not rows.write_edge(head, e, last, v, mean, information, 0, weight):
         return NOT_A_CHAIN
-    transaction_log.begin(head)
+    head[tb.UPDATE] += 1    # rows are stamped, but not logged: nothing has to be rolled back
     _write_node(head, v, last, mean)
     f = edge_f[e]
     factor_types.prepare(f, 0)
@@ -172,7 +172,6 @@ def extend(head, mean, information, weight):  # type: ignore[no-untyped-def]
         bad = _eliminate_3(root, 3, least)
     if bad >= 0:
         node_f[last, tb.SCALE_T], node_f[last, tb.SCALE_R] = scale_t, scale_r
-        transaction_log.commit(head)
         return NOT_A_CHAIN
     # nothing can fail from here on
     values, nodes = old[tb.VALUES], old[tb.NODES]
@@ -195,7 +194,7 @@ def extend(head, mean, information, weight):  # type: ignore[no-untyped-def]
     head[tb.N_NODES], head[tb.N_EDGES], head[tb.NEWEST] = v + 1, e + 1, v
     head[tb.NEXT_NODE] += 1
     head[tb.NEXT_EDGE] += 1
-    transaction_log.commit(head)
+    head[tb.LOG_I_END] = 0
     return EXTENDED
 
 

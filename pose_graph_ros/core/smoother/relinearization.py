@@ -30,13 +30,17 @@ def _append_waiting(head, entry):  # type: ignore[no-untyped-def]
 
 
 @kernel
-def _check_edge(head, e):  # type: ignore[no-untyped-def]
-    """Evaluate an edge at the present estimate; it waits if its linearization error is large."""
+def _check_edge(head, e, frame):  # type: ignore[no-untyped-def]
+    """
+    Evaluate an edge at the present estimate; it waits if its linearization error is large.
+
+    Frame is the turn of its clique, as for `factors.check_edge`.
+    """
     edge_f, scalars, edge_i = tb.edge_f(head), tb.scalars(head), tb.edge_i(head)
     transaction_log.log_energy(head, e)
     f = edge_f[e]
     scalars[tb.CHI2] -= f[tb.ENERGY]
-    factors.check_edge(head, e, clique_frames.present_turn(head, edge_i[e, tb.OWNER]))
+    factors.check_edge(head, e, frame)
     scalars[tb.CHI2] += f[tb.ENERGY]
     scalars[tb.ERROR2_SUM] += f[tb.ERROR2]
     if (f[tb.ERROR2] > factors.LEAST_FRACTION * scalars[tb.SETTING_SHARE]
@@ -70,6 +74,7 @@ def _check(head):  # type: ignore[no-untyped-def]
     iteration = head[tb.ITERATION]
     checks = work_i[head[tb.NODE_ROOM]:]
     scalars[tb.ERROR2_SUM] = 0.0
+    owner, frame = -1, factors.NO_TURN  # edges that follow each other often have the same owner
     for n in range(head[tb.N_CHECKS]):
         v = checks[n]
         entry = node_i[v, tb.EDGE_LIST]
@@ -77,7 +82,11 @@ def _check(head):  # type: ignore[no-untyped-def]
             e, side = entry >> 2, entry & 3
             if edge_i[e, tb.EDGE_CHECKED] != iteration:
                 edge_i[e, tb.EDGE_CHECKED] = iteration
-                _check_edge(head, e)
+                if edge_i[e, tb.OWNER] != owner:
+                    owner = edge_i[e, tb.OWNER]
+                    phi = clique_frames.present_turn(head, owner)
+                    frame = (phi, math.cos(phi), math.sin(phi))
+                _check_edge(head, e, frame)
             entry = edge_i[e, tb.NEXT_I + side]
         k = node_i[v, tb.OBSERVED_LIST]
         while k >= 0:

@@ -110,7 +110,7 @@ def test_energy_linearization_error_and_scale_are_those_of_the_formulas(seed: in
     rows[:, tb.DELTA:tb.DELTA + 3] = moves
     rows[:, tb.POSE:tb.POSE + 3] = se2.wrapped(before + moves)
     for e in range(12):
-        factors.check_edge(graph.memory.head, e, 0.0)
+        factors.check_edge(graph.memory.head, e, factors.NO_TURN)
     error = error_functions.edge_errors(graph.poses, edges)
     linear = (first.error + np.einsum('mij,mj->mi', first.jacobian_i, moves[i])
               + np.einsum('mij,mj->mi', first.jacobian_j, moves[j]))
