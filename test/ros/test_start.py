@@ -19,8 +19,8 @@ pytestmark = pytest.mark.untraced
 def test_nothing_is_lost_while_kernels_are_compiled(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    # what judging needs is compiled: some three seconds
-    copy_kernels(tmp_path / 'kernels', without='judgement')
+    # what batch optimisation needs is compiled: some four seconds
+    copy_kernels(tmp_path / 'kernels', without='batch')
     monkeypatch.setenv('NUMBA_CACHE_DIR', str(tmp_path / 'kernels'))
     with NodeProcess(tmp_path, program=AS_A_USER) as node:
         client = Client(int(node.env['ROS_DOMAIN_ID']))
