@@ -26,7 +26,7 @@ import pose_graph_ros
 
 OTHERS = ('numba', 'scipy.optimize', 'hypothesis', 'matplotlib', 'rosbags.highlevel', 'rclpy.node')
 """Modules whose imports take long."""
-TRACED, TRACED_THREADS = 0.1, 6.0
+TRACED, TRACED_THREADS = 0.2, 6.0
 """Time of the processor for which a function is traced, and the threads of a file [s]."""
 
 _left: dict[object, float] = {}
