@@ -26,6 +26,7 @@ CORE = {
     'core.graph': {'core.compiled', 'core.geometry'},
     'core.elimination': {'core.compiled', 'core.graph'},
     'core.batch': {'core.compiled', 'core.geometry', 'core.graph', 'core.elimination'},
+    'core.certificate': {'core.geometry', 'core.graph'},
     'core.marginalization': {
         'core.compiled', 'core.geometry', 'core.graph', 'core.elimination'},
     'core.smoother': {
