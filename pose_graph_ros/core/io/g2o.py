@@ -67,8 +67,8 @@ EDGE2_ORDERS = ('toro', 'isam')
 # Row and column of each of six numbers: of an upper triangle, and of the information in TORO.
 UPPER = ((0, 0), (0, 1), (0, 2), (1, 1), (1, 2), (2, 2))
 _TORO = ((0, 0), (0, 1), (1, 1), (2, 2), (0, 2), (1, 2))
-# Tags with the format that the caller names.
-_AMBIGUOUS = ('EDGE2', 'ODOMETRY')
+# Tags with the format that the caller names, see `edge2_order`.
+AMBIGUOUS = ('EDGE2', 'ODOMETRY')
 # Kinds of edges to landmarks, that tell where the other end is, and with a tag of their own.
 _TO_LANDMARKS = [kind for kind, factor in FACTORS.items() if factor.j == (NodeKind.LANDMARK,)]
 _PLACING = [kind for kind, factor in FACTORS.items() if factor.places]
@@ -187,7 +187,7 @@ def _read_line(
     if len(values) != sum(LAYOUT[tag]):
         raise FileFormatError(
             f'{where}: {tag} is followed by {sum(LAYOUT[tag])} numbers, got {len(values)}')
-    if tag in _AMBIGUOUS and edge2_order is None:
+    if tag in AMBIGUOUS and edge2_order is None:
         raise FileFormatError(
             f'{where}: {tag} means two formats with the information in different order; '
             f'say which this is: {" or ".join(EDGE2_ORDERS)}')
@@ -226,7 +226,7 @@ def _build(
     poses, known = np.zeros((len(ids), 3)), np.isin(ids, given)
     poses[known] = _numbers(vertices, 3)[first]
     if not np.all(known):
-        _compose_missing(poses, known, edges)
+        compose_missing(poses, known, edges)
         poses[is_landmark, 2] = 0.0
     fixed = _fixed(path, fixes, ids)
     if len(fixed) == 0 and len(observed) == 0:
@@ -270,7 +270,7 @@ def _numbers(table: _Rows, width: int) -> FloatArray:
 def _edges(rows: dict[str, _Rows], ids: IntArray, edge2_order: str | None) -> Edges:
     parts = []
     for tag, order in (('EDGE_SE2', None), ('EDGE', 'toro'),
-                       *((tag, edge2_order) for tag in _AMBIGUOUS)):
+                       *((tag, edge2_order) for tag in AMBIGUOUS)):
         numbers, ends = _numbers(rows[tag], 9), _ids(rows[tag])
         kind = np.where(np.diff(ends, axis=1)[:, 0] == 1, EdgeKind.ODOMETRY, EdgeKind.LOOP_CLOSURE)
         i, j = np.searchsorted(ids, ends).T
@@ -317,8 +317,17 @@ def _observed(rows: dict[str, _Rows], ids: IntArray) -> ObservedNodes:
     return ObservedNodes.joined(parts)
 
 
-def _compose_missing(poses: FloatArray, known: BoolArray, edges: Edges) -> None:
-    """Set the poses of the nodes that are not known by composing edges, breadth-first."""
+def compose_missing(poses: FloatArray, known: BoolArray, edges: Edges) -> None:
+    """
+    Set the poses of the nodes that are not known by composing edges, breadth-first.
+
+    Parameters
+    ----------
+    poses : ndarray, shape (N, 3), is changed in place [m, m, rad]
+    known : ndarray of bool, shape (N,); in a part without any, its first node stays
+    edges : Edges
+
+    """
     neighbours: dict[int, list[tuple[int, FloatArray]]] = {}
     placing = edges.rows(np.isin(edges.kind, _PLACING))
     for i, j, mean, kind in zip(placing.i.tolist(), placing.j.tolist(), placing.mean,

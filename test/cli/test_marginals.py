@@ -1,0 +1,95 @@
+# Copyright 2026 The pose_graph_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""Marginal covariances that `pose-graph solve` writes, against the inverse of a dense H."""
+
+from collections.abc import Sequence
+import csv
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+from sparse_system import LinearSystem
+
+from pose_graph_ros.cli.main import main
+from pose_graph_ros.core.geometry.se2 import FloatArray
+from pose_graph_ros.core.io.g2o import read_g2o
+
+DATA = Path(__file__).resolve().parents[1] / 'data'
+
+
+def covariances(lines: Sequence[str]) -> dict[int, FloatArray]:
+    """Return matrices by id."""
+    found = {}
+    for row in csv.DictReader(lines):
+        matrix = np.zeros((3, 3))
+        for key, value in row.items():
+            if key.startswith('cov_'):
+                names = key.removeprefix('cov_').replace('theta', 't')
+                i, j = ('xyt'.index(name) for name in names)
+                matrix[i, j] = matrix[j, i] = float(value)
+        found[int(row['id'])] = matrix
+    return found
+
+
+def dense(path: Path) -> dict[int, FloatArray]:
+    """Return the covariances of a file with poses at the optimum, by the inverse of all of H."""
+    file = read_g2o(path)
+    system = LinearSystem(file.graph)
+    h, _ = system.assemble(file.graph.poses)
+    inverse = np.linalg.inv(np.asarray(h.todense()))
+    found = dict.fromkeys(file.ids.tolist(), np.zeros((3, 3)))
+    for k, node in enumerate(system.free_nodes.tolist()):
+        found[int(file.ids[node])] = inverse[3 * k:3 * k + 3, 3 * k:3 * k + 3]
+    return found
+
+
+@pytest.mark.parametrize('name', ['chain.g2o', 'manhattan.g2o', 'ring.g2o'])
+def test_covariances_are_those_of_the_dense_inverse(
+    name: str, tmp_path: Path, capsys: pytest.CaptureFixture[str],
+) -> None:
+    graph, table = tmp_path / 'out.g2o', tmp_path / 'out.csv'
+    assert main(['solve', str(DATA / name), '-o', str(graph), '-o', str(table)]) == 0
+    expected = dense(graph)
+    found = covariances(table.read_text(encoding='ascii').splitlines())
+    assert list(found) == list(expected)
+    for each, matrix in expected.items():
+        np.testing.assert_allclose(found[each], matrix, rtol=1e-5, atol=1e-9)
+
+    newest = max(expected)
+    for which, names in (('newest', [newest]), (f'{newest},{min(expected)}', [
+            newest, min(expected)])):
+        capsys.readouterr()
+        assert main(['solve', str(DATA / name), '--marginals', which]) == 0
+        lines = capsys.readouterr().out.splitlines()
+        found = covariances(lines[-len(names) - 1:])
+        assert list(found) == names
+        for each in names:
+            np.testing.assert_allclose(found[each], expected[each], rtol=1e-5, atol=1e-9)
+    assert main(['solve', str(DATA / name), '--marginals', 'newest', '--json']) == 0
+    values = json.loads(capsys.readouterr().out)
+    assert list(covariances(values['marginals'])) == [newest]
+
+
+def test_a_point_has_no_heading(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    path = tmp_path / 'graph.g2o'
+    path.write_text('VERTEX_SE2 0 0 0 0\nEDGE_SE2_XY 0 1 1 2 4 0 16\n', encoding='ascii')
+    assert main(['solve', str(path), '--marginals', '1']) == 0
+    row = capsys.readouterr().out.splitlines()[-1].split(',')
+    assert [float(text or 'nan') for text in row] == pytest.approx(
+        [1.0, 1.0, 2.0, np.nan, 0.25, 0.0, np.nan, 0.0625, np.nan, np.nan], nan_ok=True)
+
+
+@pytest.mark.parametrize(('text', 'which', 'said'), [
+    ('EDGE_SE2 0 1 1 0 0 1 0 0 1 0 1', '7', 'no vertex 7'),
+    ('EDGE_SE2 0 1 1 0 0 1 0 0 1 0 1', 'some', "separated by commas, got 'some'"),
+    ('EDGE_PRIOR_SE2_XY 5 1 1 1 0 1', 'all', 'hidden node 5 is not determined')])
+def test_what_cannot_be_told_is_one_line_of_error(
+    text: str, which: str, said: str, tmp_path: Path, capsys: pytest.CaptureFixture[str],
+) -> None:
+    path = tmp_path / 'graph.g2o'
+    path.write_text(text, encoding='ascii')
+    assert main(['solve', str(path), '--marginals', which]) == 2
+    err = capsys.readouterr().err
+    assert len(err.splitlines()) == 1
+    assert said in err
