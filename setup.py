@@ -16,7 +16,8 @@ from setuptools import Distribution, find_packages, setup
 from distutils.command.install_data import install_data  # isort: skip  (setuptools provides it)
 
 PACKAGE = 'pose_graph_ros'
-EXECUTABLES = ('pose_graph_node', 'replay', 'compile_kernels')     # those for `ros2 run`
+# those for `ros2 run`
+EXECUTABLES = ('pose_graph_node', 'replay', 'compare', 'compile_kernels')
 LIBEXEC = Path('lib', PACKAGE)
 HERE = Path(__file__).resolve().parent
 
@@ -62,6 +63,7 @@ setup(
         'console_scripts': [
             'pose_graph_node = pose_graph_ros.ros.main:main',
             'replay = pose_graph_ros.cli.main:replay',
+            'compare = pose_graph_ros.cli.main:compare',
             'compile_kernels = pose_graph_ros.cli.main:compile_kernels',
             'pose-graph = pose_graph_ros.cli.main:main',
         ],
@@ -85,7 +87,7 @@ setup(
     ],
     extras_require={
         'test': ['pytest>=7.4', 'pytest-timeout>=2.2', 'pytest-xdist>=3.4', 'coverage>=7.4',
-                 'hypothesis>=6.98'],
+                 'hypothesis>=6.98', 'evo>=1.38'],
         'dev': ['ruff', 'mypy', 'scipy-stubs'],
     },
 )

@@ -19,7 +19,6 @@ from pose_graph_ros.adapters.bags import open_bag
 from pose_graph_ros.adapters.message_reader import MessageReader
 from pose_graph_ros.adapters.parameters import checked
 from pose_graph_ros.adapters.sources import source_list
-from pose_graph_ros.cli.evaluation import fit_rigid
 from pose_graph_ros.cli.replay import run_measurements
 from pose_graph_ros.core.backend import PoseGraphBackend
 from pose_graph_ros.core.config import BackendConfig, MeasurementSource, OdometryNoise
@@ -35,6 +34,7 @@ from pose_graph_ros.core.measurements import (
     Position,
     YawRate,
 )
+from pose_graph_ros.core.trajectories.similarity import fit_similarity
 
 GYRO = GyroSource(sigma_rate=5e-4, sigma_bias=0.02, sigma_bias_walk=2e-5, sigma_turn=1e-3)
 BEGIN, END = 100.0, 160.0
@@ -165,8 +165,9 @@ def husky(data: Path) -> Section:
     paths = _paths(events)
     places = paths[0].poses[:, :2]
     table.add('all: the motion alone, under its best rigid fit', *(
-        f'{_rms(np.hypot(*(se2.transform(fit_rigid(path, places), path) - places).T)):.2f}'
-        for path in (each.at(paths[0].stamps_ns)[:, :2] for each in paths[1:])))
+        f'{_rms(np.hypot(*(se2.transform(pose, path) - places).T)):.2f}'
+        for path in (each.at(paths[0].stamps_ns)[:, :2] for each in paths[1:])
+        for pose in [fit_similarity(path, places).pose]))
     say('  ' + ' | '.join(table.rows[-1]))
     section.tables += [table, _courses(paths)]
     section.notes.append(

@@ -11,10 +11,10 @@ from matplotlib.figure import Figure
 import numpy as np
 
 from benchmark.robust_closures import Recording, Run, TRUE
-from pose_graph_ros.cli.evaluation import fit_rigid
 from pose_graph_ros.cli.picture import BLUE, GREEN, GREY, INK, PURPLE, VERMILION
 from pose_graph_ros.core.geometry import se2
 from pose_graph_ros.core.geometry.trajectory import Trajectory
+from pose_graph_ros.core.trajectories.similarity import fit_similarity
 
 SIZE, DPI = (13.0, 6.5), 100
 """Of the picture [inch], and dots per inch."""
@@ -71,5 +71,6 @@ def _closures(
 def _placed(path: Trajectory, truth: Trajectory) -> np.ndarray:
     """Return the poses of a path, laid over the truth."""
     inside = truth.covers(path.stamps_ns)
-    pose = fit_rigid(path.poses[inside, :2], truth.at(path.stamps_ns[inside])[:, :2])
+    pose = fit_similarity(
+        path.poses[inside, :2], truth.at(path.stamps_ns[inside])[:, :2]).pose
     return np.asarray(se2.compose(pose, path.poses))

@@ -40,6 +40,7 @@ CORE = {
     'core.window': {
         'core.compiled', 'core.geometry', 'core.graph', 'core.elimination',
         'core.marginalization', 'core.batch', 'core.smoother', 'core.odometry'},
+    'core.trajectories': {'core.geometry'},
 }
 CORE['core.io'] = set(CORE)
 # The modules on top of the packages: the facade, what it hands out, and who drives it.

@@ -19,6 +19,7 @@ from pose_graph_ros.core.geometry import se2
 from pose_graph_ros.core.geometry.se2 import FloatArray, IntArray
 from pose_graph_ros.core.geometry.trajectory import Trajectory
 from pose_graph_ros.core.judgement.verdicts import State
+from pose_graph_ros.core.trajectories.similarity import fit_similarity
 
 
 @dataclass(frozen=True, slots=True)
@@ -78,38 +79,6 @@ class ErrorRow:
     unit: str = 'm'
 
 
-def fit_rigid(source: FloatArray, target: FloatArray) -> FloatArray:
-    """
-    Return the rigid motion that aligns points with others in the least-squares sense.
-
-    All points have the same weight. If they do not determine the angle, it is 0.
-
-    Parameters
-    ----------
-    source, target : ndarray, shape (N, 2)
-        Corresponding points [m].
-
-    Returns
-    -------
-    ndarray, shape (3,)
-        `T_target_source`; `se2.transform` with it moves `source` onto `target`.
-
-    Raises
-    ------
-    ValueError
-        If there is no point or the shapes differ.
-
-    """
-    if source.shape != target.shape or source.ndim != 2 or len(source) == 0:
-        raise ValueError(
-            f'expected equally many points (N, 2), N > 0, got {source.shape} and {target.shape}')
-    source_mean, target_mean = np.mean(source, axis=0), np.mean(target, axis=0)
-    p, q = source - source_mean, target - target_mean
-    cross = np.sum(p[:, 0] * q[:, 1] - p[:, 1] * q[:, 0])
-    theta = np.arctan2(cross, np.sum(np.sum(p * q, axis=1)))
-    return se2.wrapped(np.append(target_mean - se2.rotation(theta) @ source_mean, theta))
-
-
 def place_odometry(drive: Drive) -> Trajectory:
     """Return the odometry laid over truth, else fixes, else result; as it is if none overlaps."""
     anchors = [(drive.fix_stamps_ns, drive.fix_positions),
@@ -120,7 +89,7 @@ def place_odometry(drive: Drive) -> Trajectory:
         inside = drive.odometry.covers(stamps)
         if np.any(inside):
             odometry = drive.odometry.at(stamps[inside])[:, :2]
-            pose = fit_rigid(odometry, positions[inside])
+            pose = fit_similarity(odometry, positions[inside]).pose
             return Trajectory(drive.odometry.stamps_ns, se2.compose(pose, drive.odometry.poses))
     return drive.odometry
 

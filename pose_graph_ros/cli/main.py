@@ -20,6 +20,7 @@ SUMMARIES = {
     'demo': 'play a bag to the node over DDS',
     'replay': 'run a bag or a g2o file through the engine of the node, without ROS',
     'solve': 'optimise a g2o file',
+    'compare': 'compare trajectories: ATE, RPE, NEES',
     'simulate': 'write a simulated drive as a rosbag2',
     'parameters': 'print the parameters of the node',
     'compile-kernels': 'compile the solver for later starts',
@@ -49,6 +50,11 @@ def main(args: list[str] | None = None) -> int:
 def replay(args: list[str] | None = None) -> int:
     """Run `replay` as a separate program; return the exit code."""
     return _alone('replay', args)
+
+
+def compare(args: list[str] | None = None) -> int:
+    """Run `compare` as a separate program; return the exit code."""
+    return _alone('compare', args)
 
 
 def compile_kernels(args: list[str] | None = None) -> int:

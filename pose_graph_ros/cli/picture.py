@@ -156,15 +156,15 @@ def _draw_map(axes: Axes, drive: Drive, odometry: Trajectory) -> None:
         return f'{name}\nmedian {row.median:.{digits}f} m, rms {row.rms:.{digits}f} m'
 
     path = drive.corrected
-    axes.plot(*_some(path.poses[:, :2]).T, color=BLUE, linewidth=3.4, solid_capstyle='round',
+    axes.plot(*thinned(path.poses[:, :2]).T, color=BLUE, linewidth=3.4, solid_capstyle='round',
               zorder=3, label=label('corrected path'))
     if drive.truth is not None:
-        axes.plot(*_some(drive.truth.poses[:, :2]).T, color=INK, linewidth=0.8,
+        axes.plot(*thinned(drive.truth.poses[:, :2]).T, color=INK, linewidth=0.8,
                   linestyle=(0, (6, 4)), zorder=4, label='truth')
-    axes.plot(*_some(odometry.poses[:, :2]).T, color=PURPLE, linewidth=1.3, zorder=1,
+    axes.plot(*thinned(odometry.poses[:, :2]).T, color=PURPLE, linewidth=1.3, zorder=1,
               label=label('odometry alone'))
     used, doubted, held_out = (
-        _some(drive.fix_positions[chosen]) for chosen in drive.fix_kinds.values())
+        thinned(drive.fix_positions[chosen]) for chosen in drive.fix_kinds.values())
     if len(used):
         axes.plot(*used.T, 'o', color=ORANGE, markersize=4.5, markeredgewidth=0, alpha=0.55,
                   zorder=2, label=label('fixes'))
@@ -178,7 +178,7 @@ def _draw_map(axes: Axes, drive: Drive, odometry: Trajectory) -> None:
     for name, states, colour, line, order in LOOPS:
         shown = inside & drive.loops(*states)
         if np.any(shown):
-            ends = path.at(_some(drive.loop_stamps_ns[shown]))[..., :2]
+            ends = path.at(thinned(drive.loop_stamps_ns[shown]))[..., :2]
             apart = np.full((len(ends), 1, 2), np.nan)
             axes.plot(*np.concatenate((ends, apart), axis=1).reshape(-1, 2).T, linestyle=line,
                       color=colour, linewidth=1.2, marker='o', markerfacecolor='none',
@@ -234,7 +234,7 @@ def _draw_errors(axes: Axes, drive: Drive, odometry: Trajectory) -> None:
     highest = []
     for path, line_stamps, line_positions, style in lines:
         covered, errors = distances(path, line_stamps, line_positions)
-        axes.plot((_some(covered) - begin) * 1e-9, _some(errors), **style)
+        axes.plot((thinned(covered) - begin) * 1e-9, thinned(errors), **style)
         highest.append(float(np.percentile(errors, 99.0)) if len(errors) else 0.0)
     axes.set_xlim(0.0, max((end - begin) * 1e-9, 1.0))
     if highest[0] > LOG_RATIO * max(highest[1:], default=0.0) > 0.0:
@@ -251,7 +251,7 @@ def _draw_errors(axes: Axes, drive: Drive, odometry: Trajectory) -> None:
         axes.set_title('shaded: no fixes used', loc='right', fontsize=12, color=GREY)
 
 
-def _some(points: np.ndarray) -> np.ndarray:
+def thinned(points: np.ndarray) -> np.ndarray:
     """Return every n-th point, from the first on, so that there are not too many to draw."""
     return points[::max(-(-len(points) // MOST_POINTS), 1)]
 

@@ -3,7 +3,6 @@
 """Write the results of a run: corrected path, picture, summary and table of errors."""
 
 from collections.abc import Mapping
-from contextlib import suppress
 import json
 from pathlib import Path
 from types import MappingProxyType
@@ -12,8 +11,8 @@ from typing import Any
 import numpy as np
 
 from pose_graph_ros.adapters.bag_inputs import Inputs, read_inputs, read_static_frames
+from pose_graph_ros.adapters.bag_poses import POSE_TYPES, poses_on
 from pose_graph_ros.adapters.bags import BagError, BagReader, MessageError
-from pose_graph_ros.adapters.conversions import planar_pose, stamp_ns
 from pose_graph_ros.adapters.message_reader import MessageReader
 from pose_graph_ros.adapters.sources import Kind, ODOMETRY_KINDS
 from pose_graph_ros.cli.evaluation import Drive, evaluate, format_table, summary
@@ -30,9 +29,6 @@ from pose_graph_ros.core.measurements import Fix, GlobalPose, LoopClosure, Odome
 
 # Largest number of samples of a path that are kept for comparison and the picture.
 MOST_SAMPLES = 200_000
-
-TRUTH_TYPES = ('nav_msgs/msg/Odometry', 'geometry_msgs/msg/PoseStamped',
-               'geometry_msgs/msg/PoseWithCovarianceStamped')
 
 
 class PathCollector:
@@ -185,17 +181,13 @@ def read_truth(bag: BagReader, topic: str) -> Trajectory:
 
     """
     info = bag.topics.get(topic)
-    if info is None or info.type not in TRUTH_TYPES:
+    if info is None or info.type not in POSE_TYPES:
         what = 'no topic' if info is None else f'type {info.type} of'
         raise BagError(f'{bag.path}: {what} {topic} (--truth); expected one of '
-                       f'{", ".join(TRUTH_TYPES)}; the bag has {bag.describe()}')
+                       f'{", ".join(POSE_TYPES)}; the bag has {bag.describe()}')
     poses = PathCollector()
-    for bag_message in bag.messages([topic]):
-        with suppress(MessageError):
-            message = bag_message.decode()
-            pose = planar_pose(message.pose if info.type == TRUTH_TYPES[1] else message.pose.pose)
-            if pose is not None:
-                poses.add(stamp_ns(message), pose)
+    for stamp, pose, _ in poses_on(bag, topic):
+        poses.add(stamp, pose)
     return poses.path()
 
 

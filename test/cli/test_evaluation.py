@@ -9,8 +9,6 @@ from pathlib import Path
 import subprocess
 import sys
 
-from hypothesis import given, settings, strategies as st
-from hypothesis.extra.numpy import arrays
 from matplotlib.image import imread
 import numpy as np
 import pytest
@@ -20,7 +18,6 @@ from pose_graph_ros.cli.evaluation import (
     Drive,
     error_rows,
     evaluate,
-    fit_rigid,
     format_table,
     place_odometry,
     summary,
@@ -61,45 +58,6 @@ def without_fixes(drive: Drive) -> Drive:
     return replace(
         drive, fix_stamps_ns=np.zeros(0, dtype=np.int64), fix_positions=np.zeros((0, 2)),
         fix_held_out=np.zeros(0, dtype=bool))
-
-
-coordinates = st.floats(-1e3, 1e3)
-
-
-@settings(max_examples=50)
-@given(
-    source=st.integers(2, 20).flatmap(
-        lambda n: arrays(np.float64, (n, 2), elements=coordinates)),
-    pose=arrays(np.float64, 3, elements=coordinates))
-def test_fit_rigid_recovers_any_rigid_motion(source: np.ndarray, pose: np.ndarray) -> None:
-    target = se2.transform(pose, source)
-    fitted = fit_rigid(source, target)
-    np.testing.assert_allclose(se2.transform(fitted, source), target, atol=1e-6)
-    if np.ptp(source, axis=0).max() > 1.0:
-        np.testing.assert_allclose(
-            se2.between(fitted, se2.wrapped(pose)), 0.0, atol=1e-6)
-
-
-@settings(max_examples=30)
-@given(
-    source=arrays(np.float64, (6, 2), elements=coordinates),
-    target=arrays(np.float64, (6, 2), elements=coordinates),
-    other=arrays(np.float64, 3, elements=st.floats(-1.0, 1.0)))
-def test_no_other_rigid_motion_fits_better(
-    source: np.ndarray, target: np.ndarray, other: np.ndarray,
-) -> None:
-    fitted = fit_rigid(source, target)
-    best = np.sum((se2.transform(fitted, source) - target) ** 2)
-    moved = np.sum((se2.transform(fitted + other, source) - target) ** 2)
-    assert best <= moved * (1.0 + 1e-9) + 1e-6
-
-
-def test_fit_rigid_needs_points_and_turns_nothing_by_a_single_one() -> None:
-    np.testing.assert_allclose(
-        fit_rigid(np.array([[1.0, 2.0]]), np.array([[4.0, 6.0]])), [3.0, 4.0, 0.0])
-    for source, target in ((np.zeros((0, 2)), np.zeros((0, 2))), (np.zeros((2, 2)), np.zeros(2))):
-        with pytest.raises(ValueError, match='equally many points'):
-            fit_rigid(source, target)
 
 
 def test_distances_interpolate_inside_the_time_of_the_path_only() -> None:
