@@ -17,7 +17,7 @@ from distutils.command.install_data import install_data  # isort: skip  (setupto
 
 PACKAGE = 'pose_graph_ros'
 # those for `ros2 run`
-EXECUTABLES = ('pose_graph_node', 'replay', 'compare', 'compile_kernels')
+EXECUTABLES = ('pose_graph_node', 'replay', 'compare', 'compile_kernels', 'draw', 'marginalize')
 LIBEXEC = Path('lib', PACKAGE)
 HERE = Path(__file__).resolve().parent
 
@@ -65,6 +65,8 @@ setup(
             'replay = pose_graph_ros.cli.main:replay',
             'compare = pose_graph_ros.cli.main:compare',
             'compile_kernels = pose_graph_ros.cli.main:compile_kernels',
+            'draw = pose_graph_ros.cli.main:draw',
+            'marginalize = pose_graph_ros.cli.main:marginalize',
             'pose-graph = pose_graph_ros.cli.main:main',
         ],
     },

@@ -29,6 +29,7 @@ CORE = {
     'core.certificate': {'core.geometry', 'core.graph'},
     'core.marginalization': {
         'core.compiled', 'core.geometry', 'core.graph', 'core.elimination'},
+    'core.drawing': {'core.geometry', 'core.graph', 'core.elimination'},
     'core.smoother': {
         'core.compiled', 'core.geometry', 'core.graph', 'core.elimination', 'core.batch'},
     'core.odometry': {'core.compiled', 'core.geometry', 'core.graph'},

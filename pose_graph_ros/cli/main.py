@@ -21,6 +21,8 @@ SUMMARIES = {
     'replay': 'run a bag or a g2o file through the engine of the node, without ROS',
     'solve': 'optimise a g2o file',
     'compare': 'compare trajectories: ATE, RPE, NEES',
+    'draw': 'draw a small graph: SVG, PNG or DOT',
+    'marginalize': 'take nodes out of a graph, and keep what they told',
     'simulate': 'write a simulated drive as a rosbag2',
     'parameters': 'print the parameters of the node',
     'compile-kernels': 'compile the solver for later starts',
@@ -60,6 +62,16 @@ def compare(args: list[str] | None = None) -> int:
 def compile_kernels(args: list[str] | None = None) -> int:
     """Run `compile-kernels` as a separate program; return the exit code."""
     return _alone('compile-kernels', args)
+
+
+def draw(args: list[str] | None = None) -> int:
+    """Run `draw` as a separate program; return the exit code."""
+    return _alone('draw', args)
+
+
+def marginalize(args: list[str] | None = None) -> int:
+    """Run `marginalize` as a separate program; return the exit code."""
+    return _alone('marginalize', args)
 
 
 def _alone(tool: str, args: list[str] | None) -> int:

@@ -34,6 +34,8 @@ LEAST_PIVOT = 1e-13
 _NOTHING = 1e-14
 # Kinds of edges that turn with their poses.
 _RELATIVE = (EdgeKind.ODOMETRY, EdgeKind.LOOP_CLOSURE, EdgeKind.PRIOR)
+# Those to landmarks turn with poses and landmarks; a prior does with poses alone.
+_TO_LANDMARKS = (EdgeKind.POINT, EdgeKind.RANGE)
 
 
 class Cut(NamedTuple):
@@ -137,7 +139,7 @@ def marginal(
         says = np.flatnonzero(np.isin(columns // 3, kept))
         prior = Prior(part.node_ids[kept].astype(np.int64), poses[kept].copy(),
                       _symmetric(U[np.ix_(says, says)]), u[says], energy,
-                      bool(np.any(inside & fixed)) or _is_anchored(part))
+                      bool(np.any(inside & fixed)) or _is_anchored(part, part.node_ids[kept]))
     return Marginal(prior, part.edge_ids.astype(np.int64), part.observed_ids.astype(np.int64))
 
 
@@ -227,9 +229,12 @@ def _ends(edges: Edges) -> IntArray:
     return np.stack((edges.i, edges.j, edges.k))
 
 
-def _is_anchored(graph: Graph) -> bool:
-    """Tell whether a constraint knows where its nodes are in the map."""
-    return bool(graph.n_observed > 0 or not np.all(np.isin(graph.edges.kind, _RELATIVE))
+def _is_anchored(graph: Graph, kept: IntArray) -> bool:
+    """Tell whether a constraint knows where its nodes are in the map, of which some remain."""
+    relative = list(_RELATIVE)
+    if np.all(graph.is_pose[graph.node_rows(kept)]):
+        relative += _TO_LANDMARKS
+    return bool(graph.n_observed > 0 or not np.all(np.isin(graph.edges.kind, relative))
                 or any(prior.anchored for prior in graph.priors))
 
 

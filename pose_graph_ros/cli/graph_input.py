@@ -1,0 +1,82 @@
+# Copyright 2026 The pose_graph_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""Read a graph from a g2o file or a saved graph, and choose its nodes by their ids in the file."""
+
+import argparse
+from pathlib import Path
+import re
+import sys
+from typing import NamedTuple
+
+import numpy as np
+
+from pose_graph_ros.core.exceptions import ConfigError
+from pose_graph_ros.core.geometry.se2 import IntArray
+from pose_graph_ros.core.graph.graph import GraphRows
+from pose_graph_ros.core.io.g2o import EDGE2_ORDERS, read_g2o
+
+SAVED = b'{\n"sha256": "'
+"""Begin of the JSON file of a saved graph."""
+
+
+class NamedRows(NamedTuple):
+    """The rows of a graph, and the number of each hidden node in its file."""
+
+    rows: GraphRows
+    ids: IntArray
+
+
+def add_graph(parser: argparse.ArgumentParser, *, nargs: str | None = None) -> None:
+    """Add the arguments that give a graph."""
+    parser.add_argument('graph', type=Path, nargs=nargs,
+                        help='g2o file, or saved graph (its .json file, or the .g2o file beside '
+                             'it)')
+    parser.add_argument('--edge2', choices=EDGE2_ORDERS,
+                        help='format of the tag EDGE2 in this file')
+
+
+def read(path: Path, edge2_order: str | None) -> NamedRows:
+    """Return the graph in a file; warnings go to stderr. Raises FileFormatError."""
+    side = path if path.suffix == '.json' else path.with_suffix('.json')
+    if side == path or (side.is_file() and _begins_as_saved(side)):
+        # what reads saved graphs takes longer to load than all else here
+        from pose_graph_ros.core.io.graph_files import read_graph  # noqa: PLC0415
+
+        rows = read_graph(path).rows
+        return NamedRows(rows, rows.node_ids)
+    file = read_g2o(path, edge2_order)
+    for tag, number in sorted(file.skipped.items()):
+        print(f'warning: {path}: {number} lines {tag!r} are skipped', file=sys.stderr)
+    return NamedRows(file.graph.rows(), file.ids)
+
+
+def _begins_as_saved(path: Path) -> bool:
+    with path.open('rb') as file:
+        return file.read(len(SAVED)) == SAVED
+
+
+def rows_of(ids: IntArray, text: str, option: str) -> IntArray:
+    """
+    Return the rows of the nodes that a text names, such as `3,7,20:25`, ascending.
+
+    A range has both ends and need not be without gaps. Raises ConfigError that names the option.
+
+    Parameters
+    ----------
+    ids : ndarray, shape (N,), of all hidden nodes
+    text : str
+    option : str, for the message
+
+    """
+    chosen = np.zeros(len(ids), dtype=bool)
+    for word in text.split(','):
+        match = re.fullmatch(r'[xlb]?(-?\d{1,18})(?::[xlb]?(-?\d{1,18}))?', word.strip())
+        if match is None:
+            raise ConfigError(f'{option}: expected ids such as 3,7,20:25, got {text!r}')
+        low = int(match[1])
+        found = ids == low if match[2] is None else (ids >= low) & (ids <= int(match[2]))
+        if not np.any(found):
+            raise ConfigError(f'{option}: the graph has no hidden node {word.strip()}; ids are '
+                              f'{ids[0]} to {ids[-1]}')
+        chosen |= found
+    return np.flatnonzero(chosen)

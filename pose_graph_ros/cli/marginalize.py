@@ -1,0 +1,108 @@
+# Copyright 2026 The pose_graph_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""
+Take hidden nodes out of a graph; what their constraints say about the others remains.
+
+What remains is linear at the poses in the file, so solve it first. A single neighbour gets an
+observed node, two poses an edge; more than two a dense prior, which g2o does not have. With
+--sparse, edges stand for it which tell no more than it does.
+"""
+
+import argparse
+import json
+from pathlib import Path
+import sys
+
+import numpy as np
+
+from pose_graph_ros.cli.graph_input import add_graph, NamedRows, read, rows_of
+from pose_graph_ros.core.exceptions import ConfigError
+from pose_graph_ros.core.geometry.se2 import IntArray
+from pose_graph_ros.core.graph.constraints import NodeKind
+from pose_graph_ros.core.graph.graph import Graph, GraphUpdate
+from pose_graph_ros.core.io.g2o_writing import write_g2o
+from pose_graph_ros.core.io.saved_priors import standing_for
+from pose_graph_ros.core.marginalization.marginalize import marginalize
+
+LANDMARKS = 'landmarks'
+EXAMPLES = """
+examples:
+  pose-graph marginalize graph.g2o --nodes landmarks --sparse -o poses.g2o
+  pose-graph marginalize graph.g2o --nodes 3,7,20:25 -o smaller.g2o
+"""
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Add the arguments of this tool."""
+    add_graph(parser)
+    parser.add_argument('--nodes', metavar='IDS', required=True,
+                        help=f'nodes that leave, such as 3,7,20:25, or {LANDMARKS!r} for all of '
+                             'them')
+    parser.add_argument('-o', '--out', metavar='FILE', type=Path, required=True,
+                        help='g2o file of the graph without them')
+    parser.add_argument('--sparse', action='store_true',
+                        help='write conservative edges in place of dense priors')
+    parser.add_argument('--json', action='store_true', help='print JSON (docs/tools.md)')
+    parser.epilog = EXAMPLES
+
+
+def execute(options: argparse.Namespace) -> int:
+    """Run the tool; return the exit code."""
+    file = read(options.graph, options.edge2)
+    rows, ids = file
+    leaving = _leaving(options, file)
+    graph = Graph()
+    graph.fill(rows)
+    before = graph.energies().chi2
+    graph.apply(marginalize(graph, rows.node_ids[leaving]))
+    sizes = [len(prior.nodes) for prior in graph.priors]
+    if len(sizes) > 0 and not options.sparse:
+        raise ConfigError(
+            f'{options.graph}: without these nodes there are {len(sizes)} dense priors, the '
+            f'largest one on {max(sizes)} nodes, which g2o does not have; --sparse puts edges in '
+            'their place')
+    graph = _with_edges_for_priors(graph)
+    n_biases = int(np.count_nonzero(graph.is_bias))
+    if n_biases > 0:
+        print(f'warning: {n_biases} biases are left out of the g2o file; measurements with them '
+              'are written as if their errors were white', file=sys.stderr)
+    write_g2o(graph, options.out, np.delete(ids, leaving))
+    facts = {
+        'file': str(options.out), 'removed_nodes': len(leaving), 'hidden_nodes': graph.n_nodes,
+        'edges': graph.n_edges, 'observed_nodes': graph.n_observed, 'dense_priors': len(sizes),
+        'largest_dense_prior': max(sizes, default=0), 'chi2_before': before}
+    if options.json:
+        print(json.dumps(facts, indent=2))
+    else:
+        print(f'{len(leaving)} hidden nodes removed; {graph.n_nodes} left, with {graph.n_edges} '
+              f'edges and {graph.n_observed} observed nodes')
+        if len(sizes) > 0:
+            print(f'edges stand for {len(sizes)} dense priors, the largest one on {max(sizes)} '
+                  'nodes')
+        print(f'written: {options.out}')
+    return 0
+
+
+def _with_edges_for_priors(graph: Graph) -> Graph:
+    """Return a graph with edges and observed nodes in place of its dense priors."""
+    if graph.n_priors == 0:
+        return graph
+    rows = graph.rows()
+    edges, observed = standing_for(rows)
+    without = Graph()
+    without.fill(rows._replace(priors=()))
+    without.apply(GraphUpdate(edges=edges, observed=observed))
+    return without
+
+
+def _leaving(options: argparse.Namespace, file: NamedRows) -> IntArray:
+    """Return the rows of the nodes that leave; raise ConfigError unless there are some."""
+    if options.nodes == LANDMARKS:
+        rows = np.flatnonzero(file.rows.node_kind == NodeKind.LANDMARK)
+        if len(rows) == 0:
+            raise ConfigError(f'{options.graph}: has no landmarks')
+    else:
+        rows = rows_of(file.ids, options.nodes, '--nodes')
+    if not np.any(np.delete(file.rows.is_pose, rows)):
+        raise ConfigError('--nodes: no pose would be left')
+    return rows
