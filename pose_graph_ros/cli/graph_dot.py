@@ -25,8 +25,8 @@ def dot_text(panels: Sequence[tuple[str, Diagram, Layout]], notes: Sequence[str]
     """
     lines = ['digraph pose_graph {', '  layout=neato; overlap=true; splines=true; bgcolor=none;',
              f'  label={_quoted(" ".join(notes))}; fontcolor="{style.TEXT}"; fontsize=10;',
-             f'  node [fixedsize=true, style=filled, color="{style.BORDER}", fontcolor="{style.INK}", '
-             'fontsize=9];']
+             f'  node [fixedsize=true, style=filled, color="{style.BORDER}", '
+             f'fontcolor="{style.INK}", fontsize=9];']
     bottom = 0.0
     for n, (title, drawing, layout) in enumerate(panels):
         at = layout.at.copy()
