@@ -41,6 +41,7 @@ PATH_FILES = ('path.csv', 'path.tum')
 PICTURES = ('.png', '.pdf', '.svg')
 STATISTICS = ('rmse', 'mean', 'median', 'std', 'min', 'max', 'sse')
 LONGEST_NAME = 23
+MOST_SECONDS = 4e9  # of an offset
 MUCH_BETTER = 0.5  # ratio of the errors with and without an alignment, below which it is told
 NEES_NOTE = ('the interval of the mean holds for independent errors and a reference without any; '
              'the errors\nalong one path are not independent, so that its true interval is wider')
@@ -60,15 +61,15 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
                         help='plane of poses in space; camera poses of KITTI move in xz '
                              '(default: %(default)s)')
     association = parser.add_argument_group('association of stamps')
-    association.add_argument('--max-difference', metavar='S', type=_number, default=0.01,
+    association.add_argument('--max-difference', metavar='S', type=_difference, default=0.01,
                              help='largest difference of stamps [s] (default: %(default)s)')
-    association.add_argument('--offset', metavar='S', type=float, default=0.0,
+    association.add_argument('--offset', metavar='S', type=_seconds, default=0.0,
                              help='added to the stamps of the estimates [s]')
     association.add_argument('--interpolate', action='store_true',
                              help='of the poses so associated, interpolate those of the '
                                   'trajectory with more poses at the stamps of the other')
     relative = parser.add_argument_group('relative errors')
-    relative.add_argument('--delta', metavar='N', type=_number, default=1.0,
+    relative.add_argument('--delta', metavar='N', type=float, default=1.0,
                           help='length of the motions (default: %(default)g)')
     relative.add_argument('--unit', choices=[each.value for each in Unit], default='frames',
                           help='of --delta (default: %(default)s)')
@@ -82,11 +83,19 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
                         help=f'draw paths and errors; the name ends in {", ".join(PICTURES)}')
 
 
-def _number(text: str) -> float:
-    """Return a finite number of at least 0."""
+def _seconds(text: str) -> float:
+    """Return seconds that fit into a stamp."""
     value = float(text)
-    if not 0.0 <= value < float('inf'):
-        raise argparse.ArgumentTypeError(f'expected a finite number of at least 0, got {text}')
+    if not abs(value) <= MOST_SECONDS:
+        raise argparse.ArgumentTypeError(f'expected at most {MOST_SECONDS:g} s, got {text}')
+    return value
+
+
+def _difference(text: str) -> float:
+    """Return seconds, not below 0."""
+    value = _seconds(text)
+    if value < 0.0:
+        raise argparse.ArgumentTypeError(f'expected at least 0 s, got {text}')
     return value
 
 

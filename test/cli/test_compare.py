@@ -218,6 +218,7 @@ def test_it_is_a_program_of_its_own(paths: Path, capsys: pytest.CaptureFixture[s
     (['truth.tum', 'demo', '--offset', '900'], 'truth.tum and .*demo: no stamps are within'),
     (['truth.tum', 'broken.tum'], 'broken.tum:2: expected 8 values, got 3'),
     (['truth.tum', 'demo', '--delta', '1.5'], 'delta: expected a whole number of frames'),
+    (['truth.tum', 'demo', '--unit', 'metres', '--delta', 'nan'], 'delta: expected a finite'),
     (['truth.tum', 'demo', '--plot', 'a.txt'], 'a.txt: the name must end in .png'),
 ])
 def test_what_is_wrong_is_said_in_one_line(
@@ -232,6 +233,17 @@ def test_what_is_wrong_is_said_in_one_line(
     assert printed.err.count('\n') == 1
     for part in message.split('.*'):
         assert part in printed.err
+
+
+@pytest.mark.parametrize('words', [
+    ['--offset', 'nan'], ['--offset', '1e300'], ['--max-difference', '-1'],
+    ['--max-difference', 'inf'], ['--align', 'so3'], ['--delta', 'one']])
+def test_options_that_are_none_are_refused(
+    words: list[str], capsys: pytest.CaptureFixture[str],
+) -> None:
+    with pytest.raises(SystemExit, match='2'):
+        main(['compare', 'a', 'b', *words])
+    assert f'argument {words[0]}: ' in capsys.readouterr().err
 
 
 def test_poses_with_a_stamp_twice_are_told(

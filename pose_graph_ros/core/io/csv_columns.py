@@ -8,7 +8,8 @@ them; the separator is a comma, a semicolon, a tabulator or spaces. Units, as in
 `yaw_rad (nan if none)`, and upper case do not matter. Names that are known, others are ignored:
 
     stamp       stamp, timestamp, time, t; in seconds, or in nanoseconds if named so (stamp_ns,
-                `[ns]`) or if a whole number of at least 15 digits; without it, poses are in order
+                `[ns]`) or if a whole number of at least 15 digits
+    id          id, if there is no stamp; without both, poses are in order
     position    x, y and maybe z; also tx, pos_x, p_x, position_x, p_rs_r_x (EuRoC), east, north
     heading     theta, yaw, heading [rad]; or a quaternion qx qy qz qw, also q_x, q_rs_x (EuRoC),
                 orientation_x; without either, headings are unknown
@@ -52,6 +53,8 @@ class Columns:
     """Of the nine elements of the covariance of x, y and heading; empty if there is none."""
     stamp: int | None = None
     """Of the stamp; None if there is none."""
+    id: int | None = None
+    """Of the id of the node; None if there is none."""
     nanoseconds: bool | None = None
     """Whether stamps are in nanoseconds, not in seconds; None if nothing says so."""
     separator: str | None = None
@@ -97,7 +100,7 @@ def columns_of(path: Path, lines: list[str], first: int) -> Columns | None:
         len(names), tuple(each for each in xyz if each is not None),
         () if heading is None or None not in quaternion else (heading,),
         _all_or_none(quaternion), _all_or_none([covariance[k] for k in FULL]), stamp,
-        None if stamp is None else _in_nanoseconds(texts[stamp]), separator,
+        _find(names, ('id',)), None if stamp is None else _in_nanoseconds(texts[stamp]), separator,
         at + 1)
 
 

@@ -33,6 +33,7 @@ TUM = Columns(TUM_NUMBERS, (1, 2, 3), quaternion=(4, 5, 6, 7), stamp=0, nanoseco
 SECOND = 10**9  # [ns]
 DIGITS_OF_NANOSECONDS = 15
 """Least number of digits of a whole number that is a stamp in nanoseconds, if none says so."""
+MOST_STAMP_NS = 2**62  # the difference of two still fits
 LEAST_NORM = 1e-6  # of a quaternion
 GRAPH_TAGS = ('VERTEX', 'EDGE', 'FIX')
 
@@ -127,10 +128,13 @@ def _of_columns(path: Path, rows: list[Line], columns: Columns, plane: str) -> P
             poses[:, 2] = se2.wrap(_numbers(path, rows, columns.heading, finite=False)[:, 0])
     covariances = _numbers(path, rows, columns.covariance, finite=False).reshape(
         -1, 3, 3) if columns.covariance else None
-    if columns.stamp is None:
-        return in_order(np.arange(len(rows)), poses, Key.INDEX, covariances)
-    stamps = _stamps(path, rows, columns.stamp, columns.nanoseconds)
-    return in_order(stamps, poses, Key.STAMP, covariances)
+    if columns.stamp is not None:
+        stamps = _stamps(path, rows, columns.stamp, columns.nanoseconds)
+        return in_order(stamps, poses, Key.STAMP, covariances)
+    if columns.id is not None:
+        ids = _numbers(path, rows, [columns.id])[:, 0].astype(np.int64)
+        return in_order(ids, poses, Key.ID, covariances)
+    return in_order(np.arange(len(rows)), poses, Key.INDEX, covariances)
 
 
 def _split(
@@ -173,7 +177,10 @@ def _stamps(path: Path, rows: list[Line], column: int, nanoseconds: bool | None)
     stamps = np.empty(len(rows), dtype=np.int64)
     for k, text in enumerate(texts):
         try:
-            stamps[k] = int(text) if nanoseconds else _seconds(text)
+            stamp = int(text) if nanoseconds else _seconds(text)
+            if abs(stamp) > MOST_STAMP_NS:
+                raise OverflowError
+            stamps[k] = stamp
         except (ValueError, OverflowError, ArithmeticError) as error:
             raise FileFormatError(f'{path}:{rows[k][0]}: {text!r} is no stamp') from error
     return stamps

@@ -26,6 +26,8 @@ from pose_graph_ros.core.trajectories.statistics import (
     summarize,
 )
 
+MOST_METRES = 1e12  # beyond this, squares of errors lose all digits
+
 
 class Alignment(Enum):
     """What an estimate may be moved by before it is compared."""
@@ -109,8 +111,9 @@ def compare(
     options = Options() if options is None else options
     found = associate(reference, estimate, options.max_difference_ns, options.offset_ns,
                       interpolate=options.interpolate)
-    if not np.all(np.isfinite(found.reference[:, :2]) & np.isfinite(found.estimate[:, :2])):
-        raise TrajectoryError('positions are not finite')
+    for poses in (found.reference, found.estimate):
+        if not np.all(np.abs(poses[:, :2]) <= MOST_METRES):
+            raise TrajectoryError(f'positions are not finite, or beyond {MOST_METRES:g} m')
     rigid = fit_similarity(found.estimate[:, :2], found.reference[:, :2])
     best = np.linalg.norm((rigid.apply(found.estimate) - found.reference)[:, :2])
     similarity = {

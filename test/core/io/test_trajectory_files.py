@@ -84,6 +84,10 @@ def test_a_table_may_have_covariances_and_no_headings(tmp_path: Path) -> None:
     assert found.covariances is not None
     np.testing.assert_array_equal(found.covariances[0], [[1, 2, 3], [2, 4, 5], [3, 5, 6]])
     assert np.all(np.isnan(found.covariances[1]))
+    found = read(tmp_path / 'marginals.csv', 'id,x,y,theta,cov_xx,cov_xy,cov_xtheta,cov_yy,'
+                                             'cov_ytheta,cov_thetatheta\n4,1,2,0,1,2,3,4,5,6\n')
+    assert (found.key, found.keys.tolist()) == (Key.ID, [4])
+    np.testing.assert_array_equal(found.covariances, [[[1, 2, 3], [2, 4, 5], [3, 5, 6]]])
     found = read(tmp_path / 'gps.csv', 'x,y\n1,2\n3,4\n')
     assert found.key is Key.INDEX
     assert np.all(np.isnan(found.poses[:, 2]))
@@ -115,6 +119,7 @@ def test_vertices_of_a_graph_have_ids_and_are_composed_where_they_are_missing(
     ('0 0 0 0 0 0 0 1\nlater 0 0 0 0 0 0 1\n', "a.txt:2: 'later' is no stamp"),
     ('nan 0 0 0 0 0 0 1\n', "a.txt:1: 'nan' is no stamp"),
     ('1e400 0 0 0 0 0 0 1\n', "a.txt:1: '1e400' is no stamp"),
+    ('9e9 0 0 0 0 0 0 1\n', "a.txt:1: '9e9' is no stamp"),
     ('1,2,3,4\n', 'a.txt:1: a table needs a header'),
     ('stamp,north\n0,0\n', 'a.txt:1: the header names no x and y: stamp, north'),
     ('stamp,x,y\n0,,1\n', 'a.txt:2: holds a number that is missing'),

@@ -101,5 +101,6 @@ def test_headings_that_are_not_known_have_no_errors() -> None:
 
 def test_positions_must_be_finite() -> None:
     truth, estimate = drawn()
-    with pytest.raises(TrajectoryError, match='finite'):
-        compare(PoseSequence(Trajectory(truth.keys, truth.poses * np.inf)), estimate)
+    for factor in (np.inf, np.nan, 1e200):
+        with pytest.raises(TrajectoryError, match='not finite, or beyond'):
+            compare(PoseSequence(Trajectory(truth.keys, truth.poses * factor)), estimate)
