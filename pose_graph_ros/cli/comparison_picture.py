@@ -21,6 +21,8 @@ from pose_graph_ros.core.trajectories.statistics import PROBABILITY
 COLOURS = (BLUE, VERMILION, GREEN, ORANGE, '#CC79A7', '#56B4E9')
 SIZE, DPI = (16.0, 8.5), 100  # of the picture [inch] and resolution [dots per inch]
 LONGEST_NAME = 44
+LOG_RATIO, LOG_FLOOR = 10.0, 0.1
+"""Largest ratio of a NEES to its quantile on a linear axis; lower end of a logarithmic one."""
 
 
 def draw_comparison(
@@ -59,7 +61,7 @@ def draw_comparison(
                 axes[panel].set_title(title, loc='left', fontweight='bold', color=INK)
                 axes[panel].set_ylim(0.0, 1.08 * axes[panel].dataLim.y1 or 1.0)
         if 'nees' in axes:
-            _draw_expectation(axes['nees'])
+            _draw_expectation(axes['nees'], results)
         axes[panels[-1]].set_xlabel(
             'time [s]' if results[0].key is Key.STAMP else f'pose by {results[0].key.value}')
         figure.savefig(file)
@@ -97,13 +99,18 @@ def _draw_errors(
         line('nees', at, result.nees['position'])
 
 
-def _draw_expectation(axes: Axes) -> None:
+def _draw_expectation(axes: Axes, results: Sequence[Comparison]) -> None:
     """Draw what the NEES of a position is on average, and its 95 % quantile."""
     quantile = float(chi2.ppf(PROBABILITY, 2))
     axes.axhline(2.0, color=INK, linewidth=1.0)
     axes.axhline(quantile, color=INK, linewidth=1.0, linestyle='--')
     axes.set_title(f'solid: expected, dashed: {100.0 * PROBABILITY:g} % are below', loc='right',
                    color=GREY, fontsize=10)
+    largest = max((float(np.nanmax(result.nees['position'])) for result in results
+                   if result.nees and not np.all(np.isnan(result.nees['position']))), default=0.0)
+    if largest > LOG_RATIO * quantile:
+        axes.set_yscale('log')
+        axes.set_ylim(LOG_FLOOR, 2.0 * largest)
 
 
 def _short(name: str) -> str:

@@ -47,3 +47,35 @@ def test_it_needs_points_and_turns_nothing_by_a_single_one() -> None:
     for source, target in ((np.zeros((0, 2)), np.zeros((0, 2))), (np.zeros((2, 2)), np.zeros(2))):
         with pytest.raises(ValueError, match='equally many points'):
             fit_similarity(source, target)
+
+
+def umeyama(source: np.ndarray, target: np.ndarray) -> tuple[np.ndarray, np.ndarray, float]:
+    """Return rotation, translation and scale as in equations (39) to (43) of Umeyama 1991."""
+    means = np.mean(source, axis=0), np.mean(target, axis=0)
+    p, q = source - means[0], target - means[1]
+    U, D, Vt = np.linalg.svd(q.T @ p / len(p))
+    S = np.diag([1.0, np.sign(np.linalg.det(U) * np.linalg.det(Vt))])
+    R, scale = U @ S @ Vt, np.trace(np.diag(D) @ S) / np.mean(np.sum(p * p, axis=1))
+    return R, means[1] - scale * R @ means[0], scale
+
+
+@pytest.mark.parametrize('mirrored', [False, True])
+def test_the_similarity_is_umeyamas(mirrored: bool) -> None:
+    rng = np.random.default_rng(2)
+    source = rng.normal(size=(50, 2)) * (5.0, 2.0)
+    pose = np.array([1.0, -4.0, 2.5])
+    target = 0.3 * se2.transform(pose, source * (1.0, -1.0 if mirrored else 1.0))
+    target += 0.1 * rng.normal(size=target.shape)
+    R, t, scale = umeyama(source, target)
+    found = fit_similarity(source, target, with_scale=True)
+    np.testing.assert_allclose(se2.rotation(found.pose[2]), R, atol=1e-12)
+    np.testing.assert_allclose(found.pose[:2], t, atol=1e-12)
+    assert found.scale == pytest.approx(scale, rel=1e-12)
+    moved = found.apply(np.column_stack((source, np.zeros(50))))
+    np.testing.assert_allclose(moved[:, :2], scale * source @ R.T + t, atol=1e-12)
+
+
+def test_a_single_point_has_no_scale() -> None:
+    found = fit_similarity(np.ones((3, 2)), np.ones((3, 2)) * 5.0, with_scale=True)
+    assert found.scale == 1.0
+    np.testing.assert_allclose(found.pose, [4.0, 4.0, 0.0])
