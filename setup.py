@@ -85,6 +85,7 @@ setup(
         'pyproj>=3.6',
         'matplotlib>=3.6',
         'rosbags>=0.11',
+        'tqdm>=4.66',
         'PyYAML>=6.0',
     ],
     extras_require={

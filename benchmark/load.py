@@ -31,9 +31,9 @@ from benchmark import report
 from benchmark.feeder import DATUM, Feeder, Phase
 from benchmark.metrics import Metric
 from benchmark.section import say, Section, Table
+from pose_graph_ros.adapters.output_cdr import path_cdr
 from pose_graph_ros.cli.demo import isolated_environment
 from pose_graph_ros.core.geometry.trajectory import Trajectory
-from pose_graph_ros.ros.messages import path_cdr
 from pose_graph_ros.ros.spinning import EventsExecutor
 
 NODE = 'pose_graph_ros.ros.main'

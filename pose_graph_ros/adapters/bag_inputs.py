@@ -7,7 +7,7 @@ from dataclasses import dataclass, field
 import logging
 from typing import NamedTuple
 
-from pose_graph_ros.adapters.bags import BagError, BagMessage, BagReader, MessageError
+from pose_graph_ros.adapters.bags import Bag, BagError, BagMessage, MessageError, Span, WHOLE
 from pose_graph_ros.adapters.sources import CLOSURES, Kind, KNOWN_SOURCES, ODOMETRY_KINDS, Source
 
 logger = logging.getLogger(__name__)
@@ -25,6 +25,7 @@ class Inputs:
     kinds: Mapping[str, Kind] = field(default_factory=dict)  # kind by name of the source
     hold_out: int = 0
     """Every n-th fix (global pose, if there are no fixes) is held out; 0 holds out none."""
+    span: Span = WHOLE  # when the messages that are read were recorded
 
     def __post_init__(self) -> None:
         if self.hold_out < 0 or self.hold_out == 1:
@@ -44,8 +45,8 @@ class InputMessage(NamedTuple):
 
 
 def choose_inputs(
-    reader: BagReader, sources: Sequence[Source], wanted: Mapping[str, str | None],
-    hold_out: int = 0,
+    reader: Bag, sources: Sequence[Source], wanted: Mapping[str, str | None],
+    hold_out: int = 0, span: Span = WHOLE,
 ) -> Inputs:
     """
     Return the topics that feed the sources: wanted ones, else by parameter, else guessed.
@@ -59,6 +60,7 @@ def choose_inputs(
     sources : sequence of Source, all sources of the node
     wanted : mapping, topic by name of the source; None leaves the choice open
     hold_out : int, as in `Inputs`
+    span : Span, as in `Inputs`
 
     Raises
     ------
@@ -87,7 +89,7 @@ def choose_inputs(
         if guess is not None:
             topics[name] = guess
     ordered = {name: topics[name] for name in kinds if name in topics}
-    inputs = Inputs(ordered, {name: kinds[name] for name in ordered}, hold_out)
+    inputs = Inputs(ordered, {name: kinds[name] for name in ordered}, hold_out, span)
     if len(inputs.of(*ODOMETRY_KINDS)) == 0:
         raise BagError(f'{reader.path}: no topic of type {Kind.ODOMETRY.message_type} for the '
                        f'odometry; the bag has {reader.describe()}')
@@ -98,7 +100,7 @@ def _option(name: str) -> str:
     return name.replace('_', '-')
 
 
-def _checked(reader: BagReader, name: str, kind: Kind, topic: str) -> str:
+def _checked(reader: Bag, name: str, kind: Kind, topic: str) -> str:
     """Return a topic that was asked for, if the bag has it and it is of the type of the source."""
     option = f'--{_option(name)}' if name in OPTIONS else f'{name}.topic'
     info = reader.topics.get(topic)
@@ -112,7 +114,7 @@ def _checked(reader: BagReader, name: str, kind: Kind, topic: str) -> str:
 
 
 def _guess(
-    reader: BagReader, name: str, kinds: Mapping[str, Kind], topics: Mapping[str, str],
+    reader: Bag, name: str, kinds: Mapping[str, Kind], topics: Mapping[str, str],
     *, asked: bool,
 ) -> str | None:
     """Return the topic of a source for which none was given; None if there is no candidate."""
@@ -135,7 +137,7 @@ def _guess(
     return free[0]
 
 
-def read_inputs(reader: BagReader, inputs: Inputs) -> Iterator[InputMessage]:
+def read_inputs(reader: Bag, inputs: Inputs) -> Iterator[InputMessage]:
     """
     Iterate over the messages of the inputs in the order in which they were recorded.
 
@@ -150,14 +152,14 @@ def read_inputs(reader: BagReader, inputs: Inputs) -> Iterator[InputMessage]:
         sources.setdefault(topic, []).append(source)
     held = inputs.of(Kind.FIX) or inputs.of(Kind.GLOBAL_POSE)
     count = 0
-    for message in reader.messages(list(sources)):
+    for message in reader.messages(list(sources), inputs.span):
         for source in sources[message.topic]:
             count += source in held
             yield InputMessage(source, message, source in held and inputs.hold_out > 0
                                and count % inputs.hold_out == 0)
 
 
-def read_static_frames(reader: BagReader) -> list[BagMessage]:
+def read_static_frames(reader: Bag) -> list[BagMessage]:
     """Return the valid messages of a bag on /tf_static, to be received before all others."""
     topic, type_name = STATIC_FRAMES
     if topic not in reader.topics or reader.topics[topic].type != type_name:

@@ -8,7 +8,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from pose_graph_ros.adapters.bags import BagError, BagReader, MessageError
+from pose_graph_ros.adapters.bags import Bag, BagError, MessageError, Span, WHOLE
 from pose_graph_ros.adapters.conversions import Message, PLANAR, planar_pose, stamp_ns
 from pose_graph_ros.core.compiled.growing_array import GrowingArray
 from pose_graph_ros.core.geometry.se2 import FloatArray
@@ -28,10 +28,18 @@ class BagPose(NamedTuple):
     covariance: FloatArray | None  # in the axes of the parent frame, shape (3, 3)
 
 
-def poses_on(bag: BagReader, topic: str) -> Iterator[BagPose]:
-    """Yield the valid poses on a topic with one of `POSE_TYPES`; invalid messages are ignored."""
+def poses_on(bag: Bag, topic: str, span: Span = WHOLE) -> Iterator[BagPose]:
+    """
+    Yield the valid poses on a topic with one of `POSE_TYPES`; invalid messages are ignored.
+
+    Parameters
+    ----------
+    topic : str
+    span : Span, when the messages were recorded
+
+    """
     bare = bag.topics[topic].type == POSE
-    for bag_message in bag.messages([topic]):
+    for bag_message in bag.messages([topic], span):
         with suppress(MessageError):
             message = bag_message.decode()
             found = _pose(message, message if bare else message.pose)
@@ -39,7 +47,7 @@ def poses_on(bag: BagReader, topic: str) -> Iterator[BagPose]:
                 yield found
 
 
-def read_poses(bag: BagReader, topic: str) -> PoseSequence:
+def read_poses(bag: Bag, topic: str) -> PoseSequence:
     """
     Return the poses on a topic by stamp; of a `nav_msgs/Path`, those of the last message.
 
@@ -68,7 +76,7 @@ def read_poses(bag: BagReader, topic: str) -> PoseSequence:
                     covariances.values if len(covariances) > 0 else None)
 
 
-def _last_path(bag: BagReader, topic: str) -> Iterator[BagPose]:
+def _last_path(bag: Bag, topic: str) -> Iterator[BagPose]:
     """Yield the poses of the last valid message."""
     last = None
     for message in bag.messages([topic]):

@@ -2,7 +2,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """Write rosbag2 folders in the format of ROS 2 Jazzy, without a ROS installation."""
 
-from collections.abc import Collection
+from collections.abc import Callable, Collection
+from functools import partial
 from pathlib import Path
 import shutil
 import tempfile
@@ -10,6 +11,7 @@ from typing import Any, Final, Self
 
 from rosbags.interfaces import (
     Connection,
+    ConnectionExtRosbag1,
     Qos,
     QosDurability,
     QosHistory,
@@ -19,13 +21,24 @@ from rosbags.interfaces import (
 )
 from rosbags.rosbag2 import StoragePlugin, Writer
 from rosbags.typesys import get_typestore, Stores
+from rosbags.typesys.store import Typestore
 
-from pose_graph_ros.adapters.bags import BAG_FILE_SUFFIXES, BagError, one_line
+from pose_graph_ros.adapters.bags import (
+    BAG_FILE_SUFFIXES,
+    BagError,
+    BagMessage,
+    MessageError,
+    one_line,
+    own_types,
+)
 
 STORAGES = {'mcap': StoragePlugin.MCAP, 'sqlite3': StoragePlugin.SQLITE3}
 BAG_VERSION: Final = 9
 """Version of the metadata of ROS 2 Jazzy."""
 STATIC_TRANSFORMS = '/tf_static'
+HEADER = 'std_msgs/msg/Header'
+NO_HASH = 'RIHS01_' + 64 * '0'
+"""Of a type whose definition is unknown."""
 FOREVER = QosTime(9223372036, 854775807)  # the "infinite" duration of rmw, 2^63 - 1 ns
 
 
@@ -67,6 +80,8 @@ class BagWriter:
         self._latched = {STATIC_TRANSFORMS, *latched}
         self._types = get_typestore(Stores.ROS2_JAZZY)
         self._connections: dict[tuple[str, str], Connection] = {}
+        # by type, of ROS 1: new name of the type, and how its messages are converted
+        self._converters: dict[str, tuple[str, Callable[[bytes], bytes | memoryview]]] = {}
         # under its final name in a scratch folder: rosbags names the files after their folder
         try:
             self.folder.parent.mkdir(parents=True, exist_ok=True)
@@ -121,16 +136,87 @@ class BagWriter:
                 ) from error
         self._writer.write(self._connections[topic, type_name], recorded_ns, message)
 
+    def copy(self, message: BagMessage) -> None:
+        """
+        Append a message of another bag as it is, or converted if that is of ROS 1.
+
+        Its type may be any that its bag defines.
+
+        Raises
+        ------
+        MessageError
+            If it cannot be converted.
+
+        """
+        source, data, type_name = message.connection, message.raw, message.type
+        if isinstance(source.ext, ConnectionExtRosbag1):
+            if type_name not in self._converters:
+                self._converters[type_name] = _from_ros1(source, self._types)
+            type_name, convert = self._converters[type_name]
+            try:
+                data = bytes(convert(data))
+            except Exception as error:  # generated code can raise anything on invalid bytes
+                raise MessageError(
+                    f'{message.topic}: message recorded at {message.recorded_ns} ns is no '
+                    f'{message.type}: {one_line(error)}') from error
+        key = message.topic, type_name
+        if key not in self._connections:
+            if isinstance(source.ext, ConnectionExtRosbag1):
+                types = _ros2_types(source, self._types)
+                qos = [_qos(latched=message.topic in self._latched or bool(source.ext.latching))]
+            else:
+                types = own_types(source) or self._types
+                qos = list(source.ext.offered_qos_profiles)
+            known = type_name in types.fielddefs
+            # without a definition the type is left to the reader, as rosbag2 itself does
+            self._connections[key] = self._writer.add_connection(
+                *key, typestore=types if known else None, msgdef=None if known else '',
+                rihs01=None if known else source.digest or NO_HASH, offered_qos_profiles=qos)
+        self._writer.write(self._connections[key], message.recorded_ns, data)
+
     def _connect(self, topic: str, type_name: str) -> Connection:
         if type_name not in self._types.fielddefs:
             raise BagError(f'{self.folder}: {topic}: type {type_name} is unknown to ROS 2 Jazzy')
-        depth, durability = ((1, QosDurability.TRANSIENT_LOCAL) if topic in self._latched
-                             else (10, QosDurability.VOLATILE))
-        qos = Qos(
-            QosHistory.KEEP_LAST, depth, QosReliability.RELIABLE, durability, FOREVER, FOREVER,
-            QosLiveliness.AUTOMATIC, FOREVER, avoid_ros_namespace_conventions=False)
         return self._writer.add_connection(
-            topic, type_name, typestore=self._types, offered_qos_profiles=[qos])
+            topic, type_name, typestore=self._types,
+            offered_qos_profiles=[_qos(latched=topic in self._latched)])
+
+
+def _qos(*, latched: bool) -> Qos:
+    depth, durability = ((1, QosDurability.TRANSIENT_LOCAL) if latched
+                         else (10, QosDurability.VOLATILE))
+    return Qos(
+        QosHistory.KEEP_LAST, depth, QosReliability.RELIABLE, durability, FOREVER, FOREVER,
+        QosLiveliness.AUTOMATIC, FOREVER, avoid_ros_namespace_conventions=False)
+
+
+def _from_ros1(
+    source: Connection, jazzy: Typestore,
+) -> tuple[str, Callable[[bytes], bytes | memoryview]]:
+    """Return the ROS 2 name of a type of a ROS 1 bag, and what converts its messages to CDR."""
+    from rosbags.convert import converter  # noqa: PLC0415  (needed for few bags)
+
+    types = own_types(source) or get_typestore(Stores.ROS1_NOETIC)
+    name = converter.STATIC_MSGTYPE_RENAMES.get(source.msgtype, source.msgtype)
+    target = _ros2_types(source, jazzy)
+    if converter.is_same_wireformat(types, target, source.msgtype, name):
+        return name, partial(target.ros1_to_cdr, typename=name)
+    return name, partial(
+        converter.migrate_bytes, types, target, source.msgtype, name, {}, src_is2=False,
+        dst_is2=True)
+
+
+def _ros2_types(source: Connection, jazzy: Typestore) -> Typestore:
+    """Return ROS 2 types with that of a ROS 1 bag: the own ones, with the header of ROS 2."""
+    from rosbags.convert import converter  # noqa: PLC0415  (needed for few bags)
+
+    name = converter.STATIC_MSGTYPE_RENAMES.get(source.msgtype, source.msgtype)
+    if name in jazzy.fielddefs:
+        return jazzy
+    types = get_typestore(Stores.EMPTY)
+    types.register({**(own_types(source) or get_typestore(Stores.ROS1_NOETIC)).fielddefs,
+                    HEADER: jazzy.fielddefs[HEADER]})
+    return types
 
 
 def message_types() -> dict[str, Any]:

@@ -8,13 +8,14 @@ be read raises `BagError`, whose message begins with the path. The caller decode
 that one that cannot be decoded (`MessageError`) does not end the iteration.
 """
 
+from abc import ABC, abstractmethod
 from collections import Counter
 from collections.abc import Callable, Collection, Iterator
 from dataclasses import dataclass, field
 from functools import partial
 import logging
 from pathlib import Path
-from typing import Any, Self
+from typing import Any, NamedTuple, Self
 
 from rosbags.interfaces import Connection, MessageDefinitionFormat
 from rosbags.rosbag1 import Reader as Rosbag1Reader
@@ -56,6 +57,7 @@ class BagMessage:
     type: str
     recorded_ns: int  # when the recorder received the message [ns]; not the stamp in its header
     raw: bytes  # the message as stored: in CDR in a rosbag2, in the ROS 1 format in a .bag file
+    connection: Connection = field(repr=False, compare=False)  # definition, quality of service
     _decode: Callable[[bytes], Any] = field(repr=False, compare=False)
 
     def decode(self) -> Any:
@@ -68,7 +70,55 @@ class BagMessage:
                 f'{one_line(error)}') from error
 
 
-class BagReader:
+class Span(NamedTuple):
+    """Time in which messages were recorded."""
+
+    begin_ns: int | None = None
+    """Stamp of recording from which on there are messages [ns]; None from the first one on."""
+    end_ns: int | None = None
+    """Stamp before which they were recorded [ns]; None up to the last one."""
+
+
+WHOLE = Span()
+
+
+class Bag(ABC):
+    """What a bag and several in a row have in common."""
+
+    path: Path | str
+    topics: dict[str, TopicInfo]  # topics by name
+    start_ns: int  # when the first message was recorded [ns]
+    end_ns: int  # 1 ns after the last one was; not after `start_ns` if there are no messages
+
+    def messages(self, topics: Collection[str], span: Span = WHOLE) -> Iterator[BagMessage]:
+        """
+        Iterate over the messages of some topics in the order in which they were recorded.
+
+        Raises `BagError`: at the call for an unknown topic, on iteration for a damaged file.
+
+        Parameters
+        ----------
+        topics : collection of str
+        span : Span, when the messages were recorded
+
+        """
+        unknown = sorted(set(topics) - set(self.topics))
+        if unknown:
+            raise BagError(
+                f'{self.path}: no topic {", ".join(unknown)}; the bag has {self.describe()}')
+        return self._messages(topics, span)
+
+    def describe(self) -> str:
+        """Return the topics with their types on one line, for error messages."""
+        return ', '.join(
+            f'{name} ({info.type})' for name, info in self.topics.items()) or 'no topics'
+
+    @abstractmethod
+    def _messages(self, topics: Collection[str], span: Span) -> Iterator[BagMessage]:
+        """Iterate over the messages of topics that the bag has."""
+
+
+class BagReader(Bag):
     """
     An open bag, a context manager; made by `open_bag`.
 
@@ -82,11 +132,12 @@ class BagReader:
         self.path = path
         self._reader = reader
         self._decoders: dict[str, Callable[[bytes], Any]] = {}
-        self.topics: dict[str, TopicInfo] = {}  # topics of the bag by name
+        self.topics = {}
         for name in sorted({connection.topic for connection in reader.connections}):
             connections = [c for c in reader.connections if c.topic == name]
             types = ' | '.join(sorted({c.msgtype for c in connections}))
             self.topics[name] = TopicInfo(types, sum(c.msgcount for c in connections))
+        self.start_ns, self.end_ns = reader.start_time, reader.end_time
 
     def __enter__(self) -> Self:
         return self
@@ -94,28 +145,12 @@ class BagReader:
     def __exit__(self, *exception: object) -> None:
         self._reader.close()  # messages that were read before can still be decoded
 
-    def messages(self, topics: Collection[str]) -> Iterator[BagMessage]:
-        """
-        Iterate over the messages of some topics in the order in which they were recorded.
-
-        Raises `BagError`: at the call for an unknown topic, on iteration for a damaged file.
-        """
-        unknown = sorted(set(topics) - set(self.topics))
-        if unknown:
-            raise BagError(
-                f'{self.path}: no topic {", ".join(unknown)}; the bag has {self.describe()}')
-        return self._messages([c for c in self._reader.connections if c.topic in topics])
-
-    def describe(self) -> str:
-        """Return the topics with their types on one line, for error messages."""
-        return ', '.join(
-            f'{name} ({info.type})' for name, info in self.topics.items()) or 'no topics'
-
-    def _messages(self, connections: list[Connection]) -> Iterator[BagMessage]:
+    def _messages(self, topics: Collection[str], span: Span) -> Iterator[BagMessage]:
+        connections = [c for c in self._reader.connections if c.topic in topics]
         if len(connections) == 0:  # rosbags reads all topics if it is given none
             return
         seen: Counter[str] = Counter()
-        source = self._reader.messages(connections)
+        source = self._reader.messages(connections, *span)
         while True:
             try:
                 connection, recorded_ns, raw = next(source)
@@ -127,8 +162,10 @@ class BagReader:
                 ) from error
             seen[connection.topic] += 1
             yield BagMessage(
-                connection.topic, connection.msgtype, recorded_ns, bytes(raw),
+                connection.topic, connection.msgtype, recorded_ns, bytes(raw), connection,
                 self._decoder(connection))
+        if span != WHOLE:
+            return
         for topic in sorted({c.topic for c in connections}):
             if seen[topic] != self.topics[topic].count:
                 logger.warning('%s: %s should have %d messages, %d were found',
@@ -139,7 +176,7 @@ class BagReader:
         name, is_ros1 = connection.msgtype, isinstance(self._reader, Rosbag1Reader)
         if name not in self._decoders:
             standard = get_typestore(Stores.ROS1_NOETIC if is_ros1 else Stores.ROS2_JAZZY)
-            types = _own_types(connection) or standard
+            types = own_types(connection) or standard
             decode = types.deserialize_ros1 if is_ros1 else types.deserialize_cdr
             self._decoders[name] = partial(decode, typename=name)
             # most of a long bag
@@ -180,7 +217,7 @@ def _read_odometry(data: bytes, otherwise: Callable[[bytes], Any]) -> Any:
     return read_odometry(data) if data.startswith(LITTLE_ENDIAN) else otherwise(data)
 
 
-def _own_types(connection: Connection) -> Typestore | None:
+def own_types(connection: Connection) -> Typestore | None:
     """Return the types by the definition in the bag; None if it has none that is usable."""
     text, kind = connection.msgdef.data, connection.msgdef.format
     if kind == MessageDefinitionFormat.NONE or text.strip() == '':

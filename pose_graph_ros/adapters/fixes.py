@@ -112,6 +112,23 @@ class Datum:
         return plane.to_map(
             latitude, longitude, altitude if math.isfinite(altitude) else plane.altitude)
 
+    def geodetic(self, position: FloatArray) -> FloatArray:
+        """
+        Return latitude, longitude [degrees] and altitude [m] of points of the map, shape (..., 3).
+
+        They lie at the altitude of the newest fix; this is the inverse of `place`. Raises
+        ValueError without a datum.
+
+        Parameters
+        ----------
+        position : ndarray, shape (..., 2), in the map [m]
+
+        """
+        if self.plane is None:
+            raise ValueError('the map has no datum')
+        return self.plane.to_geodetic(
+            position, self.altitude if math.isfinite(self.altitude) else self.plane.altitude)
+
 
 def datum_of(values: Mapping[str, Any]) -> Datum:
     """Return the datum by the checked parameters; raises `ConfigError` if it is not on Earth."""

@@ -1,17 +1,19 @@
 # Copyright 2026 The pose_graph_ros authors
 # SPDX-License-Identifier: Apache-2.0
 """
-Run a bag or a g2o file through the engine of the node, without ROS and as fast as possible.
+Run bags or a g2o file through the engine of the node, without ROS and as fast as possible.
 
-Messages are read and added as in the node, but without threads, and the same full optimisation
-follows at the end. The path is the one of a node that receives the same messages. Of a g2o file,
-edges to the next vertex are odometry, with the noise of the file (odom.noise:=model takes that of
-the parameters); all others are loop closures, which come when their later end is reached.
+Bags may be of ROS 1 or ROS 2 and compressed; several are read in the order of recording. Messages
+are read and added as in the node, but without threads, and the same full optimisation follows at
+the end. The path is the one of a node that receives the same messages. Of a g2o file, edges to the
+next vertex are odometry, with the noise of the file (odom.noise:=model takes that of the
+parameters); all others are loop closures, which come when their later end is reached.
 """
 
 import argparse
 from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping, Sequence
+from contextlib import ExitStack
 from pathlib import Path
 import time
 from typing import Any, NamedTuple
@@ -24,17 +26,29 @@ from pose_graph_ros.adapters.bag_inputs import (
     read_inputs,
     read_static_frames,
 )
-from pose_graph_ros.adapters.bags import BagError, BagReader, MessageError, open_bag
+from pose_graph_ros.adapters.bag_sequence import open_bags
+from pose_graph_ros.adapters.bag_writer import BagWriter
+from pose_graph_ros.adapters.bags import Bag, BagError, MessageError, Span
+from pose_graph_ros.adapters.fixes import Datum
 from pose_graph_ros.adapters.message_reader import MessageReader
-from pose_graph_ros.adapters.sources import backend_config, CLOSURES, ODOMETRY_KINDS, source_list
+from pose_graph_ros.adapters.sources import (
+    backend_config,
+    CLOSURES,
+    Kind,
+    ODOMETRY_KINDS,
+    source_list,
+)
 from pose_graph_ros.cli import options as shared
+from pose_graph_ros.cli.corrected_bag import LATCHED, write_corrected
 from pose_graph_ros.cli.evaluation import Drive
+from pose_graph_ros.cli.exports import add_exports, covariances, require_datum, write_exports
 from pose_graph_ros.cli.g2o_inputs import read_measurements
 from pose_graph_ros.cli.judgement import judgement, judgement_lines
+from pose_graph_ros.cli.progress import WatchedBag
 from pose_graph_ros.cli.results import collect_drive, write_results
 from pose_graph_ros.core.backend import PoseGraphBackend
 from pose_graph_ros.core.batch.optimizer import Status
-from pose_graph_ros.core.estimate import UpdateReport
+from pose_graph_ros.core.estimate import Estimate, UpdateReport
 from pose_graph_ros.core.geometry.geodesy import MapOrigin
 from pose_graph_ros.core.geometry.trajectory import Trajectory
 from pose_graph_ros.core.io.g2o import EDGE2_ORDERS
@@ -43,6 +57,12 @@ from pose_graph_ros.core.judgement.texts import Key, states_by_stamps
 from pose_graph_ros.core.judgement.verdicts import State, Verdict
 from pose_graph_ros.core.measurements import Answer, LoopClosure, Measurement, OdometrySample
 
+EXAMPLES = """examples:
+  pose-graph replay my_bag --odom /wheel/odometry --fix /gnss/fix -o tuesday
+  pose-graph replay monday.bag tuesday.bag --until 600 --export kitti,csv
+  pose-graph replay my_bag --export gpx,geojson --bag corrected_bag
+  pose-graph replay my_bag --hold-out 5 --json | jq .errors
+"""
 UPDATE_EVERY = 10  # new hidden nodes after which the graph is updated, to stay near the optimum
 
 
@@ -52,7 +72,13 @@ class Replayed(NamedTuple):
     backend: PoseGraphBackend
     report: UpdateReport  # report of the final optimisation
     refused: Counter[tuple[str, str]]  # messages without a valid measurement, by source and reason
-    origin: MapOrigin | None = None  # datum of the graph
+    datum: Datum | None = None  # of the map; None for a g2o file
+
+    @property
+    def origin(self) -> MapOrigin | None:
+        """Origin of the map on the Earth; None if it is unknown."""
+        plane = None if self.datum is None else self.datum.plane
+        return None if plane is None else plane.origin
 
     def states(self, verdicts: Sequence[Verdict]) -> dict[Key, State]:
         """Return what is believed, by source and stamps; refused loop closures are not."""
@@ -60,7 +86,7 @@ class Replayed(NamedTuple):
         return states_by_stamps(verdicts) | refused
 
 
-def run(bag: BagReader, inputs: Inputs, values: Mapping[str, Any]) -> Replayed:
+def run(bag: Bag, inputs: Inputs, values: Mapping[str, Any]) -> Replayed:
     """
     Return a new engine after adding all messages of a bag and a full optimisation.
 
@@ -74,12 +100,11 @@ def run(bag: BagReader, inputs: Inputs, values: Mapping[str, Any]) -> Replayed:
         reader.frames.receive(message.decode())
     refused: Counter[tuple[str, str]] = Counter()
     backend, report = run_measurements(_read(bag, inputs, reader, refused), values)
-    plane = reader.datum.plane
-    return Replayed(backend, report, refused, None if plane is None else plane.origin)
+    return Replayed(backend, report, refused, reader.datum)
 
 
 def _read(
-    bag: BagReader, inputs: Inputs, reader: MessageReader, refused: Counter[tuple[str, str]],
+    bag: Bag, inputs: Inputs, reader: MessageReader, refused: Counter[tuple[str, str]],
 ) -> Iterator[tuple[str, OdometrySample | Measurement]]:
     """Yield the valid measurements of a bag that are not held out; count the others."""
     for source, message, held_out in read_inputs(bag, inputs):
@@ -123,9 +148,20 @@ def run_measurements(
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Add the arguments of this tool."""
-    parser.add_argument('bag', type=Path, help='rosbag2 folder, .mcap, .db3, or a .g2o file')
+    parser.add_argument('bags', metavar='BAG', type=Path, nargs='+',
+                        help='rosbag2 folder, .mcap, .db3, ROS 1 .bag; or one .g2o file')
     parser.add_argument('-o', '--out', metavar='DIR', type=Path, default=Path('replay'),
                         help='folder for the results (default: %(default)s)')
+    add_exports(parser)
+    parser.add_argument('--bag', metavar='OUT', type=Path, dest='new_bag',
+                        help='new rosbag2 folder with all messages, the corrected path, odometry '
+                             'in the map and the transform from map to odom')
+    parser.add_argument('--from', metavar='SECONDS', type=_seconds, dest='begin', default=None,
+                        help='leave out what was recorded before, counted from the first message')
+    parser.add_argument('--until', metavar='SECONDS', type=_seconds,
+                        help='leave out what was recorded from then on')
+    parser.add_argument('--json', action='store_true',
+                        help='print the contents of summary.json instead of a text')
     parser.add_argument('--stamps', metavar='FILE', type=Path,
                         help='text file with the stamps [s] of the vertices of a .g2o file '
                              '(default: a second apart)')
@@ -133,36 +169,73 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
                         help='format of the tag EDGE2 in a .g2o file')
     shared.add_inputs(parser)
     shared.add_parameters(parser)
+    parser.epilog = EXAMPLES
+
+
+def _seconds(text: str) -> float:
+    """Return a time [s], 0 included."""
+    value = float(text)
+    if not 0.0 <= value < np.inf:
+        raise argparse.ArgumentTypeError(f'expected a finite number of at least 0, got {text}')
+    return value
 
 
 def execute(options: argparse.Namespace) -> int:
     """Run the tool; return the exit code."""
-    if options.bag.suffix == '.g2o':
+    if any(path.suffix == '.g2o' for path in options.bags):
         return _execute_g2o(options)
     values = shared.parameter_values(options)
     wanted = shared.wanted_topics(options)
-    with open_bag(options.bag) as bag:
-        inputs = choose_inputs(bag, source_list(values), wanted, options.hold_out)
-        for source, topic in inputs.topics.items():
-            print(f'{source}: {topic}')
+    with ExitStack() as stack:
+        bag = stack.enter_context(open_bags(options.bags))
+        inputs = choose_inputs(
+            bag, source_list(values), wanted, options.hold_out, _span(bag, options))
+        require_datum(options.export, known=len(values['datum']) > 0 or len(
+            inputs.of(Kind.FIX)) > 0)
+        writer = None if options.new_bag is None else stack.enter_context(
+            BagWriter(options.new_bag, latched=LATCHED))
+        if not options.json:
+            print('\n'.join(f'{source}: {topic}' for source, topic in inputs.topics.items()))
         start = time.monotonic()
-        result = run(bag, inputs, values)
+        result = run(WatchedBag(bag, 'optimising'), inputs, values)
         seconds = time.monotonic() - start
         estimate = result.backend.estimate()
         if estimate is None:
             topics = ' or '.join(inputs.topics[name] for name in inputs.of(*ODOMETRY_KINDS))
-            raise BagError(f'{options.bag}: no usable odometry on {topics}')
+            raise BagError(f'{bag.path}: no usable odometry on {topics}')
         verdicts = result.backend.verdicts()
         drive = collect_drive(
-            bag, inputs, values, estimate.path, options.truth, origin=result.origin,
-            states=result.states(verdicts))
-    return _report(options, drive, result, verdicts, seconds)
+            WatchedBag(bag, 'comparing'), inputs, values, estimate.path, options.truth,
+            origin=result.origin, states=result.states(verdicts))
+        facts: dict[str, Any] = {'bags': [str(path) for path in options.bags]}
+        if writer is not None:
+            copied = write_corrected(
+                writer, WatchedBag(bag, 'writing the bag'), inputs, values, estimate=estimate,
+                covariances=covariances(result.backend, estimate))
+            facts['new_bag'] = copied._asdict()
+    return _report(options, drive, result, verdicts, facts | {'seconds': seconds})
+
+
+def _span(bag: Bag, options: argparse.Namespace) -> Span:
+    """Return the time of recording that the options ask for; raises `BagError` if it is empty."""
+    limits = [None if seconds is None else bag.start_ns + round(seconds * 1e9)
+              for seconds in (options.begin, options.until)]
+    span, length = Span(*limits), (bag.end_ns - bag.start_ns) * 1e-9
+    if (options.begin or 0.0) >= min(length, np.inf if options.until is None else options.until):
+        raise BagError(f'{bag.path}: nothing was recorded between --from and --until; the '
+                       f'recording is {max(length, 0.0):.3f} s long')
+    return span
 
 
 def _execute_g2o(options: argparse.Namespace) -> int:
     """Replay a g2o file."""
+    if len(options.bags) > 1 or options.new_bag or options.begin or options.until:
+        raise BagError(f'{options.bags[0]}: expected one .g2o file alone, without --bag, --from '
+                       'and --until')
+    require_datum(options.export, known=False)
+    path, = options.bags
     values = shared.parameter_values(options, {'odom.noise': 'twist'})
-    measurements = read_measurements(options.bag, options.stamps, options.edge2)
+    measurements = read_measurements(path, options.stamps, options.edge2)
     odometry_source = next(
         source.name for source in source_list(values) if source.kind.is_odometry)
     start = time.monotonic()
@@ -185,12 +258,12 @@ def _execute_g2o(options: argparse.Namespace) -> int:
         None, np.array(loops, dtype=np.int64).reshape(-1, 2),
         loop_states=[states.get((CLOSURES, stamp, reference), State.BELIEVED)
                      for reference, stamp in loops])
-    return _report(options, drive, result, verdicts, seconds)
+    return _report(options, drive, result, verdicts, {'seconds': seconds})
 
 
 def _report(
     options: argparse.Namespace, drive: Drive, result: Replayed, verdicts: Sequence[Verdict],
-    seconds: float,
+    facts: Mapping[str, Any],
 ) -> int:
     """Write the results and print a summary; return the exit code."""
     backend, report = result.backend, result.report
@@ -198,8 +271,9 @@ def _report(
     assert estimate is not None
     counts = {f'{source}.{answer}': count for (source, answer), count
               in sorted((backend.counts + result.refused).items())}
-    table = write_results(drive, options.out, options.bag.stem, {
-        'seconds': seconds, 'alignment': estimate.alignment.value,
+    title = options.bags[0].stem
+    table = write_results(drive, options.out, title, {
+        **facts, 'alignment': estimate.alignment.value,
         'hidden_nodes': estimate.n_hidden, 'frozen_nodes': estimate.n_frozen,
         'thinned_nodes': estimate.n_thinned, 'edges': estimate.n_edges,
         'observed_nodes': estimate.n_observed, 'biases': estimate.n_biases,
@@ -207,12 +281,30 @@ def _report(
         'status': report.status.value, 'counts': counts,
         'judged': judgement(totals, verdicts)})
     write_g2o(backend.graph, options.out / 'graph.g2o')
-    print(f'{estimate.n_hidden} hidden nodes, {estimate.n_edges} edges, {estimate.n_observed} '
-          f'observed nodes in {seconds:.2f} s; {report.status.value}, chi2 {report.chi2:.6g}; '
-          f'{estimate.alignment.value}')
+    exported = write_exports(options.export, options.out, title, backend=backend,
+                             estimate=estimate, datum=result.datum)
+    if options.json:
+        print((options.out / 'summary.json').read_text(encoding='utf-8'), end='')
+    else:
+        for line in _lines(result, estimate, verdicts, facts):
+            print(line)
+        print('counts: ' + ', '.join(f'{name} {count}' for name, count in counts.items()))
+        names = ['drive.png', 'summary.json', 'graph.g2o', *(path.name for path in exported)]
+        print(f'\n{table}\n\nwritten: {options.out}/path.tum, {", ".join(names)}')
+    return 0 if report.status is Status.CONVERGED else 1
+
+
+def _lines(
+    result: Replayed, estimate: Estimate, verdicts: Sequence[Verdict], facts: Mapping[str, Any],
+) -> Iterator[str]:
+    """Yield what is told of a run."""
+    backend, report = result.backend, result.report
+    yield (f'{estimate.n_hidden} hidden nodes, {estimate.n_edges} edges, {estimate.n_observed} '
+           f'observed nodes in {facts["seconds"]:.2f} s; {report.status.value}, chi2 '
+           f'{report.chi2:.6g}; {estimate.alignment.value}')
     if estimate.odometry_scale != 1.0:
-        print(f'{estimate.primary}: weighed with {estimate.odometry_scale:.3g} times the sigmas '
-              'that it claims')
+        yield (f'{estimate.primary}: weighed with {estimate.odometry_scale:.3g} times the sigmas '
+               'that it claims')
     for source, fit in sorted(backend.reports().items()):
         text = f'{source}: squared residual {fit.energy:.3g} sigma^2'
         if fit.errors.significant:
@@ -222,9 +314,8 @@ def _report(
             text += f'; treated as correlated over {fit.in_use.tau:.3g} s'
         if fit.wrongly_white:
             text += f', but are treated as white: see {source}.correlation_time'
-        print(text)
-    for line in judgement_lines(totals, verdicts):
-        print(line)
-    print('counts: ' + ', '.join(f'{name} {count}' for name, count in counts.items()))
-    print(f'\n{table}\n\nwritten: {options.out}/path.tum, drive.png, summary.json, graph.g2o')
-    return 0 if report.status is Status.CONVERGED else 1
+        yield text
+    yield from judgement_lines(backend.verdict_totals(), verdicts)
+    if 'new_bag' in facts:
+        yield ('new bag: {original} messages copied, {left_out} left out, {corrected} poses of '
+               'odometry corrected'.format(**facts['new_bag']))

@@ -12,7 +12,7 @@ import numpy as np
 
 from pose_graph_ros.adapters.bag_inputs import Inputs, read_inputs, read_static_frames
 from pose_graph_ros.adapters.bag_poses import POSE_TYPES, poses_on
-from pose_graph_ros.adapters.bags import BagError, BagReader, MessageError
+from pose_graph_ros.adapters.bags import Bag, BagError, MessageError, Span, WHOLE
 from pose_graph_ros.adapters.message_reader import MessageReader
 from pose_graph_ros.adapters.sources import Kind, ODOMETRY_KINDS
 from pose_graph_ros.cli.evaluation import Drive, evaluate, format_table, summary
@@ -102,7 +102,7 @@ class _Positions:
 
 
 def collect_drive(
-    bag: BagReader, inputs: Inputs, values: Mapping[str, Any], corrected: Trajectory,
+    bag: Bag, inputs: Inputs, values: Mapping[str, Any], corrected: Trajectory,
     truth_topic: str | None, *, origin: MapOrigin | None = None,
     states: Mapping[Key, State] = MappingProxyType({}),
 ) -> Drive:
@@ -163,16 +163,21 @@ def collect_drive(
     return Drive(
         odometry=odometry.path(), fix_stamps_ns=stamps, fix_positions=positions,
         fix_held_out=fixes.held_out.values, corrected=corrected,
-        truth=None if truth_topic is None else read_truth(bag, truth_topic),
+        truth=None if truth_topic is None else read_truth(bag, truth_topic, inputs.span),
         loop_stamps_ns=np.array(loops, dtype=np.int64).reshape(-1, 2), loop_states=loop_states,
         fix_unused=unused.values,
         map_axes=('east', 'north') if len(inputs.of(Kind.FIX)) > 0 and not any(values['datum'][2:])
         else ('x', 'y'))
 
 
-def read_truth(bag: BagReader, topic: str) -> Trajectory:
+def read_truth(bag: Bag, topic: str, span: Span = WHOLE) -> Trajectory:
     """
     Return the true poses in a bag; invalid messages are ignored.
+
+    Parameters
+    ----------
+    topic : str
+    span : Span, when the messages were recorded
 
     Raises
     ------
@@ -186,7 +191,7 @@ def read_truth(bag: BagReader, topic: str) -> Trajectory:
         raise BagError(f'{bag.path}: {what} {topic} (--truth); expected one of '
                        f'{", ".join(POSE_TYPES)}; the bag has {bag.describe()}')
     poses = PathCollector()
-    for stamp, pose, _ in poses_on(bag, topic):
+    for stamp, pose, _ in poses_on(bag, topic, span):
         poses.add(stamp, pose)
     return poses.path()
 

@@ -187,15 +187,7 @@ class PoseGraphBackend:
         return self._judge.decide(name, decision)
 
     def add_odometry(self, sample: OdometrySample, source: str = 'odom') -> Answer:
-        """
-        Return the answer to a sample that is added; `NodePolicy` may ask for a hidden node at it.
-
-        Parameters
-        ----------
-        sample : OdometrySample
-        source : str
-
-        """
+        """Return the answer to a sample; `NodePolicy` may ask for a hidden node at it."""
         answer = self._pipeline.count(source, self._nodes.add_sample(sample, source))
         self._collect()
         return answer
@@ -347,8 +339,7 @@ class PoseGraphBackend:
         self._smoother.interrupt()
 
     def _transaction(self) -> Transaction:
-        return Transaction(
-            self.graph, self._nodes, self._alignment, self._factors, self._judge)
+        return Transaction(self.graph, self._nodes, self._alignment, self._factors, self._judge)
 
     def _evaluate(self) -> None:
         """Update chi2 and the covariance of the newest node."""
@@ -419,6 +410,11 @@ class PoseGraphBackend:
             self._parts(), self._config.odometry_source(self._nodes.primary).noise,
             self._newest_node_covariance, self._chi2, self._tuner.odometry_scale,
             with_path=with_path)
+
+    def path_covariances(self, estimate: Estimate) -> FloatArray:
+        """Return those at the path of the present estimate; see `newest_estimate`."""
+        return newest_estimate.path_covariances(
+            self._parts(), self._smoother.covariances(), estimate)
 
     def saved(self, datum: MapOrigin | None = None) -> SavedGraph:
         """Return the graph with its state since the last update; see `io.capture.capture`."""

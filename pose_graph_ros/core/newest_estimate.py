@@ -1,6 +1,6 @@
 # Copyright 2026 The pose_graph_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""The estimate at the newest odometry, from the parts of the engine."""
+"""The estimate at the newest odometry and along the path, from the parts of the engine."""
 
 import math
 
@@ -64,6 +64,35 @@ def estimate(
         odometry_scale=scale,
         trajectory=None if not with_path else Trajectory(
             nodes.stamps_ns, nodes.poses(graph) + shift).continued(stamp_ns, newest))
+
+
+def path_covariances(parts: Parts, covariances: FloatArray, of: Estimate) -> FloatArray:
+    """
+    Return the covariances at the poses of a path, in map axes, shape (P, 3, 3).
+
+    They are NaN where they are unknown: at nodes that have left the graph by its window, and at
+    all but the newest pose while the angle between odometry and map is unknown.
+
+    Parameters
+    ----------
+    covariances : ndarray, shape (N, 3, 3), of all nodes in the graph, by row
+    of : Estimate, the present one, with its path
+
+    """
+    nodes, thinned = parts.nodes, parts.nodes.table.thinned
+    rows = parts.graph.node_rows(nodes.ids)
+    found = np.full((len(of.path), 3, 3), np.nan)
+    inside = np.flatnonzero(rows >= 0)
+    found[inside] = covariances[rows[inside]]
+    for number in thinned.places().numbers.tolist() if len(thinned) > 0 else ():
+        place = thinned.place(number)
+        assert place is not None, 'it is among them'
+        found[number] = covariance.propagated(
+            of.path.poses[place.anchor], found[place.anchor], place.mean, place.noise)
+    if of.alignment is AlignmentState.UNALIGNED:
+        found[:] = np.nan
+    found[-1] = of.covariance
+    return found
 
 
 def _turned(

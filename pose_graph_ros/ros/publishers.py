@@ -26,6 +26,7 @@ from sensor_msgs.msg import NavSatFix
 from std_msgs.msg import Header
 from visualization_msgs.msg import Marker, MarkerArray
 
+from pose_graph_ros.adapters import output_cdr
 from pose_graph_ros.adapters.conversions import frame, Message
 from pose_graph_ros.adapters.fixes import Datum
 from pose_graph_ros.adapters.markers import markers_cdr
@@ -153,10 +154,10 @@ class Publishers:
             return
         prediction = predict(estimate, sample.pose)
         if self._odometry in wanted:
-            self._odometry.publish(messages.odometry_cdr(
+            self._odometry.publish(output_cdr.odometry_cdr(
                 stamp, prediction, odometry, self.map_frame, self.base_frame))
         if self._pose in wanted:
-            self._pose.publish(messages.stamped_pose_cdr(stamp, prediction, self.map_frame))
+            self._pose.publish(output_cdr.stamped_pose_cdr(stamp, prediction, self.map_frame))
         # before the first measurement in the map, its place on the Earth is unknown
         if (self._fix in wanted and plane is not None
                 and estimate.alignment is not AlignmentState.LOCAL):
@@ -194,7 +195,7 @@ class Publishers:
             self._path_shown, self._path_at = estimate, time.monotonic()
             # a better path with the same newest odometry: 1 ns keeps the stamps increasing
             self._path_stamp_ns = max(estimate.stamp_ns, self._path_stamp_ns + 1)
-            self._path.publish(messages.path_cdr(shown, self._path_stamp_ns, self.map_frame))
+            self._path.publish(output_cdr.path_cdr(shown, self._path_stamp_ns, self.map_frame))
 
     def graph_is_due(self) -> bool:
         """Tell whether to publish the markers of the graph: wanted, and not too soon."""

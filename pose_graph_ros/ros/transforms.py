@@ -13,9 +13,9 @@ from rclpy.qos import QoSProfile
 from rclpy.serialization import deserialize_message
 from rclpy.subscription import Subscription
 
+from pose_graph_ros.adapters import output_cdr
 from pose_graph_ros.adapters.conversions import frame, stamp_ns
 from pose_graph_ros.core.geometry.se2 import FloatArray
-from pose_graph_ros.ros import messages
 from pose_graph_ros.ros.spinning import guarded
 
 try:
@@ -68,7 +68,7 @@ class TransformPublisher:
             return
         self._newest_ns = at_ns
         self._own.append((at_ns, float(T_map_odom[0]), math.sin(T_map_odom[2] / 2.0)))
-        self._publisher.publish(messages.transform_cdr(
+        self._publisher.publish(output_cdr.transform_cdr(
             at_ns, T_map_odom, self._map_frame, self._odom_frame))
 
     def forget(self) -> None:

@@ -8,6 +8,7 @@ from pathlib import Path
 import sys
 from typing import Any
 
+from circle_bag import circle, fixes, odometry, VARIANCES
 import numpy as np
 import pytest
 from tum_files import read_tum
@@ -31,34 +32,12 @@ from pose_graph_ros.core.batch.optimizer import Status
 from pose_graph_ros.core.exceptions import PoseGraphError
 from pose_graph_ros.core.geometry import se2
 from pose_graph_ros.core.geometry.geodesy import TangentPlane
-from pose_graph_ros.core.geometry.trajectory import Trajectory
 from pose_graph_ros.core.io.g2o import read_g2o
 from pose_graph_ros.core.judgement.verdicts import State
 
 TYPES = message_types()
 POSE = 'geometry_msgs/msg/PoseWithCovarianceStamped'
-SECOND = 10**9
-VARIANCES = (1e-3, 1e-3, 1e6, 1e6, 1e6, 1e-3)
 ANTENNA = np.array([1.5, -0.5])
-
-
-def circle(seconds: int = 40) -> Trajectory:
-    """Drive along a circle with a radius of 10 m at 2 m/s, a little more than once."""
-    stamps = 1_700_000_000 * SECOND + np.arange(0, seconds * SECOND, SECOND // 10)
-    angle = np.arange(len(stamps)) * 0.02
-    return Trajectory(stamps, np.column_stack(
-        (10.0 * np.sin(angle), 10.0 * (1.0 - np.cos(angle)), se2.wrap(angle))))
-
-
-def odometry() -> list[Message]:
-    """The circle in a frame of its own, 1 % too long and turning a little too far."""
-    path = circle()
-    steps = se2.between(path.poses[:-1], path.poses[1:]) * (1.01, 1.01, 1.002)
-    poses = [np.array([3.0, -4.0, 2.0])]
-    for step in steps:
-        poses.append(se2.compose(poses[-1], step))
-    return list(odometry_messages(
-        '/odom', 'odom', Trajectory(path.stamps_ns, np.array(poses)), VARIANCES))
 
 
 def pose_messages(topic: str, type_name: str, frame: str = 'map') -> list[Message]:
@@ -70,14 +49,6 @@ def pose_messages(topic: str, type_name: str, frame: str = 'map') -> list[Messag
         pose = message.pose.pose if type_name.endswith('PoseStamped') else message.pose
         made.append((topic, type_name, stamp, TYPES[type_name](message.header, pose)))
     return made[::10]
-
-
-def fixes(arm: np.ndarray) -> list[Message]:
-    """Exact positions of an antenna with a lever arm, twice a second."""
-    path = circle()
-    places = se2.transform(path.poses[::5], arm)
-    geodetic = TangentPlane(50.7, 7.1, 60.0).to_geodetic(places, 60.0)
-    return list(fix_messages('/gps/fix', path.stamps_ns[::5], geodetic, 0.1))
 
 
 def run(*words: object) -> int:

@@ -21,6 +21,7 @@ import numpy as np
 from rclpy.serialization import deserialize_message, serialize_message
 from std_msgs.msg import Header
 
+from pose_graph_ros.adapters import output_cdr
 from pose_graph_ros.adapters.conversions import PLANAR
 from pose_graph_ros.core.geometry.trajectory import Trajectory
 from pose_graph_ros.core.prediction import Prediction
@@ -48,11 +49,11 @@ def path_message(path: Trajectory, stamp_ns: int, frame: str) -> Path:
 def test_the_path_is_byte_for_byte_what_rclpy_makes(
     frame: str, count: int, monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    monkeypatch.setattr(messages, 'PATH_CHUNK', 7)
+    monkeypatch.setattr(output_cdr, 'PATH_CHUNK', 7)
     generator = np.random.default_rng(count)
     stamps = 1_700_000_000_123_456_789 + np.cumsum(generator.integers(1, 2**31, count))
     path = Trajectory(stamps, generator.normal(0.0, 100.0, (count, 3)))
-    ours = messages.path_cdr(path, 1_800_000_000_000_000_007, frame)
+    ours = output_cdr.path_cdr(path, 1_800_000_000_000_000_007, frame)
     theirs = path_message(path, 1_800_000_000_000_000_007, frame)
     assert deserialize_message(ours, Path) == theirs
     serialized = bytes(serialize_message(theirs))
@@ -99,9 +100,9 @@ def blank(data: bytes, gaps: list[int]) -> bytes:
 def test_a_long_path_is_quick() -> None:
     count = 100_000
     path = Trajectory(np.arange(1, count + 1), np.zeros((count, 3)))
-    messages.path_cdr(path, 1, 'map')
+    output_cdr.path_cdr(path, 1, 'map')
     start = time.process_time()
-    messages.path_cdr(path, 1, 'map')
+    output_cdr.path_cdr(path, 1, 'map')
     # a hundred times what it takes; message by message it would take seconds
     assert time.process_time() - start < 1.0
 
@@ -178,14 +179,14 @@ def odometry_message(
     message = Odometry(
         header=Header(stamp=messages.time_message(stamp_ns), frame_id=map_frame),
         child_frame_id=base_frame,
-        pose=pose_with_covariance(prediction, messages.UNKNOWN_VARIANCE))
+        pose=pose_with_covariance(prediction, output_cdr.UNKNOWN_VARIANCE))
     twist = source.twist
     linear, angular = twist.twist.linear, twist.twist.angular
     numbers = (linear.x, linear.y, linear.z, angular.x, angular.y, angular.z)
     if all(map(math.isfinite, numbers)) and np.all(np.isfinite(twist.covariance)):
         message.twist = twist
     else:
-        message.twist.covariance = (messages.UNKNOWN_VARIANCE * np.eye(6)).ravel()
+        message.twist.covariance = (output_cdr.UNKNOWN_VARIANCE * np.eye(6)).ravel()
     return message
 
 
@@ -217,7 +218,7 @@ def test_an_odometry_without_a_finite_twist_gets_none() -> None:
     source.twist.twist.linear.x = math.nan
     message = odometry_message(1, prediction, source, 'map', 'base_link')
     assert message.twist.twist.linear.x == 0.0
-    assert message.twist.covariance[0] == messages.UNKNOWN_VARIANCE
+    assert message.twist.covariance[0] == output_cdr.UNKNOWN_VARIANCE
     covariance = np.asarray(message.pose.covariance).reshape(6, 6)
     assert np.array_equal(np.diagonal(covariance), [1.0, 2.0, 1e6, 1e6, 1e6, 3.0])
 
@@ -254,7 +255,7 @@ def test_odometry_is_byte_for_byte_what_rclpy_makes(map_frame: str, base_frame: 
     source.twist.twist.linear.x, source.twist.twist.angular.z = 1.25, -0.5
     source.twist.covariance = np.arange(36.0)
     assert_same_bytes(
-        messages.odometry_cdr(stamp, prediction, source, map_frame, base_frame),
+        output_cdr.odometry_cdr(stamp, prediction, source, map_frame, base_frame),
         odometry_message(stamp, prediction, source, map_frame, base_frame),
         names_padding(8, map_frame, base_frame))
 
@@ -263,7 +264,7 @@ def test_odometry_is_byte_for_byte_what_rclpy_makes(map_frame: str, base_frame: 
 def test_the_pose_is_byte_for_byte_what_rclpy_makes(frame: str) -> None:
     prediction = some_prediction(1)
     assert_same_bytes(
-        messages.stamped_pose_cdr(2**31 * 10**9 - 1, prediction, frame),
+        output_cdr.stamped_pose_cdr(2**31 * 10**9 - 1, prediction, frame),
         stamped_pose_message(
             2**31 * 10**9 - 1, pose_with_covariance(prediction, 1e-6), frame),
         names_padding(8, frame))
@@ -275,7 +276,7 @@ def test_the_transform_is_byte_for_byte_what_rclpy_makes(frame: str, child: str)
     tf2_msgs = pytest.importorskip('tf2_msgs.msg', reason='tf2_msgs is not there')
     pose = np.array([1.5, -2.5, 3.0])
     assert_same_bytes(
-        messages.transform_cdr(7, pose, frame, child),
+        output_cdr.transform_cdr(7, pose, frame, child),
         tf2_msgs.TFMessage(transforms=[transform_message(7, pose, frame, child)]),
         names_padding(12, frame, child))
 
@@ -289,6 +290,6 @@ def test_serialised_odometry_without_a_finite_twist_gets_none(where: str) -> Non
     else:
         source.twist.covariance[35] = math.nan
     assert_same_bytes(
-        messages.odometry_cdr(1, prediction, source, 'map', 'base_link'),
+        output_cdr.odometry_cdr(1, prediction, source, 'map', 'base_link'),
         odometry_message(1, prediction, source, 'map', 'base_link'),
         names_padding(8, 'map', 'base_link'))

@@ -33,6 +33,10 @@ def _lines(trajectory: Trajectory) -> Iterator[str]:
         for stamp, (x, y, _), qz, qw in zip(
                 trajectory.stamps_ns[begin:begin + PART].tolist(), poses.tolist(),
                 np.sin(half).tolist(), np.cos(half).tolist(), strict=True):
-            seconds, nanoseconds = divmod(abs(stamp), NANOSECONDS)
-            sign = '-' if stamp < 0 else ''
-            yield f'{sign}{seconds}.{nanoseconds:09d} {x!r} {y!r} 0 0 0 {qz!r} {qw!r}'
+            yield f'{seconds_text(stamp)} {x!r} {y!r} 0 0 0 {qz!r} {qw!r}'
+
+
+def seconds_text(stamp_ns: int) -> str:
+    """Return a stamp [ns] in seconds, with all its digits."""
+    seconds, nanoseconds = divmod(abs(stamp_ns), NANOSECONDS)
+    return f'{"-" if stamp_ns < 0 else ""}{seconds}.{nanoseconds:09d}'

@@ -1,0 +1,127 @@
+# Copyright 2026 The pose_graph_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""Write the corrected path in the formats that other programs read."""
+
+import argparse
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import NamedTuple
+
+from pose_graph_ros.adapters.fixes import Datum
+from pose_graph_ros.core.alignment.monitor import AlignmentState
+from pose_graph_ros.core.backend import PoseGraphBackend
+from pose_graph_ros.core.estimate import Estimate
+from pose_graph_ros.core.exceptions import PoseGraphError
+from pose_graph_ros.core.geometry.se2 import FloatArray
+from pose_graph_ros.core.io.path_files import csv_lines, kitti_lines
+from pose_graph_ros.core.io.track_files import geojson_lines, gpx_lines, kml_lines
+
+ON_EARTH = {'geojson': geojson_lines, 'kml': kml_lines, 'gpx': gpx_lines}
+"""Formats whose positions are latitudes and longitudes."""
+FORMATS = ('kitti', 'csv', *ON_EARTH)
+"""Formats by name, which is also the ending of the file."""
+ALL = 'all'
+
+
+class ExportError(PoseGraphError, ValueError):
+    """A path cannot be written in a format."""
+
+
+class Exports(NamedTuple):
+    """Formats that were asked for."""
+
+    formats: tuple[str, ...] = ()
+    strict: bool = True
+    """Whether it is an error if one of them cannot be written."""
+
+    @property
+    def on_earth(self) -> str:
+        """The formats that need a datum, as a text; empty if there are none."""
+        return ', '.join(name for name in self.formats if name in ON_EARTH)
+
+
+def add_exports(parser: argparse.ArgumentParser) -> None:
+    """Add the option that chooses formats."""
+    parser.add_argument(
+        '--export', metavar='FORMATS', type=parse_exports, default=Exports(),
+        help=f'more files with the path: {", ".join(FORMATS)}, separated by commas, or {ALL}; '
+             f'{", ".join(ON_EARTH)} need fixes or a datum')
+
+
+def parse_exports(text: str) -> Exports:
+    """Return the formats that a comma-separated text names; raises ArgumentTypeError."""
+    if text == ALL:
+        return Exports(FORMATS, strict=False)
+    names = tuple(dict.fromkeys(name.strip() for name in text.split(',')))
+    for name in names:
+        if name not in FORMATS:
+            raise argparse.ArgumentTypeError(
+                f'{name!r} is no format; expected {ALL} or some of {", ".join(FORMATS)}')
+    return Exports(names)
+
+
+def require_datum(exports: Exports, *, known: bool) -> None:
+    """Raise `ExportError` if a format needs a place on the Earth, and there is none."""
+    if exports.strict and exports.on_earth and not known:
+        raise ExportError(
+            f'--export {exports.on_earth}: the place of the map on the Earth is unknown; give '
+            "fixes (--fix TOPIC), or poses in a map with a known datum (--global-pose TOPIC -p "
+            "'datum:=[LATITUDE, LONGITUDE]')")
+
+
+def write_exports(
+    exports: Exports, folder: Path, title: str, *, backend: PoseGraphBackend, estimate: Estimate,
+    datum: Datum | None,
+) -> list[Path]:
+    """
+    Return the files that were written into a folder, `path.kitti` and so on.
+
+    Parameters
+    ----------
+    title : str, name of the track
+    estimate : Estimate, the present one of the back end, with the path
+    datum : Datum, optional, of the map
+
+    Raises
+    ------
+    ExportError
+        If a format needs a place on the Earth, which is unknown, after all others are written.
+
+    """
+    written = []
+    # before the first measurement in the map, its place on the Earth is unknown
+    placed = (datum is not None and datum.plane is not None
+              and estimate.alignment is not AlignmentState.LOCAL)
+    for name in exports.formats:
+        if name == 'kitti':
+            lines = kitti_lines(estimate.path)
+        elif name == 'csv':
+            lines = csv_lines(estimate.path, covariances(backend, estimate))
+        elif placed:
+            assert datum is not None
+            lines = _on_earth(ON_EARTH[name], estimate, datum, title)
+        else:
+            continue
+        written.append(folder / f'path.{name}')
+        _write(written[-1], lines)
+    require_datum(exports, known=placed)
+    return written
+
+
+def covariances(backend: PoseGraphBackend, estimate: Estimate) -> FloatArray:
+    """Return those of the path, shape (N, 3, 3); raises `ExportError` if the solver failed."""
+    try:
+        return backend.path_covariances(estimate)
+    except ValueError as error:
+        raise ExportError(f'there are no covariances: {error}') from error
+
+
+def _on_earth(
+    lines: Callable[..., Iterator[str]], estimate: Estimate, datum: Datum, title: str,
+) -> Iterator[str]:
+    return lines(estimate.path.stamps_ns, datum.geodetic(estimate.path.poses[:, :2])[:, :2], title)
+
+
+def _write(path: Path, lines: Iterator[str]) -> None:
+    with path.open('w', encoding='utf-8') as file:
+        file.writelines(f'{line}\n' for line in lines)

@@ -1,0 +1,143 @@
+# Copyright 2026 The pose_graph_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""`pose-graph replay` of bags of ROS 1 and ROS 2, compressed, in parts, and wrong ones."""
+
+import json
+from pathlib import Path
+import sys
+
+from circle_bag import circle, fixes, NOETIC, odometry, write_compressed, write_ros1
+import numpy as np
+import pytest
+from rosbags.rosbag1 import Writer as Rosbag1Writer
+from rosbags.rosbag2 import CompressionMode
+from tum_files import read_tum
+
+from pose_graph_ros.adapters.bag_inputs import choose_inputs
+from pose_graph_ros.adapters.bag_sequence import open_bags
+from pose_graph_ros.adapters.parameters import checked
+from pose_graph_ros.adapters.sources import source_list
+from pose_graph_ros.cli.bag_messages import Message, write_bag
+from pose_graph_ros.cli.main import main
+from pose_graph_ros.cli.progress import WatchedBag
+from pose_graph_ros.cli.replay import run
+
+START = int(circle().stamps_ns[0])
+
+
+def drive() -> list[Message]:
+    return [*odometry(), *fixes(np.zeros(2))]
+
+
+def replayed(out: Path, *words: object) -> bytes:
+    """Return the path of a replay, as it is in its file."""
+    assert main(['replay', *map(str, words), '-o', str(out)]) == 0
+    return (out / 'path.tum').read_bytes()
+
+
+def error_of(capsys: pytest.CaptureFixture[str], *words: object) -> str:
+    """Return the one line that a replay of wrong input ends with."""
+    capsys.readouterr()
+    assert main(['replay', *map(str, words)]) == 2
+    text = capsys.readouterr().err
+    assert text.startswith('error: ')
+    assert text.count('\n') == 1
+    return text
+
+
+def path_of(*bags: Path) -> list[bytes]:
+    """Return stamps and poses of the path of the engine that a replay fills."""
+    values = checked({})
+    with open_bags(bags) as bag:
+        estimate = run(
+            bag, choose_inputs(bag, source_list(values), {}), values).backend.estimate()
+    assert estimate is not None
+    assert len(estimate.path) == 81
+    return [estimate.path.stamps_ns.tobytes(), estimate.path.poses.tobytes()]
+
+
+def test_the_path_is_the_same_bit_for_bit_whatever_the_bag_is(tmp_path: Path) -> None:
+    write_bag(tmp_path / 'bag', drive())
+    expected = path_of(tmp_path / 'bag')
+    for form in (None, Rosbag1Writer.CompressionFormat.BZ2, Rosbag1Writer.CompressionFormat.LZ4):
+        assert path_of(write_ros1(tmp_path / f'{form}.bag', drive(), form)) == expected
+    for mode in (CompressionMode.FILE, CompressionMode.MESSAGE, CompressionMode.STORAGE):
+        assert path_of(write_compressed(tmp_path / mode.name, drive(), mode)) == expected
+
+
+def test_several_bags_are_one_recording_whatever_their_order(tmp_path: Path) -> None:
+    messages, middle = drive(), START + 20 * 10**9
+    write_bag(tmp_path / 'whole', messages)
+    expected = path_of(tmp_path / 'whole')
+    write_bag(tmp_path / 'first', [each for each in messages if each[2] < middle])
+    last = write_ros1(tmp_path / 'last.bag', [each for each in messages if each[2] >= middle])
+    assert path_of(last, tmp_path / 'first') == expected
+    # recorded side by side
+    write_bag(tmp_path / 'odom', odometry())
+    fix = write_ros1(tmp_path / 'fix.bag', fixes(np.zeros(2)))
+    assert path_of(tmp_path / 'odom', fix) == expected
+
+
+def test_only_what_was_recorded_in_a_span_is_used(tmp_path: Path) -> None:
+    write_bag(tmp_path / 'bag', drive())
+    replayed(tmp_path / 'a', tmp_path / 'bag', '--from', 5, '--until', 15.05)
+    part = read_tum(tmp_path / 'a' / 'path.tum')
+    assert part.stamps_ns[[0, -1]].tolist() == [START + 5 * 10**9, START + 15 * 10**9]
+    inside = [each for each in drive() if 5.0 <= (each[2] - START) * 1e-9 < 15.05]
+    write_bag(tmp_path / 'inside', inside)
+    assert replayed(tmp_path / 'b', tmp_path / 'inside') == (
+        tmp_path / 'a' / 'path.tum').read_bytes()
+
+
+def test_json_is_the_summary_and_nothing_else(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str],
+) -> None:
+    write_bag(tmp_path / 'bag', drive())
+    replayed(tmp_path / 'out', tmp_path / 'bag', '--json')
+    printed = capsys.readouterr()
+    assert printed.err == ''
+    content = json.loads(printed.out)
+    assert content == json.loads((tmp_path / 'out' / 'summary.json').read_text(encoding='utf-8'))
+    assert content['bags'] == [str(tmp_path / 'bag')]
+    assert content['status'] == 'converged'
+
+
+def test_wrong_bags_are_one_line_that_names_them(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str],
+) -> None:
+    good = tmp_path / 'good'
+    write_bag(good, drive())
+    whole = write_ros1(tmp_path / 'whole.bag', drive()).read_bytes()
+    for name, data in (('cut.bag', whole[:len(whole) // 2]), ('text.bag', b'something else'),
+                       ('cut.mcap', (good / 'good.mcap').read_bytes()[:9000])):
+        (tmp_path / name).write_bytes(data)
+        text = error_of(capsys, good, tmp_path / name)
+        assert text.startswith(f'error: {tmp_path / name}: damaged, cut short or not supported')
+    metadata = write_compressed(
+        tmp_path / 'packed', drive(), CompressionMode.MESSAGE) / 'metadata.yaml'
+    metadata.write_text(metadata.read_text().replace('zstd', 'gzip'))
+    assert f'{tmp_path}/packed: damaged, cut short or not supported: Compression format' in (
+        error_of(capsys, tmp_path / 'packed'))
+    assert '/gps/fix is of type sensor_msgs/msg/NavSatFix, expected nav_msgs' in error_of(
+        capsys, good, '--odom', '/gps/fix')
+    point = NOETIC.types['geometry_msgs/msg/Point'](1.0, 2.0, 3.0)
+    other = write_ros1(tmp_path / 'other.bag', [('/odom', 'geometry_msgs/msg/Point', 1, point)])
+    assert '--odom /odom is of type geometry_msgs/msg/Point | nav_msgs/msg/Odometry' in error_of(
+        capsys, good, other, '--odom', '/odom')
+    assert 'nothing was recorded between --from and --until; the recording is 39.9' in error_of(
+        capsys, good, '--from', 50)
+    assert 'expected one .g2o file alone' in error_of(capsys, good, 'graph.g2o')
+
+
+def test_a_terminal_sees_how_far_a_bag_is_read(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    write_bag(tmp_path / 'bag', drive())
+    monkeypatch.setattr('pose_graph_ros.cli.progress.DELAY', 0.0)
+    with open_bags([tmp_path / 'bag']) as bag:
+        plain = [message.raw for message in bag.messages(['/odom'])]
+        assert [each.raw for each in WatchedBag(bag, 'reading').messages(['/odom'])] == plain
+        assert capsys.readouterr().err == ''
+        monkeypatch.setattr(sys.stderr, 'isatty', lambda: True)
+        assert [each.raw for each in WatchedBag(bag, 'reading').messages(['/odom'])] == plain
+    assert 'reading:   0 % |' in capsys.readouterr().err
