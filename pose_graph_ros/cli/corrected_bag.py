@@ -1,6 +1,6 @@
 # Copyright 2026 The pose_graph_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""Write a bag again, with the corrected path, odometry in the map, and the transform to odom."""
+"""Copy a bag, with the corrected path, odometry in the map, and the transform to odom."""
 
 import bisect
 from collections.abc import Iterator, Mapping
@@ -110,7 +110,7 @@ def write_corrected(
     estimate: Estimate, covariances: FloatArray,
 ) -> Copied:
     """
-    Copy all messages of the span of the inputs, with what the node would publish at its best.
+    Return the numbers of messages after copying those of the span of the inputs, with the result.
 
     With each message of the primary odometry comes its pose in the map by the whole recording,
     and the transform from map to odom if its frame is `odom_frame`. The path comes first.
