@@ -13,6 +13,7 @@ import numpy as np
 from pose_graph_ros.core.exceptions import ConfigError
 from pose_graph_ros.core.geometry.se2 import IntArray
 from pose_graph_ros.core.graph.graph import GraphRows
+from pose_graph_ros.core.io.edge2_order import Guess, read_guessed
 from pose_graph_ros.core.io.g2o import EDGE2_ORDERS, read_g2o
 
 SAVED = b'{\n"sha256": "'
@@ -32,7 +33,7 @@ def add_graph(parser: argparse.ArgumentParser, *, nargs: str | None = None) -> N
                         help='g2o file, or saved graph (its .json file, or the .g2o file beside '
                              'it)')
     parser.add_argument('--edge2', choices=EDGE2_ORDERS,
-                        help='format of the tag EDGE2 in this file')
+                        help='format of the tag EDGE2 in this file (default: found out)')
 
 
 def read(path: Path, edge2_order: str | None) -> NamedRows:
@@ -44,7 +45,11 @@ def read(path: Path, edge2_order: str | None) -> NamedRows:
 
         rows = read_graph(path).rows
         return NamedRows(rows, rows.node_ids)
-    file = read_g2o(path, edge2_order)
+    file, order, reason = (read_guessed(path) if edge2_order is None
+                           else Guess(read_g2o(path, edge2_order), edge2_order, ''))
+    if reason:
+        print(f'warning: {path}: EDGE2 is read in the order of {order}, as {reason}',
+              file=sys.stderr)
     for tag, number in sorted(file.skipped.items()):
         print(f'warning: {path}: {number} lines {tag!r} are skipped', file=sys.stderr)
     return NamedRows(file.graph.rows(), file.ids)

@@ -74,7 +74,7 @@ def draw(panels: Sequence[Panel], path: Path, notes: Sequence[str], *, headings:
     headings : bool, whether poses show where they head
 
     """
-    boxes = [_box(panel.layout) for panel in panels]
+    boxes = [_box(panel) for panel in panels]
     sizes = np.array([high - low for low, high in boxes])
     unit = min(UNIT, LARGEST / float(np.max(sizes)))
     sides = [_side(panel.pattern) for panel in panels]
@@ -115,9 +115,12 @@ def draw(panels: Sequence[Panel], path: Path, notes: Sequence[str], *, headings:
         figure.savefig(path, transparent=True, **options)
 
 
-def _box(layout: Layout) -> tuple[FloatArray, FloatArray]:
+def _box(panel: Panel) -> tuple[FloatArray, FloatArray]:
     """Return the lower left and the upper right corner of a diagram [radii]."""
-    points = np.concatenate([layout.at, *layout.corners])
+    at = panel.layout.at
+    points = np.concatenate([at, *(
+        _path(at[arc.start], corners, at[arc.end]) for arc, corners in zip(
+            panel.drawing.arcs, panel.layout.corners, strict=True))])
     return np.min(points, axis=0) - 1.5, np.max(points, axis=0) + 1.5
 
 
@@ -251,4 +254,4 @@ def _draw_pattern(
         axes.text(x - 0.04, y - middle, pattern.names[n], size=size, color=TEXT, ha='right',
                   va='center')
         axes.text(x + middle, y + 0.04, pattern.names[n], size=size, color=TEXT, ha='center',
-                  va='bottom', rotation=0 if longest * 0.045 < cell * every else 90)
+                  va='bottom', rotation=0 if longest * 0.0086 * size + 0.05 < cell * every else 90)

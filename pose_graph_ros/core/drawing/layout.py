@@ -102,11 +102,13 @@ def _hidden(graph: Structure) -> tuple[FloatArray, int]:
 def _apart(at: FloatArray, placed: np.ndarray) -> tuple[FloatArray, int]:
     """Push apart what is too close; return the places, and how many of the placed have moved."""
     first, n = at.copy(), len(at)
+    # there is a measurement between a bias and a pose
+    least = np.where(placed[:, None] == placed, APART, 2.1 * APART)
     for _ in range(_ROUNDS):
         apart = at[:, None] - at[None]
         distance = np.hypot(apart[..., 0], apart[..., 1])
         np.fill_diagonal(distance, np.inf)
-        if np.min(distance, initial=np.inf) >= APART - 0.01:
+        if np.all(distance >= least - 0.01):
             break
         # nodes at the same place leave in different directions
         i, j = np.nonzero(distance < 1e-6)
@@ -115,7 +117,7 @@ def _apart(at: FloatArray, placed: np.ndarray) -> tuple[FloatArray, int]:
             (np.cos(turn), np.sin(turn)))
         length = np.hypot(apart[..., 0], apart[..., 1])
         np.fill_diagonal(length, 1.0)
-        push = np.where(distance < APART, 0.5 * (APART - np.minimum(distance, APART)), 0.0)
+        push = 0.5 * (least - np.minimum(distance, least))
         at += np.sum(apart / length[..., None] * push[..., None], axis=1)
     moved = np.hypot(*(at - first).T) > 1.0
     return at, int(np.count_nonzero(moved[:n] & placed))

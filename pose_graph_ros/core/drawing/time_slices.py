@@ -15,7 +15,7 @@ from pose_graph_ros.core.drawing.diagram import Diagram, Role
 from pose_graph_ros.core.drawing.structure import Sort
 from pose_graph_ros.core.geometry.se2 import FloatArray
 
-WIDTH, NARROW = 5.0, 2.7
+WIDTH, NARROW = 5.6, 2.7
 """Distance of slices, and of measurements in one [radii]."""
 CONTROLS, MEASURED, BIASES, LANDMARKS, LOOSE = 3.6, -4.2, -8.4, -12.6, -16.8
 ABOVE, TRACK = 7.2, 3.0
@@ -52,8 +52,11 @@ def place(drawing: Diagram) -> FloatArray:
     _put_above(above, at)
     for role, level in ((Role.BIAS, BIASES), (Role.LANDMARK, LANDMARKS)):
         _put_below(drawing, [n for n, each in enumerate(vertices) if each.role is role], at, level)
-    for k, n in enumerate(loose):   # of biases or landmarks alone
-        at[n] = NARROW * k, LOOSE
+    has_landmarks = any(each.role is Role.LANDMARK for each in vertices)
+    last = -np.inf
+    for x, n in sorted((float(at[vertices[n].nodes[0], 0]), n) for n in loose):
+        last = max(x, last + NARROW)    # of biases or landmarks alone
+        at[n] = last, LOOSE if has_landmarks else LANDMARKS
     return at
 
 
@@ -74,7 +77,7 @@ def corners(drawing: Diagram, at: FloatArray) -> tuple[FloatArray, ...]:
             found.append(np.empty((0, 2)))
             continue
         right = top_x >= x
-        aside = (1.0 if right else -1.0) * (1.7 + 0.3 * min(used[arc.start, right], 2))
+        aside = (1.0 if right else -1.0) * (1.25 + 0.2 * min(used[arc.start, right], 2))
         used[arc.start, right] += 1
         found.append(np.array(((x + aside, abs(aside)), (x + aside, top))))
     return tuple(found)
@@ -98,7 +101,7 @@ def _put_above(above: list[tuple[int, int, int]], at: FloatArray) -> None:
         begin, end = at[first, 0], at[last, 0]
         track = 0
         while track < len(rows) and any(
-                begin < high + 1.0 and low < end + 1.0 for low, high in rows[track]):
+                begin < high - 1.0 and low < end - 1.0 for low, high in rows[track]):
             track += 1
         if track == len(rows):
             rows.append([])
