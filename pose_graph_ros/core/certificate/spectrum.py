@@ -55,6 +55,8 @@ def examined(form: QuadraticForm, y: ComplexArray) -> Spectrum:
     """
     Return what the certificate matrix of headings says.
 
+    Raises LinearSolveError if rounding leaves no matrix positive definite that has to be.
+
     Parameters
     ----------
     form : QuadraticForm
@@ -71,8 +73,12 @@ def examined(form: QuadraticForm, y: ComplexArray) -> Spectrum:
         return Spectrum(True, total - float(np.sum(shift)), smallest, vector)
     # a shift at which it is definite lies below the smallest eigenvalue
     sigma = float(np.max(shift))
+    # Q has no negative eigenvalue, so above the largest entry of L rounding is to blame
+    most = 100.0 * (sigma + float(np.max(np.abs(diagonal))))
     while factors is None:
         sigma *= 10.0
+        if not sigma <= most:
+            raise LinearSolveError('certificate: the numbers are too different in size')
         factors = _definite(form, sigma - diagonal)
     smallest, vector = _smallest(form, factors, -sigma, None)
     proved = total - form.n * sigma

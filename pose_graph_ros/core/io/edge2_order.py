@@ -11,6 +11,7 @@ differ less, as measured by the mean over the median, whatever the unit of the i
 """
 
 from pathlib import Path
+import re
 from typing import NamedTuple
 
 import numpy as np
@@ -72,11 +73,10 @@ def read_guessed(path: Path) -> Guess:
 def _is_ambiguous(path: Path) -> bool:
     """Tell whether a file has a tag with two meanings; False as well if it cannot be read."""
     try:
-        with path.open(encoding='utf-8') as lines:
-            return any(line.split(maxsplit=1)[:1] in ([tag] for tag in AMBIGUOUS)
-                       for line in lines)
+        text = path.read_text(encoding='utf-8')
     except (OSError, UnicodeDecodeError):
         return False
+    return any(re.search(rf'(?m)^\s*{tag}\s', text) for tag in AMBIGUOUS)
 
 
 def _smallest(graph: Graph) -> float:
