@@ -17,7 +17,8 @@ from distutils.command.install_data import install_data  # isort: skip  (setupto
 
 PACKAGE = 'pose_graph_ros'
 # those for `ros2 run`
-EXECUTABLES = ('pose_graph_node', 'replay', 'compare', 'compile_kernels', 'draw', 'marginalize')
+EXECUTABLES = ('pose_graph_node', 'replay', 'solve', 'compare', 'compile_kernels', 'draw',
+               'marginalize')
 LIBEXEC = Path('lib', PACKAGE)
 HERE = Path(__file__).resolve().parent
 
@@ -63,6 +64,7 @@ setup(
         'console_scripts': [
             'pose_graph_node = pose_graph_ros.ros.main:main',
             'replay = pose_graph_ros.cli.main:replay',
+            'solve = pose_graph_ros.cli.main:solve',
             'compare = pose_graph_ros.cli.main:compare',
             'compile_kernels = pose_graph_ros.cli.main:compile_kernels',
             'draw = pose_graph_ros.cli.main:draw',

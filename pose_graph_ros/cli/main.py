@@ -54,6 +54,11 @@ def replay(args: list[str] | None = None) -> int:
     return _alone('replay', args)
 
 
+def solve(args: list[str] | None = None) -> int:
+    """Run `solve` as a separate program; return the exit code."""
+    return _alone('solve', args)
+
+
 def compare(args: list[str] | None = None) -> int:
     """Run `compare` as a separate program; return the exit code."""
     return _alone('compare', args)
