@@ -5,6 +5,7 @@
 from dataclasses import replace
 
 import numpy as np
+import pytest
 
 from pose_graph_ros.core.backend import PoseGraphBackend
 from pose_graph_ros.core.config import (
@@ -14,7 +15,7 @@ from pose_graph_ros.core.config import (
     ThinningConfig,
     WindowConfig,
 )
-from pose_graph_ros.core.geometry import se2
+from pose_graph_ros.core.geometry import covariance, se2
 from pose_graph_ros.core.geometry.se2 import FloatArray
 from pose_graph_ros.core.graph.constraints import EdgeKind
 from pose_graph_ros.core.measurements import (
@@ -191,3 +192,21 @@ def test_neither_nodes_nor_edges_grow_with_the_laps() -> None:
     assert np.all(later <= 1.1 * earlier)
     off = se2.between(backend.graph.poses[-1], truth[len(truth) - 2])
     assert np.hypot(*off[:2]) < 0.3
+
+
+@pytest.mark.parametrize('cell', [0.0, 2.0])
+def test_covariances_along_the_path_are_those_of_its_nodes(cell: float) -> None:
+    backend, truth = driven(settings(cell))
+    estimate = backend.estimate()
+    assert estimate is not None
+    found = backend.path_covariances(estimate)
+    assert found.shape == (len(estimate.path), 3, 3)
+    np.testing.assert_array_equal(found[-1], estimate.covariance)
+    table, graph = backend._nodes.table, backend.graph
+    for number in range(len(truth) - 1):
+        place = table.attachment(number, np.zeros(3), np.zeros((3, 3)))
+        of_node = backend._smoother.covariance(place.node)
+        expected = covariance.propagated(
+            graph.poses_of(place.node), of_node, place.motion, place.noise)
+        np.testing.assert_allclose(found[number], expected, rtol=1e-5, atol=1e-9)
+    assert (len(table.thinned) > 20) == (cell > 0.0)
