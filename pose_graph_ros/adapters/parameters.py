@@ -142,8 +142,8 @@ PARAMETERS: tuple[Parameter, ...] = (
               'distance between hidden nodes is a good value.', 0.0, 1000.0),
     Parameter('thinning.angle', _THINNING.angle, 'rad', 'A hidden node only leaves for others '
               'whose heading differs from its own by less than this.', 0.01, 2.0 * math.pi),
-    Parameter('thinning.poses', float(_THINNING.poses), '', 'So many others must stay near a '
-              'hidden node that leaves.', 1.0, 1000.0),
+    Parameter('thinning.poses', float(_THINNING.poses), '', 'Number of hidden nodes that '
+              'must stay within `thinning.cell` of one that leaves.', 1.0, 1000.0),
     Parameter('thinning.newest', float(_THINNING.newest), '', 'Number of newest hidden nodes that '
               'stay in any case, with their fixes and odometry samples.', 2.0, 1e6),
     Parameter('alignment.sigma_heading', _ALIGNMENT.sigma_heading, 'rad', 'The map is aligned '
