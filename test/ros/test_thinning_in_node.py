@@ -15,9 +15,15 @@ pytestmark = pytest.mark.untraced
 def test_the_path_stays_whole_and_late_measurements_are_taken(
     node: object, client: Client,
 ) -> None:
-    drive(client, 40.0)
+    end = 40.0
+    drive(client, end)
     client.wait_current()
-    client.spin_until(lambda: int(client.values['thinned_nodes']) > 10, 'nodes have left')
+    # a few nodes leave with each update, of which a busy machine makes fewer
+    while int(client.values['thinned_nodes']) <= 10:
+        assert end < 100.0, 'no nodes have left'
+        drive(client, end + 2.0, begin=end)
+        client.wait_current()
+        end += 2.0
     assert client.values['frozen_nodes'] == '0'
     accepted = int(client.values['fix.accepted'])
     client.fix.publish(fix_at(3.05))
