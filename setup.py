@@ -54,6 +54,7 @@ setup(
     maintainer='pose_graph_ros maintainers',
     maintainer_email='maintainers@example.com',
     packages=find_packages(include=[PACKAGE, f'{PACKAGE}.*']),
+    package_data={f'{PACKAGE}.cli.page': ['*.html', '*.css', '*.js']},
     data_files=[
         ('share/ament_index/resource_index/packages', [f'resource/{PACKAGE}']),
         (f'share/{PACKAGE}', ['package.xml']),
@@ -92,7 +93,7 @@ setup(
     ],
     extras_require={
         'test': ['pytest>=7.4', 'pytest-timeout>=2.2', 'pytest-xdist>=3.4', 'coverage>=7.4',
-                 'hypothesis>=6.98', 'evo>=1.38'],
+                 'hypothesis>=6.98', 'evo>=1.38', 'playwright>=1.40'],
         'dev': ['ruff', 'mypy', 'scipy-stubs'],
     },
 )

@@ -45,6 +45,10 @@ from importlib.metadata import distribution
 points = distribution('{PACKAGE}').entry_points.select(group='console_scripts')
 print(*sorted(point.name for point in points if callable(point.load())))
 """
+RENDER = f"""
+from {PACKAGE}.cli.page.render import render
+print(render({{}}))
+"""
 
 pytestmark = [pytest.mark.ros, pytest.mark.slow]
 
@@ -192,6 +196,18 @@ def test_entry_points_load(installation):
     names = run(
         installation.python, '-c', LOAD_ENTRY_POINTS, env=installation.environment, cwd=Path('/'))
     assert names.split() == sorted(['pose-graph', *EXECUTABLES])
+
+
+def test_the_page_of_reports_is_installed_with_its_parts(installation):
+    folder = f'{PACKAGE}/cli/page'
+    expected = {path.name for path in (TREE / folder).iterdir()
+                if path.suffix in {'.html', '.css', '.js'}}
+    assert len(expected) > 3
+    page = run(installation.python, '-c', RENDER, env=installation.environment, cwd=Path('/'))
+    assert page.rstrip().endswith('</html>')
+    where = Path(run(installation.python, '-c', f'import {PACKAGE} as p; print(p.__file__)',
+                     env=installation.environment, cwd=Path('/')).strip()).parent
+    assert {path.name for path in (where / 'cli' / 'page').iterdir()} >= expected
 
 
 def test_version_is_the_same_everywhere():

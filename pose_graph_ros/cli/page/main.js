@@ -1,0 +1,22 @@
+// Copyright 2026 The pose_graph_ros authors
+// SPDX-License-Identifier: Apache-2.0
+// What is on the page, from top to bottom.
+
+showHead();
+showContents();
+const map = showMap();
+showErrors();
+showSources();
+showSprings(map);
+showUpdates();
+showSparsity();
+document.getElementById('foot').append(make('p', {},
+  'Made by pose-graph report. This file holds all its data, and loads nothing.'));
+
+// on paper the page is light, whatever it is on the screen
+let onScreen = null;
+window.addEventListener('beforeprint', () => {
+  onScreen = document.documentElement.dataset.scheme;
+  setScheme('light');
+});
+window.addEventListener('afterprint', () => setScheme(onScreen || 'light'));

@@ -1,0 +1,395 @@
+# Copyright 2026 The pose_graph_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""The page of a report in a real browser: what a reader sees, clicks and is told."""
+
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+import itertools
+import os
+from pathlib import Path
+import re
+import shutil
+from typing import Any
+
+import numpy as np
+import pytest
+from report_data import example
+
+import pose_graph_ros
+from pose_graph_ros.cli.page.render import render
+
+BROWSERS = ('chromium', 'chromium-browser', 'google-chrome', 'google-chrome-stable')
+WIDE, NARROW = 1400, 400
+HOSTILE = '</script><img src=x onerror="window.hacked=1"><!--\u2028{{data}}&amp;$&'
+CSS = (Path(pose_graph_ros.__file__).parent / 'cli' / 'page' / 'report.css').read_text('utf-8')
+
+
+@dataclass
+class Opened:
+    """A page, and what went wrong or left the machine while it was open."""
+
+    page: Any
+    troubles: list[str] = field(default_factory=list)
+    requests: list[str] = field(default_factory=list)
+
+    def view(self) -> tuple[float, float, float]:
+        """Return the middle of the map [m] and its scale [pixels / m]."""
+        text = self.page.get_attribute('#map-canvas', 'data-view')
+        x, y, scale = map(float, text.split())
+        return x, y, scale
+
+    def place(self, x: float, y: float) -> tuple[float, float]:
+        """Return where a point of the map is on the screen [pixels]."""
+        box = self.page.locator('#map-canvas').bounding_box()
+        left, top, scale = self.view()
+        return (box['x'] + box['width'] / 2 + (x - left) * scale,
+                box['y'] + box['height'] / 2 - (y - top) * scale)
+
+    def panel(self) -> str:
+        return str(self.page.inner_text('#panel'))
+
+    def painted(self) -> str:
+        """Return the picture of the map."""
+        self.settle()
+        return str(self.page.evaluate('document.getElementById("map-canvas").toDataURL()'))
+
+    def settle(self) -> None:
+        """Wait until what was asked for has been painted."""
+        self.page.evaluate('new Promise((done) => requestAnimationFrame('
+                           '() => requestAnimationFrame(done)))')
+
+    def overflow(self) -> int:
+        return int(self.page.evaluate('document.scrollingElement.scrollWidth - innerWidth'))
+
+
+def executable() -> str:
+    found = next(filter(None, map(shutil.which, BROWSERS)), None)
+    if found is None:
+        missing('no browser; do: apt install chromium (on Ubuntu, google-chrome from its maker)')
+    return str(found)
+
+
+def missing(reason: str) -> None:
+    """Skip, or fail where continuous integration should have installed it."""
+    if os.environ.get('CI'):
+        pytest.fail(reason)
+    pytest.skip(reason)
+
+
+@pytest.fixture(scope='module')
+def browser() -> Iterator[Any]:
+    try:
+        from playwright.sync_api import sync_playwright  # noqa: PLC0415
+    except ImportError:
+        missing('no playwright: pip install playwright')
+    with sync_playwright() as tool:
+        options = ['--no-sandbox'] if os.geteuid() == 0 else []
+        chromium = tool.chromium.launch(executable_path=executable(), args=options)
+        yield chromium
+        chromium.close()
+
+
+@pytest.fixture(scope='module')
+def data() -> dict[str, Any]:
+    return example()
+
+
+class Opener:
+    """Opens pages, and looks at the end whether they had troubles."""
+
+    def __init__(self, browser: Any, folder: Path) -> None:
+        self.browser, self.folder, self.opened = browser, folder, []
+
+    def __call__(self, data: dict[str, Any], width: int = WIDE, **options: Any) -> Opened:
+        file = self.folder / f'page{len(self.opened)}.html'
+        file.write_text(render(data), encoding='utf-8')
+        touch = {'has_touch': True, 'is_mobile': True} if width == NARROW else {}
+        context = self.browser.new_context(
+            viewport={'width': width, 'height': 900}, reduced_motion='reduce', **touch, **options)
+        opened = Opened(context.new_page())
+        opened.page.set_default_timeout(10_000)
+        opened.page.on('pageerror', lambda error: opened.troubles.append(str(error)))
+        opened.page.on('console', lambda message: opened.troubles.append(message.text))
+        opened.page.on('request', lambda request: opened.requests.append(request.url))
+        opened.page.goto(file.as_uri())
+        opened.settle()
+        self.opened.append(opened)
+        return opened
+
+    def close(self) -> None:
+        for opened in self.opened:
+            opened.page.context.close()
+            assert opened.troubles == []
+            assert [url for url in opened.requests if not url.startswith(('file:', 'data:'))] == []
+            assert len(opened.requests) <= 2        # itself, and its icon, which is empty
+
+
+@pytest.fixture
+def show(browser: Any, tmp_path: Path) -> Iterator[Opener]:
+    opener = Opener(browser, tmp_path)
+    yield opener
+    opener.close()
+
+
+def doubted(data: dict[str, Any]) -> tuple[float, float, str, str]:
+    """Return the middle of a doubted closure [m], its id and its reason."""
+    table = data['closures'][0]
+    k = table['state'].index(3)
+    return (0.5 * (table['x0'][k] + table['x1'][k]), 0.5 * (table['y0'][k] + table['y1'][k]),
+            table['id'][k], data['texts'][table['why'][k]])
+
+
+@pytest.mark.parametrize('width', [WIDE, NARROW])
+def test_a_click_on_a_doubted_closure_tells_its_reason(show, data, width) -> None:
+    opened = show(data, width)
+    page = opened.page
+    page.locator('#map-canvas').scroll_into_view_if_needed()
+    x, y, name, reason = doubted(data)
+    tap = page.mouse.click if width == WIDE else page.touchscreen.tap
+    assert reason not in opened.panel()
+    tap(*opened.place(x, y))
+    for text in (name, reason, 'doubted', '9.8 sigma'):
+        assert text in opened.panel()
+    # again after the map has moved
+    page.click('#panel button[aria-label=Close]')
+    before = opened.view()
+    page.click('button[aria-label="Zoom in"]')
+    page.focus('#map-canvas')
+    page.keyboard.press('ArrowUp')
+    page.keyboard.press('ArrowLeft')
+    after = opened.view()
+    assert after[0] < before[0]
+    assert after[1] > before[1]
+    assert after[2] == pytest.approx(1.6 * before[2])
+    assert reason not in opened.panel()
+    tap(*opened.place(x, y))
+    assert reason in opened.panel()
+    assert opened.overflow() <= 0
+
+
+def test_the_wheel_zooms_at_the_pointer_and_a_drag_takes_the_map_along(show, data) -> None:
+    opened = show(data)
+    page = opened.page
+    x, y, name, _ = doubted(data)
+    at = opened.place(x, y)
+    page.mouse.move(*at)
+    scale = opened.view()[2]
+    page.mouse.wheel(0, -300)
+    page.wait_for_function(
+        f'document.getElementById("map-canvas").dataset.view.split(" ")[2] > {scale}')
+    assert opened.place(x, y) == pytest.approx(at, abs=1.0)
+    page.mouse.down()
+    page.mouse.move(at[0] + 90, at[1] - 60, steps=3)
+    page.mouse.up()
+    assert opened.place(x, y) == pytest.approx((at[0] + 90, at[1] - 60), abs=1.5)
+    assert name not in opened.panel()           # a drag is no click
+    page.mouse.click(*opened.place(x, y))
+    assert name in opened.panel()
+    scale = opened.view()[2]
+    page.mouse.dblclick(*opened.place(x, y))
+    assert opened.view()[2] > 1.9 * scale
+    page.click('button[aria-label="Show all"]')
+    assert opened.view()[2] < scale
+
+
+def test_two_fingers_zoom(show, data) -> None:
+    opened = show(data, NARROW)
+    opened.page.locator('#map-canvas').scroll_into_view_if_needed()
+    x, y = data['lines']['corrected']['x'][90], data['lines']['corrected']['y'][90]
+    u, v = opened.place(x, y)
+    scale = opened.view()[2]
+    fingers = opened.page.context.new_cdp_session(opened.page)
+
+    def touch(kind: str, *places: tuple[float, float]) -> None:
+        points = [{'x': at[0], 'y': at[1], 'id': k} for k, at in enumerate(places)]
+        fingers.send('Input.dispatchTouchEvent', {'type': kind, 'touchPoints': points})
+
+    touch('touchStart', (u - 20, v), (u + 20, v))
+    for apart in (30, 45, 60):
+        touch('touchMove', (u - apart, v), (u + apart, v))
+    touch('touchEnd')
+    opened.settle()
+    assert opened.view()[2] == pytest.approx(3.0 * scale, rel=0.05)
+    assert opened.place(x, y) == pytest.approx((u, v), abs=6.0)
+
+
+@pytest.mark.parametrize('width', [WIDE, NARROW])
+def test_entries_of_lists_centre_the_map(show, data, width) -> None:
+    opened = show(data, width)
+    x, y, name, reason = doubted(data)
+    opened.page.click(f'.entry:has-text("{reason}") >> text="{name}"')
+    assert opened.view()[:2] == pytest.approx((x, y), abs=0.01)
+    assert reason in opened.panel()
+    # by keyboard, too
+    button = opened.page.locator('details[data-kind=fix] summary')
+    button.focus()
+    opened.page.keyboard.press('Enter')
+    opened.page.locator('details[data-kind=fix] .entry').first.focus()
+    opened.page.keyboard.press('Enter')
+    assert 'Fix' in opened.panel()
+    # a spring, too, with its layer
+    box = opened.page.locator('[data-layer=springs] input')
+    assert not box.is_checked()
+    opened.page.locator('.springs .entry').nth(1).click()
+    assert box.is_checked()
+    ends = [data['springs'][1][name] for name in ('from', 'to')]
+    assert opened.view()[:2] == pytest.approx(
+        [np.mean([end[axis] for end in ends]) for axis in ('x', 'y')], abs=0.01)
+    assert data['springs'][1]['name'] in opened.panel()
+    assert opened.overflow() <= 0
+
+
+def test_each_layer_and_state_can_be_hidden_and_shown(show, data) -> None:
+    opened = show(data)
+    boxes = opened.page.locator('.layers input')
+    assert boxes.count() == 7 + 5 + 4           # layers, states of fixes and of closures
+    full = opened.painted()
+    for box in boxes.all():
+        box.click()
+        assert opened.painted() != full
+        box.click()
+        assert opened.painted() == full
+
+
+def test_what_is_hidden_is_not_clicked(show, data) -> None:
+    opened = show(data)
+    x, y, name, _ = doubted(data)
+    opened.page.click('[data-layer="closure/loop_closure"] [data-state="3"] input')
+    opened.page.mouse.click(*opened.place(x, y))
+    assert name not in opened.panel()
+
+
+def test_time_links_charts_and_map(show, data) -> None:
+    opened = show(data)
+    page = opened.page
+    before = opened.painted()
+    page.focus('#time')
+    page.keyboard.press('PageUp')
+    told = page.inner_text('#where')
+    assert 'UTC' in told
+    assert 'm' in told
+    assert opened.painted() != before
+    chart = page.locator('#errors canvas.over').first
+    chart.scroll_into_view_if_needed()
+    box = chart.bounding_box()
+    page.mouse.move(box['x'] + 0.5 * box['width'], box['y'] + 0.5 * box['height'])
+    opened.settle()
+    assert page.inner_text('#where') != told
+    read_out = page.inner_text('#errors .readout >> nth=0')
+    assert 'corrected path' in read_out
+    assert 'odometry' in read_out
+
+
+def test_the_scheme_is_that_of_the_reader_until_it_is_chosen(show, data) -> None:
+    opened = show(data, color_scheme='dark')
+    page = opened.page
+
+    def background() -> str:
+        return str(page.evaluate('getComputedStyle(document.body).backgroundColor'))
+
+    dark, picture = background(), opened.painted()
+    page.emulate_media(color_scheme='light')
+    page.wait_for_function('document.documentElement.dataset.scheme === "light"')
+    assert background() != dark
+    assert opened.painted() != picture
+    page.click('#scheme')
+    assert background() == dark
+    page.emulate_media(media='print')
+    assert page.locator('nav').is_hidden()
+
+
+@pytest.mark.parametrize('width', [WIDE, NARROW])
+def test_hostile_texts_are_shown_as_texts(show, width) -> None:
+    data = example(poses=60, fixes=40, closures=12, title=HOSTILE + '\ud800')
+    data['subtitle'] = HOSTILE
+    data['texts'] = [HOSTILE * 4] * 4
+    data['facts'][0] = {'label': HOSTILE, 'value': HOSTILE, 'note': HOSTILE}
+    data['findings'][0] |= {'text': HOSTILE, 'anchor': f'source-{HOSTILE}', 'level': HOSTILE}
+    for table in (*data['fixes'], *data['closures']):
+        table['id'] = [HOSTILE] * len(table['id'])
+        table['source'] = HOSTILE
+    for each in data['sources']:
+        each |= {'name': HOSTILE, 'kind': HOSTILE, 'verdict': HOSTILE}
+    for each in data['springs']:
+        each |= {'name': HOSTILE, 'kind': HOSTILE, 'text': HOSTILE}
+    opened = show(data, width)
+    page = opened.page
+    page.locator('details[data-kind=closure] .entry').first.click()
+    assert '</script><img src=x onerror="window.hacked=1"><!--' in opened.panel()
+    page.locator('#findings a').first.click()
+    assert page.locator('img').count() == 0
+    assert page.evaluate('window.hacked') is None
+    assert page.inner_text('h1').startswith('</script><img src=x')
+    assert opened.overflow() <= 0
+
+
+def test_a_page_without_data_says_why_in_each_section(show) -> None:
+    opened = show({'title': 'nothing', 'lines': {'corrected': None}})
+    assert opened.page.locator('.nothing').count() == 6
+    assert opened.page.locator('canvas').count() == 0
+
+
+def test_numbers_that_are_not_finite_are_refused() -> None:
+    with pytest.raises(ValueError, match='float'):
+        render({'duration': float('nan')})
+
+
+# --- colours ------------------------------------------------------------------------------------
+
+def scheme(selector: str) -> dict[str, np.ndarray]:
+    """Return name -> (R, G, B) in 0..1 of a block of variables."""
+    block = re.search(rf'^{re.escape(selector)} {{(.*?)}}', CSS, re.M | re.S)
+    assert block is not None
+    return {name: np.array([int(code[k:k + 2], 16) for k in (0, 2, 4)]) / 255.0
+            for name, code in re.findall(r'--([\w-]+): #(\w{6});', block[1])}
+
+
+SCHEMES = {'light': scheme(':root'), 'dark': scheme(":root[data-scheme='dark']")}
+MARKS = ('path', 'odometry', 'truth', 'believed', 'waiting', 'doubted', 'refused', 'held-out',
+         'spring', 'axis')
+
+
+def linear(colour: np.ndarray) -> np.ndarray:
+    return np.where(colour <= 0.04045, colour / 12.92, ((colour + 0.055) / 1.055) ** 2.4)
+
+
+def contrast(one: np.ndarray, other: np.ndarray) -> float:
+    """Return the contrast ratio of WCAG 2.2."""
+    light = sorted(float(linear(colour) @ [0.2126, 0.7152, 0.0722]) for colour in (one, other))
+    return (light[1] + 0.05) / (light[0] + 0.05)
+
+
+@pytest.mark.parametrize('name', SCHEMES)
+def test_texts_and_marks_have_enough_contrast(name) -> None:
+    colours = SCHEMES[name]
+    assert colours.keys() == SCHEMES['light'].keys()
+    for ground, text in itertools.product(
+            ('page', 'surface', 'raised'),
+            ('ink', 'muted', 'accent', 'warning', 'notice', 'good')):
+        assert contrast(colours[ground], colours[text]) >= 4.5, (ground, text)
+    for mark in MARKS:
+        assert contrast(colours['surface'], colours[mark]) >= 3.0, mark
+
+
+# How colours look to people without cones for red and for green, in linear RGB (Viénot, Brettel
+# and Mollon: Digital video colourmaps for checking the legibility of displays by dichromats, 1999)
+DICHROMATS = {
+    'protanopia': [[0.11238, 0.88762, 0.0], [0.11238, 0.88762, 0.0], [0.00401, -0.00401, 1.0]],
+    'deuteranopia': [[0.29275, 0.70725, 0.0], [0.29275, 0.70725, 0.0], [-0.02234, 0.02234, 1.0]]}
+
+
+def lab(rgb: np.ndarray) -> np.ndarray:
+    """Return CIELAB of linear RGB, for the white of sRGB."""
+    xyz = np.array([[0.4124, 0.3576, 0.1805], [0.2126, 0.7152, 0.0722], [0.0193, 0.1192, 0.9505]])
+    scaled = xyz @ np.clip(rgb, 0.0, 1.0) / (xyz @ np.ones(3))
+    f = np.where(scaled > 0.008856, np.cbrt(scaled), 7.787 * scaled + 16.0 / 116.0)
+    return np.array([116.0 * f[1] - 16.0, 500.0 * (f[0] - f[1]), 200.0 * (f[1] - f[2])])
+
+
+@pytest.mark.parametrize('name', SCHEMES)
+@pytest.mark.parametrize('eyes', DICHROMATS)
+def test_marks_differ_for_the_colour_blind(name, eyes) -> None:
+    seen = {mark: lab(np.array(DICHROMATS[eyes]) @ linear(SCHEMES[name][mark]))
+            for mark in MARKS if mark not in ('truth', 'axis')}
+    for one, other in itertools.combinations(seen, 2):
+        assert np.linalg.norm(seen[one] - seen[other]) > 15.0, (one, other)
