@@ -42,6 +42,8 @@ CORE = {
         'core.compiled', 'core.geometry', 'core.graph', 'core.elimination',
         'core.marginalization', 'core.batch', 'core.smoother', 'core.odometry'},
     'core.trajectories': {'core.geometry'},
+    'core.residuals': {
+        'core.geometry', 'core.graph', 'core.smoother', 'core.odometry', 'core.sources'},
 }
 CORE['core.io'] = set(CORE)
 # The modules on top of the packages: the facade, what it hands out, and who drives it.

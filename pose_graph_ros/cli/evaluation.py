@@ -38,6 +38,10 @@ class Drive:
     """Whether a fix is doubted or waits, shape (M,); None if all are believed."""
     loop_states: Sequence[State] = ()
     """Of the loop closures; none if all are believed."""
+    fix_sources: Sequence[str] = ()
+    """Names of the sources of the fixes; none if unknown."""
+    loop_sources: Sequence[str] = ()
+    """The same of the loop closures."""
 
     @property
     def fix_kinds(self) -> dict[str, npt.NDArray[np.bool_]]:

@@ -16,6 +16,7 @@ from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import ExitStack
 from pathlib import Path
 import time
+from types import MappingProxyType
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -40,12 +41,15 @@ from pose_graph_ros.adapters.sources import (
 )
 from pose_graph_ros.cli import options as shared
 from pose_graph_ros.cli.corrected_bag import LATCHED, write_corrected
-from pose_graph_ros.cli.evaluation import Drive
+from pose_graph_ros.cli.evaluation import Drive, evaluate
 from pose_graph_ros.cli.exports import add_exports, covariances, require_datum, write_exports
 from pose_graph_ros.cli.g2o_inputs import read_measurements
 from pose_graph_ros.cli.judgement import judgement, judgement_lines
 from pose_graph_ros.cli.progress import WatchedBag
 from pose_graph_ros.cli.results import collect_drive, write_results
+from pose_graph_ros.cli.run.content import Run
+from pose_graph_ros.cli.run.document import document, write_document
+from pose_graph_ros.cli.run.recorder import Recorder, Update
 from pose_graph_ros.core.backend import PoseGraphBackend
 from pose_graph_ros.core.batch.optimizer import Status
 from pose_graph_ros.core.estimate import Estimate, UpdateReport
@@ -73,12 +77,21 @@ class Replayed(NamedTuple):
     report: UpdateReport  # report of the final optimisation
     refused: Counter[tuple[str, str]]  # messages without a valid measurement, by source and reason
     datum: Datum | None = None  # of the map; None for a g2o file
+    recorder: Recorder | None = None  # what was recorded on the way
+    values: Mapping[str, Any] = MappingProxyType({})  # all parameters of the node
+    kinds: Mapping[str, Kind] = MappingProxyType({})  # of the sources that have a topic
 
     @property
     def origin(self) -> MapOrigin | None:
         """Origin of the map on the Earth; None if it is unknown."""
         plane = None if self.datum is None else self.datum.plane
         return None if plane is None else plane.origin
+
+    def reasons(self) -> dict[Key, str]:
+        """Return why loop closures were refused."""
+        unknown = dict.fromkeys(
+            self.backend.refused_closures, 'Refused: it could not be attached to the path.')
+        return unknown | ({} if self.recorder is None else self.recorder.refused)
 
     def states(self, verdicts: Sequence[Verdict]) -> dict[Key, State]:
         """Return what is believed, by source and stamps; refused loop closures are not."""
@@ -99,8 +112,10 @@ def run(bag: Bag, inputs: Inputs, values: Mapping[str, Any]) -> Replayed:
     for message in read_static_frames(bag):
         reader.frames.receive(message.decode())
     refused: Counter[tuple[str, str]] = Counter()
-    backend, report = run_measurements(_read(bag, inputs, reader, refused), values)
-    return Replayed(backend, report, refused, reader.datum)
+    recorder = Recorder()
+    backend, report = run_measurements(_read(bag, inputs, reader, refused), values, recorder)
+    return Replayed(
+        backend, report, refused, reader.datum, recorder, values, inputs.kinds)
 
 
 def _read(
@@ -123,6 +138,7 @@ def _read(
 
 def run_measurements(
     measurements: Iterable[tuple[str, OdometrySample | Measurement]], values: Mapping[str, Any],
+    recorder: Recorder | None = None,
 ) -> tuple[PoseGraphBackend, UpdateReport]:
     """
     Return a new engine after adding measurements, and the report of the full optimisation.
@@ -131,17 +147,24 @@ def run_measurements(
     ----------
     measurements : iterable, sources and measurements, in the order of their arrival
     values : mapping, all parameters of the node
+    recorder : Recorder, optional, what is told of the run as it goes on
 
     """
     backend = PoseGraphBackend(backend_config(values))
+    recorder = Recorder() if recorder is None else recorder
     next_update = UPDATE_EVERY
     for source, measurement in measurements:
+        recorder.add_measurement(source, measurement.stamp_ns)
         if isinstance(measurement, OdometrySample):
             backend.add_odometry(measurement, source)
         else:
-            backend.add_measurement(measurement, source)
+            recorder.add_answer(source, measurement, backend.add_measurement(measurement, source))
         if backend.graph.n_nodes >= next_update:
-            backend.update()
+            begin = time.perf_counter()
+            report = backend.update()
+            recorder.log.add(Update(
+                int(backend.node_stamps_ns[-1]), backend.graph.n_nodes,
+                1e3 * (time.perf_counter() - begin), report.chi2, report.iterations))
             next_update = backend.graph.n_nodes + UPDATE_EVERY
     return backend, backend.optimize()
 
@@ -156,20 +179,25 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument('--bag', metavar='OUT', type=Path, dest='new_bag',
                         help='new rosbag2 folder with all messages, the corrected path, odometry '
                              'in the map and the transform from map to odom')
+    parser.add_argument('--json', action='store_true',
+                        help='print the contents of summary.json instead of a text')
+    add_sources(parser)
+    shared.add_inputs(parser)
+    shared.add_parameters(parser)
+    parser.epilog = EXAMPLES
+
+
+def add_sources(parser: argparse.ArgumentParser) -> None:
+    """Add the options that say which part of a bag is read, and how a .g2o file is."""
     parser.add_argument('--from', metavar='SECONDS', type=_seconds, dest='begin', default=None,
                         help='leave out what was recorded before, counted from the first message')
     parser.add_argument('--until', metavar='SECONDS', type=_seconds,
                         help='leave out what was recorded from then on')
-    parser.add_argument('--json', action='store_true',
-                        help='print the contents of summary.json instead of a text')
     parser.add_argument('--stamps', metavar='FILE', type=Path,
                         help='text file with the stamps [s] of the vertices of a .g2o file '
                              '(default: a second apart)')
     parser.add_argument('--edge2', choices=EDGE2_ORDERS,
                         help='format of the tag EDGE2 in a .g2o file')
-    shared.add_inputs(parser)
-    shared.add_parameters(parser)
-    parser.epilog = EXAMPLES
 
 
 def _seconds(text: str) -> float:
@@ -239,10 +267,12 @@ def _execute_g2o(options: argparse.Namespace) -> int:
     odometry_source = next(
         source.name for source in source_list(values) if source.kind.is_odometry)
     start = time.monotonic()
+    recorder = Recorder()
     backend, report = run_measurements((
         (odometry_source if isinstance(each, OdometrySample) else CLOSURES, each)
-        for each in measurements), values)
-    result = Replayed(backend, report, Counter())
+        for each in measurements), values, recorder)
+    result = Replayed(backend, report, Counter(), None, recorder, values, {
+        odometry_source: Kind.ODOMETRY, CLOSURES: Kind.LOOP_CLOSURE})
     seconds = time.monotonic() - start
     estimate = backend.estimate()
     assert estimate is not None, 'a graph has vertices'
@@ -281,6 +311,11 @@ def _report(
         'status': report.status.value, 'counts': counts,
         'judged': judgement(totals, verdicts)})
     write_g2o(backend.graph, options.out / 'graph.g2o')
+    write_document(document(Run(
+        title, f'replay of {", ".join(path.name for path in options.bags)}', drive, backend,
+        estimate, verdicts, result.recorder or Recorder(), result.values, result.kinds,
+        backend.counts + result.refused, evaluate(drive), report, result.origin,
+        facts['seconds'], result.reasons())), options.out)
     exported = write_exports(options.export, options.out, title, backend=backend,
                              estimate=estimate, datum=result.datum)
     if options.json:
@@ -289,7 +324,8 @@ def _report(
         for line in _lines(result, estimate, verdicts, facts):
             print(line)
         print('counts: ' + ', '.join(f'{name} {count}' for name, count in counts.items()))
-        names = ['drive.png', 'summary.json', 'graph.g2o', *(path.name for path in exported)]
+        names = ['drive.png', 'summary.json', 'run.json', 'graph.g2o',
+                 *(path.name for path in exported)]
         print(f'\n{table}\n\nwritten: {options.out}/path.tum, {", ".join(names)}')
     return 0 if report.status is Status.CONVERGED else 1
 

@@ -131,6 +131,7 @@ def collect_drive(
     preferred = inputs.of(*ODOMETRY_KINDS)[0]
     odometry, fixes = PathCollector(), _Positions()
     unused = GrowingArray((), np.bool_)
+    fix_sources, loop_sources = list[str](), list[str]()
     loops: list[tuple[int, int]] = []
     loop_states: list[State] = []
     for source, message, held_out in read_inputs(bag, inputs):
@@ -147,12 +148,14 @@ def collect_drive(
                 fixes.add(stamp, pose[:2], np.zeros(2), held_out=held_out)
             case LoopClosure(stamp, _, _, int(reference)):
                 loops.append((reference, stamp))
+                loop_sources.append(source)
                 loop_states.append(states.get((source, stamp, reference), State.BELIEVED))
             case OdometrySample(stamp, pose) if source == preferred:
                 odometry.add(stamp, pose)
         if len(fixes.stamps) > len(unused):
             stamp = int(fixes.stamps.values[-1])
             unused.append_one(not states.get((source, stamp, None), State.BELIEVED).in_graph)
+            fix_sources.append(source)
     stamps, arms = fixes.stamps.values, fixes.arms.values
     inside = corrected.covers(stamps)
     fixes.place(inside)
@@ -165,7 +168,7 @@ def collect_drive(
         fix_held_out=fixes.held_out.values, corrected=corrected,
         truth=None if truth_topic is None else read_truth(bag, truth_topic, inputs.span),
         loop_stamps_ns=np.array(loops, dtype=np.int64).reshape(-1, 2), loop_states=loop_states,
-        fix_unused=unused.values,
+        fix_unused=unused.values, fix_sources=fix_sources, loop_sources=loop_sources,
         map_axes=('east', 'north') if len(inputs.of(Kind.FIX)) > 0 and not any(values['datum'][2:])
         else ('x', 'y'))
 

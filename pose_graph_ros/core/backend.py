@@ -38,6 +38,7 @@ from pose_graph_ros.core.measurements import (
 from pose_graph_ros.core.odometry.hidden_nodes import HiddenNodes
 from pose_graph_ros.core.refiner import Refiner
 from pose_graph_ros.core.relocation import relocate
+from pose_graph_ros.core.residuals.source_residuals import collect, SourceResiduals
 from pose_graph_ros.core.smoother.incremental import IncrementalSmoother
 from pose_graph_ros.core.smoother.results import Refinement
 from pose_graph_ros.core.sources import constraint_names
@@ -47,8 +48,7 @@ from pose_graph_ros.core.sources.pipeline import MeasurementPipeline
 from pose_graph_ros.core.sources.source_report import SourceReport
 from pose_graph_ros.core.transaction import Transaction
 
-# Number of edges of a graph up to which an update may change the weights of all odometry.
-MOST_IN_UPDATE = 1000
+MOST_IN_UPDATE = 1000  # edges of a graph in which an update may change all weights of odometry
 
 
 class PoseGraphBackend:
@@ -156,6 +156,10 @@ class PoseGraphBackend:
     def view(self) -> graph_view.GraphView | None:
         """Return a copy of the graph for display; None before the first odometry."""
         return graph_view.view(self.graph, self._judge.drawn_rows())
+
+    def residuals(self) -> dict[str, SourceResiduals]:
+        """Return the residuals of each source, with their expectation; linear in the graph."""
+        return collect(self._smoother, self._nodes, self._factors)
 
     def largest_energies(self, n: int) -> list[constraint_names.ConstraintEnergy]:
         """Return the n constraints with the largest energies, with names, in descending order."""

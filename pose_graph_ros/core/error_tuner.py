@@ -284,7 +284,7 @@ class ErrorTuner:
         """Return the rows of the edges that the hidden nodes were made with."""
         graph = self._smoother.graph
         primary = graph.memory['edge_i'][:graph.n_edges, tb.EDGE_KIND] == EdgeKind.ODOMETRY
-        others = np.concatenate([[], *self._factors.pose_edges()]).astype(np.int64)
+        others = np.concatenate([[], *self._factors.pose_edges().values()]).astype(np.int64)
         primary[graph.edge_rows(others)] = False
         return np.flatnonzero(primary)
 

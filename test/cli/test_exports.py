@@ -114,7 +114,8 @@ def test_without_a_datum_there_is_no_place_on_the_earth(
     assert (tmp_path / 'out' / 'path.csv').exists()
     assert main([*words, 'all']) == 0
     assert {path.name for path in (tmp_path / 'out').iterdir()} == {
-        'path.tum', 'path.csv', 'path.kitti', 'graph.g2o', 'drive.png', 'summary.json'}
+        'path.tum', 'path.csv', 'path.kitti', 'graph.g2o', 'drive.png', 'summary.json',
+            'run.json'}
 
 
 def test_covariances_are_empty_where_nodes_have_left_the_graph(tmp_path: Path) -> None:

@@ -29,6 +29,7 @@ from pose_graph_ros.cli.bag_messages import (
 from pose_graph_ros.cli.main import guarded, main, replay as replay_alone
 from pose_graph_ros.cli.results import collect_drive, PathCollector, read_truth
 from pose_graph_ros.core.batch.optimizer import Status
+from pose_graph_ros.core.estimate import UpdateReport
 from pose_graph_ros.core.exceptions import PoseGraphError
 from pose_graph_ros.core.geometry import se2
 from pose_graph_ros.core.geometry.geodesy import TangentPlane
@@ -78,7 +79,7 @@ def test_global_poses_correct_the_path_and_all_files_are_written(
     printed = capsys.readouterr().out
     assert 'odom: /odom\nglobal_pose: /pose\nloop_closure: /loop_closure\n' in printed
     assert sorted(each.name for each in out.iterdir()) == [
-        'drive.png', 'graph.g2o', 'path.tum', 'summary.json']
+        'drive.png', 'graph.g2o', 'path.tum', 'run.json', 'summary.json']
     content = summary_of(out)
     assert content['counts'] == {
         'odom.accepted': 400, 'global_pose.accepted': 40, 'loop_closure.accepted': 1}
@@ -272,10 +273,9 @@ def test_the_exit_code_says_whether_the_optimisation_converged(
         done = replay.run(bag, choose_inputs(bag, source_list(values), {}), values)
     assert done.report.status is Status.CONVERGED
     for status, code in ((Status.CONVERGED, 0), (Status.MAX_ITERATIONS, 1), (Status.FAILED, 1)):
-        report = type('Report', (), {'status': status, 'chi2': 0.0})()
+        report = UpdateReport(status, '', 0, 0, 0.0)
         monkeypatch.setattr(
-            replay, 'run', lambda *_, report=report: replay.Replayed(
-                done.backend, report, done.refused))
+            replay, 'run', lambda *_, report=report: done._replace(report=report))
         assert run(tmp_path / 'bag', '-o', tmp_path / 'out') == code
 
 

@@ -59,11 +59,10 @@ def estimate(stamps_ns: IntArray, residuals: FloatArray) -> Autocorrelation:
     white = Autocorrelation(0.0, 0.0)
     if n < LEAST_RESIDUALS or variance <= 0.0:
         return white
-    times = (stamps_ns - stamps_ns[0]) * 1e-9
-    period = float(np.median(np.diff(times)))
+    period = float(np.median(np.diff(stamps_ns))) * 1e-9
     if period <= 0.0:
         return white
-    lags, covariance = _covariances(np.round(times / period).astype(np.int64), residuals)
+    lags, covariance = autocovariances(stamps_ns, residuals)
     if len(lags) == 0 or lags[0] > 1:
         return white
     first = float(covariance[0]) / variance
@@ -84,13 +83,20 @@ def estimate(stamps_ns: IntArray, residuals: FloatArray) -> Autocorrelation:
     return Autocorrelation(float(tau), float(np.sqrt(correlated)))
 
 
-def _covariances(ticks: IntArray, residuals: FloatArray) -> tuple[IntArray, FloatArray]:
+def autocovariances(stamps_ns: IntArray, residuals: FloatArray) -> tuple[IntArray, FloatArray]:
     """
-    Return lags, in periods, and the autocovariance at each.
+    Return lags, in median periods of the stamps, and the autocovariance at each.
 
-    Pairs of residuals are formed by their stamps, given in whole periods as `ticks`, so gaps in
-    time do not distort the lags.
+    Pairs of residuals are formed by their stamps in whole periods, so gaps in time do not distort
+    the lags.
+
+    Parameters
+    ----------
+    stamps_ns, residuals : ndarray, as for `estimate`, with a period above 0
+
     """
+    times = (stamps_ns - stamps_ns[0]) * 1e-9
+    ticks = np.round(times / float(np.median(np.diff(times)))).astype(np.int64)
     lags, values, lag = [], [], 1
     while lag <= LONGEST_LAG * len(ticks):
         partner = np.searchsorted(ticks, ticks + lag)

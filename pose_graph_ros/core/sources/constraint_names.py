@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from pose_graph_ros.core.geometry.se2 import FloatArray
+from pose_graph_ros.core.geometry.se2 import FloatArray, IntArray
 from pose_graph_ros.core.graph import tables as tb
 from pose_graph_ros.core.graph.constraints import EdgeKind
 from pose_graph_ros.core.graph.graph import Graph
@@ -32,6 +32,12 @@ class ConstraintEnergy:
     """`odometry`, `loop_closure`, `global_pose`, `position`, `heading`, or `bias`."""
     name: str
     """Readable name, such as `odom x12 - x13` or `fix at 1695.250 s near x812`."""
+    edge: bool = True
+    """Whether `number` is that of an edge; else of an observed node."""
+    number: int = -1
+    """Its id in the graph."""
+    nodes: tuple[int, ...] = ()
+    """Numbers of the hidden nodes of the path that it has, in the order of the name."""
 
 
 def largest(
@@ -58,9 +64,21 @@ def largest(
         edge = row < graph.n_edges
         number, table = (row, tables[0]) if edge else (row - graph.n_edges, tables[1])
         names = _names(number, table, graph, nodes, factors, edge=edge)
-        named.append(ConstraintEnergy(float(energies[row]), float(table.energies[number]),
-                                      int(table.freedom[number]), *names))
+        ids = graph.edge_ids if edge else graph.observed_ids
+        named.append(ConstraintEnergy(
+            float(energies[row]), float(table.energies[number]), int(table.freedom[number]),
+            *names, edge, int(ids[number]),
+            _numbers(graph, nodes, table.integers[number], edge=edge)))
     return named
+
+
+def _numbers(
+    graph: Graph, nodes: HiddenNodes, integers: IntArray, *, edge: bool,
+) -> tuple[int, ...]:
+    """Return the numbers of the hidden nodes in a row of a table, without biases."""
+    rows = integers[[tb.END_I, tb.END_J] if edge else [tb.OBS_NODE]]
+    ids = graph.node_ids[rows[graph.is_pose[rows]]]
+    return tuple(np.searchsorted(nodes.ids, ids).tolist())
 
 
 def queued(queue: Queue, nodes: HiddenNodes) -> list[str]:

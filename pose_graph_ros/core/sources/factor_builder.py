@@ -41,7 +41,7 @@ from pose_graph_ros.core.sources.gauss_markov import (
 )
 from pose_graph_ros.core.sources.gyro_bias import GyroBiases
 from pose_graph_ros.core.sources.measurement_constraints import motion_noise
-from pose_graph_ros.core.sources.source_constraints import SavedSource, SourceConstraints
+from pose_graph_ros.core.sources.source_constraints import Held, SavedSource, SourceConstraints
 from pose_graph_ros.core.sources.source_report import SourceReport
 
 # A report is renewed after so many more measurements, as a share of those in the graph.
@@ -181,9 +181,17 @@ class FactorBuilder:
         """Return the constraints of a source that has some."""
         return self._constraints[source]
 
-    def pose_edges(self) -> list[IntArray]:
-        """Return the ids of all edges between poses but those of the primary odometry."""
-        return [edges.values for edges in self._pose_edges.values()]
+    def pose_edges(self) -> dict[str, IntArray]:
+        """Return the ids of the edges between poses, by source, without primary odometry."""
+        return {source: edges.values for source, edges in self._pose_edges.items()}
+
+    def held(self) -> dict[str, tuple[IntArray, Held]]:
+        """Return the stamps of all measurements in the map [ns], and what holds them."""
+        every = {source: each.held(np.arange(len(each)))
+                 for source, each in self._constraints.items()}
+        return {source: (self._constraints[source].rows.values[:, 0], held._replace(
+            is_edge=held.is_edge | self._has_given_bias(source)))
+            for source, held in every.items()}
 
     def correlation(self, source: str) -> Correlation:
         """Return how correlated errors of a source are treated."""

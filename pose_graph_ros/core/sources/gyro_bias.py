@@ -247,6 +247,10 @@ class GyroBiases:
             known = self._edges_of(source)
             known.select(np.flatnonzero(~np.isin(known.values[:, 0], edges)))
 
+    def edges(self) -> dict[str, IntArray]:
+        """Return the ids of the edges of each source."""
+        return {source: edges.values[:, 0] for source, edges in self._edges.items()}
+
     def source_of(self, edge: int) -> str | None:
         """Return the source of an edge, by its id; None if it is not of a gyroscope."""
         for source, edges in self._edges.items():

@@ -1,0 +1,161 @@
+# Copyright 2026 The pose_graph_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""The JSON object of a run, as docs/tools.md describes it, and its file run.json."""
+
+from collections.abc import Mapping
+from dataclasses import asdict
+from datetime import datetime, UTC
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from pose_graph_ros.cli.run import places
+from pose_graph_ros.cli.run.content import Run
+from pose_graph_ros.cli.run.findings import findings
+from pose_graph_ros.cli.run.lines import number, rounded
+from pose_graph_ros.cli.run.reading import FILE, VERSION
+from pose_graph_ros.cli.run.sources import analyse, source_entry
+from pose_graph_ros.cli.run.springs import springs
+from pose_graph_ros.core.drawing import binned_pattern
+from pose_graph_ros.core.drawing.binned_pattern import BinnedPattern
+from pose_graph_ros.core.graph.graph import Graph
+
+# Stamps from the year 2000 on are times of this epoch [ns]; others count from any beginning.
+_EPOCH = 946_684_800_000_000_000
+
+
+def document(run: Run) -> dict[str, Any]:
+    """Return the JSON object of a run."""
+    drive, path = run.drive, run.drive.corrected
+    frame = places.Frame(run.start_ns, np.round(path.poses[0, :2], 3) + 0.0)
+    covariances = run.backend.path_covariances(run.estimate)
+    run.errors = places.errors(drive, covariances, frame)
+    residuals = run.backend.residuals()
+    in_use = {source: each.in_use for source, each in run.backend.reports().items()}
+    analyses = analyse(residuals, run.kinds, in_use)
+    lines, at_ns = places.lines(drive, frame)
+    return {
+        'version': VERSION, 'title': run.title, 'subtitle': run.subtitle,
+        'start': _utc(run.start_ns), 'start_ns': str(run.start_ns),
+        'duration': round(float(path.stamps_ns[-1] - path.stamps_ns[0]) * 1e-9, 3),
+        'axes': list(drive.map_axes), 'offset': rounded(frame.offset),
+        'datum': None if run.origin is None else {
+            'latitude': run.origin.latitude, 'longitude': run.origin.longitude,
+            'altitude': number(run.origin.altitude, 8), 'yaw': number(run.origin.yaw, 8)},
+        'facts': _facts(run), 'findings': findings(run, analyses), 'lines': lines,
+        'ellipses': places.ellipses(path, covariances, frame),
+        'fixes': places.fixes(drive, run.verdicts, at_ns, frame),
+        'closures': places.closures(drive, run.verdicts, run.refused, frame),
+        'states': list(places.STATES), 'errors': run.errors, 'error_table': _error_table(run),
+        'sources': [source_entry(each, frame) for each in analyses.values()],
+        'springs': springs(run.backend, path, residuals, run.verdicts, frame),
+        'updates': _updates(run, frame), 'sparsity': _sparsity(run.backend.graph),
+        'texts': frame.texts}
+
+
+def write_document(data: Mapping[str, Any], folder: Path) -> Path:
+    """Return the path of run.json after writing it into a folder."""
+    path = folder / FILE
+    text = json.dumps(data, allow_nan=False, separators=(',', ':'), ensure_ascii=False)
+    path.write_text(text + '\n', encoding='utf-8')
+    return path
+
+
+def _utc(stamp_ns: int) -> str | None:
+    """Return a stamp as a time of day with milliseconds; None if it is not of this epoch."""
+    if stamp_ns < _EPOCH:
+        return None
+    seconds, rest = divmod(stamp_ns, 1_000_000_000)
+    try:
+        text = datetime.fromtimestamp(seconds, UTC).strftime('%Y-%m-%dT%H:%M:%S')
+    except (OverflowError, ValueError, OSError):
+        return None
+    return f'{text}.{rest // 1_000_000:03d}Z'
+
+
+def _facts(run: Run) -> list[dict[str, str]]:
+    """Return what stands at the head of the page."""
+    estimate, drive = run.estimate, run.drive
+    path = drive.corrected
+    duration = float(path.stamps_ns[-1] - path.stamps_ns[0]) * 1e-9
+    travelled = float(np.sum(np.hypot(*np.diff(path.poses[:, :2], axis=0).T)))
+    updates = run.recorder.log
+    longest = max((each.milliseconds for each in updates.updates), default=None)
+    freedom = _freedom(run.backend.graph)
+    facts = [
+        ('duration', _clock(duration), ''), ('distance', _metres(travelled), 'of the path'),
+        ('hidden nodes', str(estimate.n_hidden), '' if estimate.n_frozen == 0 else
+         f'{estimate.n_frozen} of them have left the window'),
+        ('edges', str(estimate.n_edges), 'between poses'),
+        ('measurements', str(estimate.n_observed), 'in the map, in the graph'),
+        ('chi2', f'{estimate.chi2:.5g}', f'{freedom} degrees of freedom'),
+        ('alignment', estimate.alignment.value, 'of odometry with the map')]
+    if run.report is not None:
+        facts.append(('optimisation', run.report.status.value.replace('_', ' '),
+                      f'{run.report.iterations} iterations at the end'))
+    if len(drive.loop_stamps_ns) > 0:
+        facts.append(('loop closures', str(len(drive.loop_stamps_ns)), ''))
+    for row in run.rows:
+        if row.name in ('corrected path to truth', 'corrected path to fixes held out'):
+            facts.append(('error', f'{row.rms:.2f} m rms', row.name.partition(' to ')[2]))
+    if run.seconds is not None:
+        facts.append(('time to run', f'{run.seconds:.1f} s',
+                      f'{duration / max(run.seconds, 1e-9):.0f} times as fast as driven'))
+    if longest is not None:
+        facts.append(('longest update', f'{longest:.1f} ms', f'of {updates.count}'))
+    return [{'label': label, 'value': value, 'note': note} for label, value, note in facts]
+
+
+def _freedom(graph: Graph) -> int:
+    """Return the number of measured coordinates with a weight, less that of unknowns."""
+    measured = 0
+    for table in (graph.edges_by_row, graph.observed_by_row):
+        rank = np.count_nonzero(np.diagonal(table.information, axis1=1, axis2=2) > 0.0, axis=1)
+        measured += int(np.sum(rank[table.weight > 0.0]))
+    return measured - int(np.sum(graph.dimension[~graph.fixed]))
+
+
+def _clock(seconds: float) -> str:
+    if seconds < 120.0:
+        return f'{seconds:.1f} s'
+    minutes, rest = divmod(round(seconds), 60)
+    return f'{minutes} min {rest:02d} s' if minutes < 60 else (
+        f'{minutes // 60} h {minutes % 60:02d} min')
+
+
+def _metres(metres: float) -> str:
+    return f'{metres:.1f} m' if metres < 1000.0 else f'{1e-3 * metres:.2f} km'
+
+
+def _error_table(run: Run) -> list[dict[str, Any]]:
+    """Return the table of errors, as in summary.json."""
+    return [{**asdict(row), **{name: number(getattr(row, name), 5)
+                               for name in ('median', 'rms', 'p95', 'maximum')}}
+            for row in run.rows]
+
+
+def _updates(run: Run, frame: places.Frame) -> dict[str, Any] | None:
+    """Return the updates as columns; None if none was recorded."""
+    updates = run.recorder.log.updates
+    if len(updates) == 0:
+        return None
+    stamps, nodes, milliseconds, chi2, iterations = zip(*updates, strict=True)
+    return {'t': frame.seconds(np.array(stamps)), 'nodes': list(nodes),
+            'ms': rounded(milliseconds, 2), 'chi2': [number(each, 6) for each in chi2],
+            'iterations': list(iterations), 'count': run.recorder.log.count,
+            'period': number(1e3 / float(run.values['frequency']))}
+
+
+def _sparsity(graph: Graph) -> list[dict[str, Any]]:
+    """Return the patterns of H and of its factor."""
+    whole, factor = binned_pattern.hessian(graph), binned_pattern.factor(graph)
+    upper = (whole.nonzeros + whole.size) // 2
+    return [_pattern('H, poses in the order of time, then biases', whole, 0),
+            _pattern('R, in the order of elimination', factor, factor.nonzeros - upper)]
+
+
+def _pattern(title: str, pattern: BinnedPattern, fill: int) -> dict[str, Any]:
+    return {'title': title, 'size': pattern.size, 'nonzeros': pattern.nonzeros,
+            'fill': max(fill, 0), 'bins': pattern.bins, 'cells': pattern.cells.tolist()}

@@ -1,0 +1,164 @@
+# Copyright 2026 The pose_graph_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""
+What a person must know of a run, in sentences with numbers and the parameter to set.
+
+A *warning* is something to act on, a *notice* something to know, and *good* what was checked and
+is as it should be. Covariances count as wrong by a factor of 1.5 in sigma, beyond what chance
+explains; where the engine has found so by itself and allows for it, that is a notice.
+"""
+
+from collections.abc import Iterator
+import math
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from pose_graph_ros.adapters.sources import Kind
+from pose_graph_ros.cli.run import measurement_findings
+from pose_graph_ros.cli.run.content import Run
+from pose_graph_ros.cli.run.sources import claim, SourceAnalysis, WRONG
+from pose_graph_ros.core.alignment.monitor import AlignmentState
+from pose_graph_ros.core.batch.optimizer import Status
+
+# Ratio of true to claimed errors of the path from which its covariances count as too small: its
+# errors are few independent ones, as they go on for minutes.
+OVERCONFIDENT = 2.5
+# An update takes too long where it takes more than the time to the next one.
+LEVELS = ('warning', 'notice', 'good')
+
+
+class Finding(NamedTuple):
+    """One sentence."""
+
+    level: str
+    text: str
+    anchor: str
+    """Place on the page that shows more: `map`, `updates`, `errors`, or `source-NAME`."""
+
+
+def findings(run: Run, analyses: dict[str, SourceAnalysis]) -> list[dict[str, Any]]:
+    """Return all findings for run.json, the worst first."""
+    found = [*_whole(run), *(finding for each in analyses.values() for finding in _covariances(
+        run, each)), *(Finding(*each) for each in measurement_findings.found(run)),
+        *_updates(run), *_path(run)]
+    if all(each.level == 'good' for each in found):
+        found.append(Finding('good', 'nothing was found that needs a person', 'map'))
+    found.sort(key=lambda each: LEVELS.index(each.level))
+    return [each._asdict() for each in found]
+
+
+def _whole(run: Run) -> Iterator[Finding]:
+    """Yield what concerns the whole graph."""
+    estimate, report = run.estimate, run.report
+    if report is not None and report.status is not Status.CONVERGED:
+        reason = f': {report.reason}' if report.reason else ''
+        yield Finding('warning', f'the final optimisation did not converge ({report.status.value}'
+                                 f'{reason}): the path is not at the minimum', 'updates')
+    if estimate.alignment is AlignmentState.UNALIGNED:
+        yield Finding(
+            'warning', 'the angle between odometry and map is unknown, as fixes come from too '
+            'short a path: drive farther, or set alignment.minimum_baseline', 'map')
+    elif estimate.alignment is AlignmentState.LOCAL:
+        yield Finding('notice', 'nothing was measured in the map, so the path begins at its '
+                                'origin, and nothing but loop closures bounds its drift', 'map')
+    if run.backend.n_quarantined > 0:
+        names = ', '.join(run.backend.set_aside(3))
+        yield Finding('warning', f'{run.backend.n_quarantined} constraints are set aside because '
+                                 f'the solver fails with them: {names}', 'updates')
+
+
+def _covariances(run: Run, analysis: SourceAnalysis) -> Iterator[Finding]:
+    """Yield what the residuals of a source say of its covariances and their independence."""
+    source, fit, anchor = (analysis.residuals.source, analysis.fit,
+                           f'source-{analysis.residuals.source}')
+    yield from _correlation(run, analysis)
+    if fit.says_nothing:
+        return
+    used = analysis.residuals.scale[analysis.residuals.used]
+    scale = float(np.median(used)) if len(used) > 0 else 1.0
+    if not analysis.is_wrong:
+        yield Finding('good', f'{source}: its residuals are as large as its covariances claim '
+                              f'({fit.ratio:.2g} times the sigma, by {fit.independent:.0f} '
+                              'independent residuals)', anchor)
+        return
+    advice = _advice(run, analysis)
+    large = fit.ratio > 1.0
+    share = f'{fit.ratio:.2g} times' if large else f'{100.0 * fit.ratio:.2g} % of'
+    text = f'{source}: {claim(analysis)}, {share} the sigma'
+    if 1.0 / WRONG < fit.ratio / scale < WRONG:
+        yield Finding('notice', f'{text}; the estimate allows for it (sigmas times {scale:.2g}); '
+                                f'{advice} tells it from the beginning', anchor)
+    elif large:
+        yield Finding('warning', f'{text}: its covariances are {fit.ratio**2:.2g} times too '
+                                 f'small; set {advice}', anchor)
+    else:
+        yield Finding('notice', f'{text}: its covariances are {fit.ratio**-2:.2g} times too '
+                                f'large, so it counts for less than it could; {advice} would be '
+                                'right', anchor)
+
+
+def _advice(run: Run, analysis: SourceAnalysis) -> str:
+    """Return the parameter that makes the sigmas of a source right, with its value."""
+    source, ratio = analysis.residuals.source, analysis.fit.ratio
+    if analysis.kind in (Kind.ODOMETRY, Kind.TWIST, Kind.LOOP_CLOSURE):
+        return f'{source}.sigma_scale to {ratio:.2g}'
+    factor = ratio**2 * float(run.values.get(f'{source}.covariance_scale', 1.0))
+    return f'{source}.covariance_scale to {factor:.2g}'
+
+
+def _correlation(run: Run, analysis: SourceAnalysis) -> Iterator[Finding]:
+    """Yield whether errors of a source in the map go on from one measurement to the next."""
+    source = analysis.residuals.source
+    report = run.backend.reports().get(source)
+    if report is None:
+        return
+    anchor = f'source-{source}'
+    if report.in_use is not None:
+        by = 'found by itself and' if report.found else 'by its parameter,'
+        yield Finding('good', f'{source}: errors are correlated over {report.in_use.tau:.2g} s, '
+                              f'{by} allowed for', anchor)
+    elif report.wrongly_white:
+        yield Finding(
+            'warning', f'{source}: errors of {report.errors.sigma_correlated:.2g} m go on for '
+            f'{report.errors.tau:.2g} s but are treated as independent, so that the path is less '
+            f'certain than its covariances say; set {source}.correlation_time to '
+            f'{report.errors.tau:.2g}, or to -1', anchor)
+
+
+def _updates(run: Run) -> Iterator[Finding]:
+    """Yield what concerns the times of updates."""
+    updates = run.recorder.log.updates
+    period = 1e3 / float(run.values['frequency'])
+    slow = [each for each in updates if each.milliseconds > period]
+    if len(slow) > 0:
+        worst = max(slow, key=lambda each: each.milliseconds)
+        at = (worst.stamp_ns - run.start_ns) * 1e-9
+        yield Finding(
+            'notice', f'{len(slow)} of {run.recorder.log.count} updates took longer than their '
+            f'period of {period:.0f} ms, the longest {worst.milliseconds:.0f} ms at {at:.0f} s '
+            f'with {worst.nodes} nodes; a window bounds them (window.seconds)', 'updates')
+
+
+def _path(run: Run) -> Iterator[Finding]:
+    """Yield how large the errors of the path are, where there is a truth or held-out fixes."""
+    errors = run.errors
+    if errors is None:
+        return
+    far = np.array(errors['position'], dtype=float)
+    rms = math.sqrt(float(np.mean(far**2)))
+    odometry = np.array([np.nan if each is None else each for each in errors['odometry']])
+    text = f'the path is {rms:.2g} m rms from the {errors["against"]}'
+    if np.any(np.isfinite(odometry)):
+        text += f', odometry alone {math.sqrt(float(np.nanmean(odometry**2))):.2g} m'
+    yield Finding('good', text, 'errors')
+    if errors['sigma'] is None or errors['against'] != 'truth':
+        return
+    sigma = np.array([np.nan if each is None else each for each in errors['sigma']])
+    known = np.isfinite(sigma) & (sigma > 0.0)
+    if not np.any(known):
+        return
+    ratio = math.sqrt(float(np.mean((far[known] / sigma[known])**2)))
+    if ratio > OVERCONFIDENT:
+        yield Finding('warning', f'errors of the path are {ratio:.2g} times what its covariances '
+                                 'say', 'errors')

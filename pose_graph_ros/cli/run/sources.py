@@ -1,0 +1,150 @@
+# Copyright 2026 The pose_graph_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""The sources of a run in run.json: residuals, expected against found, with a verdict in words."""
+
+from collections.abc import Mapping
+import math
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from pose_graph_ros.adapters.sources import Kind
+from pose_graph_ros.cli.run.lines import number, rounded
+from pose_graph_ros.cli.run.places import Frame
+from pose_graph_ros.core.residuals.scale import fit, RowFit, ScaleFit
+from pose_graph_ros.core.residuals.source_residuals import SourceResiduals, spread
+from pose_graph_ros.core.residuals.whiteness import Whiteness, whiteness
+from pose_graph_ros.core.sources.gauss_markov import CorrelatedErrors
+
+MOST_SERIES = 2000
+"""Number of residuals of a source in its series."""
+WRONG = 1.5
+"""Ratio of true to claimed sigmas, or its reciprocal, from which covariances count as wrong."""
+EDGES = np.linspace(-5.0, 5.0, 41)
+"""Of the histogram of residuals [sigma]; those beyond count in the outermost bins."""
+_NAMES = {'map': ('x', 'y', 'heading'), 'edge': ('along', 'across', 'heading')}
+
+
+class SourceAnalysis(NamedTuple):
+    """What the residuals of a source show."""
+
+    residuals: SourceResiduals
+    kind: Kind
+    fit: ScaleFit
+    whiteness: Whiteness | None
+    in_use: CorrelatedErrors | None
+    """Statistics of its errors that the graph is built with; None for white errors."""
+
+    @property
+    def row_names(self) -> tuple[str, str, str]:
+        """Names of the three coordinates."""
+        return _NAMES['map' if self.residuals.kind == 'map' else 'edge']
+
+    @property
+    def is_wrong(self) -> bool:
+        """Whether the claimed covariances are much too small or too large, beyond chance."""
+        ratio, low, high = self.fit.ratio, self.fit.low, self.fit.high
+        return (ratio > max(WRONG, high) or ratio < min(1.0 / WRONG, low))
+
+
+def analyse(
+    residuals: Mapping[str, SourceResiduals], kinds: Mapping[str, Kind],
+    in_use: Mapping[str, CorrelatedErrors | None],
+) -> dict[str, SourceAnalysis]:
+    """
+    Return the analysis of each source.
+
+    Parameters
+    ----------
+    residuals : mapping
+    kinds : mapping, kinds of the sources by the parameters
+    in_use : mapping, statistics of the errors of sources in the map
+
+    """
+    guesses = {'odometry': Kind.ODOMETRY, 'loop_closure': Kind.LOOP_CLOSURE, 'turn': Kind.GYRO,
+               'map': Kind.GLOBAL_POSE}
+    return {source: SourceAnalysis(
+        each, kinds.get(source, guesses[each.kind]), fit(each), whiteness(each),
+        in_use.get(source)) for source, each in residuals.items()}
+
+
+def source_entry(analysis: SourceAnalysis, frame: Frame) -> dict[str, Any]:
+    """Return the entry of a source in run.json."""
+    residuals, found = analysis.residuals, analysis.fit
+    used = residuals.rows(residuals.used)
+    unused = residuals.rows(~residuals.used)
+    far = unused.distances[np.isfinite(unused.distances)]
+    expected = {row.coordinate: row.expected for row in found.rows}
+    normalised = np.full((len(used.ids), 3), np.nan)
+    for row, size in expected.items():
+        here = used.measured[:, row] & (size > 0.0)
+        normalised[here, row] = used.errors[here, row] / (used.sigmas[here, row] * size)
+    rows = [row.coordinate for row in found.rows]
+    some = spread(len(used.ids), MOST_SERIES)
+    values = normalised[np.isfinite(normalised)]
+    return {
+        'name': residuals.source, 'kind': analysis.kind.value,
+        'count': len(residuals.ids), 'used': len(used.ids),
+        'rows': [_row(row, analysis.row_names) for row in found.rows],
+        'energy': {'expected': number(found.energy_expected), 'found': number(found.energy_found),
+                   'quantile95_share': number(found.within)},
+        'ratio': number(found.ratio), 'low': number(found.low), 'high': number(found.high),
+        'redundancy': number(found.redundancy), 'independent': number(found.independent),
+        'verdict': verdict(analysis),
+        'unused': {'count': len(unused.ids),
+                   'median_distance': number(float(np.median(far))) if len(far) > 0 else None},
+        'histogram': None if len(values) == 0 or found.says_nothing else {
+            'edges': rounded(EDGES), 'count': np.histogram(
+                np.clip(values, EDGES[0] + 1e-9, EDGES[-1] - 1e-9), EDGES)[0].tolist()},
+        'series': {'t': frame.seconds(used.stamps_ns[some]),
+                   'rows': [rounded(normalised[some, row], 2) for row in rows]},
+        'autocorrelation': _autocorrelation(analysis),
+        'scale': number(float(np.median(used.scale))) if len(used.ids) > 0 else 1.0}
+
+
+def _row(row: RowFit, names: tuple[str, str, str]) -> dict[str, Any]:
+    return {'name': names[row.coordinate], 'unit': 'rad' if row.coordinate == 2 else 'm',
+            'count': row.n, 'sigma': number(row.sigma),
+            'expected': number(row.expected), 'found': number(row.found),
+            'ratio': number(row.ratio), 'low': number(row.low), 'high': number(row.high)}
+
+
+def _autocorrelation(analysis: SourceAnalysis) -> dict[str, Any] | None:
+    found = analysis.whiteness
+    if found is None:
+        return None
+    return {'lag': rounded(found.lags), 'value': rounded(found.values),
+            'band': number(found.band), 'time': number(found.tau) if found.tau > 0.0 else None,
+            'fitted': rounded(found.fitted) if found.tau > 0.0 else None,
+            'in_use': None if analysis.in_use is None else number(analysis.in_use.tau)}
+
+
+def verdict(analysis: SourceAnalysis) -> str:
+    """Return in words whether the covariances of a source are right."""
+    found = analysis.fit
+    if found.n_used == 0:
+        return 'nothing of it is used'
+    if found.says_nothing:
+        return ('its covariances cannot be checked: the path follows it, so that its residuals '
+                f'are {100.0 * found.redundancy:.2g} % of what its errors are'
+                if found.redundancy < 0.5 else
+                f'its covariances cannot be checked: {found.n_used} measurements are as few as '
+                f'{found.independent:.2g} independent ones')
+    sizes = claim(analysis)
+    if not analysis.is_wrong:
+        return f'agrees with its covariances: {sizes}, {found.ratio:.2g} times'
+    variance = found.ratio**2
+    return (f'{sizes}: its covariances are {variance:.2g} times too small' if variance > 1.0
+            else f'{sizes}: its covariances are {1.0 / variance:.2g} times too large')
+
+
+def claim(analysis: SourceAnalysis) -> str:
+    """Return what sigma a source claims, and which one was found."""
+    positions = [row for row in analysis.fit.rows if row.coordinate < 2]
+    rows = positions or list(analysis.fit.rows)
+    sigma = math.sqrt(sum(row.sigma**2 for row in rows) / len(rows))
+    per = '' if analysis.residuals.kind in ('map', 'loop_closure') else ' from node to node'
+    if len(positions) > 0:
+        return f'claims {sigma:.2g} m{per}, found {sigma * analysis.fit.ratio:.2g} m'
+    sigma = math.degrees(sigma)
+    return f'claims {sigma:.2g} deg{per}, found {sigma * analysis.fit.ratio:.2g} deg'

@@ -1,0 +1,64 @@
+# Copyright 2026 The pose_graph_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""The constraints under most tension in run.json: by name, with their ends and residuals."""
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+
+from pose_graph_ros.cli.run.lines import number, rounded
+from pose_graph_ros.cli.run.places import Frame
+from pose_graph_ros.core.backend import PoseGraphBackend
+from pose_graph_ros.core.geometry.trajectory import Trajectory
+from pose_graph_ros.core.judgement.verdicts import Verdict
+from pose_graph_ros.core.residuals.source_residuals import SourceResiduals
+
+MOST = 10
+
+
+def springs(
+    backend: PoseGraphBackend, path: Trajectory, residuals: Mapping[str, SourceResiduals],
+    verdicts: Sequence[Verdict], frame: Frame,
+) -> list[dict[str, Any]]:
+    """
+    Return the constraints with the largest weighted energies, in descending order.
+
+    Parameters
+    ----------
+    path : Trajectory, of the hidden nodes
+    residuals : mapping, by source
+    verdicts : sequence of Verdict
+
+    """
+    names = {(each.edge, each.number): each.id for each in verdicts}
+    stamps = backend.node_stamps_ns
+    found = []
+    for rank, each in enumerate(backend.largest_energies(MOST), 1):
+        place = residual = sigma = expected = None
+        source = residuals.get(each.source)
+        at = [] if source is None else np.flatnonzero(
+            (source.ids == each.number) & (source.is_edge == each.edge)).tolist()
+        if source is not None and len(at) == 1:
+            one = source.rows(np.array(at))
+            residual, sigma = one.errors[0], one.sigmas[0] * one.measured[0]
+            left = float(one.redundancies[0])
+            expected = left if np.isfinite(left) else None
+        ends = [{'node': node, 't': frame.seconds(stamps[[node]])[0],
+                 **dict(zip('xy', (axis[0] for axis in frame.places(path.poses[node, :2])),
+                            strict=True))}
+                for node in each.nodes if node < len(path)]
+        if len(ends) == 1 and residual is not None and each.kind != 'heading':
+            # from where the estimate has it to where it was measured
+            x, y = frame.places(path.poses[each.nodes[0], :2] + residual[:2])
+            place = {'node': None, 't': ends[0]['t'], 'x': x[0], 'y': y[0]}
+        found.append({
+            'rank': rank, 'name': names.get((each.edge, each.number), each.name),
+            'source': each.source, 'kind': each.kind.replace('_', ' '),
+            'energy': number(each.energy), 'expected': number(
+                float(each.freedom) if expected is None else expected),
+            'from': ends[0] if len(ends) > 0 else None,
+            'to': ends[1] if len(ends) > 1 else place,
+            'residual': None if residual is None else rounded(residual, 4),
+            'sigma': None if sigma is None else rounded(sigma, 4), 'text': each.name})
+    return found

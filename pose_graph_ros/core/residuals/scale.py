@@ -1,0 +1,203 @@
+# Copyright 2026 The pose_graph_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""
+The factor on the claimed sigmas of a source that its residuals show, and how sure that is.
+
+With R the covariances as the graph uses them and S those of the residuals, the squared residuals
+`e^T R^-1 e` are expected to be `tr(R^-1 S)`, their redundancy, so that the sum of all squares over
+the sum of redundancies is the factor on the variances (K.-R. Koch, "Parameter estimation and
+hypothesis testing in linear models", 1999, section 3.6: the estimate of a variance component).
+A square counts up to where 99.9 % of them are, so that one wrong measurement does not decide.
+
+Its uncertainty is that of a mean of n independent squares, where n is not the number of residuals:
+
+- neighbours are correlated. The mean of N squares varies as that of `N / (1 + 2 sum rho_k^2)`
+  independent ones (M. S. Bartlett, "On the theoretical specification and sampling properties of
+  autocorrelated time-series", 1946), rho_k the autocorrelation of the residuals themselves;
+- the fit takes a part of them, so n is not above the sum of redundancies either.
+
+Where next to nothing is left, as of odometry that alone determines the poses, n is small, and
+nothing is said.
+"""
+
+import math
+from typing import NamedTuple
+
+import numpy as np
+from scipy.special import chdtri
+
+from pose_graph_ros.core.geometry.se2 import BoolArray, FloatArray
+from pose_graph_ros.core.residuals.source_residuals import SourceResiduals
+
+# Number of independent residuals below which nothing is said.
+LEAST_INDEPENDENT = 10.0
+# Share of what the residuals would be without a fit below which nothing is said.
+LEAST_REDUNDANCY = 0.005
+# Probability of the interval of the factor, and of the bound of what a square counts.
+INTERVAL, BOUND = 0.95, 0.999
+# Autocorrelations count up to the first below this many standard deviations of white residuals.
+CORRELATED = 2.0
+# Longest lag that is looked at, as a share of the number of residuals.
+LONGEST = 0.25
+_COORDINATES = 3
+
+
+class RowFit(NamedTuple):
+    """How large the residuals of one coordinate are, in units of the claimed sigma."""
+
+    coordinate: int
+    """0 and 1 are positions, 2 is the heading."""
+    n: int
+    sigma: float
+    """Root mean square of the claimed sigmas [m or rad]."""
+    expected: float
+    """Root mean square that is expected: 1 less what the fit takes."""
+    found: float
+    ratio: float
+    """Of true to claimed sigmas, by this coordinate; NaN if it says nothing."""
+    low: float
+    """If the claims are right, the ratio is between this and `high` in 95 % of all runs."""
+    high: float
+
+
+class ScaleFit(NamedTuple):
+    """How large the residuals of a source are."""
+
+    n_used: int
+    rows: tuple[RowFit, ...]
+    energy_expected: float
+    """Mean of the squared residuals of a constraint that is expected."""
+    energy_found: float
+    within: float
+    """Share of the constraints whose squared residual is below the 95 % quantile of chi2."""
+    redundancy: float
+    """Share of the measurements that is left as residuals, 0 to 1."""
+    independent: float
+    """Effective number of independent residuals of a coordinate, all coordinates together."""
+    ratio: float
+    """Of true to claimed sigmas; NaN if the residuals say nothing."""
+    low: float
+    """As in `RowFit`."""
+    high: float
+
+    @property
+    def says_nothing(self) -> bool:
+        """Whether the residuals tell nothing of the covariances."""
+        return math.isnan(self.ratio)
+
+
+def fit(residuals: SourceResiduals) -> ScaleFit:
+    """Return how large the residuals of the used constraints of a source are."""
+    used = residuals.rows(residuals.used)
+    n = len(used.ids)
+    known = np.flatnonzero(np.all(np.isfinite(used.taken), axis=(1, 2)))
+    if n == 0 or len(known) == 0:
+        return ScaleFit(n, (), 0.0, 0.0, 1.0, 0.0, 0.0, math.nan, math.nan, math.nan)
+    freedom = np.sum(used.measured, axis=1)
+    energies, expected = used.energies, np.maximum(used.rows(known).redundancies, 0.0)
+    mean_freedom = float(np.mean(freedom))
+    redundancy = float(np.mean(expected)) / mean_freedom
+    scale = float(np.median(used.scale))
+    rows = _rows(used, used.rows(known))
+    independent = sum(_independent(used, row) for row in range(_COORDINATES))
+    ratio, low, high = _ratio(
+        float(np.mean(_bounded(energies, redundancy * freedom, freedom))),
+        float(np.mean(expected)), independent, redundancy)
+    return ScaleFit(
+        n, rows, float(np.mean(expected)), float(np.mean(energies)),
+        float(np.mean(energies <= _quantiles(freedom, INTERVAL))), redundancy, independent,
+        scale * ratio, low, high)
+
+
+def _rows(used: SourceResiduals, known: SourceResiduals) -> tuple[RowFit, ...]:
+    """Return the fit of each coordinate; `known` are those whose expectation is known."""
+    rows = []
+    sigmas, left = used.sigmas, _left(known)
+    for row in np.flatnonzero(np.any(used.measured, axis=0)).tolist():
+        measured = used.measured[:, row]
+        if not np.any(known.measured[:, row]):
+            continue
+        sigma = sigmas[measured, row]
+        squares = (used.errors[measured, row] / sigma)**2
+        share = float(np.mean(left[known.measured[:, row], row]))
+        one = np.ones(len(squares))
+        ratio, low, high = _ratio(
+            float(np.mean(_bounded(squares, share * one, one))), share,
+            _independent(used, row), share)
+        rows.append(RowFit(
+            row, len(squares), float(np.sqrt(np.mean(sigma**2))), math.sqrt(share),
+            float(np.sqrt(np.mean(squares))), ratio, low, high))
+    return tuple(rows)
+
+
+def _left(residuals: SourceResiduals) -> FloatArray:
+    """Return the variances of residuals in units of those of measurements, shape (M, 3)."""
+    claimed, taken = (np.diagonal(each, axis1=1, axis2=2)
+                      for each in (residuals.covariances, residuals.taken))
+    # with a diagonal R these shares add up to the redundancy
+    return np.asarray(np.clip(1.0 - taken / np.where(claimed > 0.0, claimed, 1.0), 0.0, 1.0))
+
+
+def _ratio(
+    found: float, expected: float, independent: float, redundancy: float,
+) -> tuple[float, float, float]:
+    """Return the ratio of sigmas with the interval in which it is if the claims are right."""
+    if (independent < LEAST_INDEPENDENT or redundancy < LEAST_REDUNDANCY or expected <= 0.0):
+        return math.nan, math.nan, math.nan
+    low, high = (math.sqrt(float(chdtri(independent, 0.5 + side * 0.5 * INTERVAL)) / independent)
+                 for side in (1.0, -1.0))
+    return math.sqrt(found / expected), low, high
+
+
+def _bounded(squares: FloatArray, expected: FloatArray, freedom: FloatArray) -> FloatArray:
+    """
+    Return squares up to a quantile of their distribution, if the median of all shows its scale.
+
+    Parameters
+    ----------
+    squares, expected, freedom : ndarray, shape (M,)
+
+    """
+    unit = np.where(expected > 0.0, expected / freedom, 1.0)
+    median = float(np.median(squares / (unit * _quantiles(freedom, 0.5))))
+    return np.asarray(np.minimum(squares, max(median, 1.0) * unit * _quantiles(freedom, BOUND)))
+
+
+def _quantiles(freedom: FloatArray | BoolArray, probability: float) -> FloatArray:
+    """Return quantiles of chi2, shape (M,)."""
+    values = chdtri(np.arange(1, _COORDINATES + 1), 1.0 - probability)
+    return np.asarray(values[np.clip(freedom.astype(np.int64), 1, _COORDINATES) - 1])
+
+
+def _independent(residuals: SourceResiduals, row: int) -> float:
+    """Return the effective number of independent squares of one coordinate."""
+    measured = residuals.measured[:, row]
+    if not np.any(measured):
+        return 0.0
+    values = residuals.errors[measured, row] / residuals.sigmas[measured, row]
+    n = len(values)
+    known = residuals.rows(measured & np.all(np.isfinite(residuals.taken), axis=(1, 2)))
+    left = n * float(np.mean(_left(known)[:, row])) if len(known.ids) > 0 else 0.0
+    return min(n / (1.0 + 2.0 * squared_correlations(values)), left)
+
+
+def squared_correlations(values: FloatArray) -> float:
+    """
+    Return the sum of the squared autocorrelations of a series, up to where they fade.
+
+    Parameters
+    ----------
+    values : ndarray, shape (N,), evenly spaced
+
+    """
+    n = len(values)
+    power = float(np.sum(values**2))
+    longest = int(LONGEST * n)
+    if longest < 1 or power <= 0.0:
+        return 0.0
+    size = 1 << int(2 * n - 1).bit_length()
+    spectrum = np.fft.rfft(values, size)
+    correlation = np.fft.irfft(np.abs(spectrum)**2, size)[1:longest + 1] / power
+    faded = np.flatnonzero(np.abs(correlation) < CORRELATED / math.sqrt(n))
+    end = int(faded[0]) if len(faded) > 0 else longest
+    return float(np.sum(correlation[:end]**2))

@@ -1,0 +1,266 @@
+# Copyright 2026 The pose_graph_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""
+The residuals of all constraints at the estimate, by source, with what is expected of them.
+
+A measurement with the covariance R leaves the residual e, whose covariance is
+
+    S = R - J P J^T,
+
+if all covariances are right: P is the marginal covariance of its nodes at the estimate and J the
+Jacobian of the residual, so J P J^T is what the fit takes (R. Mehra, J. Peschon, "An innovations
+approach to fault detection and diagnosis in dynamic systems", Automatica 1971, in the form for
+smoothing). This holds with correlated errors as well, where R is the whole variance of one
+measurement, with that of its bias, and e its whole error. For a measurement that the graph does
+not use, `S = R + J P J^T`.
+
+Errors of edges between poses are in the axes of the measured pose: x along and y across the
+direction of travel. Those of measurements in the map are in its axes.
+"""
+
+from collections.abc import Mapping
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from pose_graph_ros.core.geometry import se2
+from pose_graph_ros.core.geometry.se2 import BoolArray, FloatArray, IntArray
+from pose_graph_ros.core.graph.constraints import EdgeKind, Edges, ObservedNodes
+from pose_graph_ros.core.graph.graph import Graph
+from pose_graph_ros.core.odometry.hidden_nodes import HiddenNodes
+from pose_graph_ros.core.smoother.incremental import IncrementalSmoother
+from pose_graph_ros.core.sources.factor_builder import FactorBuilder
+from pose_graph_ros.core.sources.gauss_markov import STRETCH
+
+# Number of edges of a source whose J P J^T is computed: it takes up to the depth of the tree.
+MOST_EDGES = 1000
+
+
+class SourceResiduals(NamedTuple):
+    """Residuals of the M constraints of one source, in the order of their stamps."""
+
+    source: str
+    kind: str
+    """`odometry`, `loop_closure`, `turn` (a gyroscope) or `map` (fixes, poses, headings)."""
+    stamps_ns: IntArray
+    """Shape (M,); of edges, the later end."""
+    errors: FloatArray
+    """Shape (M, 3) [m, m, rad]; 0 where nothing is measured."""
+    measured: BoolArray
+    """Which coordinates are measured, shape (M, 3)."""
+    covariances: FloatArray
+    """R as the graph uses it, shape (M, 3, 3); unused constraints as if they had weight 1."""
+    taken: FloatArray
+    """J P J^T, shape (M, 3, 3); NaN where it was not computed."""
+    used: BoolArray
+    """Which constraints have a weight above 0, shape (M,)."""
+    scale: FloatArray
+    """Factor on the claimed sigmas that the graph uses, shape (M,)."""
+    ids: IntArray
+    """Ids in the graph, shape (M,)."""
+    is_edge: BoolArray
+    """Whether these are ids of edges; else of observed nodes, shape (M,)."""
+
+    def rows(self, which: BoolArray | IntArray) -> 'SourceResiduals':
+        """Return some of the constraints."""
+        return _made(self.source, self.kind, *(column[which] for column in self[2:]))
+
+    @property
+    def sigmas(self) -> FloatArray:
+        """Claimed sigmas of the coordinates, shape (M, 3) [m, m, rad]."""
+        variances = np.diagonal(self.covariances, axis1=1, axis2=2)
+        return np.asarray(np.sqrt(variances) / self.scale[:, None])
+
+    @property
+    def energies(self) -> FloatArray:
+        """Squared residuals `e^T R^-1 e`, with R as the graph uses it, shape (M,)."""
+        return np.asarray(np.einsum('mi,mij,mj->m', self.errors, self.information, self.errors))
+
+    @property
+    def information(self) -> FloatArray:
+        """R^-1 in the coordinates that are measured, else 0, shape (M, 3, 3)."""
+        return _inverse(self.covariances, self.measured)
+
+    @property
+    def redundancies(self) -> FloatArray:
+        """What is expected of the energies, tr(R^-1 S), shape (M,); NaN where not computed."""
+        trace = np.einsum('mij,mji->m', self.information, self.taken)
+        return np.asarray(np.sum(self.measured, axis=1) - trace)
+
+    @property
+    def distances(self) -> FloatArray:
+        """Of unused constraints, `sqrt(e^T (R + J P J^T)^-1 e)`, shape (M,) [sigma]."""
+        joint = _inverse(self.covariances + self.taken, self.measured)
+        return np.asarray(np.sqrt(np.einsum('mi,mij,mj->m', self.errors, joint, self.errors)))
+
+
+def collect(
+    smoother: IncrementalSmoother, nodes: HiddenNodes, factors: FactorBuilder,
+) -> dict[str, SourceResiduals]:
+    """
+    Return the residuals of each source that has constraints in the graph.
+
+    Raises ValueError if edits of the graph wait for the solver.
+
+    Parameters
+    ----------
+    smoother : IncrementalSmoother
+    nodes : HiddenNodes
+    factors : FactorBuilder, knows the sources of the constraints
+
+    """
+    graph, covariances = smoother.graph, smoother.covariances()
+    found: dict[str, SourceResiduals] = {}
+    for source, (stamps, held) in factors.held().items():
+        parts = [
+            _of_observed(graph, held.ids[~held.is_edge], covariances),
+            _of_biased(graph, held.ids[held.is_edge], covariances, _total(factors, source))]
+        order = np.concatenate((np.flatnonzero(~held.is_edge), np.flatnonzero(held.is_edge)))
+        columns = map(np.concatenate, zip(*parts, strict=True))
+        found[source] = _sorted(_made(
+            source, 'map', stamps[order], *columns, held.ids[order], held.is_edge[order]))
+    for (source, kind), ids in _edges_by_source(graph, nodes, factors).items():
+        if source not in found:
+            found[source] = _sorted(_of_edges(smoother, nodes, source, kind, ids))
+    return {source: each for source, each in found.items() if len(each.ids) > 0}
+
+
+def _edges_by_source(
+    graph: Graph, nodes: HiddenNodes, factors: FactorBuilder,
+) -> Mapping[tuple[str, str], IntArray]:
+    """Return the ids of the edges between poses by source and kind."""
+    ids, edges = graph.edge_ids, graph.edges
+    others = factors.pose_edges()
+    found: dict[tuple[str, str], IntArray] = {}
+    known = np.concatenate([np.empty(0, dtype=np.int64), *others.values()])
+    primary = np.flatnonzero((edges.kind == EdgeKind.ODOMETRY) & ~np.isin(ids, known))
+    at = np.clip(np.searchsorted(nodes.ids, edges.j[primary]), 0, len(nodes) - 1)
+    stamps = nodes.stamps_ns[at].tolist()
+    names = np.array([nodes.primary_at(stamp) for stamp in stamps], dtype=str)
+    for source in dict.fromkeys(names.tolist()):
+        found[source, 'odometry'] = ids[primary[names == source]]
+    for source, each in others.items():
+        there = each[graph.edge_rows(each) >= 0]
+        kinds = graph.edges_at(there).kind
+        for kind in (EdgeKind.LOOP_CLOSURE, EdgeKind.ODOMETRY):
+            if np.any(kinds == kind):
+                found.setdefault((source, kind.name.lower()), there[kinds == kind])
+    for source, each in factors.gyros.edges().items():
+        found[source, 'turn'] = each[graph.edge_rows(each) >= 0]
+    return found
+
+
+def _total(factors: FactorBuilder, source: str) -> float:
+    """Return the variance of a source's correlated errors in use, in units of the claimed one."""
+    errors = factors.errors_in_use(source)
+    return 1.0 if errors is None else errors.correlated + errors.white
+
+
+_Columns = tuple[FloatArray, BoolArray, FloatArray, FloatArray, BoolArray, FloatArray]
+
+
+def _of_observed(graph: Graph, ids: IntArray, covariances: FloatArray) -> _Columns:
+    """Return the columns from `errors` to `scale` of observed nodes, in map axes."""
+    observed = graph.observed_at(ids)
+    errors = graph.observed_errors(observed)
+    turn = _turns(observed.mean[:, 2])
+    information = turn @ observed.information @ np.swapaxes(turn, 1, 2)
+    measured = np.diagonal(observed.information, axis1=1, axis2=2) > 0.0
+    errors = np.einsum('kij,kj->ki', turn, errors) * measured
+    covariance, scale = _weighted(_inverse(information, measured), observed)
+    return (errors, measured, covariance,
+            _taken(graph, observed.node, observed.offset[:, :2], covariances),
+            observed.weight > 0.0, scale)
+
+
+def _of_biased(
+    graph: Graph, ids: IntArray, covariances: FloatArray, total: float,
+) -> _Columns:
+    """Return the same of edges to a bias; the bias is a part of the error."""
+    edges = graph.edges_at(ids)
+    states, factor = graph.poses_of(edges.j), edges.bias[:, [2, 2, 3]]
+    measured = np.diagonal(edges.information, axis1=1, axis2=2) > 0.0
+    errors = (graph.edge_errors(edges) - factor * states) * measured
+    variance = (factor / (1.0, 1.0, STRETCH))**2 * measured
+    covariance, scale = _weighted(
+        _inverse(edges.information, measured) + variance[:, :, None] * np.eye(3), edges)
+    return (errors, measured, covariance,
+            _taken(graph, edges.i, edges.bias[:, :2], covariances), edges.weight > 0.0,
+            np.sqrt(total) * scale)
+
+
+def _taken(
+    graph: Graph, nodes: IntArray, offsets: FloatArray, covariances: FloatArray,
+) -> FloatArray:
+    """Return J P J^T of measurements of points of the robot, in map axes, shape (K, 3, 3)."""
+    rows = graph.node_rows(nodes)
+    arms = np.einsum('kij,kj->ki', se2.rotation(graph.poses[rows, 2]), offsets)
+    J = np.tile(np.eye(3), (len(rows), 1, 1))
+    J[:, 0, 2], J[:, 1, 2] = -arms[:, 1], arms[:, 0]
+    return J @ covariances[rows] @ np.swapaxes(J, 1, 2)
+
+
+def _of_edges(
+    smoother: IncrementalSmoother, nodes: HiddenNodes, source: str, kind: str, ids: IntArray,
+) -> SourceResiduals:
+    """Return the residuals of edges between poses."""
+    graph = smoother.graph
+    edges = graph.edges_at(ids)
+    measured = np.diagonal(edges.information, axis1=1, axis2=2) > 0.0
+    covariance, _ = _weighted(_inverse(edges.information, measured), edges)
+    taken = np.full((len(ids), 3, 3), np.nan)
+    some = spread(len(ids), MOST_EDGES)
+    taken[some] = smoother.edge_innovations(edges.rows(some)).covariances
+    later = np.searchsorted(nodes.ids, np.maximum(edges.i, edges.j))
+    return SourceResiduals(
+        source, kind, nodes.stamps_ns[np.clip(later, 0, len(nodes) - 1)],
+        graph.edge_errors(edges) * measured, measured, covariance, taken, edges.weight > 0.0,
+        _scales(edges.weight), ids, np.ones(len(ids), dtype=bool))
+
+
+def spread(n: int, most: int) -> IntArray:
+    """
+    Return at most so many of the numbers from 0 to n - 1, evenly spaced.
+
+    Parameters
+    ----------
+    n, most : int
+
+    """
+    return np.arange(n) if n <= most else np.unique(
+        np.round(np.linspace(0, n - 1, most)).astype(np.int64))
+
+
+def _weighted(
+    covariance: FloatArray, constraints: Edges | ObservedNodes,
+) -> tuple[FloatArray, FloatArray]:
+    """Return covariances as the graph uses them, and the factor on sigmas."""
+    scale = _scales(constraints.weight)
+    return covariance * scale[:, None, None]**2, scale
+
+
+def _scales(weight: FloatArray) -> FloatArray:
+    """Return the factors on sigmas that weights stand for, 1 for those that are not used."""
+    return np.asarray(np.where(weight > 0.0, weight, 1.0)**-0.5)
+
+
+def _inverse(matrices: FloatArray, measured: BoolArray) -> FloatArray:
+    """Return the inverses of (M, 3, 3) in the coordinates that are measured, else 0."""
+    both = measured[:, :, None] & measured[:, None, :]
+    filled = np.where(both, matrices, 0.0) + np.eye(3) * ~measured[:, :, None]
+    return np.asarray(np.where(both, np.linalg.inv(filled), 0.0))
+
+
+def _turns(angles: FloatArray) -> FloatArray:
+    """Return rotations of poses, shape (M, 3, 3)."""
+    turn = np.tile(np.eye(3), (len(angles), 1, 1))
+    turn[:, :2, :2] = se2.rotation(angles)
+    return turn
+
+
+def _made(source: str, kind: str, *columns: Any) -> SourceResiduals:
+    return SourceResiduals(source, kind, *columns)
+
+
+def _sorted(residuals: SourceResiduals) -> SourceResiduals:
+    return residuals.rows(np.argsort(residuals.stamps_ns, kind='stable'))
