@@ -18,7 +18,7 @@ from distutils.command.install_data import install_data  # isort: skip  (setupto
 PACKAGE = 'pose_graph_ros'
 # those for `ros2 run`
 EXECUTABLES = ('pose_graph_node', 'replay', 'solve', 'compare', 'compile_kernels', 'draw',
-               'marginalize')
+               'marginalize', 'report')
 LIBEXEC = Path('lib', PACKAGE)
 HERE = Path(__file__).resolve().parent
 
@@ -70,6 +70,7 @@ setup(
             'compile_kernels = pose_graph_ros.cli.main:compile_kernels',
             'draw = pose_graph_ros.cli.main:draw',
             'marginalize = pose_graph_ros.cli.main:marginalize',
+            'report = pose_graph_ros.cli.main:report',
             'pose-graph = pose_graph_ros.cli.main:main',
         ],
     },

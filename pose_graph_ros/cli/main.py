@@ -21,6 +21,7 @@ SUMMARIES = {
     'replay': 'run a bag or a g2o file through the engine of the node, without ROS',
     'solve': 'optimise a g2o file',
     'compare': 'compare trajectories: ATE, RPE, NEES',
+    'report': 'make one HTML page of a run: map, errors, residuals, what is doubted',
     'draw': 'draw a small graph: SVG, PNG or DOT',
     'marginalize': 'take nodes out of a graph, and keep what they told',
     'simulate': 'write a simulated drive as a rosbag2',
@@ -62,6 +63,11 @@ def solve(args: list[str] | None = None) -> int:
 def compare(args: list[str] | None = None) -> int:
     """Run `compare` as a separate program; return the exit code."""
     return _alone('compare', args)
+
+
+def report(args: list[str] | None = None) -> int:
+    """Run `report` as a separate program; return the exit code."""
+    return _alone('report', args)
 
 
 def compile_kernels(args: list[str] | None = None) -> int:

@@ -1,0 +1,125 @@
+# Copyright 2026 The pose_graph_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""
+Make one HTML page of a run: map, errors, residuals by source, what is doubted and why.
+
+RUN is the folder of a replay or a demo, its run.json, or a bag or g2o file, which is replayed
+first with the options of `replay`. The page needs no network and no other file.
+"""
+
+import argparse
+from contextlib import redirect_stdout
+import io
+import json
+from pathlib import Path
+from typing import Any
+import webbrowser
+
+from pose_graph_ros.adapters.bags import BagError
+from pose_graph_ros.cli import options as shared, replay
+from pose_graph_ros.cli.page.render import render
+from pose_graph_ros.cli.run.reading import FILE, read_document
+from pose_graph_ros.core.exceptions import ConfigError, FileFormatError
+
+EXAMPLES = """
+examples:
+  pose-graph report replay                       # of a replay's folder: replay/report.html
+  pose-graph report demo -o tuesday.html --open
+  pose-graph report my_bag --odom /wheel/odometry --fix /gnss/fix --run tuesday
+  pose-graph report replay --json | jq '.findings[] | select(.level == "warning")'
+"""
+SUMMARY = ('title', 'subtitle', 'start', 'duration', 'facts', 'findings', 'error_table', 'sources',
+           'springs')
+"""Keys of run.json that --json prints; sources without their series and histograms."""
+OF_SOURCES = ('series', 'histogram')
+OF_REPLAY = ('begin', 'until', 'stamps', 'edge2', 'params_file', 'truth')
+"""Options that are of use for a bag or a g2o file alone, with inputs and parameters."""
+BAG_SUFFIXES = ('.mcap', '.db3', '.bag', '.g2o')
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Add the arguments of this tool."""
+    parser.epilog = EXAMPLES
+    parser.add_argument('runs', metavar='RUN', type=Path, nargs='+',
+                        help='folder of a replay or a demo, run.json, bags, or a .g2o file')
+    parser.add_argument('-o', '--out', metavar='FILE', type=Path,
+                        help='the page (default: report.html in the folder of the run)')
+    parser.add_argument('--run', metavar='DIR', type=Path, default=Path('report'), dest='folder',
+                        help='of a bag: folder for the results of the replay '
+                             '(default: %(default)s)')
+    parser.add_argument('--json', action='store_true',
+                        help='print what was found as JSON instead of a text')
+    parser.add_argument('--open', action='store_true', help='show the page in a browser')
+    replay.add_sources(parser)
+    shared.add_inputs(parser)
+    shared.add_parameters(parser)
+
+
+def execute(options: argparse.Namespace) -> int:
+    """Run the tool; return the exit code."""
+    code, file = 0, _file(options)
+    if file is None:
+        code, file = _replay(options), options.folder / FILE
+    data = read_document(file)
+    page = options.out or file.parent / 'report.html'
+    if page.suffix not in ('.html', '.htm'):
+        raise ConfigError(f'--out {page}: the name must end in .html')
+    page.parent.mkdir(parents=True, exist_ok=True)
+    page.write_text(render(data), encoding='utf-8')
+    if options.json:
+        print(json.dumps(summary(data) | {'page': str(page), 'bytes': page.stat().st_size},
+                         indent=2))
+    else:
+        for each in data['findings']:
+            print(f'{each["level"]:8} {each["text"]}')
+        print(f'written: {page} ({1e-6 * page.stat().st_size:.1f} MB)')
+    if options.open:
+        webbrowser.open(page.resolve().as_uri())
+    return code
+
+
+def summary(data: dict[str, Any]) -> dict[str, Any]:
+    """Return run.json without its large tables."""
+    found = {key: data[key] for key in SUMMARY}
+    found['sources'] = [{key: value for key, value in source.items() if key not in OF_SOURCES}
+                        for source in data['sources']]
+    return found
+
+
+def _file(options: argparse.Namespace) -> Path | None:
+    """Return the run.json that is asked for; None if something is to be replayed."""
+    first: Path = options.runs[0]
+    if len(options.runs) == 1 and first.is_dir() and (first / FILE).is_file():
+        file = first / FILE
+    elif len(options.runs) == 1 and first.suffix == '.json':
+        file = first
+    elif first.is_dir() and (first / 'summary.json').is_file():
+        raise FileFormatError(f'{first}: no {FILE}, so it was made by an earlier version: '
+                              'replay the bag again')
+    elif first.is_dir() and not (first / 'metadata.yaml').is_file():
+        raise FileFormatError(f'{first}: expected the folder of a replay or a demo with {FILE}, '
+                              'or a rosbag2 with metadata.yaml')
+    elif first.is_file() and first.suffix not in BAG_SUFFIXES:
+        raise FileFormatError(f'{first}: expected {FILE}, or a file with the suffix '
+                              f'{", ".join(BAG_SUFFIXES)}')
+    else:
+        return None
+    given = [name for name in OF_REPLAY if getattr(options, name) is not None]
+    given += [name for name, topic in shared.wanted_topics(options).items() if topic is not None]
+    given += ['param'] if options.param else []
+    given += ['hold_out'] if options.hold_out else []
+    if len(given) > 0:
+        option = {'begin': 'from'}.get(given[0], given[0]).replace('_', '-')
+        raise ConfigError(f'--{option}: {first} has been run already; the option is for a bag')
+    return file
+
+
+def _replay(options: argparse.Namespace) -> int:
+    """Replay bags or a g2o file into the folder of the run; return the exit code."""
+    if (options.folder / 'metadata.yaml').is_file():
+        raise BagError(f'--run {options.folder}: this is a bag; name another folder')
+    words = argparse.Namespace(**vars(options))
+    words.bags, words.out, words.json = options.runs, options.folder, False
+    words.export, words.new_bag = [], None
+    with redirect_stdout(io.StringIO()):
+        return replay.execute(words)
