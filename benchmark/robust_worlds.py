@@ -15,13 +15,13 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from benchmark.robust_closures import closing, Recording, SECOND
-from benchmark.streets import street_path
 from benchmark.worlds import integrate, World
 from pose_graph_ros.core.config import OdometryNoise
 from pose_graph_ros.core.geometry import se2
 from pose_graph_ros.core.geometry.se2 import FloatArray, IntArray
 from pose_graph_ros.core.geometry.trajectory import Trajectory
 from pose_graph_ros.core.graph.constraints import EdgeKind
+from pose_graph_ros.core.simulation.streets import street_path
 
 LEAST_WRONG = 3.5
 """Smallest error of a closure that is meant to be wrong [m]."""

@@ -20,15 +20,12 @@ The sigmas of these sets are much larger than their noise (chi2 per degree of fr
 from itertools import pairwise
 
 import numpy as np
-from scipy.ndimage import uniform_filter1d
 from scipy.spatial import cKDTree
 
 from benchmark.worlds import arranged, closures, odometry, SEED, seen, World
 from pose_graph_ros.core.geometry.se2 import FloatArray, IntArray
 from pose_graph_ros.core.graph.constraints import Edges
-
-# Four directions of a crossing's streets, counter-clockwise.
-_DIRECTIONS = np.array([(1, 0), (0, 1), (-1, 0), (0, -1)])
+from pose_graph_ros.core.simulation.streets import street_path
 
 
 def grid(n: int = 3500, seed: int = SEED) -> World:
@@ -89,64 +86,6 @@ def drive(n: int = 4541, seed: int = SEED) -> World:
     edges = Edges.joined((odometry(truth, sigma, rng, weight=weight),
                           closures(truth, j, i, sigma, rng, weight=weight)))
     return arranged('drive', truth, edges)
-
-
-def street_path(
-    rng: np.random.Generator, n: int, step: float, spacing: FloatArray, *, fresh: float,
-    rounding: int = 0,
-) -> FloatArray:
-    """
-    Return poses, shape (N, 3), at equal steps along a random drive through a grid of streets.
-
-    Parameters
-    ----------
-    rng : Generator
-    n : int
-    step : float
-        Distance of the poses [m].
-    spacing : ndarray, shape (K,)
-        Distances of the streets [m], for both axes; the second in reverse.
-    fresh : float
-        How much likelier than one driven before a new street is chosen.
-    rounding : int
-        Corners are cut over this many steps to each side; with 0 a corner is a turn on the spot.
-
-    """
-    streets = np.concatenate(([0.0], np.cumsum(spacing)))
-    avenues = np.concatenate(([0.0], np.cumsum(spacing[::-1])))
-    cell, facing = np.array([len(streets) // 2, len(avenues) // 2]), 0
-    visits: dict[tuple[int, int, int], int] = {}
-    corners = [cell]
-    length = 0.0
-    while length <= (n + 1) * step:
-        weights = np.zeros(4)
-        for turn, likely in ((0, 3.0), (1, 1.0), (3, 1.0), (2, 1e-9)):
-            way = (facing + turn) % 4
-            end = cell + _DIRECTIONS[way]
-            if np.all(end >= 0) and end[0] < len(streets) and end[1] < len(avenues):
-                seen_before = visits.get((*_middle(cell, end), way % 2), 0)
-                weights[way] = likely * (fresh if seen_before == 0 else 1.0)
-        facing = int(rng.choice(4, p=weights / weights.sum()))
-        end = cell + _DIRECTIONS[facing]
-        street = (*_middle(cell, end), facing % 2)
-        visits[street] = visits.get(street, 0) + 1
-        length += abs(streets[end[0]] - streets[cell[0]]) + abs(avenues[end[1]] - avenues[cell[1]])
-        cell = end
-        corners.append(cell)
-    nodes = np.array(corners)
-    points = np.column_stack((streets[nodes[:, 0]], avenues[nodes[:, 1]]))
-    along = np.concatenate(([0.0], np.cumsum(np.sum(np.abs(np.diff(points, axis=0)), axis=1))))
-    at = step * np.arange(n + 1)
-    path = np.column_stack([np.interp(at, along, points[:, axis]) for axis in (0, 1)])
-    if rounding > 0:
-        path = uniform_filter1d(path, 2 * rounding + 1, axis=0, mode='nearest')
-    moves = np.diff(path, axis=0)
-    return np.column_stack((path[:-1], np.arctan2(moves[:, 1], moves[:, 0])))
-
-
-def _middle(a: IntArray, b: IntArray) -> tuple[int, int]:
-    """Return what names the street between two crossings, in either direction."""
-    return int(a[0] + b[0]), int(a[1] + b[1])
 
 
 def _candidates(truth: FloatArray, radius: float, gap: int) -> IntArray:

@@ -44,6 +44,7 @@ CORE = {
     'core.trajectories': {'core.geometry'},
     'core.residuals': {
         'core.geometry', 'core.graph', 'core.smoother', 'core.odometry', 'core.sources'},
+    'core.simulation': {'core.geometry', 'core.graph'},
 }
 CORE['core.io'] = set(CORE)
 # The modules on top of the packages: the facade, what it hands out, and who drives it.

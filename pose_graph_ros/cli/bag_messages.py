@@ -10,9 +10,9 @@ import numpy as np
 
 from pose_graph_ros.adapters.bag_writer import BagWriter, message_types
 from pose_graph_ros.adapters.conversions import PLANAR
-from pose_graph_ros.core.geometry import se2
 from pose_graph_ros.core.geometry.se2 import FloatArray, IntArray
 from pose_graph_ros.core.geometry.trajectory import Trajectory
+from pose_graph_ros.core.simulation.sensors import velocities
 
 Message = tuple[str, str, int, Any]
 """Topic, type, time of recording [ns] and message; recorded at its stamp, if made here."""
@@ -41,15 +41,18 @@ def write_bag(
 
 def odometry_messages(
     topic: str, frame: str, path: Trajectory, variances: Sequence[float],
+    rates: FloatArray | None = None,
 ) -> Iterator[Message]:
     """
-    Return nav_msgs/Odometry messages with the twists between consecutive poses.
+    Return nav_msgs/Odometry messages.
 
     Parameters
     ----------
     path : Trajectory, poses of base_link in the frame
     variances : sequence of float, length 6
         Of the pose and of the twist.
+    rates : ndarray, shape (N, 3), optional
+        Velocities in base_link [m/s, m/s, rad/s]; by default those between consecutive poses.
 
     """
     pose_with_covariance, twist_with_covariance, make_twist, vector = (
@@ -57,9 +60,9 @@ def odometry_messages(
         for key in ('PoseWithCovariance', 'TwistWithCovariance', 'Twist', 'Vector3'))
     covariance = np.diag(variances).ravel()
     stamps, poses = path.stamps_ns, path.poses
-    steps = se2.between(poses[:-1], poses[1:]) / (np.diff(stamps) * 1e-9)[:, None]
-    rates = np.concatenate((steps[:1], steps)).tolist()
-    for stamp, pose, (vx, _, yaw_rate) in zip(stamps.tolist(), poses.tolist(), rates, strict=True):
+    rates = velocities(path) if rates is None else rates
+    for stamp, pose, (vx, _, yaw_rate) in zip(
+            stamps.tolist(), poses.tolist(), rates.tolist(), strict=True):
         twist = make_twist(vector(vx, 0.0, 0.0), vector(0.0, 0.0, yaw_rate))
         yield topic, _ODOMETRY, stamp, _TYPES[_ODOMETRY](
             _header(stamp, frame), 'base_link', pose_with_covariance(_pose(pose), covariance),
@@ -129,12 +132,39 @@ def loop_closure_messages(
 
     """
     pose_with_covariance = _TYPES['geometry_msgs/msg/PoseWithCovariance']
-    full = np.diag([0.0, 0.0, 0.01, 3e-4, 3e-4, 0.0])
-    full[PLANAR] = covariance
+    full = _spatial(covariance)
     for (old, new), pose in zip(stamps_ns.tolist(), poses.tolist(), strict=True):
         yield topic, _POSE, new, _TYPES[_POSE](
             _header(new, f'@{old // 10**9}.{old % 10**9:09d}'),
-            pose_with_covariance(_pose(pose), full.ravel()))
+            pose_with_covariance(_pose(pose), full))
+
+
+def pose_messages(
+    topic: str, stamps_ns: IntArray, poses: FloatArray, covariance: FloatArray,
+) -> Iterator[Message]:
+    """
+    Return poses in the map as geometry_msgs/PoseWithCovarianceStamped messages.
+
+    Parameters
+    ----------
+    stamps_ns : ndarray, shape (M,)
+    poses : ndarray, shape (M, 3) [m, m, rad]
+    covariance : ndarray, shape (3, 3)
+        Of each of the poses, in map axes.
+
+    """
+    pose_with_covariance = _TYPES['geometry_msgs/msg/PoseWithCovariance']
+    full = _spatial(covariance)
+    for stamp, pose in zip(stamps_ns.tolist(), poses.tolist(), strict=True):
+        yield topic, _POSE, stamp, _TYPES[_POSE](
+            _header(stamp, 'map'), pose_with_covariance(_pose(pose), full))
+
+
+def _spatial(covariance: FloatArray) -> FloatArray:
+    """Return a planar covariance, shape (3, 3), in the order of messages, shape (36,)."""
+    full = np.diag([0.0, 0.0, 0.01, 3e-4, 3e-4, 0.0])
+    full[PLANAR] = covariance
+    return full.ravel()
 
 
 def _header(stamp_ns: int, frame: str) -> Any:

@@ -1,15 +1,36 @@
 # Copyright 2026 The pose_graph_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""Show how far a bag has been read, on a terminal only."""
+"""Show how far a bag has been read or written, on a terminal only."""
 
-from collections.abc import Collection, Iterator
+from collections.abc import Collection, Iterable, Iterator
 import sys
+from typing import TypeVar
 
 from pose_graph_ros.adapters.bags import Bag, BagMessage, Span
 
 DELAY = 0.5  # after which a bar appears [s]
 STEPS = 500  # number of times that it moves
 FORMAT = '{desc}: {percentage:3.0f} % |{bar}| {n:.0f} of {total:.0f} s [{remaining} left]'
+
+Item = TypeVar('Item')
+
+
+def watched(items: Iterable[Item], title: str, total: int) -> Iterable[Item]:
+    """
+    Return the same items, with a bar on standard error while they are used, if that is a terminal.
+
+    Parameters
+    ----------
+    items : iterable
+    title : str, in front of the bar
+    total : int, number of items
+
+    """
+    if not sys.stderr.isatty():
+        return items
+    from tqdm import tqdm  # noqa: PLC0415  (not needed without a terminal)
+
+    return tqdm(items, desc=title, total=total, leave=False, delay=DELAY)
 
 
 class WatchedBag(Bag):

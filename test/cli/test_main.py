@@ -12,7 +12,6 @@ import pytest
 from pose_graph_ros import __version__
 from pose_graph_ros.adapters.bags import open_bag
 from pose_graph_ros.adapters.parameter_texts import as_markdown, as_yaml, sources_as_markdown
-from pose_graph_ros.cli import simulate
 from pose_graph_ros.cli.main import main, SUMMARIES
 from pose_graph_ros.cli.simulate import simulate_drive
 
@@ -92,13 +91,11 @@ def test_parameters_are_printed_as_tables_and_as_a_file(
 
 
 def test_a_drive_is_simulated_once(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str],
+    tmp_path: Path, capsys: pytest.CaptureFixture[str],
 ) -> None:
-    monkeypatch.setattr(simulate, 'simulate_drive', lambda seed, **options: simulate_drive(
-        seed, 12.0, **options))
     folder = tmp_path / 'drive'
-    assert main(['simulate', str(folder), '--seed', '5']) == 0
-    assert capsys.readouterr().out == f'written: {folder}\n'
+    assert main(['simulate', str(folder), '--seed', '5', '--duration', '12']) == 0
+    assert capsys.readouterr().out.endswith(f'written: {folder}, {folder}_truth.json\n')
     drive = simulate_drive(5, 12.0)
     with open_bag(folder) as bag:
         assert sorted(bag.topics) == ['/gps/fix', '/ground_truth', '/odom']

@@ -8,29 +8,41 @@ import numpy as np
 import pytest
 
 from pose_graph_ros.adapters.bags import open_bag
-from pose_graph_ros.cli.simulate import (
-    FALSE_GROUP,
-    FALSE_MIN_DISTANCE,
-    FALSE_SINGLE,
-    FIX_PERIOD_S,
-    FIX_SIGMA,
-    LOOP_SIGMAS,
-    MULTIPATH_OFFSET,
-    MULTIPATH_S,
-    simulate_drive,
-    SimulatedDrive,
-    write_drive,
-)
+from pose_graph_ros.cli.simulate import simulate_drive, write_drive
 from pose_graph_ros.core.geometry import se2
 from pose_graph_ros.core.geometry.geodesy import TangentPlane
+from pose_graph_ros.core.simulation.recording import Recording
+from pose_graph_ros.core.simulation.settings import Closures, FalseClosures, Fixes
+from pose_graph_ros.core.simulation.worlds import REFLECTED
+
+OLD = Path(__file__).parents[1] / 'data' / 'drive_2.npz'
+FIX_PERIOD_S, FIX_SIGMA = Fixes().period_s, Fixes().sigma
+LOOP_SIGMAS = Closures().sigmas
+FALSE_SINGLE, FALSE_GROUP, FALSE_MIN_DISTANCE = 4, 4, FalseClosures().min_distance
+MULTIPATH_OFFSET = np.array(REFLECTED.step[:2])
+MULTIPATH_S = REFLECTED.at_s, REFLECTED.at_s + REFLECTED.seconds
 
 
 @pytest.fixture(scope='module')
-def drive() -> SimulatedDrive:
+def drive() -> Recording:
     return simulate_drive(seed=1)
 
 
-def test_equal_seeds_give_equal_drives_and_others_do_not(drive: SimulatedDrive) -> None:
+def test_the_drive_is_the_one_of_the_first_version() -> None:
+    # every 50th or 500th number of what the first version made, and all of its fixes and closures
+    drive, old = simulate_drive(2, gyro=True, heading_drift=0.002), np.load(OLD)
+    for name in ('fix_stamps_ns', 'loop_stamps_ns', 'fix_is_wrong', 'loop_is_false'):
+        np.testing.assert_array_equal(getattr(drive, name), old[name])
+    for name, path in (('odometry', drive.odometry), ('truth', drive.truth)):
+        np.testing.assert_array_equal(path.stamps_ns[::50], old[f'{name}_stamps_ns'])
+        np.testing.assert_allclose(path.poses[::50], old[name], rtol=0.0, atol=1e-9)
+    np.testing.assert_array_equal(drive.rate_stamps_ns[::500], old['rate_stamps_ns'])
+    np.testing.assert_allclose(drive.rates[::500], old['rates'], rtol=0.0, atol=1e-9)
+    np.testing.assert_allclose(drive.fixes, old['fixes'], rtol=0.0, atol=1e-12)
+    np.testing.assert_allclose(drive.loop_poses, old['loop_poses'], rtol=0.0, atol=1e-9)
+
+
+def test_equal_seeds_give_equal_drives_and_others_do_not(drive: Recording) -> None:
     again, other = simulate_drive(seed=1), simulate_drive(seed=2)
     np.testing.assert_array_equal(again.odometry.poses, drive.odometry.poses)
     np.testing.assert_array_equal(again.fixes, drive.fixes)
@@ -38,7 +50,7 @@ def test_equal_seeds_give_equal_drives_and_others_do_not(drive: SimulatedDrive) 
     assert not np.array_equal(other.fixes[:10], drive.fixes[:10])
 
 
-def test_the_car_moves_like_a_car(drive: SimulatedDrive) -> None:
+def test_the_car_moves_like_a_car(drive: Recording) -> None:
     steps = se2.between(drive.truth.poses[:-1], drive.truth.poses[1:])
     period = np.diff(drive.truth.stamps_ns) * 1e-9
     speed = steps[:, 0] / period
@@ -52,7 +64,7 @@ def test_the_car_moves_like_a_car(drive: SimulatedDrive) -> None:
     assert 0.02 < np.mean(speed < 0.01) < 0.3  # it stops at lights
 
 
-def test_odometry_is_good_over_seconds_and_drifts_over_minutes(drive: SimulatedDrive) -> None:
+def test_odometry_is_good_over_seconds_and_drifts_over_minutes(drive: Recording) -> None:
     stamps = drive.odometry.stamps_ns
     stamps = stamps[drive.truth.covers(stamps)]
     odometry, truth = drive.odometry.at(stamps), drive.truth.at(stamps)
@@ -64,7 +76,7 @@ def test_odometry_is_good_over_seconds_and_drifts_over_minutes(drive: SimulatedD
     assert abs(se2.wrap(truth[0, 2] - odometry[0, 2] - 2.0)) < 0.05
 
 
-def test_fixes_err_by_their_sigma_but_for_reflected_ones(drive: SimulatedDrive) -> None:
+def test_fixes_err_by_their_sigma_but_for_reflected_ones(drive: Recording) -> None:
     errors = []
     for seed in range(1, 6):
         other = simulate_drive(seed)
@@ -83,13 +95,13 @@ def test_fixes_err_by_their_sigma_but_for_reflected_ones(drive: SimulatedDrive) 
     assert np.all(np.hypot(*(off - MULTIPATH_OFFSET).T) < 10.0)    # to one side
 
 
-def test_fixes_pause_once(drive: SimulatedDrive) -> None:
+def test_fixes_pause_once(drive: Recording) -> None:
     gaps = np.diff(drive.fix_stamps_ns) * 1e-9
     assert 68.0 < gaps.max() < 72.0
     assert np.sum(gaps > 1.0) == 1
 
 
-def test_loop_closures_are_true_up_to_their_noise(drive: SimulatedDrive) -> None:
+def test_loop_closures_are_true_up_to_their_noise(drive: Recording) -> None:
     true = ~drive.loop_is_false
     old, new = drive.loop_stamps_ns[true].T
     assert np.sum(true) >= 24
@@ -105,7 +117,7 @@ def test_loop_closures_are_true_up_to_their_noise(drive: SimulatedDrive) -> None
     assert np.sum((new > outage[0]) & (new < outage[1])) >= 4
 
 
-def test_false_loop_closures_tie_places_that_are_far_apart(drive: SimulatedDrive) -> None:
+def test_false_loop_closures_tie_places_that_are_far_apart(drive: Recording) -> None:
     ends = drive.loop_stamps_ns[drive.loop_is_false]
     assert len(ends) == FALSE_SINGLE + FALSE_GROUP
     assert np.all(np.diff(drive.loop_stamps_ns[:, 1]) >= 0)

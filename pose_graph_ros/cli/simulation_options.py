@@ -1,0 +1,290 @@
+# Copyright 2026 The pose_graph_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""Options of `pose-graph simulate` for sensors and disturbances, and what they change."""
+
+import argparse
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+import math
+from typing import Any
+
+from pose_graph_ros.core.exceptions import ConfigError
+from pose_graph_ros.core.simulation.settings import (
+    ClaimedSigma,
+    ClockOffset,
+    CLOSURES,
+    Closures,
+    Delay,
+    Duplicates,
+    FalseClosures,
+    FIXES,
+    Fixes,
+    GlobalPoses,
+    GYRO,
+    Gyro,
+    Jump,
+    ODOMETRY,
+    OdometryErrors,
+    Outage,
+    POSES,
+    Setup,
+    Wheels,
+)
+
+NONE, RESET = 'none', 'reset'
+FALSE_SIZE = 4  # closures of a group of false ones
+# Options of what a graph does not have, by their names among the parsed ones.
+ONLY_IN_BAGS = ('odometry', 'wheel_scale', 'slip', 'heading_drift', 'gyro', 'gyro_noise', 'delay',
+                'duplicate', 'clock_offset')
+Change = tuple[str, Any]  # a topic and what happens to it, None if nothing shall
+
+
+def add_sensors(parser: argparse.ArgumentParser) -> None:
+    """Add the options on sensors and disturbances."""
+    parser.usage = '%(prog)s OUT [options]'
+    wheels = parser.add_argument_group('odometry on /odom, 20 Hz')
+    wheels.add_argument('--odometry', choices=[each.value for each in OdometryErrors],
+                        help='errors of two wheels, or a random walk as the node assumes it '
+                             '(default: wheels; a graph always has the latter)')
+    wheels.add_argument('--wheel-scale', metavar='LEFT,RIGHT', type=_numbers(2),
+                        help='ratio of measured to true distance (default: 1.0068,1.0070)')
+    wheels.add_argument('--slip', metavar='PER_MINUTE', type=number(0.0),
+                        help='events of slip of each wheel, which then measures 1 cm too much at '
+                             '1 m/s (default: 1; hall: 0.5)')
+    wheels.add_argument('--heading-drift', metavar='RAD_PER_M', type=number(),
+                        help='drift of the heading by the wheels [rad/m] (default: 0)')
+    gyro = parser.add_argument_group('gyroscope on /imu/data, 100 Hz')
+    gyro.add_argument('--gyro', action='store_true', help='with a gyroscope')
+    gyro.add_argument('--gyro-noise', metavar='WHITE,BIAS,WALK', type=_numbers(3),
+                      help='white noise [rad/sqrt(s)], bias at the start [rad/s] and its walk '
+                           '[rad/s/sqrt(s)]; implies --gyro (default: 5e-4,0.01,2e-5)')
+    fixes = parser.add_argument_group('GNSS on /gps/fix')
+    fixes.add_argument('--fix', action=argparse.BooleanOptionalAction,
+                       help='with fixes (default: in the drive; the options below imply it)')
+    fixes.add_argument('--fix-period', metavar='S', type=number(0.01), help='(default: 0.5)')
+    fixes.add_argument('--fix-sigma', metavar='M', type=number(0.0),
+                       help='white error of a coordinate (default: 0.4)')
+    fixes.add_argument('--fix-correlated', metavar='M,S', type=_numbers(2),
+                       help='standard deviation and time constant of the correlated '
+                            '(Gauss-Markov) error of a coordinate; 0,1 for none '
+                            '(default: 1.2,60)')
+    poses = parser.add_argument_group('global poses on /global_pose')
+    poses.add_argument('--global-pose', metavar='PERIOD', type=number(0.01),
+                       help='a pose in the map every so many seconds (default: there are none)')
+    poses.add_argument('--global-pose-sigma', metavar='M,RAD', type=_numbers(2),
+                       help='white errors; implies --global-pose 1 (default: 0.1,0.02)')
+    loops = parser.add_argument_group('loop closures on /loop_closure')
+    loops.add_argument('--closures', metavar='RATE', type=number(0.0),
+                       help='share of the stretches driven before in which a closure is found, '
+                            '0 to 1; stretches are of 25 m (drive), 5 m (hall), 1 m (grid) '
+                            '(default: 1; grid: 0.5)')
+    loops.add_argument('--closure-sigma', metavar='M,RAD', type=_numbers(2),
+                       help='(default: 0.1,0.0175; hall: 0.05,0.01; grid: 0.1,0.02)')
+    loops.add_argument('--false-rate', metavar='SHARE', type=number(0.0),
+                       help='share of all closures that tie two different places '
+                            '(default: 0; drive: 4 single ones and a group of 4)')
+    loops.add_argument('--false-groups', metavar='N[:SIZE]', type=_groups,
+                       help='of the false ones so many groups agree with one another, as if a '
+                            f'stretch was taken for another (default of SIZE: {FALSE_SIZE})')
+    _add_disturbances(parser)
+
+
+def _add_disturbances(parser: argparse.ArgumentParser) -> None:
+    group = parser.add_argument_group(
+        'disturbances', 'each may be repeated; times are seconds since the start. The drive '
+        'has an outage and a jump of /gps/fix, which yours replace; "/gps/fix:none" removes them.')
+    for name, grammar, kind, text in (
+            ('--outage', 'TOPIC:FROM:TO', _outage, 'nothing is measured in between'),
+            ('--jump', 'TOPIC:AT:DX,DY[,RAD][:FOR]', _jump,
+             'step of odometry in the frame of the robot; or step of fixes or global poses, east '
+             'and north, for so many seconds; /odom:AT:reset: odometry begins again at its '
+             'origin'),
+            ('--delay', 'TOPIC:S[:JITTER]', _delay,
+             'recorded so long after the stamp, plus 0 to JITTER at random, which shuffles '
+             'messages'),
+            ('--duplicate', 'TOPIC:SHARE', _valued(Duplicates),
+             'share of the messages that come again within a second'),
+            ('--clock-offset', 'TOPIC:S', _valued(ClockOffset),
+             'the clock of this sensor is ahead'),
+            ('--claimed-sigma', 'TOPIC:FACTOR', _valued(ClaimedSigma),
+             'ratio of the sigmas in the messages to the true ones (default: 1, honest)')):
+        group.add_argument(name, metavar=grammar, type=_spoken(grammar, kind), action='append',
+                           default=[], help=text)
+
+
+def changed(usual: Setup, options: argparse.Namespace) -> Setup:
+    """Return what is simulated, by the usual of the world and the options; raises ConfigError."""
+    setup = replace(
+        usual, wheels=_wheels(usual.wheels, options), gyro=_gyro(options),
+        fixes=_fixes(usual.fixes, options), poses=_poses(options),
+        closures=_closures(usual.closures or Closures(), options))
+    present = [ODOMETRY, *(topic for topic, sensor in (
+        (GYRO, setup.gyro), (FIXES, setup.fixes), (POSES, setup.poses), (CLOSURES, setup.closures))
+        if sensor is not None)]
+    fields = {'outage': 'outages', 'jump': 'jumps', 'delay': 'delays', 'duplicate': 'duplicates',
+              'clock_offset': 'offsets', 'claimed_sigma': 'claims'}
+    values: dict[str, Any] = {}
+    for option, name in fields.items():
+        given: Sequence[Change] = getattr(options, option)
+        for topic, _ in given:
+            if topic not in present:
+                raise ConfigError(
+                    f'--{option.replace("_", "-")} {topic}: nothing is simulated there, expected '
+                    f'one of {", ".join(present)}')
+        replaced = {topic for topic, _ in given}
+        values[name] = (
+            *(each for each in getattr(usual, name)
+              if each.topic not in replaced and each.topic in present),
+            *(each for _, each in given if each is not None))
+    return replace(setup, **values)
+
+
+def refuse_what_graphs_lack(options: argparse.Namespace) -> None:
+    """Raise ConfigError if an option is given that a graph cannot have."""
+    for name in ONLY_IN_BAGS:
+        if getattr(options, name) not in (None, False, []):
+            raise ConfigError(f'--{name.replace("_", "-")}: only a bag has it, but {options.out} '
+                              'is a graph')
+    for topic, _ in options.outage:
+        if topic == ODOMETRY:
+            raise ConfigError(f'--outage {ODOMETRY}: a graph cannot do without odometry')
+
+
+def _wheels(usual: Wheels, options: argparse.Namespace) -> Wheels:
+    given = {'errors': options.odometry and OdometryErrors(options.odometry),
+             'scale': options.wheel_scale, 'heading_drift': options.heading_drift,
+             'slip_events_per_s': None if options.slip is None else options.slip / 60.0}
+    return replace(usual, **_present(given))
+
+
+def _gyro(options: argparse.Namespace) -> Gyro | None:
+    if options.gyro_noise is not None:
+        return Gyro(*options.gyro_noise)
+    return Gyro() if options.gyro else None
+
+
+def _fixes(usual: Fixes | None, options: argparse.Namespace) -> Fixes | None:
+    correlated, correlation = options.fix_correlated or (None, None)
+    given = _present({'period_s': options.fix_period, 'white': options.fix_sigma,
+                      'correlated': correlated, 'correlation_s': correlation})
+    if options.fix is False:
+        if given:
+            raise ConfigError('--no-fix: expected no other option on fixes, but there is one')
+        return None
+    if usual is None and options.fix is None and not given:
+        return None
+    return replace(usual or Fixes(), **given)
+
+
+def _poses(options: argparse.Namespace) -> GlobalPoses | None:
+    given = _present({'period_s': options.global_pose, 'sigmas': options.global_pose_sigma})
+    return GlobalPoses(**given) if given else None
+
+
+def _closures(usual: Closures, options: argparse.Namespace) -> Closures:
+    false: FalseClosures = usual.false
+    if options.false_rate is not None or options.false_groups is not None:
+        number_of_groups, size = options.false_groups or (0, FALSE_SIZE)
+        false = replace(false, share=options.false_rate, singles=0, groups=number_of_groups,
+                        size=size, loose=False)
+    sigmas = options.closure_sigma and (options.closure_sigma[0], *options.closure_sigma)
+    return replace(usual, false=false, **_present({'rate': options.closures, 'sigmas': sigmas}))
+
+
+def _present(values: dict[str, Any]) -> dict[str, Any]:
+    return {name: value for name, value in values.items() if value is not None}
+
+
+def number(least: float = -math.inf, *, whole: bool = False) -> Callable[[str], Any]:
+    """
+    Return what reads a finite number, and raises ArgumentTypeError if it cannot.
+
+    Parameters
+    ----------
+    least : float, smallest number that is accepted
+    whole : bool, whether it must be an integer
+
+    """
+    kind = 'a whole number' if whole else 'a number'
+    expected = kind if least == -math.inf else f'{kind} of at least {least:g}'
+
+    def read(text: str) -> Any:
+        try:
+            value = int(text) if whole else float(text)
+        except ValueError:
+            value = math.nan
+        if not (math.isfinite(value) and value >= least):
+            raise argparse.ArgumentTypeError(f'expected {expected}, got {text!r}')
+        return value
+    return read
+
+
+def _numbers(count: int) -> Callable[[str], tuple[float, ...]]:
+    """Return what reads so many numbers with commas between them."""
+    def read(text: str) -> tuple[float, ...]:
+        try:
+            values = tuple(float(each) for each in text.split(','))
+        except ValueError:
+            values = ()
+        if len(values) != count or not all(map(math.isfinite, values)):
+            raise argparse.ArgumentTypeError(
+                f'expected {count} numbers with commas between them, got {text!r}')
+        return values
+    return read
+
+
+def _groups(text: str) -> tuple[int, int]:
+    """Return the number of groups of false closures and their size."""
+    words = text.split(':')
+    if len(words) > 2 or not all(each.isdecimal() for each in words):
+        raise argparse.ArgumentTypeError(f'expected N or N:SIZE, got {text!r}')
+    groups, size = int(words[0]), int(words[1]) if len(words) == 2 else FALSE_SIZE
+    if size < 2:
+        raise argparse.ArgumentTypeError(f'expected groups of at least 2, got {text!r}')
+    return groups, size
+
+
+def _spoken(
+    grammar: str, kind: Callable[[str, list[str]], Any],
+) -> Callable[[str], Change]:
+    """Return what reads a disturbance, and says what was expected if it cannot."""
+    def read(text: str) -> Change:
+        topic, *words = text.split(':')
+        if words == [NONE]:
+            return topic, None
+        try:
+            return topic, kind(topic, words)
+        except ConfigError as error:
+            raise argparse.ArgumentTypeError(f'{text!r}: {error}') from error
+        except ValueError:
+            raise argparse.ArgumentTypeError(f'expected {grammar}, got {text!r}') from None
+    return read
+
+
+def _outage(topic: str, words: list[str]) -> Outage:
+    begin, end = map(float, words)
+    return Outage(topic, begin, end)
+
+
+def _jump(topic: str, words: list[str]) -> Jump:
+    at, step, *duration = words
+    seconds, = map(float, duration or ['inf'])
+    if step == RESET:
+        return Jump(topic, float(at), None, seconds)
+    dx, dy, *turn = map(float, step.split(','))
+    heading, = turn or [0.0]
+    return Jump(topic, float(at), (dx, dy, heading), seconds)
+
+
+def _delay(topic: str, words: list[str]) -> Delay:
+    seconds, *rest = map(float, words)
+    jitter, = rest or [0.0]
+    return Delay(topic, seconds, jitter)
+
+
+def _valued(kind: Callable[[str, float], Any]) -> Callable[[str, list[str]], Any]:
+    """Return what reads a topic and a number."""
+    def read(topic: str, words: list[str]) -> Any:
+        value, = map(float, words)
+        return kind(topic, value)
+    return read
