@@ -17,6 +17,7 @@ import webbrowser
 
 from pose_graph_ros.adapters.bags import BagError
 from pose_graph_ros.cli import options as shared, replay
+from pose_graph_ros.cli.exports import Exports
 from pose_graph_ros.cli.page.render import render
 from pose_graph_ros.cli.run.reading import FILE, read_document
 from pose_graph_ros.core.exceptions import ConfigError, FileFormatError
@@ -120,6 +121,6 @@ def _replay(options: argparse.Namespace) -> int:
         raise BagError(f'--run {options.folder}: this is a bag; name another folder')
     words = argparse.Namespace(**vars(options))
     words.bags, words.out, words.json = options.runs, options.folder, False
-    words.export, words.new_bag = [], None
+    words.export, words.new_bag = Exports(), None
     with redirect_stdout(io.StringIO()):
         return replay.execute(words)
