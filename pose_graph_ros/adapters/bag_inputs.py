@@ -46,7 +46,7 @@ class InputMessage(NamedTuple):
 
 def choose_inputs(
     reader: Bag, sources: Sequence[Source], wanted: Mapping[str, str | None],
-    hold_out: int = 0, span: Span = WHOLE,
+    hold_out: int = 0, span: Span = WHOLE, *, truth: str | None = None,
 ) -> Inputs:
     """
     Return the topics that feed the sources: wanted ones, else by parameter, else guessed.
@@ -61,6 +61,7 @@ def choose_inputs(
     wanted : mapping, topic by name of the source; None leaves the choice open
     hold_out : int, as in `Inputs`
     span : Span, as in `Inputs`
+    truth : str, optional, topic that is not guessed, as it has what the result is compared with
 
     Raises
     ------
@@ -85,14 +86,15 @@ def choose_inputs(
     for name in ('odom', 'fix', CLOSURES, 'global_pose', 'imu', 'gyro'):
         if name in topics or name not in kinds or name in named:
             continue
-        guess = _guess(reader, name, kinds, topics, asked=asked)
+        guess = _guess(reader, name, kinds, topics, asked=asked, truth=truth)
         if guess is not None:
             topics[name] = guess
     ordered = {name: topics[name] for name in kinds if name in topics}
     inputs = Inputs(ordered, {name: kinds[name] for name in ordered}, hold_out, span)
     if len(inputs.of(*ODOMETRY_KINDS)) == 0:
+        other = '' if truth is None else f' but that of the truth, {truth}'
         raise BagError(f'{reader.path}: no topic of type {Kind.ODOMETRY.message_type} for the '
-                       f'odometry; the bag has {reader.describe()}')
+                       f'odometry{other}; the bag has {reader.describe()}')
     return inputs
 
 
@@ -115,12 +117,12 @@ def _checked(reader: Bag, name: str, kind: Kind, topic: str) -> str:
 
 def _guess(
     reader: Bag, name: str, kinds: Mapping[str, Kind], topics: Mapping[str, str],
-    *, asked: bool,
+    *, asked: bool, truth: str | None,
 ) -> str | None:
     """Return the topic of a source for which none was given; None if there is no candidate."""
     kind, option = kinds[name], f'--{_option(name)}'
     free = [topic for topic, info in reader.topics.items()
-            if info.type == kind.message_type
+            if info.type == kind.message_type and topic != truth
             and (kind is Kind.GYRO or topic not in topics.values())]
     if kind is Kind.LOOP_CLOSURE:
         usual = '/' + KNOWN_SOURCES[CLOSURES][1]

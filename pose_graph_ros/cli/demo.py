@@ -71,7 +71,8 @@ def execute(options: argparse.Namespace) -> int:
     options.out.mkdir(parents=True, exist_ok=True)
     bag_path, wanted, truth, title = _bag(options)
     with open_bag(bag_path) as bag:
-        inputs = choose_inputs(bag, source_list(values), wanted, options.hold_out)
+        inputs = choose_inputs(
+            bag, source_list(values), wanted, options.hold_out, truth=truth)
     if bag_path.suffix == '.bag':
         raise BagError(f'{bag_path}: a ROS 1 bag cannot be played to a ROS 2 node; '
                        'pose-graph replay reads it')

@@ -217,7 +217,8 @@ def execute(options: argparse.Namespace) -> int:
     with ExitStack() as stack:
         bag = stack.enter_context(open_bags(options.bags))
         inputs = choose_inputs(
-            bag, source_list(values), wanted, options.hold_out, _span(bag, options))
+            bag, source_list(values), wanted, options.hold_out, _span(bag, options),
+            truth=options.truth)
         require_datum(options.export, known=len(values['datum']) > 0 or len(
             inputs.of(Kind.FIX)) > 0)
         writer = None if options.new_bag is None else stack.enter_context(

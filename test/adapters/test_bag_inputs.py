@@ -108,6 +108,15 @@ def test_a_topic_that_the_parameters_name_is_taken_before_a_guess() -> None:
     assert choose_inputs(reader, sources, {'odom': '/o'}).topics == {'odom': '/o'}
 
 
+def test_the_topic_of_the_truth_is_no_guess() -> None:
+    reader = bag(o='odom', truth='odom')
+    assert choose_inputs(reader, SOURCES, {}, truth='/truth').topics == {'odom': '/o'}
+    assert choose_inputs(reader, SOURCES, {'odom': '/truth'}, truth='/truth').topics == {
+        'odom': '/truth'}
+    with pytest.raises(BagError, match='but that of the truth, /truth; the bag has'):
+        choose_inputs(bag(truth='odom'), SOURCES, {}, truth='/truth')
+
+
 def test_an_option_for_a_source_that_is_not_there_says_so() -> None:
     sources = source_list(checked({'sources': ['odom']}))
     with pytest.raises(BagError, match='--fix /f: the parameter sources has no fix'):
