@@ -22,7 +22,8 @@ OF_RCLPY = ('qos_overrides.', 'use_sim_time', 'start_type_description_service')
 def add_inputs(parser: argparse.ArgumentParser) -> None:
     """Add the options that choose topics and the fixes to hold out."""
     group = parser.add_argument_group(
-        'topics in the bag', 'by default, the only topic of the type is used, apart from that of the truth')
+        'topics in the bag',
+        'by default, the only topic of the type is used, apart from that of the truth')
     pose = 'geometry_msgs/PoseWithCovarianceStamped'
     for option, text in (
             ('--odom', 'nav_msgs/Odometry'), ('--fix', 'sensor_msgs/NavSatFix'),
