@@ -37,7 +37,7 @@ function makeChart(host, {title, x, y, marks, height = 230, note = null}) {
 function legendOf(mark) {
   if (mark.kind === 'band') return swatch({...mark, fill: 0.25});
   if (mark.kind === 'bars') return swatch({...mark, fill: 0.55});
-  if (mark.kind === 'dots') return swatch({...mark, shape: mark.shape || SHAPES.disc, dash: null});
+  if (mark.kind === 'dots') return swatch({...mark, shape: mark.shape || SHAPES.disc, dash: null, solid: true});
   return swatch({...mark, dash: mark.dash || []});
 }
 
@@ -176,8 +176,8 @@ function tracePixels(xs, ys, context, {toX, toY}) {
 
 function paintDots(mark, context, {toX, toY}) {
   context.fillStyle = colour(mark.colour);
-  const size = mark.x.length > 600 ? 1.3 : 2;
-  context.globalAlpha = mark.x.length > 600 ? 0.75 : 1;
+  const size = mark.x.length > 600 ? 1.2 : 1.6;
+  context.globalAlpha = 0.8;
   for (let k = 0; k < mark.x.length; k += 1) {
     if (!known(mark.y[k])) continue;
     const [at, value] = [toX(mark.x[k]), toY(mark.y[k])];

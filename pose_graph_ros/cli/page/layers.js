@@ -148,15 +148,17 @@ function stamp(shape, name, context, u, v, size = 1) {
   context.restore();
 }
 
-/** The state that matters most is painted last. */
-const ORDER = [5, 0, 1, 2, 4, 3];
+/** States that are painted below the corrected path, and those above; the worst comes last. */
+const BELOW = [HELD_OUT, BELIEVED, WEAK];
+const ABOVE = [WAITING, REFUSED, DOUBTED];
 
-function paintFixes({table, states, counts}, context, {view, width, height}) {
+function paintFixes({table, states, counts}, context, {view, width, height}, order) {
   const [scale, left, top] = [view.scale, width / 2 - view.x * view.scale,
     height / 2 + view.y * view.scale];
   const cell = 3;
   const columns = Math.ceil(width / cell) + 1;
-  for (const state of ORDER) {
+  const crowded = scale * spacing(table) < 9;
+  for (const state of order) {
     if (!states.has(state) || counts[state] === 0) continue;
     const {shape, colour: name} = lookOf(state);
     const taken = new Uint8Array(columns * (Math.ceil(height / cell) + 1));
@@ -170,17 +172,30 @@ function paintFixes({table, states, counts}, context, {view, width, height}) {
       taken[place] = 1;
       places.push(u, v);
     }
-    const small = places.length > 2 * 600;
+    const small = places.length > 2 * 600 || (crowded && order === BELOW);
     context.fillStyle = colour(name);
     for (let k = 0; k < places.length; k += 2) {
       if (small) context.fillRect(places[k] - 1.25, places[k + 1] - 1.25, 2.5, 2.5);
-      else stamp(shape, name, context, places[k], places[k + 1], state === BELIEVED ? 0.7 : 1);
+      else stamp(shape, name, context, places[k], places[k + 1], state === BELIEVED ? 0.75 : 1);
     }
   }
 }
 
-function paintClosures({table, states, counts}, context, {view, width, height}) {
-  for (const state of ORDER) {
+/** Half of the fixes are farther from the one before than this [m]. */
+function spacing(table) {
+  if (table.spacing === undefined) {
+    const apart = [];
+    for (let k = 1; k < table.x.length; k += Math.ceil(table.x.length / 1000)) {
+      apart.push(Math.hypot(table.x[k] - table.x[k - 1], table.y[k] - table.y[k - 1]));
+    }
+    apart.sort((one, other) => one - other);
+    table.spacing = apart.length > 0 ? apart[apart.length >> 1] : Infinity;
+  }
+  return table.spacing;
+}
+
+function paintClosures({table, states, counts}, context, {view, width, height}, order) {
+  for (const state of order) {
     if (!states.has(state) || counts[state] === 0) continue;
     const {shape, colour: name, dash} = lookOf(state);
     const middles = [];

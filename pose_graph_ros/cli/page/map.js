@@ -46,6 +46,8 @@ function showMap() {
     lookAtItem(item);
     centreOn(item, view, surface, box);
   };
+  const label = make('div', {class: 'readout', hidden: true});
+  stage.append(label);
   addGestures(surface, view, {
     onFit: fit,
     onPick: (u, v, within) => {
@@ -53,7 +55,7 @@ function showMap() {
       lookAtItem(item);
       if (item) lookAtTime(item.times[item.times.length - 1]);
     },
-    onHover: (u, v) => hover(layers, view, surface, lines.corrected, u, v),
+    onHover: (u, v) => hover(layers, view, surface, lines.corrected, label, u, v),
   });
   stage.append(mapButtons(view, fit));
   const updates = showLayers(side, layers, surface);
@@ -100,9 +102,19 @@ function centreOn(item, view, surface, box) {
 }
 
 /** The pointer on the map marks the time at which the robot was there. */
-function hover(layers, view, surface, path, u, v) {
+function hover(layers, view, surface, path, label, u, v) {
+  const item = u === null ? null : pick(layers, view, u, v, 9);
+  label.hidden = item === null;
   if (u === null) return;
-  surface.canvas.style.cursor = pick(layers, view, u, v, 9) ? 'pointer' : 'grab';
+  surface.canvas.style.cursor = item ? 'pointer' : 'grab';
+  if (item) {
+    label.replaceChildren(make('b', {}, item.id || item.source),
+      make('span', {}, item.spring ? 'spring' : STATES[item.state]));
+    const left = u > surface.canvas.clientWidth / 2;
+    Object.assign(label.style, {
+      left: left ? 'auto' : `${u + 14}px`,
+      right: left ? `${surface.canvas.clientWidth - u + 14}px` : 'auto', top: `${v + 12}px`});
+  }
   const [x, y] = view.toMap(u, v);
   let [best, found] = [14 / view.scale, null];
   for (let k = 0; k < path.x.length; k += 1) {
@@ -215,7 +227,13 @@ function poseAt({t, x, y, theta}, time) {
 
 function paintMap(layers, context, frame) {
   paintGrid(context, frame);
-  for (const layer of layers) if (layer.shown) layer.paint(layer, context, frame);
+  const shown = layers.filter((layer) => layer.shown);
+  const later = shown.filter((layer) => layer.id === 'corrected' || layer.id === 'springs');
+  for (const layer of shown) {
+    if (!later.includes(layer)) layer.paint(layer, context, frame, BELOW);
+  }
+  for (const layer of later) layer.paint(layer, context, frame);
+  for (const layer of shown) if (layer.kind) layer.paint(layer, context, frame, ABOVE);
   if (focus.item) paintChosen(focus.item, context, frame);
   if (focus.time !== null) paintRobot(DATA.lines.corrected, context, frame);
   paintScaleBar(context, frame);

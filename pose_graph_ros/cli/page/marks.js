@@ -23,7 +23,7 @@ const LOOKS = [
   {colour: 'refused', shape: SHAPES.square, dash: [3, 3]},
   {colour: 'held-out', shape: SHAPES.diamond, dash: [12, 3]},
 ];
-const [BELIEVED, , , DOUBTED, REFUSED, HELD_OUT] = LOOKS.keys();
+const [BELIEVED, WEAK, WAITING, DOUBTED, REFUSED, HELD_OUT] = LOOKS.keys();
 const lookOf = (state) => LOOKS[state] || LOOKS[0];
 
 /** Looks of the lines of the map. */
@@ -34,7 +34,7 @@ const LINES = {
 };
 
 /** A small picture of a mark or of a line, for lists and legends. */
-function swatch({colour: name, shape, dash, width, fill: filled}) {
+function swatch({colour: name, shape, dash, width, fill: filled, solid}) {
   const paint = `var(--${name})`;
   const picture = draw('svg', {class: 'swatch', viewBox: '-13 -7 26 14', 'aria-hidden': 'true'});
   if (filled) {
@@ -49,7 +49,7 @@ function swatch({colour: name, shape, dash, width, fill: filled}) {
   if (shape) {
     picture.append(draw('path', {
       d: shape.path, stroke: paint, 'stroke-width': 1.7,
-      fill: shape.open ? 'var(--surface)' : paint}));
+      fill: shape.open && !solid ? 'var(--surface)' : paint}));
   }
   return picture;
 }

@@ -106,7 +106,9 @@ function showErrors() {
       y: errors.heading.map((value) => (known(value) ? degrees(value) : null)), colour: 'path',
       name: 'corrected path'}]});
   }
-  if ((DATA.error_table || []).length > 0) host.append(errorTable(DATA.error_table));
+  if ((DATA.error_table || []).length > 0) {
+    host.append(make('div', {class: 'card table'}, errorTable(DATA.error_table)));
+  }
 }
 
 const ERROR_COLUMNS = {rms: 'rms', median: 'median', max: 'largest', heading_rms_deg: 'heading, rms'};
@@ -142,7 +144,7 @@ function showSprings(map) {
       'aria-hidden': 'true'},
     draw('rect', {x: 0, y: 1, width: 100, height: 8, fill: 'var(--line)'}),
     draw('rect', {x: 0, y: 1, width: 100 * ((energy || 0) / most), height: 8, fill: 'var(--spring)'}),
-    draw('rect', {x: 100 * ((expected || 0) / most) - 0.4, y: 0, width: 0.8, height: 10,
+    draw('rect', {x: 100 * ((expected || 0) / most) - 0.2, y: 0, width: 0.4, height: 10,
       fill: 'var(--ink)'}));
     const button = make('button', {type: 'button', class: 'entry', disabled: item.ends.length === 0,
       onclick: () => map.choose(item)},
