@@ -24,11 +24,15 @@ function fill(node, properties, children) {
   for (const [name, value] of Object.entries(properties || {})) {
     if (value === null || value === undefined || value === false) continue;
     if (name.startsWith('on')) node.addEventListener(name.slice(2), value);
-    else if (name === 'style') Object.assign(node.style, value);
+    else if (name === 'style') styleOf(node, value);
     else node.setAttribute(name, value === true ? '' : value);
   }
   node.append(...children.flat().filter((child) => child !== null && child !== undefined));
   return node;
+}
+
+function styleOf(node, values) {
+  for (const [name, value] of Object.entries(values)) node.style.setProperty(name, value);
 }
 
 /** Make a section of the page with a heading, and put it on the page. */
@@ -96,7 +100,10 @@ function colour(name) {
 function setScheme(name) {
   document.documentElement.dataset.scheme = name;
   palette = {};
-  for (const surface of surfaces) surface.paint();
+  for (const surface of surfaces) {
+    if (surface.reset) surface.reset();
+    surface.paint();
+  }
 }
 
 // --- numbers ------------------------------------------------------------------------------------

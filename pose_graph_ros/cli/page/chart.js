@@ -5,7 +5,7 @@
 // the time that is marked with each other and with the map.
 
 const FONT = '12px system-ui, -apple-system, "Segoe UI", Roboto, sans-serif';
-const PAD = {left: 54, right: 14, top: 12, bottom: 40};
+const PAD = {left: 34, right: 14, top: 12, bottom: 40};
 
 /**
  * Make a chart.
@@ -81,13 +81,15 @@ function ticksOf(each, pixels, spacing) {
 // --- the plot -----------------------------------------------------------------------------------
 
 function paintPlot(chart, {context, width, height}) {
-  const box = {
-    left: PAD.left, top: PAD.top, width: width - PAD.left - PAD.right,
-    height: height - PAD.top - PAD.bottom};
+  context.font = FONT;
+  const down = height - PAD.top - PAD.bottom;
+  const widest = Math.max(0, ...ticksOf(chart.y, down, 40).map(
+    (value) => context.measureText(chart.y.format(value)).width));
+  const left = PAD.left + Math.ceil(widest);
+  const box = {left, top: PAD.top, width: width - left - PAD.right, height: down};
   const toX = (value) => box.left + box.width * chart.x.part(value);
   const toY = (value) => box.top + box.height * (1 - chart.y.part(value));
   Object.assign(chart, {box, toX, toY});
-  context.font = FONT;
   paintAxes(chart, context);
   context.save();
   context.beginPath();
@@ -258,7 +260,8 @@ function followPointer(chart, over) {
   const say = (value) => {
     chart.pointer = value;
     over.later();
-    if (chart.x.time) lookAtTime(value);
+    // the time stays when the pointer leaves, so that its place on the map can be looked at
+    if (chart.x.time && value !== null) lookAtTime(value);
   };
   const move = (event) => {
     const at = (event.offsetX - chart.box.left) / chart.box.width;

@@ -74,38 +74,83 @@ function measurements(kind, table, name) {
 
 // --- paths and ellipses -------------------------------------------------------------------------
 
-/** Trace a path in pixels, without points that do not show and parts that are out of sight. */
-function tracePath({x, y}, context, {view, width, height}) {
+/** So many pieces of a path are painted at once: longer ones take more than in proportion. */
+const PIECES = 250;
+
+/** Paint a path, without the points that do not show and the parts that are out of sight. */
+function paintPath({line, look}, context, frame) {
+  const {view, width, height} = frame;
+  const {x, y} = line;
+  const kept = simplified(line, 2 ** Math.floor(Math.log2(view.scale)));
   const [scale, left, top] = [view.scale, width / 2 - view.x * view.scale,
     height / 2 + view.y * view.scale];
   const sideOf = (u, v) => (u < -5 ? 1 : u > width + 5 ? 2 : 0) | (v < -5 ? 4 : v > height + 5 ? 8 : 0);
-  let [u0, v0, side0, drawn] = [NaN, NaN, 0, false];
-  for (let k = 0; k < x.length; k += 1) {
-    if (x[k] === null) { [u0, drawn] = [NaN, false]; continue; }
+  context.strokeStyle = colour(look.colour);
+  context.lineWidth = look.width;
+  // where thousands of lines lie on each other, dashes and round joints cost much and do not show
+  const crowded = kept.length > 8000;
+  context.lineJoin = crowded ? 'bevel' : 'round';
+  context.setLineDash(crowded ? [] : look.dash);
+  context.beginPath();
+  let [u0, v0, side0, pieces] = [NaN, NaN, 0, 0];
+  for (const k of kept) {
     const [u, v] = [left + x[k] * scale, top - y[k] * scale];
-    if (Math.abs(u - u0) < 0.8 && Math.abs(v - v0) < 0.8 && k < x.length - 1) continue;
     const side = sideOf(u, v);
-    if (Number.isNaN(u0) || (side & side0) !== 0) {
-      drawn = false;
+    if (k === 0 || (side & side0) !== 0) {
+      pieces = 0;
     } else {
-      if (!drawn) context.moveTo(u0, v0);
+      if (pieces % PIECES === 0) {
+        context.stroke();
+        context.beginPath();
+        context.moveTo(u0, v0);
+      }
       context.lineTo(u, v);
-      drawn = true;
+      pieces += 1;
+      frame.points += 1;
     }
     [u0, v0, side0] = [u, v, side];
   }
-}
-
-function paintPath(layer, context, frame) {
-  context.strokeStyle = colour(layer.look.colour);
-  context.lineWidth = layer.look.width;
-  context.lineJoin = 'round';
-  context.setLineDash(layer.look.dash);
-  context.beginPath();
-  tracePath(layer.line, context, frame);
   context.stroke();
   context.setLineDash([]);
 }
+
+/**
+ * Which points of a path are needed at a scale: all others are within half a pixel of the lines
+ * between these. From each point that is kept, the directions are followed that pass all points
+ * after it closely enough; when the next point is in none of them, the one before it is kept.
+ */
+function simplified(line, scale) {
+  line.levels = line.levels || new Map();
+  if (line.levels.has(scale)) return line.levels.get(scale);
+  const {x, y} = line;
+  const [kept, near] = [[0], 0.5 / scale];
+  let [from, first, low, high] = [0, 0, -Infinity, Infinity];
+  let farthest = 0;
+  for (let k = 1; k < x.length; k += 1) {
+    const [right, up] = [x[k] - x[from], y[k] - y[from]];
+    const far = Math.hypot(right, up);
+    if (far <= near) continue;
+    const direction = Math.atan2(up, right);
+    const turned = wrap(direction - first);
+    if (farthest === 0) [first, low, high] = [direction, -Math.PI, Math.PI];
+    // a path that comes back would be shortened
+    if (farthest > 0 && (turned < low || turned > high || far < farthest - near)) {
+      from = k - 1;
+      kept.push(from);
+      [farthest, k] = [0, k - 1];
+      continue;
+    }
+    const room = Math.asin(Math.min(1, near / far));
+    const at = farthest === 0 ? 0 : turned;
+    [low, high] = [Math.max(low, at - room), Math.min(high, at + room)];
+    farthest = Math.max(far, farthest);
+  }
+  if (x.length > 1) kept.push(x.length - 1);
+  line.levels.set(scale, kept);
+  return kept;
+}
+
+const wrap = (angle) => angle - 2 * Math.PI * Math.round(angle / (2 * Math.PI));
 
 /** Half axes [m] and direction [rad] of an ellipse of so many sigma. */
 function ellipseAxes(xx, xy, yy, sigmas) {
@@ -126,7 +171,7 @@ function paintEllipses({ellipses: e, factor}, context, {view, width, height}) {
     context.ellipse(u, v, long, Math.max(short, 0.3), -angle, 0, 7);
     context.globalAlpha = 0.1;
     context.fill();
-    context.globalAlpha = 0.55;
+    context.globalAlpha = 0.4;
     context.stroke();
   }
   context.globalAlpha = 1;
@@ -152,7 +197,8 @@ function stamp(shape, name, context, u, v, size = 1) {
 const BELOW = [HELD_OUT, BELIEVED, WEAK];
 const ABOVE = [WAITING, REFUSED, DOUBTED];
 
-function paintFixes({table, states, counts}, context, {view, width, height}, order) {
+function paintFixes({table, states, counts}, context, frame, order) {
+  const {view, width, height} = frame;
   const [scale, left, top] = [view.scale, width / 2 - view.x * view.scale,
     height / 2 + view.y * view.scale];
   const cell = 3;
@@ -171,6 +217,7 @@ function paintFixes({table, states, counts}, context, {view, width, height}, ord
       if (taken[place]) continue;
       taken[place] = 1;
       places.push(u, v);
+      frame.points += 1;
     }
     const small = places.length > 2 * 600 || (crowded && order === BELOW);
     context.fillStyle = colour(name);

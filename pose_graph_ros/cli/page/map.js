@@ -15,17 +15,20 @@ function showMap() {
   const side = make('div', {class: 'side'});
   host.append(make('div', {class: 'map-grid'}, make('div', {class: 'map-main'}, stage), side));
 
-  const frame = {view: null, width: 0, height: 0};
+  const frame = {view: null, width: 0, height: 0, points: 0,
+    picture: {canvas: document.createElement('canvas'), seen: null, painted: 0,
+      oldest: OLDEST}};
   const surface = canvasIn(stage, {
     id: 'map-canvas', class: 'map', tabindex: '0', role: 'application',
     'aria-roledescription': 'map',
     'aria-label': 'Map of the drive. Arrow keys pan, plus and minus zoom, 0 shows all, Enter '
       + 'chooses what is nearest to the middle, Escape chooses nothing.',
-  }, ({context, width, height}) => {
+  }, ({width, height}) => {
     Object.assign(frame, {width, height});
     if (!placed) { placed = true; view.fit(box, false); }
-    paintMap(layers, context, frame);
+    paintMap(layers, surface, frame);
   });
+  surface.reset = () => { frame.picture.seen = null; };
   let placed = false;
   const view = makeView(surface, () => {
     surface.canvas.dataset.view = `${view.x} ${view.y} ${view.scale}`;
@@ -43,7 +46,9 @@ function showMap() {
       if (layer.states) layer.states.add(item.state);
     }
     for (const update of updates) update();
+    surface.reset();
     lookAtItem(item);
+    if (item.times.length > 0) lookAtTime(item.times[item.times.length - 1]);
     centreOn(item, view, surface, box);
   };
   const label = make('div', {class: 'readout', hidden: true});
@@ -143,6 +148,7 @@ function showLayers(host, layers, surface) {
   const tick = (text, mark, count, read, write) => {
     const input = make('input', {type: 'checkbox', onchange: () => {
       write(input.checked);
+      surface.reset();
       surface.later();
     }});
     updates.push(() => { input.checked = read(); });
@@ -173,6 +179,7 @@ function sizeOfEllipses(layer, surface) {
   const choice = make('select', {'aria-label': 'Size of the covariance ellipses',
     onchange: () => {
       layer.factor = Number(choice.value);
+      surface.reset();
       surface.later();
     }}, [1, 3, 10, 30, 100].map((factor) => make('option', {value: factor},
     factor === 1 ? 'true to scale' : `${factor} times as large`)));
@@ -225,7 +232,49 @@ function poseAt({t, x, y, theta}, time) {
 
 // --- the picture --------------------------------------------------------------------------------
 
-function paintMap(layers, context, frame) {
+/** Above so many points a picture of the layers is moved with the map, and seldom painted anew. */
+const HEAVY = 6000;
+/** How old it may become meanwhile: at least so much [ms], and so many times what it takes. */
+const [OLDEST, TIMES] = [250, 8];
+
+function paintMap(layers, surface, frame) {
+  const {context, canvas} = surface;
+  const {view, picture} = frame;
+  const now = performance.now();
+  const seen = [view.x, view.y, view.scale, canvas.width, canvas.height];
+  const same = picture.seen && seen.every((value, k) => value === picture.seen[k]);
+  const resized = !picture.seen || seen[3] !== picture.seen[3] || seen[4] !== picture.seen[4];
+  if (!same && (resized || frame.points < HEAVY || now - picture.painted >= picture.oldest)) {
+    paintLayers(layers, canvas, frame);
+    Object.assign(picture, {seen, painted: now});
+    requestAnimationFrame(() => {
+      picture.oldest = Math.max(OLDEST, TIMES * (performance.now() - now));
+    });
+  } else if (!same) {
+    clearTimeout(picture.again);
+    picture.again = setTimeout(() => {
+      picture.painted = -Infinity;
+      surface.later();
+    }, OLDEST);
+  }
+  const [x, y, scale] = picture.seen;
+  const [left, top] = view.toScreen(x, y);
+  const [width, height] = [frame.width, frame.height].map((size) => (size * view.scale) / scale);
+  context.drawImage(picture.canvas, left - width / 2, top - height / 2, width, height);
+  if (focus.item) paintChosen(focus.item, context, frame);
+  if (focus.time !== null) paintRobot(DATA.lines.corrected, context, frame);
+  paintScaleBar(context, frame);
+  paintNorth(context, frame);
+}
+
+/** Paint the layers on a canvas of their own. */
+function paintLayers(layers, {width, height}, frame) {
+  const {canvas} = frame.picture;
+  if (canvas.width !== width || canvas.height !== height) Object.assign(canvas, {width, height});
+  const context = canvas.getContext('2d');
+  context.setTransform(width / frame.width, 0, 0, height / frame.height, 0, 0);
+  context.clearRect(0, 0, frame.width, frame.height);
+  frame.points = 0;
   paintGrid(context, frame);
   const shown = layers.filter((layer) => layer.shown);
   const later = shown.filter((layer) => layer.id === 'corrected' || layer.id === 'springs');
@@ -234,10 +283,6 @@ function paintMap(layers, context, frame) {
   }
   for (const layer of later) layer.paint(layer, context, frame);
   for (const layer of shown) if (layer.kind) layer.paint(layer, context, frame, ABOVE);
-  if (focus.item) paintChosen(focus.item, context, frame);
-  if (focus.time !== null) paintRobot(DATA.lines.corrected, context, frame);
-  paintScaleBar(context, frame);
-  paintNorth(context, frame);
 }
 
 /** Lines at round coordinates, with these at the left and at the lower border. */

@@ -58,10 +58,20 @@ function factsOf(item) {
     const {rank, kind, energy, expected, residual, sigma} = item.spring;
     rows.push(['rank', `${rank} of ${DATA.springs.length}`], ['kind', kind],
       ['energy', `${number(energy)}, where ${number(expected)} is expected`]);
-    if (residual) rows.push(['residual', residual.map((value) => number(value)).join(', ')]);
-    if (sigma) rows.push(['sigma', sigma.map((value) => number(value)).join(', ')]);
+    if (residual && sigma) rows.push(...residualRows(kind, residual, sigma));
   }
   return rows.filter(([, value]) => value !== null && value !== undefined);
+}
+
+/** Residuals of a spring with their units and in sigma; coordinates without a sigma say nothing. */
+function residualRows(kind, residual, sigma) {
+  const names = ['position', 'fix', 'global_pose'].includes(kind) ? ['x', 'y', 'heading']
+    : ['along', 'across', 'heading'];
+  return names.flatMap((name, k) => {
+    if (!known(residual[k]) || !known(sigma[k]) || sigma[k] <= 0) return [];
+    const value = name === 'heading' ? `${number(degrees(residual[k]))}°` : length(residual[k]);
+    return [[name, `${value}, ${number(residual[k] / sigma[k], 2)} sigma`]];
+  });
 }
 
 /** A list of the measurements of a kind that are doubted or refused, the farthest off first. */
@@ -92,9 +102,10 @@ function entryOf(item, onChoose) {
     type: 'button', class: 'entry', onclick: () => onChoose(item)},
   swatch({...lookOf(item.state), dash: null}),
   make('span', {class: 'entry-name'}, item.id || `${item.source} at ${clock(item.times[0])}`),
-  make('span', {class: 'entry-far'}, known(item.distance) ? `${number(item.distance, 2)} σ` : ''),
-  make('span', {class: 'entry-why'},
-    `${STATES[item.state]}${item.reason ? `: ${item.reason}` : ''}`));
+  make('span', {class: 'entry-far'}, known(item.distance) ? `${number(item.distance)} σ` : ''),
+  make('span', {class: 'entry-why'}, item.reason
+    ? [make('span', {class: 'unseen'}, `${STATES[item.state]}: `), item.reason]
+    : STATES[item.state]));
   followers.item.push((chosen) => {
     if (sameItem(chosen, item)) button.setAttribute('aria-current', 'true');
     else button.removeAttribute('aria-current');

@@ -31,8 +31,12 @@ function showHead() {
       make('p', {class: 'subtitle'}, [DATA.subtitle, when, DATA.duration ? `${
         clock(DATA.duration, 0)} long` : null].filter((text) => text).join(' · '))),
     toggle);
+  const facts = DATA.facts || [];
+  // as many columns as leave the fewest places empty
+  const empty = (count) => (count - (facts.length % count)) % count;
+  const columns = [7, 6, 5, 4].reduce((one, other) => (empty(other) < empty(one) ? other : one));
   document.getElementById('main').append(
-    make('dl', {class: 'facts'}, (DATA.facts || []).map(({label, value, note}) => make(
+    make('dl', {class: 'facts', style: {'--columns': columns}}, facts.map(({label, value, note}) => make(
       'div', {class: 'card'}, make('dt', {}, label), make('dd', {}, value),
       note ? make('dd', {class: 'note'}, note) : null))));
   showFindings();
@@ -73,8 +77,8 @@ function showErrors() {
   const {errors} = DATA;
   const host = section('errors', 'Errors over time');
   if (!errors || errors.t.length === 0) {
-    host.append(nothing('Nothing to compare with: the run had no truth, and no fixes were held '
-      + 'out (--truth, --hold-out).'));
+    host.append(nothing('No errors over time: the run had no truth, and no fixes were held out '
+      + '(--truth, --hold-out).'), ...errorTable(DATA.error_table));
     return;
   }
   host.append(make('p', {class: 'lead'}, `Distance to ${errors.against === 'truth' ? 'the truth'
@@ -106,22 +110,24 @@ function showErrors() {
       y: errors.heading.map((value) => (known(value) ? degrees(value) : null)), colour: 'path',
       name: 'corrected path'}]});
   }
-  if ((DATA.error_table || []).length > 0) {
-    host.append(make('div', {class: 'card table'}, errorTable(DATA.error_table)));
-  }
+  host.append(...errorTable(DATA.error_table));
 }
 
-const ERROR_COLUMNS = {rms: 'rms', median: 'median', max: 'largest', heading_rms_deg: 'heading, rms'};
+const ERROR_COLUMNS = {median: 'median', rms: 'rms', p95: '95 %', maximum: 'largest', count: 'of'};
 
+/** The table of distances between paths and what they are compared with, if there is one. */
 function errorTable(rows) {
+  if (!rows || rows.length === 0) return [];
   const shown = Object.keys(ERROR_COLUMNS).filter((name) => rows.some((row) => known(row[name])));
-  const cell = (row, name) => (name === 'heading_rms_deg'
-    ? (known(row[name]) ? `${number(row[name])}°` : '–') : length(row[name]));
-  return make('table', {class: 'errors'},
-    make('thead', {}, make('tr', {}, make('th', {scope: 'col'}, 'error of'), shown.map(
+  const cell = (row, name) => {
+    if (name === 'count') return number(row[name], 6);
+    return row.unit === 'deg' ? `${number(row[name])}°` : length(row[name]);
+  };
+  return [make('div', {class: 'card table'}, make('table', {class: 'errors'},
+    make('thead', {}, make('tr', {}, make('th', {scope: 'col'}, 'distance'), shown.map(
       (name) => make('th', {scope: 'col'}, ERROR_COLUMNS[name])))),
     make('tbody', {}, rows.map((row) => make('tr', {}, make('th', {scope: 'row'}, row.name),
-      shown.map((name) => make('td', {}, cell(row, name)))))));
+      shown.map((name) => make('td', {}, cell(row, name))))))))];
 }
 
 // --- springs ------------------------------------------------------------------------------------
@@ -151,7 +157,7 @@ function showSprings(map) {
     make('span', {class: 'rank'}, rank), make('span', {class: 'entry-name'}, name),
     make('span', {class: 'kind'}, kind), bar,
     make('span', {class: 'energy'}, make('b', {}, number(energy)), ` / ${number(expected)}`),
-    text ? make('span', {class: 'entry-why'}, text) : null);
+    text && text !== name ? make('span', {class: 'entry-why'}, text) : null);
     followers.item.push((chosen) => button.classList.toggle('chosen', sameItem(chosen, item)));
     return make('li', {}, button);
   })));
@@ -170,7 +176,8 @@ function showUpdates() {
   const times = updates.ms.filter(known).sort((one, other) => one - other);
   const share = (part) => times[Math.min(times.length - 1, Math.floor(part * times.length))];
   if (times.length > 0) {
-    host.append(make('p', {class: 'lead'}, `${counted(updates.t.length, 'update')}: half took less `
+    host.append(make('p', {class: 'lead'}, `${counted(updates.count || updates.t.length, 'update')}`
+      + `: half took less `
       + `than ${number(share(0.5))} ms, 95 % less than ${number(share(0.95))} ms, the longest `
       + `${number(share(1))} ms.`));
   }
@@ -181,7 +188,10 @@ function showUpdates() {
     const found = extent((column || []).filter((value) => value > 0));
     return found !== null && found[1] > 20 * found[0];
   };
-  makeChart(charts, {title: 'Time of an update', x, marks: [
+  const period = known(updates.period) && updates.period < 20 * share(1)
+    ? [{kind: 'rule', of: 'y', at: updates.period, colour: 'doubted', dash: [6, 4],
+      name: `period of the node, ${number(updates.period)} ms`}] : [];
+  makeChart(charts, {title: 'Time of an update', x, marks: [...period,
     {kind: 'dots', x: updates.t, y: updates.ms, colour: 'path', name: 'update',
       format: (value) => `${number(value)} ms`}],
   y: {label: wide(updates.ms) ? 'time [ms], logarithmic' : 'time [ms]', log: wide(updates.ms)}});

@@ -15,9 +15,13 @@ function showSources() {
 }
 
 function showSource(source) {
-  const {name, kind, count, used, verdict, energy, scale} = source;
+  const {name, kind, count, used, verdict, energy, scale, unused, independent} = source;
   const numbers = [`${counted(count, 'measurement')}, ${number(used, 6)} used`];
-  if (known(scale) && scale !== 1) numbers.push(`sigmas multiplied by ${number(scale)} in the graph`);
+  if (unused && unused.count > 0 && known(unused.median_distance)) {
+    numbers[0] += ` (of the others half are more than ${number(unused.median_distance)} sigma off)`;
+  }
+  if (known(independent)) numbers.push(`${counted(Math.round(independent), 'independent residual')}`);
+  if (known(scale) && Math.abs(scale - 1) > 0.005) numbers.push(`sigmas multiplied by ${number(scale)} in the graph`);
   if (energy && known(energy.found)) {
     numbers.push(`mean energy ${number(energy.found)}, expected ${number(energy.expected)}`);
   }
@@ -63,9 +67,10 @@ function ratioPicture({ratio, low, high}) {
       height: 10, rx: 2, fill: 'var(--believed)', 'fill-opacity': 0.4}));
   }
   if (known(ratio) && ratio > 0) {
-    const outside = known(low) && (ratio < low || ratio > high);
+    const sign = !known(low) || (ratio >= low && ratio <= high) ? 'believed'
+      : (ratio > high ? 'doubted' : 'waiting');
     picture.append(draw('circle', {cx: at(ratio), cy: 9, r: 5, stroke: 'var(--surface)',
-      fill: `var(--${outside ? 'doubted' : 'believed'})`}));
+      fill: `var(--${sign})`}));
   }
   return picture;
 }
@@ -83,7 +88,8 @@ function showHistogram(host, {histogram}) {
     y.push((total * (edges[1] - edges[0]) * Math.exp(-0.5 * value * value)) / Math.sqrt(2 * Math.PI));
   }
   makeChart(host, {
-    title: 'How large they are', x: {label: 'residual [sigma]', domain: [edges[0],
+    title: 'How large they are',
+    note: 'Larger ones are counted in the outermost bars.', x: {label: 'residual [sigma]', domain: [edges[0],
       edges[edges.length - 1]]}, y: {label: 'count', format: (value) => number(value, 4)},
     marks: [
       {kind: 'bars', edges, y: count, colour: 'path', name: 'found', x: []},
@@ -123,9 +129,12 @@ function showAutocorrelation(host, {autocorrelation: found}) {
   };
   rule(found.time, `suggests ${number(found.time)} s`, [], 'doubted');
   rule(found.in_use, `in use ${number(found.in_use)} s`, [2, 3], 'held-out');
+  // lags that grow by a factor are told apart on an axis that does so as well
+  const log = lag[0] > 0 && lag[lag.length - 1] > 20 * lag[0];
   const farthest = Math.max(lag[lag.length - 1], found.time || 0, found.in_use || 0);
   makeChart(host, {title: 'How long they keep their direction', marks,
-    x: {label: 'lag [s]', domain: [0, Math.min(farthest, 2 * lag[lag.length - 1])]},
+    x: log ? {label: 'lag [s], logarithmic', short: 'lag [s]', log}
+      : {label: 'lag [s]', domain: [0, Math.min(farthest, 2 * lag[lag.length - 1])]},
     y: {label: 'autocorrelation'},
     note: known(found.time) ? null : 'No correlation time is suggested: within the band, '
       + 'residuals say nothing of each other.'});
