@@ -15,7 +15,8 @@ STATES = ['believed', 'believed weakly', 'waiting', 'doubted', 'refused', 'held 
 
 
 def example(
-    poses: int = 400, fixes: int = 300, closures: int = 24, title: str = 'figure of eight',
+    poses: int = 400, fixes: int = 300, closures: int = 24, *, others: int = 400,
+    title: str = 'figure of eight',
 ) -> dict[str, Any]:
     """
     Return the data of a report.
@@ -24,6 +25,8 @@ def example(
     ----------
     poses, fixes, closures : int
         Numbers of points of each of the three paths, of fixes, and of closures.
+    others : int
+        Number of errors and of updates, at most `poses`.
 
     """
     rng = np.random.default_rng(16)
@@ -36,6 +39,7 @@ def example(
     truth = path + 0.4 * np.stack((np.sin(t / 30.0), np.cos(t / 23.0)), axis=1)
     odometry = path + drift[:, None] * np.stack((np.cos(t / 50.0), np.sin(t / 70.0)), axis=1)
     some = np.linspace(0, poses - 1, min(poses, 200)).astype(int)
+    told = np.linspace(0, poses - 1, min(poses, others)).astype(int)
     return {
         'version': 1, 'title': title, 'subtitle': 'replay of figure_of_eight',
         'start': '2015-02-26T10:11:12.123Z', 'start_ns': '1424945472123000000',
@@ -64,14 +68,15 @@ def example(
         'closures': [closure_table(rng, t, path, closures)],
         'states': STATES, 'texts': REASONS,
         'errors': {
-            'against': 'truth', 't': column(t), 'position': column(np.abs(error)),
-            'heading': column(rng.normal(0.0, 0.01, poses), 4),
-            'sigma': column(np.full(poses, 0.55)), 'odometry': column(np.abs(drift) + 0.2)},
+            'against': 'truth', 't': column(t[told]), 'position': column(np.abs(error)[told]),
+            'heading': column(rng.normal(0.0, 0.01, len(told)), 4),
+            'sigma': column(np.full(len(told), 0.55)),
+            'odometry': column(np.abs(drift[told]) + 0.2)},
         'error_table': [
-            {'name': 'corrected path', 'rms': 0.92, 'median': 0.8, 'max': 1.6,
-             'heading_rms_deg': 0.6},
-            {'name': 'odometry, aligned', 'rms': 6.1, 'median': 5.0, 'max': 12.0,
-             'heading_rms_deg': None}],
+            {'name': 'corrected path to truth', 'count': 400, 'median': 0.8, 'rms': 0.92,
+             'p95': 1.2, 'maximum': 1.6, 'unit': 'm'},
+            {'name': 'corrected heading to truth', 'count': 400, 'median': 0.4, 'rms': 0.5,
+             'p95': 0.9, 'maximum': 1.6, 'unit': 'deg'}],
         'sources': [source(rng, t, 'gps', kind='fix', count=fixes, ratio=2.1),
                     source(rng, t, 'odom', kind='odometry', count=poses, ratio=0.97),
                     {'name': 'loop_closure', 'kind': 'loop_closure', 'count': closures, 'used': 0,
@@ -79,10 +84,11 @@ def example(
                      'series': None, 'autocorrelation': None, 'scale': 1.0}],
         'springs': [spring(rank, t, path) for rank in range(1, 11)],
         'updates': {
-            't': column(t), 'nodes': list(range(1, poses + 1)), 'iterations': None,
-            'ms': column(np.exp(rng.normal(0.0, 0.7, poses)) * (
-                1 + 30 * (rng.random(poses) < 0.01))),
-            'chi2': column(np.cumsum(rng.chisquare(3, poses)))},
+            't': column(t[told]), 'nodes': (told + 1).tolist(), 'iterations': None,
+            'ms': column(np.exp(rng.normal(0.0, 0.7, len(told))) * (
+                1 + 30 * (rng.random(len(told)) < 0.01))),
+            'chi2': column(np.cumsum(rng.chisquare(3, len(told)))), 'count': poses,
+            'period': 100.0},
         'sparsity': [sparsity('H, nodes in order of time', poses, 0),
                      sparsity('R, in an order of elimination', poses, 310)]}
 
