@@ -23,7 +23,6 @@ from scipy.sparse import linalg
 from benchmark.runs import Plan, quiet, Run
 from benchmark.worlds import chain, laps, World
 from pose_graph_ros.core.batch import chordal_start, optimizer
-from pose_graph_ros.core.config import SolverConfig
 from pose_graph_ros.core.elimination import symbolic
 from pose_graph_ros.core.geometry import se2
 from pose_graph_ros.core.geometry.se2 import FloatArray, IntArray
@@ -32,6 +31,7 @@ from pose_graph_ros.core.graph.constraints import Edges, ObservedKind, ObservedN
 from pose_graph_ros.core.graph.graph import Graph, GraphUpdate
 from pose_graph_ros.core.smoother.incremental import IncrementalSmoother
 from pose_graph_ros.core.smoother.results import UpdateResult
+from pose_graph_ros.core.solver_config import SolverConfig
 
 NAME, REFINED = 'ours', 'ours, refined'
 BATCH = SolverConfig(max_iterations=100, step_tolerance=1e-5)

@@ -18,15 +18,17 @@ MODULES = sorted(path.relative_to(PACKAGE) for path in PACKAGE.rglob('*.py'))
 
 # What everything in `core` may import: settings, values and errors.
 BASE = {'core.exceptions', 'core.config', 'core.gyro_config', 'core.measurements',
-        'core.saved_columns', 'core.setting_checks'}
+        'core.saved_columns', 'core.setting_checks', 'core.solver_config'}
 # The packages of `core`, and the other packages that each may import.
 CORE = {
     'core.compiled': set(),
     'core.geometry': set(),
     'core.graph': {'core.compiled', 'core.geometry'},
     'core.elimination': {'core.compiled', 'core.graph'},
-    'core.batch': {'core.compiled', 'core.geometry', 'core.graph', 'core.elimination'},
-    'core.certificate': {'core.geometry', 'core.graph'},
+    'core.sparse': {'core.geometry'},
+    'core.batch': {
+        'core.compiled', 'core.geometry', 'core.graph', 'core.elimination', 'core.sparse'},
+    'core.certificate': {'core.geometry', 'core.graph', 'core.sparse'},
     'core.marginalization': {
         'core.compiled', 'core.geometry', 'core.graph', 'core.elimination'},
     'core.drawing': {'core.geometry', 'core.graph', 'core.elimination'},

@@ -6,16 +6,20 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from pose_graph_ros.cli.solve_starts import METHODS
+from pose_graph_ros.core.batch import gnc
 from pose_graph_ros.core.batch.optimizer import optimize_from_linear_start, Status
 from pose_graph_ros.core.batch.truncated import Choice, TruncatedProblem
-from pose_graph_ros.core.config import SolverConfig
 from pose_graph_ros.core.geometry.se2 import BoolArray, FloatArray, IntArray
 from pose_graph_ros.core.graph.constraints import EdgeKind, Edges
 from pose_graph_ros.core.graph.graph import Graph, GraphUpdate
 from pose_graph_ros.core.judgement import selection
 from pose_graph_ros.core.judgement.floors import floored, forward
 from pose_graph_ros.core.judgement.residual_scale import give_scale
+from pose_graph_ros.core.solver_config import SolverConfig
 
+# Ways to decide: the lowest truncated cost of several sets, or graduated non-convexity alone.
+SURROGATES = {'gnc': gnc.Surrogate.TRUNCATED, 'gnc-gm': gnc.Surrogate.GEMAN_MCCLURE}
 # Number of sets of closures that are tried to join parts that no odometry joins.
 TRIES = 5
 
@@ -36,7 +40,9 @@ class BelievedEdges:
     """Factor on the sigmas of closures that those believed show, at least 1."""
 
 
-def believe(graph: Graph, sigmas: FloatArray) -> BelievedEdges | None:
+def believe(
+    graph: Graph, sigmas: FloatArray, method: str = METHODS[0],
+) -> BelievedEdges | None:
     """
     Return which edges of a graph to believe, and poses at which they agree; None if it fails.
 
@@ -47,6 +53,7 @@ def believe(graph: Graph, sigmas: FloatArray) -> BelievedEdges | None:
     ----------
     graph : Graph, it is not changed
     sigmas : ndarray, shape (3,), least sigmas of closures for the decision [m, m, rad]
+    method : str, one of `METHODS`
 
     """
     edges = forward(graph.edges)
@@ -64,7 +71,7 @@ def believe(graph: Graph, sigmas: FloatArray) -> BelievedEdges | None:
     for k in range(TRIES if n_parts > 1 else 1):
         known = _joining(edges, closures, parts.copy(), k)
         rows = closures[~np.isin(closures, known)]
-        choice = _choice(graph, edges, rows)
+        choice = _choice(graph, edges, rows, method)
         if choice is not None and (best is None or choice.cost < best.cost):
             best, best_rows = choice, rows
     if best is None:
@@ -79,14 +86,19 @@ def believe(graph: Graph, sigmas: FloatArray) -> BelievedEdges | None:
     return BelievedEdges(closures, believed, n_parts, copy.poses.copy(), scale)
 
 
-def _choice(graph: Graph, edges: Edges, closures: IntArray) -> Choice | None:
-    """Return the best set of closures, from the start that all other constraints give."""
+def _choice(
+    graph: Graph, edges: Edges, closures: IntArray, method: str,
+) -> Choice | None:
+    """Return a set of closures, from the start that all other constraints give."""
     copy = Graph()
     copy.fill(graph.rows()._replace(edges=edges))
     copy.apply(GraphUpdate(remove_edges=closures.tolist()))
     if optimize_from_linear_start(copy, SolverConfig()).status is Status.FAILED:
         return None
-    return selection.best(TruncatedProblem(copy, closures, start=copy.poses.copy()))
+    problem = TruncatedProblem(copy, closures, start=copy.poses.copy())
+    if method in SURROGATES:
+        return gnc.select(problem, SURROGATES[method], patient=True)
+    return selection.best(problem)
 
 
 class _Parts:

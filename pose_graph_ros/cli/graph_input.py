@@ -12,10 +12,11 @@ import numpy as np
 
 from pose_graph_ros.core.exceptions import ConfigError
 from pose_graph_ros.core.geometry.se2 import IntArray
-from pose_graph_ros.core.graph.graph import GraphRows
+from pose_graph_ros.core.graph.graph_update import GraphRows
 from pose_graph_ros.core.io.edge2_order import Guess, read_guessed
-from pose_graph_ros.core.io.g2o import EDGE2_ORDERS, read_g2o
+from pose_graph_ros.core.io.g2o import EDGE2_ORDERS, GraphFile, read_g2o
 
+N_TAGS = 10  # number of tags that are warned of
 SAVED = b'{\n"sha256": "'
 """Begin of the JSON file of a saved graph."""
 
@@ -45,14 +46,27 @@ def read(path: Path, edge2_order: str | None) -> NamedRows:
 
         rows = read_graph(path).rows
         return NamedRows(rows, rows.node_ids)
+    file, _ = read_file(path, edge2_order)
+    return NamedRows(file.rows, file.ids)
+
+
+def read_file(path: Path, edge2_order: str | None) -> tuple[GraphFile, str | None]:
+    """Return a g2o, TORO or iSAM file with the order of its EDGE2; warnings go to stderr."""
     file, order, reason = (read_guessed(path) if edge2_order is None
                            else Guess(read_g2o(path, edge2_order), edge2_order, ''))
+    tags = sorted(file.skipped, key=lambda tag: -file.skipped[tag])
+    lines = [f'{file.skipped[tag]} lines {tag!r} are skipped'
+             + (': TORO may merge these nodes, which their edges connect anyway'
+                if tag == 'EQUIV' else '') for tag in tags[:N_TAGS]]
+    if len(tags) > N_TAGS:
+        lines.append(f'lines with {len(tags) - N_TAGS} other tags are skipped')
+    lines += file.notes
     if reason:
-        print(f'warning: {path}: EDGE2 is read in the order of {order}, as {reason}',
-              file=sys.stderr)
-    for tag, number in sorted(file.skipped.items()):
-        print(f'warning: {path}: {number} lines {tag!r} are skipped', file=sys.stderr)
-    return NamedRows(file.graph.rows(), file.ids)
+        lines.append(f'EDGE2 is read in the order of {order}, as {reason}; say which it is with '
+                     f'--edge2')
+    for line in lines:
+        print(f'warning: {path}: {line}', file=sys.stderr)
+    return file, order
 
 
 def _begins_as_saved(path: Path) -> bool:

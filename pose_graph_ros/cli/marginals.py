@@ -4,18 +4,17 @@
 
 import numpy as np
 
-from pose_graph_ros.cli.solve_starts import CONFIG
+from pose_graph_ros.cli.solve_starts import CONFIG, Problem
 from pose_graph_ros.core.batch.optimizer import optimize
 from pose_graph_ros.core.exceptions import PoseGraphError
 from pose_graph_ros.core.geometry.se2 import IntArray
 from pose_graph_ros.core.graph.constraints import upper
-from pose_graph_ros.core.io.g2o import GraphFile
 from pose_graph_ros.core.smoother.incremental import IncrementalSmoother
 
 HEADER = 'id,x,y,theta,cov_xx,cov_xy,cov_xtheta,cov_yy,cov_ytheta,cov_thetatheta'
 
 
-def chosen_rows(file: GraphFile, which: str) -> IntArray:
+def chosen_rows(problem: Problem, which: str) -> IntArray:
     """
     Return the rows of the nodes that are asked for; raise PoseGraphError if there is no such node.
 
@@ -25,9 +24,9 @@ def chosen_rows(file: GraphFile, which: str) -> IntArray:
 
     """
     if which == 'all':
-        return np.arange(len(file.ids))
+        return np.arange(len(problem.ids))
     if which == 'newest':
-        return np.array([file.graph.newest_pose])
+        return np.array([problem.engine.newest_pose])
     names = []
     for word in which.split(','):
         try:
@@ -35,15 +34,15 @@ def chosen_rows(file: GraphFile, which: str) -> IntArray:
         except ValueError:
             raise PoseGraphError(f'--marginals: expected all, newest or ids separated by commas, '
                                  f'got {which!r}') from None
-    rows = np.searchsorted(file.ids, names)
+    rows = np.searchsorted(problem.ids, names)
     missing = [name for name, row in zip(names, rows.tolist(), strict=True)
-               if row == len(file.ids) or file.ids[row] != name]
+               if row == len(problem.ids) or problem.ids[row] != name]
     if len(missing) > 0:
         raise PoseGraphError(f'--marginals: the file has no vertex {missing[0]}')
     return rows
 
 
-def csv_lines(file: GraphFile, rows: IntArray) -> list[str]:
+def csv_lines(problem: Problem, rows: IntArray) -> list[str]:
     """
     Return lines of CSV with poses and covariances in map axes [m, rad], those of points shorter.
 
@@ -52,7 +51,7 @@ def csv_lines(file: GraphFile, rows: IntArray) -> list[str]:
     rows : ndarray of int, shape (K,), of nodes in a graph that the batch optimiser has solved
 
     """
-    graph = file.graph
+    graph = problem.engine
     # H at the optimum; the last step before it was linearised one step away
     optimize(graph, CONFIG)
     smoother = IncrementalSmoother(graph=graph)
@@ -66,5 +65,5 @@ def csv_lines(file: GraphFile, rows: IntArray) -> list[str]:
         if not graph.is_pose[row]:
             # a point has no heading
             texts = ['' if k in {2, 5, 7, 8} else text for k, text in enumerate(texts)]
-        lines.append(','.join((str(file.ids[row]), *texts)))
+        lines.append(','.join((str(problem.ids[row]), *texts)))
     return lines

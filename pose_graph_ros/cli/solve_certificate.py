@@ -6,12 +6,11 @@ from dataclasses import dataclass
 import time
 from typing import Any
 
-from pose_graph_ros.cli.solve_starts import resumed, Solution, solve
-from pose_graph_ros.core.batch.optimizer import SAME_MINIMUM, Status
-from pose_graph_ros.core.certificate.certify import Certificate, certify, Verdict
+from pose_graph_ros.cli.solve_starts import Problem, resumed, Solution, solve
+from pose_graph_ros.core.batch.outcome import SAME_MINIMUM, Status
+from pose_graph_ros.core.certificate.certify import Certificate, certify, NearHessian, Verdict
 from pose_graph_ros.core.certificate.formulation import formulate, NotCoveredError
 from pose_graph_ros.core.exceptions import LinearSolveError
-from pose_graph_ros.core.io.g2o import GraphFile
 
 
 @dataclass(frozen=True, slots=True)
@@ -79,9 +78,20 @@ class Report:
         return lines
 
 
-def with_certificate(file: GraphFile, solution: Solution) -> tuple[Solution, Report]:
-    """Return the certificate of a solution, and a better solution if it leads to one."""
-    begin, graph = time.monotonic(), file.graph
+def with_certificate(
+    problem: Problem, solution: Solution, *, eigenvalue: bool,
+) -> tuple[Solution, Report]:
+    """
+    Return the certificate of a solution, and a better solution if it leads to one.
+
+    Parameters
+    ----------
+    problem : Problem
+    solution : Solution
+    eigenvalue : bool, whether to compute the smallest eigenvalue if there is a proof without it
+
+    """
+    begin, graph = time.monotonic(), problem.graph
 
     def none(reason: str) -> tuple[Solution, Report]:
         return solution, Report(
@@ -91,20 +101,22 @@ def with_certificate(file: GraphFile, solution: Solution) -> tuple[Solution, Rep
         return none('the constraints do not determine the poses')
     try:
         formulation = formulate(graph)
-        made = certify(formulation, graph.poses)
+        by = solution.optimizer
+        made = certify(formulation, graph.poses, eigenvalue=eigenvalue, hessian=(
+            None if by is None else NearHessian(by.places, by.heading_steps)))
     except (NotCoveredError, LinearSolveError) as error:
         return none(str(error))
     found = None
     if made.is_lower:
         poses = graph.poses.copy()
         graph.set_poses(made.poses)
-        other = solve(file, 'present')
+        other = solve(problem, 'present')
         found = other.result.chi2
         if (other.result.status is not Status.FAILED
                 and found < solution.result.chi2 * (1.0 - SAME_MINIMUM)):
             solution = Solution(other.result, 'minimum of the chordal objective',
                                 other.determined, solution.tried)
         else:
-            solution = resumed(file, solution, poses)
+            solution = resumed(problem, solution, poses)
     return solution, Report(made, '', time.monotonic() - begin, solution.result.chi2,
                             formulation.below_chi2, found)

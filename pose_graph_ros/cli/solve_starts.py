@@ -5,21 +5,30 @@
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 import re
+from typing import TYPE_CHECKING
 
 import numpy as np
 
-from pose_graph_ros.core.batch import optimizer
-from pose_graph_ros.core.batch.optimizer import BatchResult, Status
-from pose_graph_ros.core.config import SolverConfig
-from pose_graph_ros.core.elimination import symbolic
+from pose_graph_ros.core.batch.outcome import BatchResult, Status
+from pose_graph_ros.core.batch.plain_graph import PlainGraph
+from pose_graph_ros.core.batch.plain_optimizer import PlainOptimizer
 from pose_graph_ros.core.geometry.se2 import FloatArray
-from pose_graph_ros.core.graph.constraints import ObservedKind, ObservedNodes
-from pose_graph_ros.core.graph.graph import Graph, GraphUpdate
+from pose_graph_ros.core.graph.constraints import ObservedNodes
+from pose_graph_ros.core.graph.graph_update import GraphUpdate
+from pose_graph_ros.core.graph.kinds import ObservedKind
 from pose_graph_ros.core.io.g2o import compose_missing, GraphFile
+from pose_graph_ros.core.solver_config import SolverConfig
+
+if TYPE_CHECKING:
+    from pose_graph_ros.core.graph.graph import Graph
 
 STARTS = ('chordal', 'file', 'odometry', 'best')
+# Ways to decide which closures to believe; the first one is the default.
+METHODS = ('selection', 'gnc', 'gnc-gm')
 WEAK = 1e-7  # information of a weak prior, as a fraction of that of the median constraint
 CONFIG = SolverConfig(max_iterations=200)
+# Nodes up to which a graph is solved without compiled kernels, if possible.
+MOST_PLAIN_NODES = 20_000
 
 
 @dataclass(frozen=True, slots=True)
@@ -33,18 +42,63 @@ class Solution:
     """Whether the constraints determine all poses."""
     tried: tuple[tuple[str, BatchResult], ...] = ()
     """All starts with their results, if there were several."""
+    optimizer: PlainOptimizer | None = None
+    """What found it, if no compiled kernels were used."""
 
 
-def hold_parts(graph: Graph) -> list[int]:
-    """Fix the first node of each part that has no fixed and no observed one; return these."""
-    held = []
-    while (node := symbolic.loose_part(graph.memory.head)[0]) >= 0:
-        graph.apply(GraphUpdate(fix=[int(node)]))
-        held.append(int(node))
-    return held
+class Problem:
+    """
+    A graph from a file that is to be optimised.
+
+    Parameters
+    ----------
+    file : GraphFile
+    plain : bool
+        Whether to do without compiled kernels if the graph is simple and not large. Loading them
+        takes longer than to solve such a graph.
+
+    """
+
+    def __init__(self, file: GraphFile, *, plain: bool) -> None:
+        self.ids, self.has_start, self._file = file.ids, file.has_start, file
+        self._held: list[int] = []
+        self.plain: PlainGraph | None = None
+        """The graph, if no kernels are used."""
+        rows = file.rows
+        if (plain and len(rows.poses) <= MOST_PLAIN_NODES and not np.all(rows.fixed)
+                and PlainGraph.is_covered(rows)):
+            self.plain = PlainGraph(rows)
+
+    @property
+    def graph(self) -> 'Graph | PlainGraph':
+        """The graph, with the best poses that were found."""
+        return self._file.graph if self.plain is None else self.plain
+
+    @property
+    def engine(self) -> 'Graph':
+        """The graph for the compiled kernels, at its present poses; it is used from now on."""
+        graph = self._file.graph
+        if self.plain is not None:
+            graph.apply(GraphUpdate(fix=self._held))
+            graph.set_poses(self.plain.poses)
+            self.plain = None
+        return graph
+
+    def hold_parts(self) -> list[int]:
+        """Fix the first node of each part that has no fixed and no observed one; return these."""
+        if self.plain is not None:
+            self._held = self.plain.hold_parts()
+            return self._held
+        from pose_graph_ros.core.elimination import symbolic  # noqa: PLC0415
+
+        graph, held = self.engine, []
+        while (node := symbolic.loose_part(graph.memory.head)[0]) >= 0:
+            graph.apply(GraphUpdate(fix=[int(node)]))
+            held.append(int(node))
+        return held
 
 
-def solve(file: GraphFile, start: str) -> Solution:
+def solve(problem: Problem, start: str) -> Solution:
     """
     Return the result of optimising a graph in place.
 
@@ -54,22 +108,22 @@ def solve(file: GraphFile, start: str) -> Solution:
 
     """
     if start != 'best':
-        return _solve_from(file, start, file.graph.poses.copy())
-    present = file.graph.poses.copy()
+        return _solve_from(problem, start, problem.graph.poses.copy())
+    present = problem.graph.poses.copy()
     # poses that were composed from edges are those of odometry
-    names = [name for name in STARTS if name != 'best' and (name != 'file' or file.has_start)]
+    names = [name for name in STARTS if name != 'best' and (name != 'file' or problem.has_start)]
     found: list[tuple[Solution, FloatArray]] = []
     for name in names:
-        solution = _solve_from(file, name, present)
-        found.append((solution, file.graph.poses.copy()))
+        solution = _solve_from(problem, name, present)
+        found.append((solution, problem.graph.poses.copy()))
     best, poses = min(found, key=lambda each: (
         each[0].result.status is Status.FAILED, each[0].result.chi2))
     if best is not found[-1][0]:
-        best = resumed(file, best, poses)
+        best = resumed(problem, best, poses)
     return replace(best, tried=tuple((each.start, each.result) for each, _ in found))
 
 
-def resumed(file: GraphFile, solution: Solution, poses: FloatArray) -> Solution:
+def resumed(problem: Problem, solution: Solution, poses: FloatArray) -> Solution:
     """
     Return a solution after optimising from its poses again, so that the graph is factorised there.
 
@@ -78,25 +132,34 @@ def resumed(file: GraphFile, solution: Solution, poses: FloatArray) -> Solution:
     poses : ndarray, shape (N, 3), at the minimum [m, m, rad]
 
     """
-    again = _solve_from(file, 'present', poses)
+    again = _solve_from(problem, 'present', poses)
     if again.result.status is not Status.CONVERGED:
         return replace(again, start=solution.start)
     return replace(solution, result=replace(solution.result, chi2=again.result.chi2))
 
 
-def _solve_from(file: GraphFile, start: str, poses: FloatArray) -> Solution:
-    graph = file.graph
+def _solve_from(problem: Problem, start: str, poses: FloatArray) -> Solution:
+    if problem.plain is not None and start in {'chordal', 'present'}:
+        problem.plain.set_poses(poses)
+        plain = PlainOptimizer(problem.plain, CONFIG)
+        found = plain.from_chordal_start() if start == 'chordal' else plain.from_present_poses()
+        if found is not None:
+            return Solution(found, found.start.value, True, (), plain)
+    # loads the compiled kernels
+    from pose_graph_ros.core.batch import optimizer  # noqa: PLC0415
+
+    graph = problem.engine
     graph.set_poses(_composed(graph) if start == 'odometry' else poses)
     optimize = (optimizer.optimize_from_linear_start if start == 'chordal' else optimizer.optimize)
     result, determined = _held_weakly(graph, optimize)
-    reason = re.sub(r'hidden node (\d+)', lambda node: f'hidden node {file.ids[int(node[1])]}',
+    reason = re.sub(r'hidden node (\d+)', lambda node: f'hidden node {problem.ids[int(node[1])]}',
                     result.reason)
     names = {'file': 'present poses', 'odometry': 'odometry'}
     return Solution(replace(result, reason=reason), names.get(start, result.start.value),
                     determined)
 
 
-def _composed(graph: Graph) -> FloatArray:
+def _composed(graph: 'Graph') -> FloatArray:
     """Return poses composed from odometry if it joins all nodes, else from all edges."""
     edges, poses, known = graph.edges, graph.poses.copy(), graph.fixed.copy()
     edges = edges.rows(edges.weight > 0.0)
@@ -108,7 +171,7 @@ def _composed(graph: Graph) -> FloatArray:
 
 
 def _held_weakly(
-    graph: Graph, optimize: Callable[[Graph, SolverConfig], BatchResult],
+    graph: 'Graph', optimize: Callable[['Graph', SolverConfig], BatchResult],
 ) -> tuple[BatchResult, bool]:
     """
     Optimise a graph; if poses are not determined, choose those near the present ones.
@@ -119,7 +182,7 @@ def _held_weakly(
     result = optimize(graph, CONFIG)
     if result.status is not Status.FAILED or not np.isfinite(result.chi2):
         return result, True
-    copy, n = Graph(), graph.n_nodes
+    copy, n = type(graph)(), graph.n_nodes
     copy.fill(graph.rows())
     typical = np.concatenate([np.einsum('mii->mi', table.weighted_information).ravel()
                               for table in (graph.edges, graph.observed)])

@@ -16,13 +16,11 @@ from pose_graph_ros.core.exceptions import ConfigError
 from pose_graph_ros.core.gyro_config import GyroSource, Integrate
 from pose_graph_ros.core.measurements import HeadingOnly, LoopClosure, Measurement
 from pose_graph_ros.core.setting_checks import require, require_member, require_same
+from pose_graph_ros.core.solver_config import SolverConfig
 
 # Motion since the last hidden node below which the robot stands still [m], [rad].
 REST_DISTANCE = 0.05
 REST_HEADING = 0.05
-# Least sigmas of loop closures to decide by whether to believe them, as claimed covariances are
-# mostly too small [m, m, rad].
-CLOSURE_FLOORS = (0.3, 0.3, 0.05)
 # Sigma of a heading that is uniform on the circle [rad].
 FLAT_GUESS = math.pi / math.sqrt(3.0)
 
@@ -286,22 +284,6 @@ class AlignmentPolicy:
 
     def __post_init__(self) -> None:
         require(self, 'sigma_heading', 'minimum_baseline', 'baseline_in_sigmas', positive=True)
-
-
-@dataclass(frozen=True, slots=True)
-class SolverConfig:
-    """Settings of Gauss-Newton with Levenberg-Marquardt damping, for a whole graph."""
-
-    max_iterations: int = 50
-    """Maximum number of iterations."""
-    step_tolerance: float = 1e-8
-    """Converged if no coordinate of the next step is larger than this [m, rad]."""
-
-    def __post_init__(self) -> None:
-        if self.max_iterations < 1:
-            raise ConfigError(f'SolverConfig.max_iterations: expected >= 1, '
-                              f'got {self.max_iterations!r}')
-        require(self, 'step_tolerance', positive=True)
 
 
 @dataclass(frozen=True, slots=True)

@@ -19,7 +19,7 @@ DATA = Path(__file__).resolve().parents[1] / 'data'
 GOLDEN = json.loads((DATA / 'golden.json').read_text(encoding='utf-8'))
 NAMES = [name for name in GOLDEN if name.endswith('.g2o')]
 KEYS = {'hidden_nodes', 'edges', 'observed_nodes', 'chi2_start', 'chi2', 'iterations', 'seconds',
-        'status', 'reason', 'start', 'starts', 'held', 'doubted', 'edge2', 'certificate'}
+        'status', 'reason', 'start', 'starts', 'held', 'doubted', 'robust', 'edge2', 'certificate'}
 OF_CERTIFICATE = {'verdict', 'reason', 'seconds', 'chi2', 'gap', 'relative_gap', 'lambda_min',
                   'rank', 'lower_minimum', 'chi2_from_it', 'chi2_bound', 'chi2_gap'}
 # Optima of public files, where they are present: name, chi2, whether the bound is one of chi2.

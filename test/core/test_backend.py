@@ -26,7 +26,6 @@ from pose_graph_ros.core.config import (
     POSITIONS,
     Robust,
     SmootherConfig,
-    SolverConfig,
 )
 from pose_graph_ros.core.estimate import UpdateReport
 from pose_graph_ros.core.geometry import se2
@@ -45,6 +44,7 @@ from pose_graph_ros.core.measurements import (
 )
 from pose_graph_ros.core.smoother.incremental import IncrementalSmoother
 from pose_graph_ros.core.smoother.results import UpdateResult
+from pose_graph_ros.core.solver_config import SolverConfig
 
 SECOND = 1_000_000_000
 # The promise: the same measurements give the same path, whatever their order [m, rad].

@@ -17,9 +17,9 @@ from pose_graph_ros.core.config import (
     OdometryNoise,
     OdometrySource,
     SmootherConfig,
-    SolverConfig,
 )
 from pose_graph_ros.core.exceptions import ConfigError
+from pose_graph_ros.core.solver_config import SolverConfig
 
 NUMBERS = [(kind, item.name)
            for kind in (NodePolicy, OdometryNoise, OdometrySource, CovariancePolicy,

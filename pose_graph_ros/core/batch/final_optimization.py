@@ -19,9 +19,9 @@ from pose_graph_ros.core.batch.optimizer import (
     Solve,
     Status,
 )
-from pose_graph_ros.core.config import SolverConfig
 from pose_graph_ros.core.graph.graph import Graph, GraphUpdate
 from pose_graph_ros.core.graph.reweighting import Reweighting
+from pose_graph_ros.core.solver_config import SolverConfig
 
 # Maximum number of reweighting iterations.
 REWEIGHTINGS = 200

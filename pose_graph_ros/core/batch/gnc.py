@@ -66,7 +66,9 @@ class Surrogate(Enum):
         return max(1.0 / (2.0 * largest - 1.0), _LEAST)
 
 
-def select(problem: TruncatedProblem, surrogate: Surrogate) -> Choice | None:
+def select(
+    problem: TruncatedProblem, surrogate: Surrogate, *, patient: bool = False,
+) -> Choice | None:
     """
     Return the set that graduated non-convexity ends with.
 
@@ -77,9 +79,11 @@ def select(problem: TruncatedProblem, surrogate: Surrogate) -> Choice | None:
     ----------
     problem : TruncatedProblem
     surrogate : Surrogate
+    patient : bool, whether to try it however long it takes
 
     """
-    if problem.factorisation(problem.allowed.astype(np.float64)) > MOST_NUMBERS:
+    if not patient and (
+            problem.factorisation(problem.allowed.astype(np.float64)) > MOST_NUMBERS):
         return None
     if not problem.solve(np.zeros(len(problem))):
         return None

@@ -21,8 +21,8 @@ from pose_graph_ros.core.exceptions import LinearSolveError
 from pose_graph_ros.core.geometry import se2
 from pose_graph_ros.core.geometry.se2 import BoolArray, ComplexArray, FloatArray, IntArray
 from pose_graph_ros.core.graph.constraints import EdgeKind, Edges, ObservedKind, ObservedNodes
-from pose_graph_ros.core.graph.factor_types import FACTORS
 from pose_graph_ros.core.graph.graph import Graph
+from pose_graph_ros.core.graph.kinds import FACTORS
 from pose_graph_ros.core.graph.priors import Prior
 
 # The headings of `unit_headings` are pulled to length 1 with these fractions of their information,

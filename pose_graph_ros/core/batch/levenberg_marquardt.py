@@ -21,9 +21,15 @@ from typing import NamedTuple
 import numpy as np
 
 from pose_graph_ros.core.batch import gauss_newton as gn
-from pose_graph_ros.core.config import SolverConfig
+from pose_graph_ros.core.batch.outcome import (
+    CHORD_RATIO,
+    has_converged,
+    KEEP_RATIO,
+    UPHILL_STEPS,
+)
 from pose_graph_ros.core.geometry.se2 import FloatArray
 from pose_graph_ros.core.graph import tables as tb
+from pose_graph_ros.core.solver_config import SolverConfig
 
 # Damping lambda after the first rejected step, its factor of growth after each further one and of
 # decay after each accepted one, the value below which it is set to 0, and the largest value.
@@ -32,9 +38,6 @@ DAMPING_GROWTH = 10.0
 DAMPING_DECAY = 0.1
 LEAST_DAMPING = 1e-9
 LARGEST_DAMPING = 1e12
-# Number of steps in a row for which chi2 may exceed the lowest so far, by any factor: a step along
-# a narrow curved valley, as stiff constraints make it, ends high up, the next one far down.
-UPHILL_STEPS = 2
 # Number of damped steps in a row after which one without damping is tried again.
 DAMPED_STEPS = 10
 # Number of steps that change chi2 by rounding only and do not become shorter, until convergence.
@@ -45,14 +48,6 @@ LEVEL_STEPS = 2
 STALL = 1e-6
 AT_THE_END = 1e-9
 LEAST_DECREASE = 1e-16
-# A step that is no shorter than the last one but below this is rounding noise [m, rad].
-NOISE_STEP = 1e-7
-# Limit of the predicted sum of all further steps at convergence [fraction of the tolerance].
-SURE = 0.1
-# Largest ratio of the lengths of two steps after which the next one is a chord step: after a step
-# with a new factorisation, and after a chord step.
-KEEP_RATIO = 0.1
-CHORD_RATIO = 0.4
 
 
 class Termination(Enum):
@@ -129,7 +124,7 @@ def minimize(
             # an uphill step or stronger damping before this step changes its length
             comparable = uphill == 0 and damping <= last_damping
             if n_level >= LEVEL_STEPS or (
-                    comparable and _has_converged(length, previous, config.step_tolerance)):
+                    comparable and has_converged(length, previous, config.step_tolerance)):
                 end = Termination.CONVERGED
                 break
             chord = comparable and damping == 0.0 and previous < math.inf and (
@@ -192,19 +187,3 @@ def _refactorized(
     if not predicted > least * max(chi2, 1.0):
         return Termination.CONVERGED
     return Termination.STALLED if end is Termination.CONVERGED else end
-
-
-def _has_converged(length: float, previous: float, tolerance: float) -> bool:
-    """
-    Tell whether the sum of all further steps is below the tolerance.
-
-    Gauss-Newton converges linearly if errors remain at the minimum. If r is the ratio of the
-    lengths of the last two steps and remains so, the further steps add up to r / (1 - r) times the
-    last one.
-    """
-    if length >= previous:
-        return length < NOISE_STEP
-    if previous == math.inf:
-        return length < tolerance
-    ratio = length / previous
-    return length * ratio < SURE * tolerance * (1.0 - ratio)

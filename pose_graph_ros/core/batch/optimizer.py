@@ -9,68 +9,49 @@ poses, with which the incremental smoother can continue.
 """
 
 from collections.abc import Callable, Collection, Generator
-from dataclasses import dataclass, replace
-from enum import Enum
+from dataclasses import replace
 from typing import TypeVar
 
 import numpy as np
 
 from pose_graph_ros.core.batch import chordal_start, gauss_newton
 from pose_graph_ros.core.batch.levenberg_marquardt import minimize, Termination
-from pose_graph_ros.core.config import SolverConfig
+from pose_graph_ros.core.batch.outcome import (
+    BatchResult,
+    SAME_MINIMUM,
+    Start,
+    Status,
+    TRUSTED_ITERATIONS,
+)
 from pose_graph_ros.core.elimination import symbolic
 from pose_graph_ros.core.exceptions import LinearSolveError
 from pose_graph_ros.core.geometry.se2 import FloatArray
 from pose_graph_ros.core.graph import editing, tables as tb
 from pose_graph_ros.core.graph.graph import Graph
+from pose_graph_ros.core.solver_config import SolverConfig
 
-
-class Status(Enum):
-    """Outcome of an optimisation or of an update."""
-
-    CONVERGED = 'converged'
-    MAX_ITERATIONS = 'max_iterations'
-    STALLED = 'stalled'
-    """
-    No step lowers chi2 although the linear model predicts a decrease: a heading error is at pi.
-    """
-    FAILED = 'failed'
-
-
-class Start(Enum):
-    """Poses from which an optimisation began."""
-
-    CHORDAL = 'chordal start'
-    JOINT = 'joint start'
-    """Headings and positions solved for together, where nodes are observed."""
-    UNIT = 'start with unit headings'
-    PRESENT = 'present poses'
-
-
-@dataclass(frozen=True, slots=True)
-class BatchResult:
-    """Result of an optimisation."""
-
-    status: Status
-    reason: str
-    """One sentence when the status is FAILED, else empty."""
-    iterations: int
-    """Number of steps."""
-    chi2: float
-    """chi2 at the poses after the call."""
-    start: Start = Start.PRESENT
-
+__all__ = [
+    'SAME_MINIMUM',
+    'TRUSTED_ITERATIONS',
+    'BatchResult',
+    'Parts',
+    'Solve',
+    'Start',
+    'Status',
+    'chi2_of',
+    'from_linear_start',
+    'in_parts',
+    'optimize',
+    'optimize_from_linear_start',
+    'optimize_from_two_starts',
+    'to_the_end',
+]
 
 Result = TypeVar('Result')
 Parts = Generator[None, None, BatchResult]
 """An optimisation that pauses after parts of at most an iteration; it returns the result."""
 Solve = Callable[[Graph, SolverConfig], BatchResult]
 """Function that optimises a graph in place, such as `optimize`."""
-
-# Relative difference of chi2 below which two minima count as the same.
-SAME_MINIMUM = 1e-9
-# Iterations within which a good start converges; if it takes more, the next one is tried.
-TRUSTED_ITERATIONS = 20
 
 _STATUS = {Termination.CONVERGED: Status.CONVERGED, Termination.STALLED: Status.STALLED,
            Termination.MAX_ITERATIONS: Status.MAX_ITERATIONS}

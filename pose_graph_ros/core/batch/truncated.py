@@ -21,11 +21,11 @@ from typing import Final
 import numpy as np
 
 from pose_graph_ros.core.batch.optimizer import chi2_of, optimize, Status
-from pose_graph_ros.core.config import SolverConfig
 from pose_graph_ros.core.elimination import symbolic
 from pose_graph_ros.core.geometry.se2 import BoolArray, FloatArray, IntArray
 from pose_graph_ros.core.graph.error_functions import energies
 from pose_graph_ros.core.graph.graph import Graph, GraphUpdate
+from pose_graph_ros.core.solver_config import SolverConfig
 
 # Value that 99 % of the energies of right constraints are below, by the rank of the information.
 LIMITS: Final = np.array([0.0, 6.635, 9.210, 11.345])

@@ -17,16 +17,18 @@ What is proved holds for this objective, and for chi2 with the error (3.48) as f
 is nowhere above chi2: `Formulation.below_chi2`, docs/solver.md.
 """
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from enum import Enum
+from typing import NamedTuple
 
 import numpy as np
 
 from pose_graph_ros.core.certificate.formulation import Formulation
 from pose_graph_ros.core.certificate.quadratic_form import QuadraticForm
-from pose_graph_ros.core.certificate.riemannian import minimized, unit_rows
+from pose_graph_ros.core.certificate.riemannian import Inverse, minimized, unit_rows
 from pose_graph_ros.core.certificate.spectrum import examined, LEAST_COST, Spectrum
-from pose_graph_ros.core.geometry.se2 import ComplexArray, FloatArray
+from pose_graph_ros.core.geometry.se2 import ComplexArray, FloatArray, IntArray
 
 MAX_RANK = 6
 # Gap up to which a minimum is called global, as a fraction of its cost (at least LEAST_COST).
@@ -57,7 +59,11 @@ class Certificate:
     gap: float
     """How far below `chi2` the global minimum may be at most."""
     smallest: float | None
-    """Smallest eigenvalue of the certificate matrix of the best minimum, but for the zero."""
+    """
+    Smallest eigenvalue of the certificate matrix of the best minimum, but for the zero.
+
+    None if it is not known.
+    """
     rank: int
     """Numbers for each heading with which the bound was found; 1 without the staircase."""
     poses: FloatArray
@@ -79,7 +85,37 @@ class Certificate:
         return self.chi2 < self.near - LOWER * max(self.near, LEAST_COST)
 
 
-def certify(formulation: Formulation, poses: FloatArray) -> Certificate:
+class NearHessian(NamedTuple):
+    """What an optimiser that has moved the poses to a minimum of chi2 knows of it."""
+
+    places: IntArray
+    """Place of each hidden node that is not fixed in its order of elimination, shape (F,)."""
+    solve: Callable[[FloatArray], FloatArray]
+    """
+    From derivatives of chi2 by the headings of these, shape (F,), to a step of Gauss-Newton.
+
+    The steps for them are those with which the positions change as well.
+    """
+
+    def order(self, formulation: Formulation) -> IntArray:
+        """Return the place of each unknown of the objective, the map last."""
+        places = np.full(formulation.n_unknowns, len(self.places))
+        places[1:] = self.places
+        return places
+
+    def inverse(self, formulation: Formulation) -> Inverse:
+        """Return the preconditioner for `minimized`."""
+        def inverse(derivative: FloatArray) -> FloatArray:
+            change = np.zeros(formulation.n_unknowns)
+            change[1:] = self.solve(derivative[1:])
+            return change
+        return inverse
+
+
+def certify(
+    formulation: Formulation, poses: FloatArray, *, eigenvalue: bool = True,
+    hessian: NearHessian | None = None,
+) -> Certificate:
     """
     Return a certificate for the minimum of the objective near some poses, or for a lower one.
 
@@ -89,15 +125,18 @@ def certify(formulation: Formulation, poses: FloatArray) -> Certificate:
     ----------
     formulation : Formulation
     poses : ndarray, shape (N, 3), of all hidden nodes [m, m, rad]
+    eigenvalue : bool, whether to compute `smallest` if there is a proof without it
+    hessian : NearHessian, optional, spares work
 
     """
-    form = QuadraticForm(formulation)
+    form = QuadraticForm(formulation, None if hessian is None else hessian.order(formulation))
     if form.n == 1:
         cost = form.cost(np.ones((1, 1), dtype=np.complex128))
         return Certificate(Verdict.CERTIFIED, cost, cost, 0.0, None, 1, poses.copy())
-    z = minimized(form, formulation.headings(poses)[:, None])
+    z = minimized(form, formulation.headings(poses)[:, None],
+                  None if hessian is None else hessian.inverse(formulation))
     cost = near = form.cost(z)
-    spectrum = examined(form, z)
+    spectrum = examined(form, z, eigenvalue=eigenvalue)
     bound, rank = spectrum.bound, 1
     if not spectrum.positive:
         y, rank, above = _staircase(form, z, spectrum)
@@ -105,7 +144,7 @@ def certify(formulation: Formulation, poses: FloatArray) -> Certificate:
         bound = max(bound, above)
         if form.cost(other) < near - LOWER * max(near, LEAST_COST):
             z, cost = other, form.cost(other)
-            spectrum = examined(form, z)
+            spectrum = examined(form, z, eigenvalue=eigenvalue)
             bound = max(bound, spectrum.bound)
     gap = max(cost - bound, 0.0)
     certified = gap <= GAP * max(cost, LEAST_COST)

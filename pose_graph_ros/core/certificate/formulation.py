@@ -24,18 +24,47 @@ So every constraint is, with arms a and b (0 unless the end is fixed or observed
 """
 
 from dataclasses import dataclass
+from typing import Any, Protocol
 
 import numpy as np
-import scipy.sparse
-from scipy.sparse.csgraph import connected_components
+import numpy.typing as npt
 
 from pose_graph_ros.core.exceptions import PoseGraphError
-from pose_graph_ros.core.geometry.se2 import ComplexArray, FloatArray, IntArray
-from pose_graph_ros.core.graph.constraints import NodeKind
-from pose_graph_ros.core.graph.graph import Graph
+from pose_graph_ros.core.geometry.se2 import BoolArray, ComplexArray, FloatArray, IntArray
+from pose_graph_ros.core.graph.constraints import Edges, ObservedNodes
+from pose_graph_ros.core.graph.kinds import NodeKind
+from pose_graph_ros.core.sparse.components import components
 
 # Relative difference up to which information counts as isotropic.
 ISOTROPIC = 1e-9
+
+
+class Constrained(Protocol):
+    """What is needed of a graph, a `Graph` or a `PlainGraph`."""
+
+    @property
+    def node_kind(self) -> npt.NDArray[Any]:
+        """`NodeKind` of hidden nodes, shape (N,)."""
+
+    @property
+    def n_priors(self) -> int:
+        """Number of dense priors."""
+
+    @property
+    def poses(self) -> FloatArray:
+        """Of all hidden nodes, shape (N, 3) [m, m, rad]."""
+
+    @property
+    def fixed(self) -> BoolArray:
+        """Whether hidden nodes keep their pose, shape (N,)."""
+
+    @property
+    def edges_by_row(self) -> Edges:
+        """All edges, with rows for ends."""
+
+    @property
+    def observed_by_row(self) -> ObservedNodes:
+        """All observed nodes, with rows for their nodes."""
 
 
 class NotCoveredError(PoseGraphError):
@@ -98,7 +127,7 @@ class Formulation:
         return np.where(self.number[:, None] > 0, poses, self.fixed)
 
 
-def formulate(graph: Graph) -> Formulation:
+def formulate(graph: Constrained) -> Formulation:
     """
     Return the objective for a graph, or raise NotCoveredError with the reason.
 
@@ -165,11 +194,8 @@ def _is_below(information: FloatArray, kappa: FloatArray, tau: FloatArray) -> bo
 def _check_held(form: Formulation) -> None:
     """Raise NotCoveredError unless constraints on positions join all unknowns to the map."""
     joining = form.tau > 0.0
-    n = form.n_unknowns
-    matrix = scipy.sparse.coo_array(
-        (np.ones(int(np.sum(joining))), (form.i[joining], form.j[joining])), shape=(n, n))
-    n_parts, part = connected_components(matrix, directed=False)
-    if n_parts > 1:
+    part = components(form.i[joining], form.j[joining], form.n_unknowns)
+    if np.any(part != 0):
         raise NotCoveredError(
-            f'constraints on positions join {int(np.sum(part != part[0]))} nodes to nothing fixed '
+            f'constraints on positions join {int(np.sum(part != 0))} nodes to nothing fixed '
             f'and nothing observed')

@@ -16,10 +16,11 @@ from collections.abc import Callable
 
 import numpy as np
 
-from pose_graph_ros.core.certificate.quadratic_form import factorized, is_positive, QuadraticForm
+from pose_graph_ros.core.certificate.quadratic_form import QuadraticForm
 from pose_graph_ros.core.geometry.se2 import ComplexArray, FloatArray
 
 Operator = Callable[[ComplexArray], ComplexArray]
+Inverse = Callable[[FloatArray], FloatArray]
 MAX_STEPS = 300
 MAX_INNER = 300
 # The iteration ends at a predicted decrease of f of this fraction.
@@ -64,7 +65,9 @@ def multipliers(y: ComplexArray, product: ComplexArray) -> FloatArray:
     return np.asarray(np.sum(y.real * product.real + y.imag * product.imag, axis=1))
 
 
-def minimized(form: QuadraticForm, y: ComplexArray) -> ComplexArray:
+def minimized(
+    form: QuadraticForm, y: ComplexArray, inverse: Inverse | None = None,
+) -> ComplexArray:
     """
     Return headings at a minimum of f near the given ones, or where steps no longer lower it.
 
@@ -72,11 +75,14 @@ def minimized(form: QuadraticForm, y: ComplexArray) -> ComplexArray:
     ----------
     form : QuadraticForm
     y : ndarray, shape (n, r), rows of length 1
+    inverse : callable, optional
+        From derivatives by the headings, shape (n,), to changes of them, near the minimum: of
+        headings that are angles, r = 1.
 
     """
     cost, radius = form.cost(y), np.inf
     product = form.product(y)
-    solve = _preconditioner(form, multipliers(y, product))
+    solve = None if inverse is not None else _preconditioner(form, multipliers(y, product))
     for _ in range(MAX_STEPS):
         diagonal = multipliers(y, product)[:, None]
         tangent = _projection(y)
@@ -86,8 +92,14 @@ def minimized(form: QuadraticForm, y: ComplexArray) -> ComplexArray:
                     tangent: Operator = tangent) -> ComplexArray:
             return tangent(form.product(v) - diagonal * v)
 
-        def precondition(v: ComplexArray, tangent: Operator = tangent) -> ComplexArray:
-            return tangent(solve(v))
+        def precondition(
+            v: ComplexArray, tangent: Operator = tangent, y: ComplexArray = y,
+        ) -> ComplexArray:
+            if solve is not None:
+                return tangent(solve(v))
+            assert inverse is not None
+            # a change of the angle turns a heading at a right angle
+            return tangent(1j * y * inverse((y.conj() * v).imag[:, 0])[:, None])
 
         decrease = inner(gradient, precondition(gradient))
         if not decrease > TOLERANCE * cost:
@@ -121,18 +133,14 @@ def _projection(y: ComplexArray) -> Operator:
 
 def _preconditioner(form: QuadraticForm, diagonal: FloatArray) -> Operator:
     """Return v -> (Q - L)^-1 v with row 0 held, or with Q alone if that is not definite."""
-    n = form.n
-    kept = np.delete(np.arange(2 * n - 1), n - 1)
-    damping = DAMPING * form.matrix.diagonal().real[n - 1:]
-    factors = factorized(form.shifted(damping - diagonal)[kept][:, kept].tocsc())
-    if not is_positive(factors):
-        factors = factorized(form.shifted(damping)[kept][:, kept].tocsc())
+    damping = DAMPING * form.diagonal
+    factors = form.factors(damping - diagonal, turned=False)
+    if not factors.is_positive:
+        factors = form.factors(damping, turned=False)
 
     def solve(v: ComplexArray) -> ComplexArray:
-        right = np.zeros((2 * n - 2, v.shape[1]), dtype=np.complex128)
-        right[n - 1:] = v[1:]
-        out = np.zeros_like(v)
-        out[1:] = factors.solve(right)[n - 1:]
+        out = form.inverse(factors, v)
+        out[0] = 0.0
         return out
     return solve
 

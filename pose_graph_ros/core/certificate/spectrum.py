@@ -13,15 +13,14 @@ optimal solutions, and verification", T-RO 2016; N. Boumal, V. Voroninski, A. Ba
 """
 
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
-import scipy.sparse.linalg
 
-from pose_graph_ros.core.certificate.quadratic_form import factorized, is_positive, QuadraticForm
+from pose_graph_ros.core.certificate.quadratic_form import QuadraticForm
 from pose_graph_ros.core.certificate.riemannian import multipliers
 from pose_graph_ros.core.exceptions import LinearSolveError
 from pose_graph_ros.core.geometry.se2 import ComplexArray, FloatArray
+from pose_graph_ros.core.sparse.block_matrix import BlockFactors
 
 # Fraction of f that the shifts s of all headings lower the bound by.
 SHIFT = 5e-7
@@ -45,13 +44,13 @@ class Spectrum:
     """
     Smallest eigenvalue, but for those of the columns of Y, which are zero at a stationary point.
 
-    None if the iteration for it did not converge.
+    None if it was not asked for, or the iteration for it did not converge.
     """
     direction: ComplexArray | None
     """Its eigenvector, shape (n,)."""
 
 
-def examined(form: QuadraticForm, y: ComplexArray) -> Spectrum:
+def examined(form: QuadraticForm, y: ComplexArray, *, eigenvalue: bool = True) -> Spectrum:
     """
     Return what the certificate matrix of headings says.
 
@@ -61,15 +60,16 @@ def examined(form: QuadraticForm, y: ComplexArray) -> Spectrum:
     ----------
     form : QuadraticForm
     y : ndarray, shape (n, r), rows of length 1 at a stationary point of f
+    eigenvalue : bool, whether to compute the smallest eigenvalue if there is a proof without it
 
     """
     diagonal = multipliers(y, form.product(y))
     total = float(np.sum(diagonal))
-    entries = form.matrix.diagonal().real[form.n - 1:]
-    shift = ROUNDING * entries + SHIFT * (abs(total) + LEAST_COST) / form.n
+    shift = ROUNDING * form.diagonal + SHIFT * (abs(total) + LEAST_COST) / form.n
     factors = _definite(form, shift - diagonal)
     if factors is not None:
-        smallest, vector = _smallest(form, factors, -float(np.mean(shift)), y)
+        smallest, vector = (_smallest(form, factors, -float(np.mean(shift)), y) if eigenvalue
+                            else (None, None))
         return Spectrum(True, total - float(np.sum(shift)), smallest, vector)
     # a shift at which it is definite lies below the smallest eigenvalue
     sigma = float(np.max(shift))
@@ -90,17 +90,17 @@ def examined(form: QuadraticForm, y: ComplexArray) -> Spectrum:
     return Spectrum(False, proved, smallest, vector)
 
 
-def _definite(form: QuadraticForm, shift: FloatArray) -> Any:
+def _definite(form: QuadraticForm, shift: FloatArray) -> BlockFactors | None:
     """Return the factors of M with a shift of the headings if it is definite, else None."""
     try:
-        factors = factorized(form.shifted(shift))
+        factors = form.factors(shift)
     except LinearSolveError:
         return None
-    return factors if is_positive(factors) else None
+    return factors if factors.is_positive else None
 
 
 def _smallest(
-    form: QuadraticForm, factors: Any, sigma: float, known: ComplexArray | None,
+    form: QuadraticForm, factors: BlockFactors, sigma: float, known: ComplexArray | None,
 ) -> tuple[float | None, ComplexArray | None]:
     """Return the smallest eigenvalue of S, orthogonal to the known vectors, and its vector."""
     n = form.n
@@ -109,9 +109,11 @@ def _smallest(
     basis = np.zeros((n, 0), dtype=np.complex128) if known is None else np.linalg.qr(known)[0]
 
     def inverse(v: ComplexArray) -> ComplexArray:
-        right = np.zeros(2 * n - 1, dtype=np.complex128)
-        right[n - 1:] = _without(basis, v.ravel())
-        return _without(basis, factors.solve(right)[n - 1:])
+        right = _without(basis, v.ravel())[:, None]
+        return _without(basis, form.inverse(factors, right)[:, 0])
+
+    # takes 0.1 s to load
+    import scipy.sparse.linalg  # noqa: PLC0415
 
     operator = scipy.sparse.linalg.LinearOperator((n, n), matvec=inverse, dtype=np.complex128)
     rng = np.random.default_rng(0)

@@ -17,14 +17,14 @@ from pose_graph_ros.core.graph.constraints import (
     ObservedNodes,
 )
 from pose_graph_ros.core.graph.error_functions import edge_errors, energies, observed_errors
-from pose_graph_ros.core.graph.factor_types import FACTORS
 from pose_graph_ros.core.graph.graph_update import (
     Energies,
     GraphRows,
     GraphUpdate,
     NextIds,
 )
-from pose_graph_ros.core.graph.identities import Ids, known
+from pose_graph_ros.core.graph.ids import Ids, known
+from pose_graph_ros.core.graph.kinds import FACTORS
 from pose_graph_ros.core.graph.prior_edits import priors_of
 from pose_graph_ros.core.graph.priors import model, Prior
 from pose_graph_ros.core.graph.tables import Memory

@@ -10,8 +10,9 @@ import numpy.typing as npt
 
 from pose_graph_ros.core.exceptions import GraphUpdateError
 from pose_graph_ros.core.geometry.se2 import FloatArray, IntArray
-from pose_graph_ros.core.graph.factor_types import NodeKind, type_of
-from pose_graph_ros.core.graph.identities import Ids
+from pose_graph_ros.core.graph.factor_types import type_of
+from pose_graph_ros.core.graph.ids import Ids
+from pose_graph_ros.core.graph.kinds import NodeKind
 
 
 def checked_poses(name: str, poses: FloatArray) -> FloatArray:

@@ -3,8 +3,8 @@
 """
 The types of constraints (factors), each defined here and nowhere else.
 
-`FACTORS` says which nodes a kind of edge has for ends, which rows its error has, and its tag in
-g2o files. `error` has the errors with their Jacobians; `factors` derives from it what solvers
+`kinds.FACTORS` says which nodes a kind of edge has for ends, which rows its error has, and its tag
+in g2o files. `error` has the errors with their Jacobians; `factors` derives from it what solvers
 need. Numbers in parentheses are equations of C. Merfels, "Sensor fusion for localization of
 automated vehicles", section 3.4.6. A node is x = (t, th), its theta wrapped; R_i and R_z are the
 rotations (3.47) of node i and of the measured pose z = (t_z, th_z), o an offset in node i. With
@@ -27,92 +27,14 @@ Jacobians; with them `R e_t = d + constant`. Of the heading of i only the rotati
 which is given as (c, s).
 """
 
-from enum import IntEnum
 import math
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy.typing as npt
 
 from pose_graph_ros.core.compiled.jit import kernel
 from pose_graph_ros.core.graph import tables as tb
-
-
-class NodeKind(IntEnum):
-    """What a hidden node is."""
-
-    POSE = 0
-    BIAS = 1
-    """Time-correlated error of a source of measurements, of dimension 1 to 3."""
-    LANDMARK = 2
-    """A point in the map, of dimension 2."""
-
-
-class EdgeKind(IntEnum):
-    """Where an edge comes from."""
-
-    ODOMETRY = 0
-    LOOP_CLOSURE = 1
-    BIAS = 2
-    """
-    Leads to a bias j, from the pose i that was measured with it or from the next bias i; the error
-    is `F x_j + mean - x_i * offset` in map axes, F = diag(f_t, f_t, f_th).
-    """
-    TURN = 3
-    """Change of the heading, as from a gyro, whose bias is the third node if there is one."""
-    POINT = 4
-    """Position of landmark j in the frame of i."""
-    PRIOR = 5
-    """What marginalisation leaves of edges between poses; the error is that of odometry."""
-    RANGE = 6
-    """Distance of landmark j from a point of the robot i."""
-
-
-class ObservedKind(IntEnum):
-    """What was measured of an observed node; the error is the same for all kinds."""
-
-    GLOBAL_POSE = 0
-    POSITION = 1
-    HEADING = 2
-    PRIOR = 3
-    """What marginalisation leaves."""
-
-
-class FactorType(NamedTuple):
-    """What `constraints.check`, files and pictures need to know of a kind of edges."""
-
-    name: str
-    i: tuple[NodeKind, ...]
-    """Kinds of nodes that the edge may start from."""
-    j: tuple[NodeKind, ...]
-    k: tuple[NodeKind, ...] = ()
-    """Kinds of the third node, which may be missing."""
-    rows: tuple[int, ...] = (0, 1, 2)
-    """Rows that the error has; mean and information are zero in the others."""
-    bias: tuple[int, ...] = ()
-    """Columns of `Edges.bias` that it uses."""
-    tag: str = ''
-    """
-    Tag in g2o files, followed by i, j and, of the rows that it has, mean and upper triangle of the
-    information.
-    """
-
-    @property
-    def places(self) -> bool:
-        """Whether its mean is a position of j in the frame of i."""
-        return self.rows[:2] == (0, 1) and self.j != (NodeKind.BIAS,)
-
-
-_POSE, _BIAS, _LANDMARK = (NodeKind.POSE,), (NodeKind.BIAS,), (NodeKind.LANDMARK,)
-FACTORS = {
-    EdgeKind.ODOMETRY: FactorType('odometry', _POSE, _POSE, tag='EDGE_SE2'),
-    EdgeKind.LOOP_CLOSURE: FactorType('loop closure', _POSE, _POSE, tag='EDGE_SE2'),
-    EdgeKind.BIAS: FactorType('bias', (*_POSE, *_BIAS), _BIAS, bias=(0, 1, 2, 3)),
-    EdgeKind.TURN: FactorType('turn', _POSE, _POSE, _BIAS, rows=(2,), bias=(3,)),
-    EdgeKind.POINT: FactorType('point', _POSE, _LANDMARK, rows=(0, 1), tag='EDGE_SE2_XY'),
-    EdgeKind.PRIOR: FactorType('prior', _POSE, _POSE, tag='EDGE_SE2'),
-    EdgeKind.RANGE: FactorType(
-        'range', _POSE, _LANDMARK, rows=(0,), bias=(0, 1), tag='EDGE_RANGE_SE2_XY'),
-}
+from pose_graph_ros.core.graph.kinds import EdgeKind
 
 # Numbers of the definitions: kinds of edges, then observed nodes.
 ODOMETRY, BIAS, TURN, PRIOR, RANGE = (int(kind) for kind in (

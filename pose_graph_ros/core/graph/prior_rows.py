@@ -20,8 +20,8 @@ import numpy as np
 
 from pose_graph_ros.core.compiled.jit import kernel
 from pose_graph_ros.core.graph import pools, tables as tb, transaction_log
-from pose_graph_ros.core.graph.factor_types import NodeKind
 from pose_graph_ros.core.graph.factors import wrap
+from pose_graph_ros.core.graph.kinds import NodeKind
 from pose_graph_ros.core.graph.normal_equations import weakest_of
 from pose_graph_ros.core.graph.pools import row_start, triangle_size
 

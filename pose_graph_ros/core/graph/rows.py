@@ -13,7 +13,8 @@ import numpy as np
 
 from pose_graph_ros.core.compiled.jit import kernel
 from pose_graph_ros.core.graph import factors, identities, tables as tb
-from pose_graph_ros.core.graph.factor_types import BIAS, FACTORS, NodeKind, ObservedKind
+from pose_graph_ros.core.graph.factor_types import BIAS
+from pose_graph_ros.core.graph.kinds import FACTORS, NodeKind, ObservedKind
 
 # Tolerance of the symmetry and the eigenvalues of an information matrix whose diagonal is scaled
 # to 1; a tenth of that in `constraints.check`.

@@ -11,16 +11,15 @@ differ less, as measured by the mean over the median, whatever the unit of the i
 """
 
 from pathlib import Path
-import re
 from typing import NamedTuple
 
 import numpy as np
 
-from pose_graph_ros.core.batch.optimizer import optimize_from_linear_start
-from pose_graph_ros.core.config import SolverConfig
 from pose_graph_ros.core.exceptions import FileFormatError
-from pose_graph_ros.core.graph.graph import Graph
-from pose_graph_ros.core.io.g2o import AMBIGUOUS, EDGE2_ORDERS, GraphFile, read_g2o
+from pose_graph_ros.core.graph.graph_update import GraphRows
+from pose_graph_ros.core.io.g2o import EDGE2_ORDERS, graph_of, GraphFile
+from pose_graph_ros.core.io.g2o_text import AMBIGUOUS, read_lines
+from pose_graph_ros.core.solver_config import SolverConfig
 
 # Smallest eigenvalue of a positive definite matrix, its diagonal scaled to 1.
 DEFINITE = 1e-9
@@ -42,18 +41,21 @@ def read_guessed(path: Path) -> Guess:
 
     Raises FileFormatError, with what is wrong in TORO's order, if neither can be read.
     """
-    if not _is_ambiguous(path):
-        return Guess(read_g2o(path), None, '')
+    text = read_lines(path)
+    if text.tags.isdisjoint(AMBIGUOUS):
+        return Guess(graph_of(text), None, '')
     files: dict[str, GraphFile] = {}
     errors: dict[str, FileFormatError] = {}
     for order in EDGE2_ORDERS:
         try:
-            files[order] = read_g2o(path, order)
+            files[order] = graph_of(text, order)
         except FileFormatError as error:
             errors[order] = error
     if len(files) == 0:
         raise errors[EDGE2_ORDERS[0]]
-    worst = {order: _smallest(file.graph) for order, file in files.items()}
+    if 'LANDMARK' in text.tags and 'isam' in files:
+        return Guess(files['isam'], 'isam', 'LANDMARK is a tag of iSAM')
+    worst = {order: _smallest(file.rows) for order, file in files.items()}
     definite = [order for order, value in worst.items() if value > DEFINITE]
     if len(definite) == 1:
         other = next(order for order in EDGE2_ORDERS if order != definite[0])
@@ -62,7 +64,7 @@ def read_guessed(path: Path) -> Guess:
     if len(files) == 1:
         order, = files
         return Guess(files[order], order, 'the other order is refused')
-    spread = {order: _spread(file.graph) for order, file in files.items()}
+    spread = {order: _spread(file.rows) for order, file in files.items()}
     order = min(EDGE2_ORDERS, key=lambda each: spread[each])
     other = next(each for each in EDGE2_ORDERS if each != order)
     return Guess(files[order], order, (
@@ -70,27 +72,22 @@ def read_guessed(path: Path) -> Guess:
         f'the order of {other} {spread[other]:.3g} times'))
 
 
-def _is_ambiguous(path: Path) -> bool:
-    """Tell whether a file has a tag with two meanings; False as well if it cannot be read."""
-    try:
-        text = path.read_text(encoding='utf-8')
-    except (OSError, UnicodeDecodeError):
-        return False
-    return any(re.search(rf'(?m)^\s*{tag}\s', text) for tag in AMBIGUOUS)
-
-
-def _smallest(graph: Graph) -> float:
+def _smallest(rows: GraphRows) -> float:
     """Return the smallest eigenvalue of an information matrix, its diagonal scaled to 1."""
-    information = graph.edges.information
+    information = rows.edges.information
     root = np.sqrt(np.maximum(np.einsum('mii->mi', information), np.finfo(float).tiny))
     scaled = information / root[:, :, None] / root[:, None, :]
     return float(np.min(np.linalg.eigvalsh(scaled), initial=1.0))
 
 
-def _spread(graph: Graph) -> float:
+def _spread(rows: GraphRows) -> float:
     """Return the mean over the median of the energies of edges at the optimum."""
+    # loads the compiled kernels
+    from pose_graph_ros.core.batch.optimizer import optimize_from_linear_start  # noqa: PLC0415
+    from pose_graph_ros.core.graph.graph import Graph  # noqa: PLC0415
+
     copy = Graph()
-    copy.fill(graph.rows())
+    copy.fill(rows)
     optimize_from_linear_start(copy, SolverConfig())
     energies = copy.energies().edges
     median = float(np.median(energies))

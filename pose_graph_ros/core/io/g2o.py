@@ -32,92 +32,91 @@ matrix the upper triangle is written.
 The tags `VERTEX2` and `EDGE2` are used by two formats with different numbers: TORO orders the
 information as 11 12 22 33 13 23, iSAM stores its square root as R11 R12 R13 R22 R23 R33. The
 caller has to say which of them a file has. `VERTEX` and `EDGE` are TORO's old tags, `ODOMETRY` is
-another one of iSAM's for `EDGE2`.
+another one of iSAM's for `EDGE2`. iSAM's `LANDMARK i l x y R11 R12 R22` is read as
+`EDGE_SE2_XY`, with the square root of the information (M. Kaess, iSAM 1.7, `Loader.cpp`).
+Landmarks have their own numbers there, so they get others if a pose has one of these.
 
 A loop closure with a switch, `EDGE_SE2_SWITCHABLE i j switch x y theta I11 ...`, is read as an
 edge; its switch, `VERTEX_SWITCH` and `EDGE_SWITCH_PRIOR`, is not needed.
 
 Lines with any other tag are skipped and counted: parameters of sensors, constraints in space. So
 are the lines `EQUIV i j` of TORO: they allow it to merge two nodes that an edge of the file
-connects, and add nothing to that edge.
+connects, and add nothing to that edge. A file may be compressed by gzip.
 """
 
-from dataclasses import dataclass
+from functools import cached_property
+import math
 from pathlib import Path
-from typing import NoReturn
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from pose_graph_ros.core.exceptions import FileFormatError, GraphUpdateError
 from pose_graph_ros.core.geometry import se2
 from pose_graph_ros.core.geometry.se2 import BoolArray, FloatArray, IntArray
-from pose_graph_ros.core.graph.constraints import (
-    EdgeKind,
-    Edges,
-    NodeKind,
-    ObservedKind,
-    ObservedNodes,
+from pose_graph_ros.core.graph.constraints import check, Edges, ObservedNodes
+from pose_graph_ros.core.graph.graph_update import GraphRows, NextIds
+from pose_graph_ros.core.graph.kinds import EdgeKind, FACTORS, NodeKind, ObservedKind
+from pose_graph_ros.core.io.g2o_text import (
+    AMBIGUOUS,
+    GraphText,
+    Lines,
+    OWN_TAGS,
+    read_lines,
 )
-from pose_graph_ros.core.graph.factor_types import FACTORS
-from pose_graph_ros.core.graph.graph import Graph, GraphRows, GraphUpdate, NextIds
 
-SWITCHES = ('VERTEX_SWITCH', 'EDGE_SWITCH_PRIOR')
+if TYPE_CHECKING:
+    from pose_graph_ros.core.graph.graph import Graph
+
 # Formats of EDGE2.
 EDGE2_ORDERS = ('toro', 'isam')
 # Row and column of each of six numbers: of an upper triangle, and of the information in TORO.
 UPPER = ((0, 0), (0, 1), (0, 2), (1, 1), (1, 2), (2, 2))
 _TORO = ((0, 0), (0, 1), (1, 1), (2, 2), (0, 2), (1, 2))
-# Tags with the format that the caller names, see `edge2_order`.
-AMBIGUOUS = ('EDGE2', 'ODOMETRY')
-# Kinds of edges to landmarks, that tell where the other end is, and with a tag of their own.
+# Kinds of edges to landmarks, that tell where the other end is.
 _TO_LANDMARKS = [kind for kind, factor in FACTORS.items() if factor.j == (NodeKind.LANDMARK,)]
 _PLACING = [kind for kind, factor in FACTORS.items() if factor.places]
-_OWN_TAGS = {kind: factor.tag for kind, factor in FACTORS.items()
-             if factor.tag not in {'', 'EDGE_SE2'}}
-# Numbers of ids and of values behind each tag; FIX is followed by any number of ids.
-LAYOUT = {
-    'VERTEX_SE2': (1, 3),
-    'VERTEX2': (1, 3),
-    'VERTEX': (1, 3),
-    'EDGE_SE2': (2, 9),
-    'EDGE2': (2, 9),
-    'ODOMETRY': (2, 9),
-    'EDGE': (2, 9),
-    'EDGE_PRIOR_SE2': (1, 9),
-    'EDGE_PRIOR_SE2_XY': (1, 5),
-    'OBSERVED_SE2_OFFSET': (1, 12),
-    'VERTEX_XY': (1, 2),
-    **{tag: (2, len(FACTORS[kind].rows) * (len(FACTORS[kind].rows) + 3) // 2)
-       for kind, tag in _OWN_TAGS.items()},
-}
+_POINT = OWN_TAGS[EdgeKind.POINT]
+_EDGES = ('EDGE_SE2', 'EDGE', *AMBIGUOUS, *OWN_TAGS.values())
+_OBSERVED = ('EDGE_PRIOR_SE2', 'EDGE_PRIOR_SE2_XY', 'OBSERVED_SE2_OFFSET')
 
 
-@dataclass(frozen=True, slots=True)
 class GraphFile:
-    """A graph that was read from a file."""
+    """
+    A graph that was read from a file.
 
-    graph: Graph
-    ids: IntArray
-    """Id in the file of each hidden node, shape (N,), increasing."""
-    has_start: bool
-    """Whether the file has the poses of all nodes; else missing ones were composed from edges."""
-    skipped: dict[str, int]
-    """Number of lines that were skipped, by their tag."""
+    Parameters
+    ----------
+    rows : GraphRows
+    ids : ndarray of int, shape (N,), id in the file of each hidden node, increasing
+    has_start : bool
+    skipped : dict of str to int
+    notes : tuple of str
 
+    """
 
-class _Rows:
-    """Rows with one tag: ids, values and line number of each."""
+    def __init__(
+        self, rows: GraphRows, ids: IntArray, has_start: bool, skipped: dict[str, int],
+        notes: tuple[str, ...] = (),
+    ) -> None:
+        self.rows = rows
+        """The graph as it was read."""
+        self.ids = ids
+        self.has_start = has_start
+        """Whether the file has the poses of all nodes; else missing ones were composed."""
+        self.skipped = skipped
+        """Number of lines that were skipped, by their tag."""
+        self.notes = notes
+        """Sentences about what was read otherwise than it is in the file."""
 
-    def __init__(self, n_ids: int) -> None:
-        self.n_ids = n_ids
-        self.ids: list[list[int]] = []
-        self.numbers: list[list[float]] = []
-        self.lines: list[int] = []
+    @cached_property
+    def graph(self) -> 'Graph':
+        """The graph for the solvers, made at first use: that loads the compiled kernels."""
+        from pose_graph_ros.core.graph.graph import Graph  # noqa: PLC0415
 
-    def add(self, words: list[str], line: int) -> None:
-        self.ids.append([int(np.int64(int(word))) for word in words[:self.n_ids]])
-        self.numbers.append([float(word) for word in words[self.n_ids:]])
-        self.lines.append(line)
+        graph = Graph()
+        graph.fill(self.rows)
+        return graph
 
 
 def read_g2o(path: Path, edge2_order: str | None = None) -> GraphFile:
@@ -136,156 +135,107 @@ def read_g2o(path: Path, edge2_order: str | None = None) -> GraphFile:
     """
     if edge2_order is not None and edge2_order not in EDGE2_ORDERS:
         raise ValueError(f'edge2_order: expected one of {EDGE2_ORDERS}, got {edge2_order!r}')
-    rows = {tag: _Rows(n_ids) for tag, (n_ids, _) in LAYOUT.items()}
-    fixes = _Rows(1)
-    skipped: dict[str, list[list[str]]] = {}
-    try:
-        text = path.read_text(encoding='utf-8')
-    except (OSError, UnicodeDecodeError) as error:
-        raise FileFormatError(f'{path}: cannot be read as text ({error})') from error
-    for line, content in enumerate(text.splitlines(), 1):
-        words = content.split()
-        if words[:1] == ['EDGE_SE2_SWITCHABLE']:
-            words = ['EDGE_SE2', *words[1:3], *words[4:]]
-        if len(words) == 0 or words[0].startswith('#') or words[0] in SWITCHES:
-            continue
-        where = f'{path}:{line}'
-        if words[0] == 'FIX':
-            for word in words[1:]:
-                _add(where, fixes, [word], 'FIX', line)
-        elif words[0] in rows:
-            _read_line(where, words, rows, edge2_order, line)
-        else:
-            skipped.setdefault(words[0], []).append([str(line), *words[1:2]])
-    _forget_landmarks(fixes, skipped)
-    if all(len(table.lines) == 0 for table in rows.values()):
-        _raise_empty(path, skipped)
-    graph, ids, has_start = _build(path, rows, fixes, edge2_order)
-    return GraphFile(graph, ids, has_start, {tag: len(found) for tag, found in skipped.items()})
+    return graph_of(read_lines(path), edge2_order)
 
 
-def _forget_landmarks(fixes: _Rows, skipped: dict[str, list[list[str]]]) -> None:
-    """Remove the FIX of vertices that were skipped."""
-    names = {words[1] for tag, found in skipped.items() if tag.startswith('VERTEX')
-             for words in found if len(words) > 1}
-    kept = [k for k, (name,) in enumerate(fixes.ids) if str(name) not in names]
-    fixes.ids, fixes.lines = [fixes.ids[k] for k in kept], [fixes.lines[k] for k in kept]
+def graph_of(text: GraphText, edge2_order: str | None = None) -> GraphFile:
+    """
+    Return the graph in the lines of a file, as `read_g2o` does.
 
+    Parameters
+    ----------
+    text : GraphText
+    edge2_order : {'toro', 'isam'}, optional
 
-def _raise_empty(path: Path, skipped: dict[str, list[list[str]]]) -> NoReturn:
-    for tag, found in skipped.items():
+    """
+    ambiguous = [(int(text.rows[tag].lines[0]), tag) for tag in AMBIGUOUS if tag in text.tags]
+    if edge2_order is None and len(ambiguous) > 0:
+        line, tag = min(ambiguous)
         raise FileFormatError(
-            f'{path}:{found[0][0]}: tag {tag!r} is not known, and there is no line with one of '
-            f'{", ".join(LAYOUT)}')
-    raise FileFormatError(f'{path}: holds no vertex and no edge')
-
-
-def _read_line(
-    where: str, words: list[str], rows: dict[str, _Rows], edge2_order: str | None, line: int,
-) -> None:
-    tag, values = words[0], words[1:]
-    if len(values) != sum(LAYOUT[tag]):
-        raise FileFormatError(
-            f'{where}: {tag} is followed by {sum(LAYOUT[tag])} numbers, got {len(values)}')
-    if tag in AMBIGUOUS and edge2_order is None:
-        raise FileFormatError(
-            f'{where}: {tag} means two formats with the information in different order; '
-            f'say which this is: {" or ".join(EDGE2_ORDERS)}')
-    _add(where, rows[tag], values, tag, line)
-
-
-def _add(where: str, rows: _Rows, values: list[str], tag: str, line: int) -> None:
-    try:
-        rows.add(values, line)
-    except (ValueError, OverflowError) as error:
-        raise FileFormatError(f'{where}: {tag}: {error}') from error
-    if not np.all(np.isfinite(rows.numbers[-1])):
-        raise FileFormatError(f'{where}: {tag} holds a number that is not finite')
-
-
-def _build(
-    path: Path, rows: dict[str, _Rows], fixes: _Rows, edge2_order: str | None,
-) -> tuple[Graph, IntArray, bool]:
-    vertices = _joined(rows['VERTEX_SE2'], rows['VERTEX2'], rows['VERTEX'])
+            f'{text.where(line)}: {tag} means two formats with the information in different '
+            f'order; say which this is: {" or ".join(EDGE2_ORDERS)}')
+    rows = dict(text.rows)
+    vertices = Lines.joined(rows[tag] for tag in ('VERTEX_SE2', 'VERTEX2', 'VERTEX'))
     points = rows['VERTEX_XY']
-    vertices.ids += points.ids
-    vertices.numbers += [[*position, 0.0] for position in points.numbers]
-    vertices.lines += points.lines
-    ids = np.unique(np.concatenate([_ids(table).ravel() for table in rows.values()]))
-    given, first = np.unique(_ids(vertices).ravel(), return_index=True)
-    if len(given) < len(vertices.lines):
-        again = sorted(set(range(len(vertices.lines))) - set(first.tolist()))[0]
-        raise FileFormatError(f'{path}:{vertices.lines[again]}: vertex '
-                              f'{vertices.ids[again][0]} is in the file twice')
-
-    is_landmark = np.isin(ids, np.concatenate(
-        (_ids(points)[:, 0], *(_ids(rows[FACTORS[kind].tag])[:, 1] for kind in _TO_LANDMARKS))))
+    vertices = Lines.joined((vertices, Lines(points.ids, np.pad(
+        points.numbers, ((0, 0), (0, 1))), points.lines)))
+    rows[_POINT], notes = _with_landmarks(text, rows)
+    ids = np.unique(np.concatenate([table.ids.ravel() for tag, table in rows.items()
+                                    if tag != 'LANDMARK']))
+    given, first = np.unique(vertices.ids.ravel(), return_index=True)
+    if len(given) < len(vertices):
+        again = np.setdiff1d(np.arange(len(vertices)), first)[0]
+        raise FileFormatError(f'{text.where(vertices.lines[again])}: vertex '
+                              f'{vertices.ids[again, 0]} is in the file twice')
+    is_landmark = np.isin(ids, np.concatenate((
+        points.ids[:, 0], *(rows[FACTORS[kind].tag].ids[:, 1] for kind in _TO_LANDMARKS))))
     kind = np.where(is_landmark, NodeKind.LANDMARK, NodeKind.POSE)
-    edges = _edges(rows, ids, edge2_order)
-    observed = _observed(rows, ids)
+    edges = Edges.joined([_edges(tag, rows[tag], ids, edge2_order) for tag in _EDGES])
+    observed = ObservedNodes.joined([_observed(tag, rows[tag], ids) for tag in _OBSERVED])
+    try:
+        check(edges, kind)
+        check(observed, kind)
+    except GraphUpdateError as error:
+        where, error = _first_refused(text, rows, ids, edge2_order, kind) or (text.path, error)
+        raise FileFormatError(f'{where}: {error}') from error
     poses, known = np.zeros((len(ids), 3)), np.isin(ids, given)
-    poses[known] = _numbers(vertices, 3)[first]
+    poses[known] = vertices.numbers[first]
     if not np.all(known):
         compose_missing(poses, known, edges)
         poses[is_landmark, 2] = 0.0
-    fixed = _fixed(path, fixes, ids)
-    if len(fixed) == 0 and len(observed) == 0:
-        fixed = [int(np.argmin(is_landmark))]
-    try:
-        graph = _graph(poses, kind)
-        graph.apply(GraphUpdate(edges=edges, observed=observed, fix=fixed))
-    except GraphUpdateError as error:
-        raise FileFormatError(
-            f'{_refused_line(path, rows, ids, edge2_order, kind)}: {error}') from error
-    return graph, ids, bool(len(given) == len(ids))
+    if not np.all(np.isfinite(poses)):
+        raise FileFormatError(f'{text.path}: poses composed from edges are not finite')
+    fixed = _fixed(text, ids)
+    if not np.any(fixed) and len(observed) == 0:
+        fixed[np.argmin(is_landmark)] = True
+    n = len(ids)
+    graph = GraphRows(
+        se2.wrapped(poses), kind, fixed, edges, observed, np.arange(n), np.arange(len(edges)),
+        np.arange(len(observed)), NextIds(n, len(edges), len(observed)))
+    return GraphFile(graph, ids, bool(len(given) == n), text.skipped, notes)
 
 
-def _graph(poses: FloatArray, kind: IntArray) -> Graph:
-    """Return a graph of hidden nodes without constraints."""
-    graph, n = Graph(), len(poses)
-    graph.fill(GraphRows(
-        poses, kind, np.zeros(n, dtype=bool), Edges(), ObservedNodes(), np.arange(n),
-        np.empty(0, np.int64), np.empty(0, np.int64), NextIds(n, 0, 0)))
-    return graph
+def _with_landmarks(
+    text: GraphText, rows: dict[str, Lines],
+) -> tuple[Lines, tuple[str, ...]]:
+    """Return the lines of `EDGE_SE2_XY` with those of `LANDMARK`, and a note of other numbers."""
+    seen = rows['LANDMARK']
+    if len(seen) == 0:
+        return rows[_POINT], ()
+    ids = seen.ids.copy()
+    others = np.unique(np.concatenate(
+        [table.ids.ravel() for tag, table in rows.items() if tag != 'LANDMARK']
+        + [ids[:, 0], text.fixes.ids.ravel()]))
+    notes: tuple[str, ...] = ()
+    if np.any(np.isin(ids[:, 1], others)):
+        first = max(int(np.max(others)), 0) + 1 - min(int(np.min(ids[:, 1])), 0)
+        if first + int(np.max(ids[:, 1])) > np.iinfo(np.int64).max:
+            raise FileFormatError(f'{text.where(seen.lines[0])}: LANDMARK: the ids are too large')
+        ids[:, 1] += first
+        notes = (f'landmark 0 of iSAM is node {first} here, 1 is {first + 1} and so on, as poses '
+                 f'have the same numbers',)
+    a, b, c = seen.numbers[:, 2:].T
+    numbers = np.column_stack((seen.numbers[:, :2], a * a, a * b, b * b + c * c))
+    return Lines.joined((rows[_POINT], Lines(ids, numbers, seen.lines))), notes
 
 
-def _joined(*tables: _Rows) -> _Rows:
-    """Return the rows of all tables in one."""
-    joined = _Rows(tables[0].n_ids)
-    for table in tables:
-        joined.ids += table.ids
-        joined.numbers += table.numbers
-        joined.lines += table.lines
-    return joined
-
-
-def _ids(table: _Rows) -> IntArray:
-    return np.array(table.ids, dtype=np.int64).reshape(-1, table.n_ids)
-
-
-def _numbers(table: _Rows, width: int) -> FloatArray:
-    return np.array(table.numbers, dtype=np.float64).reshape(-1, width)
-
-
-def _edges(rows: dict[str, _Rows], ids: IntArray, edge2_order: str | None) -> Edges:
-    parts = []
-    for tag, order in (('EDGE_SE2', None), ('EDGE', 'toro'),
-                       *((tag, edge2_order) for tag in AMBIGUOUS)):
-        numbers, ends = _numbers(rows[tag], 9), _ids(rows[tag])
-        kind = np.where(np.diff(ends, axis=1)[:, 0] == 1, EdgeKind.ODOMETRY, EdgeKind.LOOP_CLOSURE)
-        i, j = np.searchsorted(ids, ends).T
-        parts.append(Edges(
-            i, j, se2.wrapped(numbers[:, :3]), _information(numbers[:, 3:], order), kind))
-    for each, tag in _OWN_TAGS.items():
-        size = len(FACTORS[each].rows)
-        numbers, ends = _numbers(rows[tag], LAYOUT[tag][1]), _ids(rows[tag])
-        mean, information = np.zeros((len(ends), 3)), np.zeros((len(ends), 3, 3))
-        mean[:, :size] = numbers[:, :size]
-        for column, (row, col) in enumerate(zip(*np.triu_indices(size), strict=True), size):
-            information[:, row, col] = information[:, col, row] = numbers[:, column]
-        i, j = np.searchsorted(ids, ends).T
-        parts.append(Edges(i, j, mean, information, np.full(len(ends), each)))
-    return Edges.joined(parts)
+def _edges(tag: str, lines: Lines, ids: IntArray, edge2_order: str | None) -> Edges:
+    """Return the edges of a tag, with rows for ends."""
+    ends, numbers = lines.ids, lines.numbers
+    i, j = np.searchsorted(ids, ends).T
+    for each, own in OWN_TAGS.items():
+        if tag == own:
+            size = len(FACTORS[each].rows)
+            mean, information = np.zeros((len(ends), 3)), np.zeros((len(ends), 3, 3))
+            mean[:, :size] = numbers[:, :size]
+            for column, (row, col) in enumerate(zip(*np.triu_indices(size), strict=True), size):
+                information[:, row, col] = information[:, col, row] = numbers[:, column]
+            return Edges(i, j, mean, information, np.full(len(ends), each))
+    order = {'EDGE': 'toro'}.get(tag, edge2_order if tag in AMBIGUOUS else None)
+    # the next id; a difference could overflow
+    is_next = ends[:, 1] == ends[:, 0] + 1
+    kind = np.where(is_next, EdgeKind.ODOMETRY, EdgeKind.LOOP_CLOSURE)
+    return Edges(i, j, se2.wrapped(numbers[:, :3]), _information(numbers[:, 3:], order), kind)
 
 
 def _information(numbers: FloatArray, order: str | None) -> FloatArray:
@@ -298,23 +248,19 @@ def _information(numbers: FloatArray, order: str | None) -> FloatArray:
     return np.swapaxes(matrix, 1, 2) @ matrix if order == 'isam' else matrix
 
 
-def _observed(rows: dict[str, _Rows], ids: IntArray) -> ObservedNodes:
-    parts = []
-    for tag in ('EDGE_PRIOR_SE2', 'EDGE_PRIOR_SE2_XY', 'OBSERVED_SE2_OFFSET'):
-        numbers = _numbers(rows[tag], LAYOUT[tag][1])
-        node = np.searchsorted(ids, _ids(rows[tag])[:, 0])
-        offset = np.zeros((len(node), 3))
-        if tag == 'OBSERVED_SE2_OFFSET':
-            offset, numbers = numbers[:, :3], numbers[:, 3:]
-        if tag == 'EDGE_PRIOR_SE2_XY':
-            # as a pose with zeros for the heading
-            numbers = np.insert(numbers, (2, 4, 5, 5), 0.0, axis=1)
-        information = _information(numbers[:, 3:], None)
-        kind = np.where(
-            information[:, 2, 2] == 0.0, ObservedKind.POSITION, ObservedKind.GLOBAL_POSE)
-        parts.append(
-            ObservedNodes(node, offset, se2.wrapped(numbers[:, :3]), information, kind))
-    return ObservedNodes.joined(parts)
+def _observed(tag: str, lines: Lines, ids: IntArray) -> ObservedNodes:
+    """Return the observed nodes of a tag, with rows for their nodes."""
+    numbers, node = lines.numbers, np.searchsorted(ids, lines.ids[:, 0])
+    offset = np.zeros((len(node), 3))
+    if tag == 'OBSERVED_SE2_OFFSET':
+        offset, numbers = numbers[:, :3], numbers[:, 3:]
+    if tag == 'EDGE_PRIOR_SE2_XY':
+        # as a pose with zeros for the heading
+        numbers = np.insert(numbers, (2, 4, 5, 5), 0.0, axis=1)
+    information = _information(numbers[:, 3:], None)
+    kind = np.where(
+        information[:, 2, 2] == 0.0, ObservedKind.POSITION, ObservedKind.GLOBAL_POSE)
+    return ObservedNodes(node, offset, se2.wrapped(numbers[:, :3]), information, kind)
 
 
 def compose_missing(poses: FloatArray, known: BoolArray, edges: Edges) -> None:
@@ -328,51 +274,74 @@ def compose_missing(poses: FloatArray, known: BoolArray, edges: Edges) -> None:
     edges : Edges
 
     """
-    neighbours: dict[int, list[tuple[int, FloatArray]]] = {}
+    neighbours: dict[int, list[tuple[int, list[float]]]] = {}
     placing = edges.rows(np.isin(edges.kind, _PLACING))
-    for i, j, mean, kind in zip(placing.i.tolist(), placing.j.tolist(), placing.mean,
-                                placing.kind.tolist(), strict=True):
-        neighbours.setdefault(i, []).append((j, mean))
+    for i, j, forward, backward, kind in zip(
+            placing.i.tolist(), placing.j.tolist(), placing.mean.tolist(),
+            se2.inverse(placing.mean).tolist(), placing.kind.tolist(), strict=True):
+        neighbours.setdefault(i, []).append((j, forward))
         if kind not in _TO_LANDMARKS:
-            neighbours.setdefault(j, []).append((i, se2.inverse(mean)))
-    known = known.copy()
+            neighbours.setdefault(j, []).append((i, backward))
+    # Python's numbers, as NumPy takes several times as long for a single pose
+    found, reached = poses.tolist(), known.tolist()
     for start in (*np.flatnonzero(known).tolist(), *range(len(known))):
-        known[start] = True
+        reached[start] = True
         frontier = [start]
         while len(frontier) > 0:
-            reached = []
+            further = []
             for node in frontier:
                 for neighbour, mean in neighbours.get(node, ()):
-                    if not known[neighbour]:
-                        poses[neighbour] = se2.compose(poses[node], mean)
-                        known[neighbour] = True
-                        reached.append(neighbour)
-            frontier = reached
+                    if not reached[neighbour]:
+                        found[neighbour] = _composed(found[node], mean)
+                        reached[neighbour] = True
+                        further.append(neighbour)
+            frontier = further
+    poses[:] = found
 
 
-def _fixed(path: Path, fixes: _Rows, ids: IntArray) -> list[int]:
-    fixed = []
-    for (name,), line in zip(fixes.ids, fixes.lines, strict=True):
-        node = int(np.searchsorted(ids, name))
-        if node == len(ids) or ids[node] != name:
-            raise FileFormatError(f'{path}:{line}: FIX {name}: there is no such vertex')
-        fixed.append(node)
+def _composed(pose: list[float], motion: list[float]) -> list[float]:
+    """Return the pose after a motion [m, m, rad], its heading not wrapped."""
+    if not math.isfinite(pose[2]):
+        return [math.nan] * 3
+    c, s = math.cos(pose[2]), math.sin(pose[2])
+    return [pose[0] + c * motion[0] - s * motion[1], pose[1] + s * motion[0] + c * motion[1],
+            math.remainder(pose[2] + motion[2], math.tau)]
+
+
+def _fixed(text: GraphText, ids: IntArray) -> BoolArray:
+    """Return which nodes are fixed."""
+    fixed, names = np.zeros(len(ids), dtype=bool), text.fixes.ids.ravel()
+    rows = np.minimum(np.searchsorted(ids, names), len(ids) - 1)
+    missing = np.flatnonzero(ids[rows] != names)
+    if len(missing) > 0:
+        raise FileFormatError(f'{text.where(text.fixes.lines[missing[0]])}: FIX '
+                              f'{names[missing[0]]}: there is no such vertex')
+    fixed[rows] = True
     return fixed
 
 
-def _refused_line(
-    path: Path, rows: dict[str, _Rows], ids: IntArray, edge2_order: str | None, kind: IntArray,
-) -> str:
-    """Return file and number of the first line whose row the graph refuses, tried one by one."""
-    lines = [(line, tag, k) for tag, table in rows.items() if not tag.startswith('VERTEX')
-             for k, line in enumerate(table.lines)]
-    for line, tag, k in sorted(lines):
-        single = {name: _Rows(table.n_ids) for name, table in rows.items()}
-        single[tag].ids, single[tag].numbers = [rows[tag].ids[k]], [rows[tag].numbers[k]]
-        graph = _graph(np.zeros((len(ids), 3)), kind)
-        try:
-            graph.apply(GraphUpdate(edges=_edges(single, ids, edge2_order),
-                                    observed=_observed(single, ids)))
-        except GraphUpdateError:
-            return f'{path}:{line}'
-    return str(path)
+def _first_refused(
+    text: GraphText, rows: dict[str, Lines], ids: IntArray, edge2_order: str | None,
+    kind: IntArray,
+) -> tuple[str, GraphUpdateError] | None:
+    """Return the place of the first line whose constraint is refused, with the reason."""
+    found = []
+    for tag in (*_EDGES, *_OBSERVED):
+        lines = rows[tag].rows(np.argsort(rows[tag].lines, kind='stable'))
+        table = (_edges(tag, lines, ids, edge2_order) if tag in _EDGES
+                 else _observed(tag, lines, ids))
+        # the rows before `low` are valid, one of those up to `high` is not
+        low, high, reason = 0, len(lines), None
+        while low < high:
+            middle = (low + high) // 2
+            try:
+                check(table.rows(slice(low, middle + 1)), kind)
+                low = middle + 1
+            except GraphUpdateError as error:
+                high, reason = middle, error
+        if reason is not None and low < len(lines):
+            found.append((int(lines.lines[low]), reason))
+    if len(found) == 0:
+        return None
+    line, reason = min(found, key=lambda each: each[0])
+    return text.where(line), reason

@@ -3,15 +3,15 @@
 """Writing of graphs in the g2o text format; `g2o` has the tags, and what is left out."""
 
 from pathlib import Path
+from typing import Protocol
 
 import numpy as np
 
 from pose_graph_ros.core.geometry.se2 import BoolArray, FloatArray, IntArray
 from pose_graph_ros.core.graph.constraints import EdgeKind, Edges, ObservedNodes, upper
-from pose_graph_ros.core.graph.factor_types import FACTORS
-from pose_graph_ros.core.graph.graph import Graph, GraphRows
+from pose_graph_ros.core.graph.graph_update import GraphRows
+from pose_graph_ros.core.graph.kinds import FACTORS
 from pose_graph_ros.core.io.g2o import UPPER
-from pose_graph_ros.core.io.saved_priors import standing_for
 
 NOT_USED = '# not used '
 """Begin of the line of a constraint with weight 0."""
@@ -19,7 +19,11 @@ STANDING_FOR_PRIORS = '# instead of dense priors, which g2o does not have, '
 """Begin of the line behind which there is nothing but edges and observed nodes for priors."""
 
 
-def write_g2o(graph: Graph, path: Path, ids: IntArray | None = None) -> None:
+class _HasRows(Protocol):
+    def rows(self) -> GraphRows: ...
+
+
+def write_g2o(graph: _HasRows, path: Path, ids: IntArray | None = None) -> None:
     """
     Write a graph so that its numbers read back bit for bit.
 
@@ -68,6 +72,9 @@ def g2o_text(rows: GraphRows, ids: IntArray | None = None) -> str:
 
 
 def _lines_for_priors(rows: GraphRows, ids: IntArray) -> list[str]:
+    # not needed for files, and takes long to load
+    from pose_graph_ros.core.io.saved_priors import standing_for  # noqa: PLC0415
+
     edges, observed = standing_for(rows)
     edges, observed = edges.renumbered(rows.rows_of), observed.renumbered(rows.rows_of)
     lines = [*_edge_lines(edges, ids),
@@ -132,4 +139,5 @@ def _begins(used: BoolArray) -> list[str]:
 
 def _texts(rows: FloatArray) -> list[str]:
     """Return the numbers of each row with the digits needed to read them back bit for bit."""
-    return [' '.join(map(repr, row)) for row in rows.tolist()]
+    # the text of a list is made at once
+    return [repr(row)[1:-1].replace(',', '') for row in rows.tolist()]

@@ -34,10 +34,10 @@ from pose_graph_ros.core.graph.constraints import (
     ObservedNodes,
     upper,
 )
-from pose_graph_ros.core.graph.factor_types import FACTORS
 from pose_graph_ros.core.graph.graph import GraphRows, NextIds
+from pose_graph_ros.core.graph.kinds import FACTORS
 from pose_graph_ros.core.io.atomic_files import write_files
-from pose_graph_ros.core.io.g2o import LAYOUT
+from pose_graph_ros.core.io.g2o_text import LAYOUT
 from pose_graph_ros.core.io.g2o_writing import g2o_text, NOT_USED, STANDING_FOR_PRIORS
 from pose_graph_ros.core.io.json_values import annotations, decoded, encoded, optional
 from pose_graph_ros.core.io.old_versions import with_ids, with_judgement, with_names

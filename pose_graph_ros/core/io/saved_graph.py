@@ -20,7 +20,7 @@ from pose_graph_ros.core.geometry.geodesy import distances, MapOrigin, TangentPl
 from pose_graph_ros.core.geometry.se2 import FloatArray, IntArray, wrap
 from pose_graph_ros.core.graph.constraints import check as check_table, EdgeKind, KindArray
 from pose_graph_ros.core.graph.graph import GraphRows
-from pose_graph_ros.core.graph.identities import Ids
+from pose_graph_ros.core.graph.ids import Ids
 from pose_graph_ros.core.graph.priors import check_priors
 from pose_graph_ros.core.graph.reweighting import SavedLosses
 from pose_graph_ros.core.judgement.closure_states import SavedClosures

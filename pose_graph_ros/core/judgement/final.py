@@ -18,7 +18,6 @@ import numpy as np
 from pose_graph_ros.core.batch import final_optimization, optimizer
 from pose_graph_ros.core.batch.optimizer import Start, Status
 from pose_graph_ros.core.batch.truncated import Choice, TruncatedProblem
-from pose_graph_ros.core.config import SolverConfig
 from pose_graph_ros.core.geometry.se2 import BoolArray, IntArray
 from pose_graph_ros.core.graph.constraints import Edges
 from pose_graph_ros.core.graph.graph import Graph, GraphUpdate
@@ -31,6 +30,7 @@ from pose_graph_ros.core.judgement.copies import (
 )
 from pose_graph_ros.core.judgement.floors import floored, forward
 from pose_graph_ros.core.judgement.jumps import Jump
+from pose_graph_ros.core.solver_config import SolverConfig
 
 CONFIG = SolverConfig(max_iterations=100)
 # Nodes and closures, together, above which the set is only improved, and the number of retests.

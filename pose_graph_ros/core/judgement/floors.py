@@ -11,10 +11,10 @@ from dataclasses import replace
 
 import numpy as np
 
-from pose_graph_ros.core.config import CLOSURE_FLOORS
 from pose_graph_ros.core.geometry import se2
 from pose_graph_ros.core.geometry.se2 import FloatArray
 from pose_graph_ros.core.graph.constraints import EdgeKind, Edges
+from pose_graph_ros.core.solver_config import CLOSURE_FLOORS
 
 FLOORS = np.array(CLOSURE_FLOORS)
 # Added to an information, relative to its largest entry, before it is inverted.

@@ -8,7 +8,6 @@ import numpy as np
 
 from pose_graph_ros.core.batch import optimizer
 from pose_graph_ros.core.batch.optimizer import Status
-from pose_graph_ros.core.config import SolverConfig
 from pose_graph_ros.core.geometry import se2
 from pose_graph_ros.core.graph.graph import Graph
 from pose_graph_ros.core.judgement import jumps, strain
@@ -17,6 +16,7 @@ from pose_graph_ros.core.judgement.copies import copied_rows, in_rows
 from pose_graph_ros.core.judgement.jumps import Jump
 from pose_graph_ros.core.judgement.odometry_motions import Odometry
 from pose_graph_ros.core.judgement.swaps import Found, residuals, Swap, write
+from pose_graph_ros.core.solver_config import SolverConfig
 
 CONFIG = SolverConfig(max_iterations=20, step_tolerance=1e-3)
 # Number of doubted closures that all others are compared with, and of comparisons in a part.

@@ -19,8 +19,8 @@ from pose_graph_ros.core.geometry import se2
 from pose_graph_ros.core.geometry.se2 import FloatArray, IntArray
 from pose_graph_ros.core.graph import factors, tables as tb
 from pose_graph_ros.core.graph.constraints import EdgeKind, full, upper
-from pose_graph_ros.core.graph.factor_types import NodeKind
 from pose_graph_ros.core.graph.graph import Graph
+from pose_graph_ros.core.graph.kinds import NodeKind
 
 # Weight that one of 0 counts as.
 _LEAST_WEIGHT = 1e-9

@@ -4,13 +4,13 @@
 
 import numpy as np
 
-from pose_graph_ros.core.config import CLOSURE_FLOORS
 from pose_graph_ros.core.geometry import se2
 from pose_graph_ros.core.geometry.se2 import FloatArray, IntArray
 from pose_graph_ros.core.graph import tables as tb
 from pose_graph_ros.core.graph.constraints import EdgeKind
 from pose_graph_ros.core.graph.graph import Graph
 from pose_graph_ros.core.judgement.odometry_chain import OdometryChain
+from pose_graph_ros.core.solver_config import CLOSURE_FLOORS
 
 # Sigmas of the motion over a jump, which the closures over it determine [m, m, rad].
 SIGMAS = 2.0 * np.array(CLOSURE_FLOORS)

@@ -18,7 +18,6 @@ import numpy as np
 
 from pose_graph_ros.core.batch import optimizer
 from pose_graph_ros.core.batch.optimizer import Parts, Status
-from pose_graph_ros.core.config import SolverConfig
 from pose_graph_ros.core.geometry.se2 import BoolArray, FloatArray, IntArray
 from pose_graph_ros.core.graph.constraints import Edges
 from pose_graph_ros.core.graph.error_functions import energies
@@ -27,6 +26,7 @@ from pose_graph_ros.core.judgement.closures import GATE
 from pose_graph_ros.core.judgement.consistency import Closures
 from pose_graph_ros.core.judgement.copies import copied_rows, in_rows
 from pose_graph_ros.core.judgement.jumps import Jump
+from pose_graph_ros.core.solver_config import SolverConfig
 
 _CONFIG = SolverConfig(max_iterations=20, step_tolerance=1e-3)
 # Factors on the limit of r^2 in successive rounds; in the first ones the clique stays in.

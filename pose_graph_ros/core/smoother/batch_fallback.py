@@ -14,9 +14,9 @@ import numpy as np
 
 from pose_graph_ros.core.batch import optimizer
 from pose_graph_ros.core.batch.optimizer import Start, Status
-from pose_graph_ros.core.config import SolverConfig
 from pose_graph_ros.core.graph import transaction_log
 from pose_graph_ros.core.graph.graph import Graph
+from pose_graph_ros.core.solver_config import SolverConfig
 
 _CONFIG = SolverConfig(max_iterations=50, step_tolerance=1e-6)
 # Unit headings take longer than an update may.

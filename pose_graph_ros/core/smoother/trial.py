@@ -17,11 +17,11 @@ import numpy as np
 
 from pose_graph_ros.core.batch import optimizer
 from pose_graph_ros.core.batch.optimizer import BatchResult, Parts, Start, Status
-from pose_graph_ros.core.config import SolverConfig
 from pose_graph_ros.core.geometry import se2
 from pose_graph_ros.core.geometry.se2 import FloatArray, IntArray
 from pose_graph_ros.core.graph.graph import Graph, GraphUpdate
 from pose_graph_ros.core.graph.priors import packed, Prior
+from pose_graph_ros.core.solver_config import SolverConfig
 
 # With more iterations it would converge where an update does not: at a minimum with errors so
 # large that Gauss-Newton leads away from it.

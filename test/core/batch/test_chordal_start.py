@@ -9,12 +9,12 @@ import pytest
 from random_graphs import chordal, consistent_graph, random_graph, random_observed, random_poses
 
 from pose_graph_ros.core.batch import optimizer
-from pose_graph_ros.core.config import SolverConfig
 from pose_graph_ros.core.exceptions import LinearSolveError
 from pose_graph_ros.core.geometry import se2
 from pose_graph_ros.core.geometry.se2 import FloatArray
 from pose_graph_ros.core.graph.constraints import EdgeKind, Edges, ObservedKind, ObservedNodes
 from pose_graph_ros.core.graph.graph import Graph, GraphUpdate
+from pose_graph_ros.core.solver_config import SolverConfig
 
 # Absolute error of two linear solves with condition numbers of some 1e3 [m, rad].
 EXACT = 1e-11

@@ -13,13 +13,7 @@ from scipy.optimize import minimize
 from pose_graph_ros.core.backend import PoseGraphBackend
 from pose_graph_ros.core.batch import final_optimization, optimizer
 from pose_graph_ros.core.batch.optimizer import BatchResult, Status
-from pose_graph_ros.core.config import (
-    BackendConfig,
-    Loss,
-    MeasurementSource,
-    OdometrySource,
-    SolverConfig,
-)
+from pose_graph_ros.core.config import BackendConfig, Loss, MeasurementSource, OdometrySource
 from pose_graph_ros.core.geometry import se2
 from pose_graph_ros.core.geometry.se2 import FloatArray
 from pose_graph_ros.core.graph import error_functions
@@ -32,6 +26,7 @@ from pose_graph_ros.core.measurements import (
     OdometrySample,
     Position,
 )
+from pose_graph_ros.core.solver_config import SolverConfig
 
 SECOND = 1_000_000_000
 ENDING = (Loss.TUKEY, Loss.TRUNCATED)

@@ -28,7 +28,6 @@ from slow_smoother import EXACT
 
 from pose_graph_ros.core.batch import optimizer
 from pose_graph_ros.core.batch.optimizer import Start, Status
-from pose_graph_ros.core.config import SolverConfig
 from pose_graph_ros.core.exceptions import LinearSolveError
 from pose_graph_ros.core.geometry import se2
 from pose_graph_ros.core.geometry.se2 import FloatArray
@@ -36,6 +35,7 @@ from pose_graph_ros.core.graph.constraints import EdgeKind, Edges, ObservedKind,
 from pose_graph_ros.core.graph.graph import Graph, GraphUpdate
 from pose_graph_ros.core.io.g2o import read_g2o
 from pose_graph_ros.core.smoother.incremental import IncrementalSmoother
+from pose_graph_ros.core.solver_config import SolverConfig
 
 # chi2 is flat at its minimum: steps of 1e-8 leave a relative error of some 1e-15.
 SAME_CHI2 = 1e-9

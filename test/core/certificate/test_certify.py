@@ -14,11 +14,11 @@ from pose_graph_ros.core.certificate.formulation import formulate, Formulation, 
 from pose_graph_ros.core.certificate.quadratic_form import QuadraticForm
 from pose_graph_ros.core.certificate.riemannian import minimized, unit_rows
 from pose_graph_ros.core.certificate.spectrum import examined
-from pose_graph_ros.core.config import SolverConfig
 from pose_graph_ros.core.geometry import se2
 from pose_graph_ros.core.geometry.se2 import ComplexArray, FloatArray
 from pose_graph_ros.core.graph.constraints import EdgeKind, Edges, ObservedKind, ObservedNodes
 from pose_graph_ros.core.graph.graph import Graph, GraphUpdate
+from pose_graph_ros.core.solver_config import SolverConfig
 
 
 def ring(n: int, winding: int) -> Graph:

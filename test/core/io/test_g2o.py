@@ -11,13 +11,13 @@ import pytest
 from random_graphs import random_edges, random_information, random_poses, snapshot
 
 from pose_graph_ros.core.batch import optimizer
-from pose_graph_ros.core.config import SolverConfig
 from pose_graph_ros.core.exceptions import FileFormatError
 from pose_graph_ros.core.geometry import se2
 from pose_graph_ros.core.graph.constraints import EdgeKind, Edges, ObservedKind, ObservedNodes
 from pose_graph_ros.core.graph.graph import Graph, GraphUpdate
 from pose_graph_ros.core.io.g2o import GraphFile, read_g2o
 from pose_graph_ros.core.io.g2o_writing import write_g2o
+from pose_graph_ros.core.solver_config import SolverConfig
 
 seeds = st.integers(0, 2**32 - 1)
 IDENTITY = '1 0 0 1 0 1'

@@ -8,13 +8,7 @@ import pytest
 from pose_graph_ros.core.backend import PoseGraphBackend
 from pose_graph_ros.core.batch import optimizer
 from pose_graph_ros.core.batch.optimizer import Status
-from pose_graph_ros.core.config import (
-    BackendConfig,
-    NodePolicy,
-    OdometryNoise,
-    OdometrySource,
-    SolverConfig,
-)
+from pose_graph_ros.core.config import BackendConfig, NodePolicy, OdometryNoise, OdometrySource
 from pose_graph_ros.core.geometry import se2
 from pose_graph_ros.core.geometry.se2 import FloatArray
 from pose_graph_ros.core.graph.constraints import Edges
@@ -28,6 +22,7 @@ from pose_graph_ros.core.smoother.incremental import IncrementalSmoother
 from pose_graph_ros.core.smoother.innovations import Innovations
 from pose_graph_ros.core.smoother.results import DIVERGED, UpdateResult
 from pose_graph_ros.core.smoother.trial import Trial
+from pose_graph_ros.core.solver_config import SolverConfig
 
 SECOND = 10**9
 COVARIANCE = np.square(np.diag([0.1, 0.1, 0.03]))

@@ -9,13 +9,7 @@ import pytest
 
 from pose_graph_ros.core.backend import PoseGraphBackend
 from pose_graph_ros.core.batch.optimizer import Status
-from pose_graph_ros.core.config import (
-    BackendConfig,
-    CLOSURE_FLOORS,
-    MeasurementSource,
-    NodePolicy,
-    Robust,
-)
+from pose_graph_ros.core.config import BackendConfig, MeasurementSource, NodePolicy, Robust
 from pose_graph_ros.core.geometry import se2
 from pose_graph_ros.core.geometry.se2 import FloatArray
 from pose_graph_ros.core.graph.constraints import EdgeKind, Edges
@@ -27,6 +21,7 @@ from pose_graph_ros.core.judgement.floors import forward
 from pose_graph_ros.core.judgement.set_search import SetSearch
 from pose_graph_ros.core.judgement.verdicts import Decision, State, Verdict
 from pose_graph_ros.core.measurements import AnswerStatus, LoopClosure, OdometrySample
+from pose_graph_ros.core.solver_config import CLOSURE_FLOORS
 
 SECOND = 10**9
 LAP, LAPS = 80, 3

@@ -12,7 +12,7 @@ from random_graphs import snapshot
 from pose_graph_ros.core.backend import PoseGraphBackend
 from pose_graph_ros.core.batch import optimizer
 from pose_graph_ros.core.batch.optimizer import BatchResult, Status
-from pose_graph_ros.core.config import BackendConfig, Correlation, POSITIONS, SolverConfig
+from pose_graph_ros.core.config import BackendConfig, Correlation, POSITIONS
 from pose_graph_ros.core.geometry import se2
 from pose_graph_ros.core.geometry.se2 import FloatArray
 from pose_graph_ros.core.graph.graph import Graph, GraphUpdate
@@ -20,6 +20,7 @@ from pose_graph_ros.core.judgement.verdicts import Decision, State, Verdict
 from pose_graph_ros.core.measurements import Measurement, OdometrySample, Position
 from pose_graph_ros.core.smoother.incremental import IncrementalSmoother
 from pose_graph_ros.core.smoother.results import UpdateResult
+from pose_graph_ros.core.solver_config import SolverConfig
 
 SECOND = 1_000_000_000
 Event = OdometrySample | Measurement

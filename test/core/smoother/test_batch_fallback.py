@@ -8,10 +8,10 @@ from random_graphs import consistent_graph, random_edges, random_poses, snapshot
 
 from pose_graph_ros.core.batch import optimizer
 from pose_graph_ros.core.batch.optimizer import Status
-from pose_graph_ros.core.config import SolverConfig
 from pose_graph_ros.core.geometry import se2
 from pose_graph_ros.core.graph.graph import Graph, GraphUpdate
 from pose_graph_ros.core.smoother.batch_fallback import optimize_copy
+from pose_graph_ros.core.solver_config import SolverConfig
 
 
 @pytest.mark.parametrize('seed', range(4))

@@ -11,7 +11,6 @@ from slow_smoother import cliques, differences, EXACT, SlowGraph, state, World, 
 
 from pose_graph_ros.core.batch import optimizer
 from pose_graph_ros.core.batch.optimizer import Status
-from pose_graph_ros.core.config import SolverConfig
 from pose_graph_ros.core.exceptions import GraphUpdateError
 from pose_graph_ros.core.geometry import se2
 from pose_graph_ros.core.geometry.se2 import FloatArray
@@ -20,6 +19,7 @@ from pose_graph_ros.core.graph.graph import Graph, GraphUpdate
 from pose_graph_ros.core.graph.priors import model
 from pose_graph_ros.core.marginalization.marginalize import marginalize
 from pose_graph_ros.core.smoother.incremental import IncrementalSmoother
+from pose_graph_ros.core.solver_config import SolverConfig
 
 # Tolerance of poses [m, rad] and of covariances, relative to the largest.
 CLOSE = 1e-9

@@ -13,7 +13,7 @@ from slow_smoother import differences, EXACT, information, SlowGraph, state, wor
 
 from pose_graph_ros.core.batch import optimizer
 from pose_graph_ros.core.batch.optimizer import Status
-from pose_graph_ros.core.config import SmootherConfig, SolverConfig
+from pose_graph_ros.core.config import SmootherConfig
 from pose_graph_ros.core.exceptions import GraphUpdateError
 from pose_graph_ros.core.geometry import se2
 from pose_graph_ros.core.geometry.se2 import FloatArray
@@ -22,6 +22,7 @@ from pose_graph_ros.core.graph.constraints import EdgeKind, Edges, ObservedKind,
 from pose_graph_ros.core.graph.graph import Graph, GraphUpdate
 from pose_graph_ros.core.smoother import step, tree_update
 from pose_graph_ros.core.smoother.incremental import IncrementalSmoother
+from pose_graph_ros.core.solver_config import SolverConfig
 
 # Tolerance of poses after an exact step [m, rad].
 CLOSE = 1e-6

@@ -8,12 +8,12 @@ from slow_smoother import state
 
 from pose_graph_ros.core.batch import optimizer
 from pose_graph_ros.core.batch.optimizer import Status
-from pose_graph_ros.core.config import SolverConfig
 from pose_graph_ros.core.geometry import se2
 from pose_graph_ros.core.graph import tables as tb
 from pose_graph_ros.core.graph.constraints import EdgeKind, Edges, ObservedKind, ObservedNodes
 from pose_graph_ros.core.graph.graph import Graph, GraphUpdate
 from pose_graph_ros.core.smoother.incremental import IncrementalSmoother
+from pose_graph_ros.core.solver_config import SolverConfig
 
 SIGMA = np.array([0.05, 0.05, 0.02])
 INFORMATION = np.diag(SIGMA**-2.0)

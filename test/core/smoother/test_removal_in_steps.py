@@ -12,12 +12,12 @@ from slow_smoother import differences, EXACT, SlowGraph, state, world
 
 from pose_graph_ros.core.batch import optimizer
 from pose_graph_ros.core.batch.optimizer import Status
-from pose_graph_ros.core.config import SolverConfig
 from pose_graph_ros.core.geometry import se2
 from pose_graph_ros.core.graph import tables as tb
 from pose_graph_ros.core.graph.constraints import EdgeKind, Edges
 from pose_graph_ros.core.graph.graph import Graph, GraphUpdate
 from pose_graph_ros.core.smoother.incremental import IncrementalSmoother
+from pose_graph_ros.core.solver_config import SolverConfig
 
 MOTION, INFORMATION = np.array([1.0, 0.0, 0.1]), np.diag([100.0, 100.0, 400.0])
 

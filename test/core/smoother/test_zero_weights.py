@@ -9,12 +9,12 @@ from slow_smoother import differences, state, World, world
 
 from pose_graph_ros.core.batch import optimizer
 from pose_graph_ros.core.batch.optimizer import chi2_of
-from pose_graph_ros.core.config import SolverConfig
 from pose_graph_ros.core.exceptions import GraphUpdateError
 from pose_graph_ros.core.graph import tables as tb
 from pose_graph_ros.core.graph.constraints import Edges, ObservedNodes
 from pose_graph_ros.core.graph.graph import GraphUpdate
 from pose_graph_ros.core.smoother.incremental import IncrementalSmoother
+from pose_graph_ros.core.solver_config import SolverConfig
 
 seeds = st.integers(0, 2**32 - 1)
 

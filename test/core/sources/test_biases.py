@@ -23,7 +23,7 @@ from slow_smoother import cliques, differences, EXACT, SlowGraph, state, world
 from pose_graph_ros.core.batch import optimizer
 from pose_graph_ros.core.batch.joint_start import joint
 from pose_graph_ros.core.batch.optimizer import Status
-from pose_graph_ros.core.config import SmootherConfig, SolverConfig
+from pose_graph_ros.core.config import SmootherConfig
 from pose_graph_ros.core.exceptions import LinearSolveError
 from pose_graph_ros.core.geometry import se2
 from pose_graph_ros.core.geometry.se2 import FloatArray
@@ -34,6 +34,7 @@ from pose_graph_ros.core.io.g2o import read_g2o
 from pose_graph_ros.core.io.g2o_writing import write_g2o
 from pose_graph_ros.core.smoother import batch_fallback
 from pose_graph_ros.core.smoother.incremental import IncrementalSmoother
+from pose_graph_ros.core.solver_config import SolverConfig
 
 seeds = st.integers(0, 2**32 - 1)
 

@@ -1,0 +1,119 @@
+# Copyright 2026 The pose_graph_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""The optimiser without compiled kernels against the one with them."""
+
+from hypothesis import given, settings, strategies as st
+import numpy as np
+import pytest
+from random_graphs import corridor_graph
+
+from pose_graph_ros.core.batch.optimizer import optimize_from_linear_start
+from pose_graph_ros.core.batch.outcome import Status
+from pose_graph_ros.core.batch.plain_graph import errors, linearized, PlainGraph
+from pose_graph_ros.core.batch.plain_optimizer import PlainOptimizer
+from pose_graph_ros.core.geometry import se2
+from pose_graph_ros.core.geometry.se2 import FloatArray
+from pose_graph_ros.core.graph.constraints import EdgeKind, Edges, ObservedNodes
+from pose_graph_ros.core.graph.graph import Graph, GraphUpdate
+from pose_graph_ros.core.solver_config import SolverConfig
+
+CONFIG = SolverConfig(max_iterations=200)
+
+
+def noisy_graph(seed: int, n: int = 30, noise: float = 0.1) -> Graph:
+    """Return a chain with chords, also backward and parallel ones, from wrong poses."""
+    rng = np.random.default_rng(seed)
+    truth = np.column_stack((rng.uniform(-9.0, 9.0, (n, 2)), rng.uniform(-np.pi, np.pi, n)))
+    chords = rng.integers(0, n, (n, 2))
+    chords = chords[chords[:, 0] != chords[:, 1]]
+    i, j = np.concatenate((np.column_stack((np.arange(n - 1), np.arange(1, n))), chords,
+                           chords[:3])).T
+    root = np.triu(rng.normal(size=(len(i), 3, 3))) + 3.0 * np.eye(3)
+    mean = se2.between(truth[i], truth[j]) + noise * rng.normal(size=(len(i), 3))
+    kind = np.where(j - i == 1, EdgeKind.ODOMETRY, EdgeKind.LOOP_CLOSURE)
+    graph = Graph()
+    graph.apply(GraphUpdate(
+        truth + rng.normal(size=(n, 3)), Edges(
+            i, j, mean, np.swapaxes(root, 1, 2) @ root, kind), fix=[3, 7] if seed % 2 else [0]))
+    return graph
+
+
+@settings(max_examples=40, deadline=None)
+@given(seed=st.integers(0, 2**32 - 1))
+def test_the_optimum_is_that_of_the_compiled_optimiser(seed: int) -> None:
+    graph = noisy_graph(seed)
+    plain = PlainGraph(graph.rows())
+    assert plain.energies().chi2 == pytest.approx(graph.energies().chi2, rel=1e-12)
+    result = PlainOptimizer(plain, CONFIG).from_chordal_start()
+    expected = optimize_from_linear_start(graph, CONFIG)
+    if result is None:
+        # what is not simple is left to the other one
+        np.testing.assert_array_equal(plain.poses, PlainGraph(noisy_graph(seed).rows()).poses)
+        return
+    assert result.status is Status.CONVERGED
+    assert result.chi2 == pytest.approx(plain.energies().chi2, rel=1e-12)
+    assert result.chi2 <= expected.chi2 * (1.0 + 1e-9)
+    if result.chi2 >= expected.chi2 * (1.0 - 1e-9):
+        change = plain.poses - graph.poses
+        change[:, 2] = se2.wrap(change[:, 2])
+        np.testing.assert_allclose(change, 0.0, atol=1e-6)
+    np.testing.assert_array_equal(plain.poses[graph.fixed], graph.rows().poses[graph.fixed])
+
+
+def test_nearly_all_of_these_are_simple() -> None:
+    # those with one fixed node: two at wrong poses contradict the rest
+    graphs = [PlainGraph(noisy_graph(seed, noise=0.03).rows()) for seed in range(0, 40, 2)]
+    found = [PlainOptimizer(graph, CONFIG).from_chordal_start() for graph in graphs]
+    assert sum(each is not None for each in found) >= 18
+
+
+@settings(max_examples=40, deadline=None)
+@given(seed=st.integers(0, 2**32 - 1))
+def test_errors_and_jacobians(seed: int) -> None:
+    graph = noisy_graph(seed, n=8)
+    edges, poses = graph.edges, graph.poses.copy()
+    error, by_i, by_j = linearized(poses, edges)
+    np.testing.assert_allclose(error, graph.edge_errors(edges), atol=1e-12)
+    np.testing.assert_array_equal(errors(poses, edges), error)
+    for node, jacobian in ((edges.i, by_i), (edges.j, by_j)):
+        for row in range(len(edges)):
+            single = edges.rows(np.array([row]))
+            for column in range(3):
+                h = 1e-6
+                differences = []
+                for sign in (-1.0, 1.0):
+                    moved = poses.copy()
+                    moved[node[row], column] += sign * h
+                    differences.append(errors(moved, single)[0])
+                slope = (differences[1] - differences[0]) / (2.0 * h)
+                slope[2] = se2.wrap(differences[1][2] - differences[0][2]) / (2.0 * h)
+                np.testing.assert_allclose(jacobian[row, :, column], slope, atol=1e-6)
+
+
+def test_a_hard_graph_is_left_to_the_other_optimiser() -> None:
+    # its chordal start leads to a minimum far from the lowest one
+    graph = corridor_graph(1, sigma=0.3)
+    plain = PlainGraph(graph.rows())
+    before: FloatArray = plain.poses.copy()
+    assert PlainOptimizer(plain, CONFIG).from_chordal_start() is None
+    np.testing.assert_array_equal(plain.poses, before)
+
+
+def test_what_is_covered() -> None:
+    graph = noisy_graph(0)
+    assert PlainGraph.is_covered(graph.rows())
+    for update in (
+            GraphUpdate(observed=ObservedNodes([0], None, np.zeros((1, 3)), np.eye(3)[None], [0])),
+            GraphUpdate(landmarks=np.zeros((1, 2))), GraphUpdate(remove_edges=[4])):
+        other = noisy_graph(0)
+        other.apply(update)
+        assert not PlainGraph.is_covered(other.rows())
+
+
+def test_parts_are_held_as_nodes_are_numbered() -> None:
+    graph = noisy_graph(0, n=6)
+    rows = graph.rows()
+    keep = np.flatnonzero((rows.edges.i // 2) == (rows.edges.j // 2))
+    plain = PlainGraph(rows.with_edges(rows.edges.rows(keep)))
+    assert plain.hold_parts() == [2, 4]
+    assert plain.hold_parts() == []
