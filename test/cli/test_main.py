@@ -61,7 +61,7 @@ def test_what_needs_no_tool_loads_none(word: str) -> None:
 
 
 def test_solve_loads_what_it_needs(tmp_path: Path) -> None:
-    # neither Numba nor, but for one extension module, SciPy: they take longer to load than all else
+    # neither Numba nor, but for an extension module, SciPy: they take longer to load than all else
     names = loaded('solve', RING, '-o', tmp_path / 'ring.g2o')
     assert 'pose_graph_ros.core.batch.plain_optimizer' in names
     assert names & set(HEAVY) <= {'numpy'}
