@@ -13,10 +13,16 @@ showSparsity();
 document.getElementById('foot').append(make('p', {},
   'Made by pose-graph report. This file holds all its data, and loads nothing.'));
 
-// on paper the page is light, whatever it is on the screen
+// on paper the page is light and has all findings, whatever it is on the screen
 let onScreen = null;
+let folded = [];
 window.addEventListener('beforeprint', () => {
   onScreen = document.documentElement.dataset.scheme;
+  folded = [...document.querySelectorAll('details.good:not([open])')];
+  for (const each of folded) each.open = true;
   setScheme('light');
 });
-window.addEventListener('afterprint', () => setScheme(onScreen || 'light'));
+window.addEventListener('afterprint', () => {
+  for (const each of folded) each.open = false;
+  setScheme(onScreen || 'light');
+});

@@ -24,12 +24,16 @@ function showMap() {
     'aria-label': 'Map of the drive. Arrow keys pan, plus and minus zoom, 0 shows all, Enter '
       + 'chooses what is nearest to the middle, Escape chooses nothing.',
   }, ({width, height}) => {
-    Object.assign(frame, {width, height});
-    if (!placed) { placed = true; view.fit(box, false); }
+    if (width !== frame.width || height !== frame.height) {
+      // as much is seen as before, and all if all was seen
+      const change = Math.min(width / frame.width, height / frame.height);
+      if (frame.width === 0 || view.fits(box, frame)) view.fit(box, false);
+      else view.set(view.x, view.y, view.scale * change);
+      Object.assign(frame, {width, height});
+    }
     paintMap(layers, surface, frame);
   });
   surface.reset = () => { frame.picture.seen = null; };
-  let placed = false;
   const view = makeView(surface, () => {
     surface.canvas.dataset.view = `${view.x} ${view.y} ${view.scale}`;
     surface.later();
@@ -308,13 +312,13 @@ function paintGrid(context, {view, width, height}) {
     if (v > 12 && v < height - 60) labels.push([number(y / unit, 6), 6, v - 3, 'left']);
   }
   context.stroke();
-  context.font = FONT;
-  context.textBaseline = 'alphabetic';
   for (const [text, u, v, align] of labels) halo(context, text, u, v, align);
 }
 
 /** A text that can be read on whatever is below it. */
 function halo(context, text, u, v, align = 'left', name = 'muted') {
+  context.font = FONT;
+  context.textBaseline = 'alphabetic';
   context.textAlign = align;
   context.lineJoin = 'round';
   context.strokeStyle = colour('surface');

@@ -28,8 +28,7 @@ function showHead() {
   head.append(
     make('div', {class: 'title'}, make('p', {class: 'brand'}, 'pose-graph report'),
       make('h1', {}, DATA.title || 'report'),
-      make('p', {class: 'subtitle'}, [DATA.subtitle, when, DATA.duration ? `${
-        clock(DATA.duration, 0)} long` : null].filter((text) => text).join(' · '))),
+      make('p', {class: 'subtitle'}, [DATA.subtitle, when].filter((text) => text).join(' · '))),
     toggle);
   const facts = DATA.facts || [];
   // as many columns as leave the fewest places empty
@@ -42,21 +41,33 @@ function showHead() {
   showFindings();
 }
 
+/** What a person must know; what is as it should be is folded away, unless there is nothing else. */
 function showFindings() {
-  const found = DATA.findings || [];
-  const list = make('ul', {class: 'findings', id: 'findings', 'aria-label': 'Findings'});
-  for (const {level, text, anchor} of found) {
-    const body = make('span', {}, make('b', {class: 'unseen'}, `${LEVELS[level] || 'Notice'}: `), text);
-    const sign = draw('svg', {viewBox: '0 0 16 16', 'aria-hidden': 'true'}, draw('path', {
-      d: LEVEL_SIGNS[level] || LEVEL_SIGNS.notice, fill: 'none', stroke: 'currentColor',
-      'stroke-width': 1.6, 'stroke-linejoin': 'round', 'stroke-linecap': 'round'}));
-    const link = anchor ? make('a', {href: `#${encodeURIComponent(anchor)}`, onclick: (event) => {
-      event.preventDefault();
-      goTo(document.getElementById(anchor));
-    }}, 'Show') : null;
-    list.append(make('li', {'data-level': level in LEVELS ? level : 'notice'}, sign, body, link));
+  const all = DATA.findings || [];
+  const isGood = ({level}) => level === 'good';
+  const [good, others] = [all.filter(isGood), all.filter((each) => !isGood(each))];
+  const host = make('div', {id: 'findings', role: 'region', 'aria-label': 'Findings'});
+  if (others.length > 0) host.append(make('ul', {class: 'findings'}, others.map(findingOf)));
+  if (good.length > 0) {
+    host.append(make('details', {class: 'good', open: others.length === 0},
+      make('summary', {}, others.length > 0
+        ? `${counted(good.length, 'thing')} ${good.length === 1 ? 'is as it' : 'are as they'} should be`
+        : 'All that was checked is as it should be'),
+      make('ul', {class: 'findings'}, good.map(findingOf))));
   }
-  if (found.length > 0) document.getElementById('main').append(list);
+  if (all.length > 0) document.getElementById('main').append(host);
+}
+
+function findingOf({level, text, anchor}) {
+  const body = make('span', {}, make('b', {class: 'unseen'}, `${LEVELS[level] || 'Notice'}: `), text);
+  const sign = draw('svg', {viewBox: '0 0 16 16', 'aria-hidden': 'true'}, draw('path', {
+    d: LEVEL_SIGNS[level] || LEVEL_SIGNS.notice, fill: 'none', stroke: 'currentColor',
+    'stroke-width': 1.6, 'stroke-linejoin': 'round', 'stroke-linecap': 'round'}));
+  const link = anchor ? make('a', {href: `#${encodeURIComponent(anchor)}`, onclick: (event) => {
+    event.preventDefault();
+    goTo(document.getElementById(anchor));
+  }}, 'Show') : null;
+  return make('li', {'data-level': level in LEVELS ? level : 'notice'}, sign, body, link);
 }
 
 /** Links to the sections of the page. */

@@ -44,14 +44,22 @@ function makeView(surface, onChange) {
     view.moving = requestAnimationFrame(step);
   };
   /** Show a box of the map as a whole. */
-  view.fit = ({left, right, bottom, top}, fly = true) => {
-    const [width, height] = [surface.canvas.clientWidth, surface.canvas.clientHeight];
-    const scale = Math.min((width - 60) / Math.max(right - left, 1),
-      (height - 70) / Math.max(top - bottom, 1));
-    const move = fly ? view.flyTo : view.set;
-    move((left + right) / 2, (bottom + top) / 2, Math.max(scale, SCALES[0]));
+  view.fit = (box, fly = true) => {
+    const {clientWidth: width, clientHeight: height} = surface.canvas;
+    (fly ? view.flyTo : view.set)(...middleAndScale(box, {width, height}));
+  };
+  /** Whether just this box is shown. */
+  view.fits = (box, size) => {
+    const [x, y, scale] = middleAndScale(box, size);
+    return Math.hypot(view.x - x, view.y - y) * scale < 1 && Math.abs(view.scale / scale - 1) < 1e-6;
   };
   return view;
+}
+
+function middleAndScale({left, right, bottom, top}, {width, height}) {
+  const scale = Math.min((width - 60) / Math.max(right - left, 1),
+    (height - 70) / Math.max(top - bottom, 1));
+  return [(left + right) / 2, (bottom + top) / 2, Math.min(SCALES[1], Math.max(scale, SCALES[0]))];
 }
 
 /** Let pointer, wheel and keys change a view; `onPick` gets clicks, `onHover` where the mouse is. */
