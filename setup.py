@@ -18,7 +18,7 @@ from distutils.command.install_data import install_data  # isort: skip  (setupto
 PACKAGE = 'pose_graph_ros'
 # those for `ros2 run`
 EXECUTABLES = ('pose_graph_node', 'replay', 'solve', 'compare', 'compile_kernels', 'draw',
-               'marginalize', 'report', 'simulate')
+               'marginalize', 'report', 'simulate', 'tune')
 LIBEXEC = Path('lib', PACKAGE)
 HERE = Path(__file__).resolve().parent
 
@@ -72,6 +72,7 @@ setup(
             'marginalize = pose_graph_ros.cli.main:marginalize',
             'report = pose_graph_ros.cli.main:report',
             'simulate = pose_graph_ros.cli.main:simulate',
+            'tune = pose_graph_ros.cli.main:tune',
             'pose-graph = pose_graph_ros.cli.main:main',
         ],
     },

@@ -47,6 +47,8 @@ CORE = {
     'core.residuals': {
         'core.geometry', 'core.graph', 'core.smoother', 'core.odometry', 'core.sources'},
     'core.simulation': {'core.geometry', 'core.graph'},
+    'core.tuning': {
+        'core.compiled', 'core.geometry', 'core.graph', 'core.odometry', 'core.sources'},
 }
 CORE['core.io'] = set(CORE)
 # The modules on top of the packages: the facade, what it hands out, and who drives it.

@@ -24,6 +24,7 @@ SUMMARIES = {
     'report': 'make one HTML page of a run: map, errors, residuals, what is doubted',
     'draw': 'draw a small graph: SVG, PNG or DOT',
     'marginalize': 'take nodes out of a graph, and keep what they told',
+    'tune': 'estimate the noise of the sources from bags; write a parameter file',
     'simulate': 'write a simulated drive as a rosbag2 or a graph',
     'parameters': 'print the parameters of the node',
     'compile-kernels': 'compile the solver for later starts',
@@ -88,6 +89,11 @@ def marginalize(args: list[str] | None = None) -> int:
 def simulate(args: list[str] | None = None) -> int:
     """Run `simulate` as a separate program; return the exit code."""
     return _alone('simulate', args)
+
+
+def tune(args: list[str] | None = None) -> int:
+    """Run `tune` as a separate program; return the exit code."""
+    return _alone('tune', args)
 
 
 def _alone(tool: str, args: list[str] | None) -> int:

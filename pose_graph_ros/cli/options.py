@@ -19,8 +19,8 @@ OF_RCLPY = ('qos_overrides.', 'use_sim_time', 'start_type_description_service')
 """What the names of parameters begin with that every node has."""
 
 
-def add_inputs(parser: argparse.ArgumentParser) -> None:
-    """Add the options that choose topics and the fixes to hold out."""
+def add_inputs(parser: argparse.ArgumentParser, *, hold_out: bool = True) -> None:
+    """Add the options that choose topics and, if it is asked for, the fixes to hold out."""
     group = parser.add_argument_group(
         'topics in the bag',
         'by default, the only topic of the type is used, apart from that of the truth')
@@ -36,8 +36,9 @@ def add_inputs(parser: argparse.ArgumentParser) -> None:
             ('--truth', 'Odometry, PoseStamped or PoseWithCovarianceStamped in the map, only used '
                         'for comparison')):
         group.add_argument(option, metavar='TOPIC', help=text)
-    parser.add_argument('--hold-out', metavar='N', type=int, default=0,
-                        help='keep every N-th fix out of the graph and use it for comparison')
+    if hold_out:
+        parser.add_argument('--hold-out', metavar='N', type=int, default=0,
+                            help='keep every N-th fix out of the graph and use it for comparison')
 
 
 def add_parameters(parser: argparse.ArgumentParser) -> None:

@@ -113,15 +113,23 @@ def run(bag: Bag, inputs: Inputs, values: Mapping[str, Any]) -> Replayed:
         reader.frames.receive(message.decode())
     refused: Counter[tuple[str, str]] = Counter()
     recorder = Recorder()
-    backend, report = run_measurements(_read(bag, inputs, reader, refused), values, recorder)
+    backend, report = run_measurements(
+        measurements_of(bag, inputs, reader, refused), values, recorder)
     return Replayed(
         backend, report, refused, reader.datum, recorder, values, inputs.kinds)
 
 
-def _read(
+def measurements_of(
     bag: Bag, inputs: Inputs, reader: MessageReader, refused: Counter[tuple[str, str]],
 ) -> Iterator[tuple[str, OdometrySample | Measurement]]:
-    """Yield the valid measurements of a bag that are not held out; count the others."""
+    """
+    Yield the valid measurements of a bag that are not held out, and their sources.
+
+    Parameters
+    ----------
+    refused : Counter, receives the number of others by source and reason
+
+    """
     for source, message, held_out in read_inputs(bag, inputs):
         if held_out:
             continue

@@ -20,6 +20,7 @@ import time
 from pose_graph_ros.core import backend  # noqa: F401  imports all modules with kernels
 from pose_graph_ros.core.compiled import jit
 from pose_graph_ros.core.helper_process import end_with_parent, HelperProcess
+from pose_graph_ros.core.tuning import likelihood  # noqa: F401  the tool has kernels of its own
 
 # Functions that the helper processes call: one begins with the first kernel, one with the last.
 HELPERS = ((__name__, 'compile_forwards'), (__name__, 'compile_backwards'))

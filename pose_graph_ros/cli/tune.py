@@ -1,0 +1,186 @@
+# Copyright 2026 The pose_graph_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""
+Estimate the noise of odometry and of what measures in the map from bags; write a parameter file.
+
+Parameters are those under which the measurements are the most likely, each with an interval.
+Those that the data do not tell stay as they are. The table shows how well a path predicts fixes
+(global poses) of whole stretches of the drive that were held out, from the tuning too, before and
+after. What makes these worse is not changed. The exit code is 1 if so, 2 for wrong input.
+"""
+
+import argparse
+from collections.abc import Mapping
+from dataclasses import asdict
+import json
+from pathlib import Path
+import sys
+import time
+from typing import Any
+
+from pose_graph_ros.adapters.bag_inputs import choose_inputs
+from pose_graph_ros.adapters.bag_sequence import open_bags
+from pose_graph_ros.adapters.bags import BagError
+from pose_graph_ros.adapters.sources import source_list
+from pose_graph_ros.cli import options as shared
+from pose_graph_ros.cli.progress import WatchedBag
+from pose_graph_ros.cli.results import read_truth
+from pose_graph_ros.cli.tuned_parameters import interval, yaml_text
+from pose_graph_ros.cli.tuning import Outcome, Tuning, Verdict
+from pose_graph_ros.cli.tuning_drive import TuningDrive
+from pose_graph_ros.core.tuning.fit import CONTRADICTION
+from pose_graph_ros.core.tuning.held_out import Summary
+
+EXAMPLES = """examples:
+  pose-graph tune my_bag --odom /wheel/odometry --fix /gnss/fix -o tuned.yaml
+  pose-graph tune monday.bag tuesday.bag --params-file robot.yaml --json | jq .parameters
+  ros2 run pose_graph_ros pose_graph_node --ros-args --params-file tuned.yaml
+"""
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Add the arguments of this tool."""
+    parser.add_argument('bags', metavar='BAG', type=Path, nargs='+',
+                        help='rosbag2 folder, .mcap, .db3, ROS 1 .bag')
+    parser.add_argument('-o', '--out', metavar='FILE', type=Path, default=Path('tuned.yaml'),
+                        help='parameter file to write (default: %(default)s)')
+    parser.add_argument('--folds', metavar='N', type=_folds, default=4,
+                        help='parts of the drive that are held out in turn '
+                             '(default: %(default)s)')
+    parser.add_argument('--budget', metavar='SECONDS', type=_budget, default=600.0,
+                        help='with less time, fewer parts are held out (default: %(default)g)')
+    parser.add_argument('--json', action='store_true', help='print the results as JSON')
+    shared.add_inputs(parser, hold_out=False)
+    shared.add_parameters(parser)
+    parser.epilog = EXAMPLES
+
+
+def _folds(text: str) -> int:
+    """Return a number of folds."""
+    value = int(text)
+    if not 2 <= value <= 50:
+        raise argparse.ArgumentTypeError(f'expected a number from 2 to 50, got {text}')
+    return value
+
+
+def _budget(text: str) -> float:
+    """Return a time [s]."""
+    value = float(text)
+    if not value > 0.0:
+        raise argparse.ArgumentTypeError(f'expected a positive number, got {text}')
+    return value
+
+
+def execute(options: argparse.Namespace) -> int:
+    """Run the tool; return the exit code."""
+    start = time.monotonic()
+    values = shared.parameter_values(options)
+    if options.out.is_dir():
+        raise BagError(f'{options.out}: is a folder; expected a file to write')
+    if not options.out.resolve().parent.is_dir():
+        raise BagError(f'{options.out}: there is no folder {options.out.resolve().parent}')
+    with open_bags(options.bags) as bag:
+        inputs = choose_inputs(bag, source_list(values), shared.wanted_topics(options))
+        truth = None if options.truth is None else read_truth(bag, options.truth)
+        drive = TuningDrive(WatchedBag(bag, 'reading'), inputs, values)
+        path = str(bag.path)
+    with _Status() as status:
+        tuning = Tuning(drive, inputs, values, path, status.show)
+        outcome = tuning.tune(options.folds, start + options.budget, truth)
+    names = ' '.join(each.name for each in options.bags)
+    headline = [f'Noise by `pose-graph tune {names}`', *_notes(outcome, drive)]
+    options.out.write_text(yaml_text(outcome.tuned, headline), encoding='utf-8')
+    if options.json:
+        print(json.dumps(_facts(options, outcome, drive, time.monotonic() - start), indent=2))
+    else:
+        print('\n'.join(f'{source}: {topic}' for source, topic in inputs.topics.items()))
+        print('\n'.join(_lines(outcome, drive)))
+        print(f'\nwritten: {options.out}')
+    return 1 if outcome.verdict is Verdict.WORSE else 0
+
+
+class _Status:
+    """A line on standard error that says what is being done, on a terminal only."""
+
+    def __enter__(self) -> '_Status':
+        self._shown = ''
+        return self
+
+    def show(self, text: str) -> None:
+        """Show a text instead of the one before."""
+        if sys.stderr.isatty() and text != self._shown:
+            print(f'\r{text:<{len(self._shown)}}', end='', file=sys.stderr, flush=True)
+            self._shown = text
+
+    def __exit__(self, *_: object) -> None:
+        self.show('')
+        if self._shown == '' and sys.stderr.isatty():
+            print('\r', end='', file=sys.stderr, flush=True)
+
+
+def _notes(outcome: Outcome, drive: TuningDrive) -> list[str]:
+    """Return what is to be known of the estimate."""
+    notes = [f'{outcome.measured}; {outcome.folds_done} of {outcome.folds} parts of the drive '
+             f'held out in turn, in stretches of {outcome.stretch:.3g} s']
+    if drive.is_cut:
+        notes.append('the bag is long: only its first part was read')
+    if outcome.n_doubted > 0:
+        notes.append(f'{outcome.n_doubted} measurements contradict the others and were left out')
+    if outcome.contradiction > CONTRADICTION:
+        notes.append('stretches of the drive contradict each other: odometry has errors that are '
+                     'no random walk, and intervals are wider')
+    return [*notes, outcome.verdict.value]
+
+
+def _lines(outcome: Outcome, drive: TuningDrive) -> list[str]:
+    """Return the tables as text."""
+    rows = [('', 'before', 'after', '95 %', ''), *(
+        (each.name, _value(each.before), _value(each.after) if each.changes else '',
+         interval(each), each.note.strip('; ')) for each in outcome.tuned)]
+    widths = [max(len(row[k]) for row in rows) for k in range(4)]
+    lines = ['', *('  '.join([f'{row[0]:<{widths[0]}}', *(
+        f'{cell:>{width}}' for cell, width in zip(row[1:4], widths[1:], strict=True)),
+        row[4]]).rstrip() for row in rows)]
+    lines += ['', f'{"held out":<22}{"rms":>9}{"median":>9}{"NEES":>9}{"NLPD":>9}'
+                  f'{"correlation":>13}{"count":>8}']
+    for name, of in (('before', outcome.before), ('after', outcome.after)):
+        lines.append(
+            f'{name:<22}{of.rms:>7.3f} m{of.median:>7.3f} m{of.nees:>9.3g}{of.nlpd:>9.3f}'
+            f'{of.correlation_time:>11.3g} s{of.n:>8}')
+    for name, error in zip(('before, to truth', 'after, to truth'), outcome.to_truth,
+                           strict=False):
+        lines.append(f'{name:<22}{error:>7.3f} m')
+    return [*lines, '', *_notes(outcome, drive)]
+
+
+def _value(value: Any) -> str:
+    """Return a value for the table."""
+    if isinstance(value, list | tuple):
+        return '[' + ', '.join(map(_value, value)) + ']' if len(value) > 0 else 'unset'
+    return f'{value:.4g}' if isinstance(value, int | float) else str(value)
+
+
+def _facts(
+    options: argparse.Namespace, outcome: Outcome, drive: TuningDrive, seconds: float,
+) -> dict[str, Any]:
+    """Return the results as plain values for JSON."""
+    return {
+        'bags': [str(each) for each in options.bags], 'file': str(options.out),
+        'verdict': outcome.verdict.name.lower(), 'reason': outcome.verdict.value,
+        'parameters': [_plain(asdict(each)) | {'changed': each.changes}
+                       for each in outcome.tuned],
+        'before': _summary(outcome.before), 'after': _summary(outcome.after),
+        'to_truth': dict(zip(('before', 'after'), outcome.to_truth, strict=False)) or None,
+        'folds': outcome.folds, 'folds_done': outcome.folds_done, 'stretch_s': outcome.stretch,
+        'doubted': outcome.n_doubted, 'contradiction': outcome.contradiction,
+        'is_cut': drive.is_cut, 'seconds': seconds}
+
+
+def _summary(of: Summary) -> dict[str, Any]:
+    return _plain(of._asdict())
+
+
+def _plain(facts: Mapping[str, Any]) -> dict[str, Any]:
+    """Return facts with null for what is not a finite number, which JSON does not know."""
+    return {name: None if isinstance(value, float) and not abs(value) < float('inf') else value
+            for name, value in facts.items()}

@@ -1,0 +1,229 @@
+# Copyright 2026 The pose_graph_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""From estimated noise to parameters of the node, and their file with a reason for each."""
+
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
+import math
+from typing import Any
+
+from pose_graph_ros.cli.tuning_drive import SourceOfPoses
+from pose_graph_ros.core.tuning import likelihood as lk
+from pose_graph_ros.core.tuning.fit import Fit, Found
+from pose_graph_ros.core.tuning.problem import Role
+
+ODOMETRY = ('sigma_distance', 'sigma_lateral', 'sigma_heading_distance', 'sigma_heading_turn')
+LARGEST_SIGMA = 10.0  # of odometry, by the range of its parameters
+DIGITS = 3  # that numbers have in the file
+UNDECIDED = 'kept: the data do not tell'
+AGREES = 'kept: as good as any'
+
+
+@dataclass(frozen=True, slots=True)
+class Tuned:
+    """One parameter of the node, before and after."""
+
+    name: str
+    before: Any
+    after: Any
+    low: float = math.nan
+    """Ends of its interval of 95 %, in its unit; NaN if it has none."""
+    high: float = math.nan
+    note: str = ''
+
+    @property
+    def changes(self) -> bool:
+        """Whether it has another value than before."""
+        return bool(self.after != self.before)
+
+    @property
+    def source(self) -> str:
+        """Name of the source."""
+        return self.name.partition('.')[0]
+
+    def kept(self, note: str) -> 'Tuned':
+        """Return the parameter with the value before."""
+        return replace(self, after=self.before, note=note)
+
+
+def odometry_parameters(source: str, found: Fit, values: Mapping[str, Any]) -> Iterator[Tuned]:
+    """
+    Yield the parameters of a source of odometry by a fit.
+
+    Parameters
+    ----------
+    source : str
+    found : Fit
+    values : mapping, all parameters before
+
+    """
+    own = [each for each in found.found if each.parameter.role is Role.ODOMETRY]
+    scale = math.sqrt(values[f'{source}.covariance_scale'])
+    changed = False
+    for each in sorted(own, key=lambda one: one.parameter.index):
+        if each.parameter.index == lk.GIVEN:
+            yield _one(f'{source}.covariance_scale', each, values, lambda sigma: sigma**2)
+            changed = changed or not each.kept
+            continue
+        yield _one(f'{source}.{ODOMETRY[each.parameter.index]}', each, values,
+                   lambda sigma: min(sigma / scale, LARGEST_SIGMA))
+        changed = changed or not each.kept
+    before = values[f'{source}.sigma_scale']
+    if changed:
+        yield Tuned(f'{source}.sigma_scale', before, 1.0,
+                    note='the sigmas are those of this odometry')
+
+
+def source_parameters(
+    source: SourceOfPoses, index: int, found: Fit, values: Mapping[str, Any],
+) -> Iterator[Tuned]:
+    """
+    Yield the parameters of a source of measurements in the map by a fit.
+
+    Parameters
+    ----------
+    source : SourceOfPoses
+    index : int, of the source in the fit
+    found : Fit
+    values : mapping, all parameters before
+
+    """
+    of = {each.parameter.role: each for each in found.found
+          if each.parameter.index == index and each.parameter.role is not Role.ODOMETRY}
+    size, heading = of.get(Role.CORRELATED) or of.get(Role.WHITE), of.get(Role.HEADING)
+    share, more = 0.0, ''
+    if Role.TAU in of:
+        share = of[Role.SHARE].value
+        if share > 1.0:     # parameters cannot say it
+            more = '; errors are correlated as well, which the node finds'
+    if size is not None:
+        factor = 1.0 + share if share > 1.0 else 1.0
+        size = size._replace(value=size.value * factor, low=size.low * factor,
+                             high=size.high * factor)
+    yield from _sizes(source, size, heading, values, more)
+    if Role.TAU in of and share <= 1.0:
+        yield _one(f'{source.name}.correlation_time', of[Role.TAU], values, float)
+        yield _one(f'{source.name}.white_share', of[Role.SHARE], values, lambda x: min(x, 1.0))
+
+
+def _sizes(
+    source: SourceOfPoses, size: Found | None, heading: Found | None, values: Mapping[str, Any],
+    more: str,
+) -> Iterator[Tuned]:
+    """Yield the factor on the covariances that a source claims, or what replaces these."""
+    leading = heading if size is None else size
+    if leading is None:
+        return
+    scale, override = f'{source.name}.covariance_scale', f'{source.name}.covariance_override'
+    apart = size is not None and heading is not None and source.is_constant and (
+        heading.value != size.value)
+    if source.is_scalable and not apart:
+        at_scale = values[scale]
+        one = _one(scale, leading, values, lambda ratio: at_scale * ratio)
+        if source.is_constant and source.sigma > 0.0 and one.changes:
+            one = replace(one, note=f'{one.note}; sigma {_number(source.sigma)} m claimed, '
+                          f'{_number(source.sigma * math.sqrt(leading.value))} m found')
+        if one.changes and size is not None and heading is not None and (
+                heading.value != size.value):
+            more += (f'; of headings by themselves it would be '
+                     f'{_number(at_scale * heading.value)}')
+        yield replace(one, note=one.note + more)
+        return
+    if leading.kept and (heading is None or heading.kept):
+        yield Tuned(override, values[override], values[override],
+                    source.sigma * math.sqrt(leading.low),
+                    source.sigma * math.sqrt(leading.high), note=_kept_note(leading) + more)
+        return
+    sigmas = [] if size is None else [source.sigma * math.sqrt(size.value)]
+    if heading is not None or source.sigma_heading > 0.0:
+        ratio = 1.0 if heading is None else heading.value
+        sigmas = [*(sigmas or [1.0]), source.sigma_heading * math.sqrt(ratio)]
+    of = source.sigma if size is not None else source.sigma_heading
+    yield Tuned(override, values[override], [_rounded(each) for each in sigmas],
+                of * math.sqrt(leading.low), of * math.sqrt(leading.high),
+                note='instead of covariances that are not valid' + more
+                if not source.is_scalable else 'of position and heading' + more)
+    if values[scale] != 1.0:
+        yield Tuned(scale, values[scale], 1.0, note='part of covariance_override')
+
+
+def _one(name: str, found: Found, values: Mapping[str, Any], value: Any) -> Tuned:
+    """Return a parameter by its estimate."""
+    before = values[name]
+    after = before if found.kept else _rounded(value(found.value))
+    note = _kept_note(found) if found.kept else ''
+    if not found.kept and found.is_wide:
+        note = 'the data tell this one only roughly'
+    return Tuned(name, before, after, float(value(found.low)), float(value(found.high)), note)
+
+
+def _kept_note(found: Found) -> str:
+    return UNDECIDED if found.is_wide else AGREES
+
+
+def changed(tuned: Iterable[Tuned]) -> dict[str, Any]:
+    """Return the new values by name."""
+    return {each.name: each.after for each in tuned if each.changes}
+
+
+def yaml_text(tuned: Sequence[Tuned], headline: Sequence[str]) -> str:
+    """
+    Return a parameter file with what changes, and comments.
+
+    If nothing changes, it has what was kept: a file without parameters is none for a node.
+
+    Parameters
+    ----------
+    tuned : sequence of Tuned
+    headline : sequence of str, the first lines, without marks of comments
+
+    """
+    lines = [*(f'# {line}'.rstrip() for line in headline), '/**:', '  ros__parameters:']
+    nothing = not any(each.changes for each in tuned)
+    for source in dict.fromkeys(each.source for each in tuned):
+        own = [each for each in tuned if each.source == source]
+        if not nothing and not any(each.changes for each in own):
+            lines += [f'    # {each.name}: {_text(each.before)}, {_why(each)}' for each in own]
+            continue
+        lines.append(f'    {source}:')
+        for each in own:
+            leaf = each.name.partition('.')[2]
+            if each.changes:
+                lines += [f'      # {_text(each.before)} before; {_why(each)}',
+                          f'      {leaf}: {_text(each.after)}']
+            elif nothing and each.after != []:
+                lines += [f'      # {_why(each)}', f'      {leaf}: {_text(each.after)}']
+            else:
+                lines.append(f'      # {leaf}: {_text(each.before)}, {_why(each)}')
+    return '\n'.join(lines) + '\n'
+
+
+def interval(tuned: Tuned) -> str:
+    """Return the interval of a parameter; empty if it has none."""
+    if math.isnan(tuned.low):
+        return ''
+    return f'{_number(tuned.low)} to {_number(tuned.high)}'
+
+
+def _why(tuned: Tuned) -> str:
+    parts = [f'95 %: {interval(tuned)}'] if interval(tuned) != '' else []
+    return '; '.join([*parts, *([tuned.note.strip('; ')] if tuned.note else [])])
+
+
+def _rounded(value: float) -> float:
+    """Return a value with some digits."""
+    return float(f'{value:.{DIGITS}g}')
+
+
+def _number(value: float) -> str:
+    return 'no bound' if math.isinf(value) else f'{value:.{DIGITS}g}'
+
+
+def _text(value: Any) -> str:
+    """Return a value as YAML, numbers as floating-point ones."""
+    if isinstance(value, list | tuple):
+        return f'[{", ".join(_text(each) for each in value)}]'
+    if not isinstance(value, int | float):
+        return str(value)
+    text = repr(float(value))   # YAML takes 1e-05 for a text
+    return text.replace('e', '.0e') if 'e' in text and '.' not in text else text

@@ -1,0 +1,301 @@
+# Copyright 2026 The pose_graph_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""
+Tune with all measurements of a drive, and find out how well that does on stretches held out.
+
+For each part of the drive in turn the noise is estimated from all others, and the engine runs with
+all others, with the settings before and after. So the estimate in the file is from all
+measurements, and the errors in the table are those of estimates that are made in the same way, at
+fixes that took no part in these. If they are worse, the same is done with the noise of odometry,
+or that of the other sources, as it was.
+"""
+
+from collections.abc import Callable, Collection, Mapping, Sequence
+from dataclasses import dataclass
+from enum import Enum
+import time
+from typing import Any
+
+import numpy as np
+
+from pose_graph_ros.adapters.bag_inputs import Inputs
+from pose_graph_ros.adapters.bags import BagError
+from pose_graph_ros.adapters.parameters import checked
+from pose_graph_ros.adapters.sources import backend_config, ODOMETRY_KINDS
+from pose_graph_ros.cli.tuned_parameters import (
+    changed,
+    odometry_parameters,
+    source_parameters,
+    Tuned,
+)
+from pose_graph_ros.cli.tuning_drive import Key, LEAST, Run, SourceOfPoses, TuningDrive
+from pose_graph_ros.core.geometry.trajectory import Trajectory
+from pose_graph_ros.core.tuning.drive_rows import timeline
+from pose_graph_ros.core.tuning.estimation import estimate
+from pose_graph_ros.core.tuning.fit import Fit
+from pose_graph_ros.core.tuning.held_out import (
+    Errors,
+    fold_of,
+    joined,
+    stretch_length,
+    Summary,
+    summary,
+    wrong,
+)
+from pose_graph_ros.core.tuning.problem import Role
+
+# Held-out errors count as worse from this ratio of the rms, or this difference of the NLPD, on.
+WORSE_RMS, WORSE_NLPD = 1.002, 0.05
+
+
+class Verdict(Enum):
+    """What came of a tuning."""
+
+    BETTER = 'held-out errors are lower after tuning'
+    SAME = 'nothing is changed: the settings are as good as any'
+    WORSE = 'held-out errors are higher after tuning: what makes them higher is not changed'
+
+
+@dataclass(frozen=True, slots=True)
+class Outcome:
+    """Result of a tuning."""
+
+    tuned: Sequence[Tuned]
+    verdict: Verdict
+    before: Summary
+    after: Summary
+    to_truth: Sequence[float]
+    """Rms error of the paths before and after to the truth [m]; empty if it is not known."""
+    folds: int
+    folds_done: int
+    stretch: float
+    """Length of the stretches that were held out [s]."""
+    measured: str
+    """How much was measured."""
+    n_doubted: int
+    contradiction: float
+
+
+@dataclass(slots=True)
+class _Fold:
+    """One part of the drive that is held out."""
+
+    held_out: frozenset[Key]
+    tuned: list[Tuned]
+    before: list[Errors]
+    to_truth: float
+
+
+class Tuning:
+    """
+    Tunes with the measurements of a drive.
+
+    Parameters
+    ----------
+    values : mapping, all parameters before
+    path : str, of the bag, for errors
+    show : callable, receives what is being done
+
+    """
+
+    def __init__(
+        self, drive: TuningDrive, inputs: Inputs, values: Mapping[str, Any], path: str,
+        show: Callable[[str], None],
+    ) -> None:
+        self._drive, self._inputs, self._values, self._show = drive, inputs, values, show
+        self._config = backend_config(values)
+        self._odometry = {}
+        for name in inputs.of(*ODOMETRY_KINDS):
+            found = timeline(drive.odometry(name), self._config.odometry_source(name))
+            if len(found) > 1:
+                self._odometry[name] = found
+        if len(self._odometry) == 0:
+            topics = ' or '.join(inputs.topics[name] for name in inputs.of(*ODOMETRY_KINDS))
+            raise BagError(f'{path}: no usable odometry on {topics}')
+        stamps = next(iter(self._odometry.values())).stamps_ns
+        self._start_ns, self._duration = int(stamps[0]), float(stamps[-1] - stamps[0]) * 1e-9
+        self._sources = [each for each in drive.sources_of_poses(inputs, values)
+                         if each.measured.has_positions or each.measured.has_headings]
+        if not any(each.measured.has_positions for each in self._sources):
+            raise BagError(
+                f'{path}: nothing to tune by: at least {LEAST} valid fixes or global poses are '
+                f'needed; used are {_topics(inputs)}')
+
+    def tune(self, folds: int, deadline: float, truth: Trajectory | None) -> Outcome:
+        """
+        Return the parameters that are the most likely, and how well these do.
+
+        Parameters
+        ----------
+        folds : int
+        deadline : float, by `time.monotonic` [s]
+        truth : Trajectory, optional, only for comparison
+
+        """
+        tuned, fits = self._estimate(frozenset(), 'estimating noise')
+        start = time.monotonic()
+        self._show('running with it')
+        run = self._drive.run(self._with(tuned))
+        seconds = time.monotonic() - start
+        doubted = frozenset() if run is None else run.doubted
+        if len(doubted) > 0:
+            tuned, fits = self._estimate(doubted, 'estimating noise again')
+        fit_seconds = time.monotonic() - start - seconds
+        primary = next(iter(fits.values()))
+        tau = max((each.value for each in primary.found if each.parameter.role is Role.TAU),
+                  default=0.0)
+        stretch = stretch_length(self._duration, self._period(), tau, folds)
+        per_fold = 2.5 * seconds + fit_seconds + 1.0
+        n_done = int(np.clip((deadline - time.monotonic()) / per_fold, 1, folds))
+        parts = [self._fold(k, folds, stretch, doubted, truth) for k in range(n_done)]
+        before = [each.before for each in parts]
+        self._show('comparing')
+        groups: list[Callable[[Tuned], bool]] = [
+            lambda _: True, lambda each: each.source not in self._odometry,
+            lambda each: each.source in self._odometry]
+        verdict, best = Verdict.SAME, self._nothing(tuned)
+        best_after: tuple[list[list[Errors]], list[float]] = before, []
+        first: tuple[list[list[Errors]], list[float]] | None = None
+        for group in groups if len(changed(tuned)) > 0 else ():
+            if first is not None and time.monotonic() + n_done * seconds > deadline:
+                break
+            after, to_truth = self._after(parts, group, truth)
+            one, other = self._summaries(before, after, doubted)
+            is_worse = other.rms > WORSE_RMS * one.rms or not other.nlpd < one.nlpd + WORSE_NLPD
+            if first is None:
+                first = (after, to_truth)
+            if not is_worse:
+                verdict = Verdict.BETTER if first[0] is after else Verdict.WORSE
+                best = [each if group(each) else each.kept('kept: held-out errors get worse')
+                        for each in tuned]
+                best_after = (after, to_truth)
+                break
+            verdict = Verdict.WORSE
+        if verdict is Verdict.WORSE and len(changed(best)) == 0:
+            best = [each.kept('kept: held-out errors get worse') if each.changes else each
+                    for each in tuned]
+        one, other = self._summaries(before, best_after[0], doubted)
+        errors = [float(np.sqrt(np.mean(np.square(each)))) for each in (
+            [part.to_truth for part in parts],
+            best_after[1] or [part.to_truth for part in parts])] if truth is not None else []
+        return Outcome(best, verdict, one, other, errors, folds, n_done, stretch,
+                       self._measured(), len(doubted),
+                       max(each.contradiction for each in fits.values()))
+
+    def _nothing(self, tuned: Sequence[Tuned]) -> list[Tuned]:
+        return [each.kept(each.note) for each in tuned]
+
+    def _with(self, tuned: Sequence[Tuned]) -> dict[str, Any]:
+        """Return all parameters, with those that were tuned."""
+        return checked({**self._values, **changed(tuned)})
+
+    def _estimate(
+        self, without: Collection[Key], text: str,
+    ) -> tuple[list[Tuned], dict[str, Fit]]:
+        """Return what is the most likely without some measurements."""
+        count = 0
+
+        def tick() -> None:
+            nonlocal count
+            count += 1
+            if count % 100 == 0:
+                self._show(f'{text}: {count} evaluations')
+        sources = [self._without(each, without) for each in self._sources]
+        fits = estimate(self._odometry, {
+            each.name: each.measured for each in sources}, self._config, tick)
+        tuned: list[Tuned] = []
+        for name, found in fits.items():
+            tuned += odometry_parameters(name, found, self._values)
+            if len(tuned) > 0 and name == next(iter(fits)):
+                for k, source in enumerate(sources):
+                    tuned += source_parameters(source, k, found, self._values)
+        return tuned, fits
+
+    def _without(self, source: SourceOfPoses, without: Collection[Key]) -> SourceOfPoses:
+        """Return a source without some measurements."""
+        if len(without) == 0:
+            return source
+        kept = np.array([(source.name, stamp) not in without
+                         for stamp in source.measured.stamps_ns.tolist()], dtype=bool)
+        return SourceOfPoses(
+            source.name, source.measured.rows(kept), is_constant=source.is_constant,
+            is_scalable=source.is_scalable, sigma=source.sigma,
+            sigma_heading=source.sigma_heading)
+
+    def _period(self) -> float:
+        """Return the longest median time between measurements of a source of positions [s]."""
+        return max((float(np.median(np.diff(each.measured.stamps_ns))) * 1e-9
+                    for each in self._sources if each.measured.has_positions), default=1.0)
+
+    def _fold(
+        self, k: int, folds: int, stretch: float, doubted: Collection[Key],
+        truth: Trajectory | None,
+    ) -> _Fold:
+        """Return a fold, with the estimate of the noise and the errors before."""
+        held_out = frozenset(
+            (source.name, stamp) for source in self._sources if source.measured.has_positions
+            for stamp in source.measured.stamps_ns[fold_of(
+                source.measured.stamps_ns, self._start_ns, stretch, folds) == k].tolist())
+        text = f'part {k + 1} of {folds} held out'
+        tuned, _ = self._estimate(held_out | frozenset(doubted), text)
+        self._show(f'{text}: running with the settings before')
+        run = self._drive.run(self._values, held_out)
+        return _Fold(held_out, tuned, self._errors(run, self._values, held_out),
+                     _to_truth(run, truth))
+
+    def _after(
+        self, parts: Sequence[_Fold], group: Callable[[Tuned], bool], truth: Trajectory | None,
+    ) -> tuple[list[list[Errors]], list[float]]:
+        """Return the errors of all folds after tuning some parameters, also those to the truth."""
+        after, to_truth = [], []
+        for k, part in enumerate(parts):
+            self._show(f'part {k + 1} held out: running with the settings after')
+            values = self._with([each for each in part.tuned if group(each)])
+            run = self._drive.run(values, part.held_out)
+            after.append(self._errors(run, values, part.held_out))
+            to_truth.append(_to_truth(run, truth))
+        return after, to_truth
+
+    def _errors(
+        self, run: Run | None, values: Mapping[str, Any], held_out: Collection[Key],
+    ) -> list[Errors]:
+        return [] if run is None else self._drive.errors(run, values, self._inputs, held_out)
+
+    def _summaries(
+        self, before: Sequence[Sequence[Errors]], after: Sequence[Sequence[Errors]],
+        doubted: Collection[Key],
+    ) -> tuple[Summary, Summary]:
+        """Return the statistics before and after, of the same positions."""
+        stamps = np.array([stamp for _, stamp in doubted], dtype=np.int64)
+        ones, others = [], []
+        for part, same in zip(before, after, strict=True):
+            for one, other in zip(part, same, strict=True):
+                common = np.isin(one.stamps_ns, other.stamps_ns) & ~np.isin(one.stamps_ns, stamps)
+                kept = np.isin(other.stamps_ns, one.stamps_ns[common])
+                ones.append(one.rows(common))
+                others.append(other.rows(kept))
+        if len(ones) == 0:
+            empty = Errors(np.empty(0, np.int64), np.empty((0, 2)), np.empty((0, 2, 2)))
+            return summary(empty), summary(empty)
+        first, second = joined(ones), joined(others)
+        right = ~wrong([first, second]) if len(first.stamps_ns) > 0 else np.empty(0, dtype=bool)
+        return summary(first.rows(right)), summary(second.rows(right))
+
+    def _measured(self) -> str:
+        """Return how much was measured, in words."""
+        counts = ', '.join(f'{len(each.measured.stamps_ns)} of {each.name}'
+                           for each in self._sources)
+        return f'{self._duration:.0f} s of odometry, {counts}'
+
+
+def _to_truth(run: Run | None, truth: Trajectory | None) -> float:
+    """Return the rms error of a path [m]."""
+    if run is None or truth is None:
+        return float('nan')
+    inside = run.path.covers(truth.stamps_ns)
+    errors = run.path.at(truth.stamps_ns[inside])[:, :2] - truth.poses[inside, :2]
+    return float(np.sqrt(np.mean(np.sum(errors**2, axis=1))))
+
+
+def _topics(inputs: Inputs) -> str:
+    return ', '.join(f'{topic} ({source})' for source, topic in inputs.topics.items())

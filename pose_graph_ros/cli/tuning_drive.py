@@ -1,0 +1,223 @@
+# Copyright 2026 The pose_graph_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""The measurements of a bag, in memory, and what runs of the engine with some of them show."""
+
+from collections import Counter
+from collections.abc import Collection, Mapping, Sequence
+from dataclasses import dataclass
+from itertools import islice
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from pose_graph_ros.adapters.bag_inputs import Inputs, read_static_frames
+from pose_graph_ros.adapters.bags import Bag
+from pose_graph_ros.adapters.message_reader import MessageReader
+from pose_graph_ros.adapters.sources import backend_config, Kind
+from pose_graph_ros.cli.replay import measurements_of, run_measurements
+from pose_graph_ros.core.config import MeasurementSource
+from pose_graph_ros.core.geometry.se2 import FloatArray
+from pose_graph_ros.core.geometry.trajectory import Trajectory
+from pose_graph_ros.core.judgement.texts import states_by_stamps
+from pose_graph_ros.core.judgement.verdicts import State
+from pose_graph_ros.core.measurements import (
+    Fix,
+    GlobalPose,
+    HeadingOnly,
+    LoopClosure,
+    Measurement,
+    OdometrySample,
+    Position,
+)
+from pose_graph_ros.core.sources.validation import validate, Validated
+from pose_graph_ros.core.tuning import likelihood as lk
+from pose_graph_ros.core.tuning.drive_rows import Measured, measured
+from pose_graph_ros.core.tuning.held_out import Errors, errors_at
+
+# Measurements that are kept in memory, of about 700 bytes each.
+MOST_MEASUREMENTS = 1_000_000
+# Least number of measurements of a source whose noise is estimated.
+LEAST = 20
+# Claimed variances with a smaller ratio are the same.
+SAME = 1.05
+
+Key = tuple[str, int]
+"""Source and stamp [ns] of a measurement."""
+
+
+@dataclass(frozen=True, slots=True)
+class SourceOfPoses:
+    """What a source has measured in the map, by the settings of its covariances."""
+
+    name: str
+    measured: Measured
+    is_constant: bool
+    """Whether it always claims the same covariance."""
+    is_scalable: bool
+    """Whether a factor on what it claims makes sense: that is valid and not at a bound."""
+    sigma: float
+    """Median sigma of a coordinate [m]; 0 without positions."""
+    sigma_heading: float
+    """The same of a heading [rad]."""
+
+
+class Run(NamedTuple):
+    """Result of a run of the engine."""
+
+    path: Trajectory
+    covariances: FloatArray
+    """Of the path, shape (P, 3, 3), in map axes."""
+    factors: Mapping[str, float]
+    """By which the engine multiplies the variances that a source claims."""
+    doubted: frozenset[Key]
+    """Measurements that contradict the others."""
+
+
+class TuningDrive:
+    """
+    The measurements of a bag, all fixes in the same map.
+
+    Parameters
+    ----------
+    values : mapping, all parameters of the node
+
+    """
+
+    def __init__(self, bag: Bag, inputs: Inputs, values: Mapping[str, Any]) -> None:
+        reader = MessageReader(values)
+        for message in read_static_frames(bag):
+            reader.frames.receive(message.decode())
+        self.refused: Counter[tuple[str, str]] = Counter()
+        stream = measurements_of(bag, inputs, reader, self.refused)
+        measurements = list(islice(stream, MOST_MEASUREMENTS))
+        self.is_cut = next(stream, None) is not None
+        """Whether the bag has more."""
+        self.measurements = _in_the_map(measurements)
+
+    def odometry(self, source: str) -> list[OdometrySample]:
+        """Return the samples of a source of odometry."""
+        return [each for name, each in self.measurements
+                if name == source and isinstance(each, OdometrySample)]
+
+    def closures(self) -> list[tuple[str, LoopClosure]]:
+        """Return the loop closures and their sources."""
+        return [(name, each) for name, each in self.measurements
+                if isinstance(each, LoopClosure)]
+
+    def sources_of_poses(
+        self, inputs: Inputs, values: Mapping[str, Any],
+    ) -> list[SourceOfPoses]:
+        """
+        Return the sources with enough valid measurements in the map.
+
+        Parameters
+        ----------
+        values : mapping, all parameters of the node, which say what is valid
+
+        """
+        config, found = backend_config(values), []
+        for name in inputs.of(Kind.FIX, Kind.GLOBAL_POSE, Kind.IMU):
+            kept = [each for of, each in self.measurements if of == name
+                    and isinstance(each, Position | GlobalPose | HeadingOnly)]
+            source = None if len(kept) == 0 else _source_of_poses(
+                name, kept, config.measurement_source(name, type(kept[0])))
+            if source is not None:
+                found.append(source)
+        return found
+
+    def run(self, values: Mapping[str, Any], without: Collection[Key] = ()) -> Run | None:
+        """
+        Return the result of the engine without some measurements; None if it has no path.
+
+        Parameters
+        ----------
+        values : mapping, all parameters of the node
+        without : collection, sources and stamps [ns] of measurements
+
+        """
+        backend, _ = run_measurements((
+            (name, each) for name, each in self.measurements
+            if isinstance(each, OdometrySample) or (name, each.stamp_ns) not in without), values)
+        estimate = backend.estimate()
+        if estimate is None:
+            return None
+        factors = {
+            name: 1.0 if report.in_use is None else report.in_use.correlated + report.in_use.white
+            for name, report in backend.reports().items()}
+        doubted = frozenset(
+            (name, stamp) for (name, stamp, _), state
+            in states_by_stamps(backend.verdicts()).items() if state is State.DOUBTED)
+        return Run(estimate.path, backend.path_covariances(estimate), factors, doubted)
+
+    def errors(
+        self, run: Run, values: Mapping[str, Any], inputs: Inputs, held_out: Collection[Key],
+    ) -> list[Errors]:
+        """
+        Return the errors of a path at positions that were held out, for each source.
+
+        Parameters
+        ----------
+        values : mapping, all parameters, by which the covariances of positions are those of run
+        held_out : collection, sources and stamps [ns]
+
+        """
+        parts = []
+        for source in self.sources_of_poses(inputs, values):
+            chosen = np.array([(source.name, stamp) in held_out
+                               for stamp in source.measured.stamps_ns.tolist()], dtype=bool)
+            parts.append(errors_at(run.path, run.covariances, source.measured.rows(chosen),
+                                   run.factors.get(source.name, 1.0)))
+        return parts
+
+
+def _source_of_poses(
+    name: str, kept: Sequence[Position | GlobalPose | HeadingOnly], settings: MeasurementSource,
+) -> SourceOfPoses | None:
+    """Return the valid ones of some measurements; None if they are too few."""
+    policy = settings.covariance
+    valid, repaired, newest_ns = [], False, -10**18
+    for each in sorted(kept, key=lambda one: one.stamp_ns):
+        one = validate(each, policy)
+        if not isinstance(one, Validated) or (
+                each.stamp_ns - newest_ns < settings.minimum_period * 1e9):
+            continue
+        newest_ns = each.stamp_ns
+        repaired = repaired or len(one.repairs) > 0
+        assert isinstance(one.measurement, Position | GlobalPose | HeadingOnly)
+        valid.append(one.measurement)
+    if len(valid) < LEAST:
+        return None
+    columns = measured(valid)
+    variances = 0.5 * (columns.values[:, lk.XX - lk.X] + columns.values[:, lk.YY - lk.X])
+    variances = variances[variances > 0.0]
+    headings = columns.values[:, lk.HEADING_VAR - lk.X]
+    headings = headings[headings > 0.0]
+    bounds = policy.position_floor**2, policy.position_ceiling**2
+    inside = len(variances) == 0 or bool(
+        np.min(variances) > 1.01 * bounds[0] and np.max(variances) < 0.99 * bounds[1])
+    return SourceOfPoses(
+        name, columns, is_constant=_is_same(variances) and _is_same(headings),
+        is_scalable=inside and not repaired and len(policy.override) == 0,
+        sigma=_median_sigma(variances), sigma_heading=_median_sigma(headings))
+
+
+def _in_the_map(
+    measurements: list[tuple[str, OdometrySample | Measurement]],
+) -> list[tuple[str, OdometrySample | Measurement]]:
+    """Return measurements with fixes placed; the first one that odometry covers goes first."""
+    start = min((each.stamp_ns for _, each in measurements
+                 if isinstance(each, OdometrySample)), default=0)
+    order = sorted(range(len(measurements)), key=lambda k: measurements[k][1].stamp_ns < start)
+    for k in order:
+        name, each = measurements[k]
+        if isinstance(each, Fix):
+            measurements[k] = name, each.placed()
+    return measurements
+
+
+def _is_same(variances: FloatArray) -> bool:
+    return len(variances) == 0 or bool(np.max(variances) < SAME * np.min(variances))
+
+
+def _median_sigma(variances: FloatArray) -> float:
+    return float(np.sqrt(np.median(variances))) if len(variances) > 0 else 0.0
