@@ -29,12 +29,14 @@ from pose_graph_ros.cli.simulation_options import (
 from pose_graph_ros.core.exceptions import ConfigError, FileWriteError
 from pose_graph_ros.core.io.atomic_files import write_files
 from pose_graph_ros.core.io.tum import tum_text
-from pose_graph_ros.core.simulation.graph import graph_of
+from pose_graph_ros.core.simulation.graph import graph_of, SimulatedGraph
 from pose_graph_ros.core.simulation.recording import course, record, Recording
 from pose_graph_ros.core.simulation.settings import Gyro, Setup
 from pose_graph_ros.core.simulation.worlds import WORLDS
 
 GRAPH_SUFFIX = '.g2o'
+LONGEST_S = 100_000.0  # of a simulation, which takes 100 MB an hour
+PICTURES = ('.png', '.pdf', '.svg')
 EXAMPLES = """\
 examples:
   pose-graph simulate city                                        # as in `pose-graph demo`
@@ -56,7 +58,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
                         help='folder of the rosbag2, or a graph if the name ends in .g2o')
     parser.add_argument('--world', choices=WORLDS, default='drive',
                         help='(default: %(default)s)')
-    parser.add_argument('--duration', metavar='S', type=number(10.0),
+    parser.add_argument('--duration', metavar='S', type=number(10.0, LONGEST_S),
                         help='length [s] (default: ' + ', '.join(
                             f'{each.duration_s:g} for {name}' for name, each in WORLDS.items())
                         + ')')
@@ -69,6 +71,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
                          f'{each.node_distance:g} for {name}' for name, each in WORLDS.items())
                      + ')')
     out.add_argument('--tum', action='store_true', help='also write the truth as OUT_truth.tum')
+    out.add_argument('--plot', metavar='FILE', type=Path,
+                     help=f'draw a map; the name ends in {", ".join(PICTURES)}')
     out.add_argument('--json', action='store_true',
                      help='print what was simulated, the content of OUT_truth.json, as JSON '
                           '(docs/tools.md)')
@@ -77,6 +81,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def execute(options: argparse.Namespace) -> int:
     """Run the tool; return the exit code."""
     world = WORLDS[options.world]
+    if options.plot is not None and options.plot.suffix not in PICTURES:
+        raise ConfigError(f'--plot {options.plot}: the name must end in {", ".join(PICTURES)}')
     beside = {kind: options.out.with_name(f'{options.out.stem}_truth.{kind}'
                                           if options.out.suffix == GRAPH_SUFFIX else
                                           f'{options.out.name}_truth.{kind}')
@@ -96,21 +102,23 @@ def execute(options: argparse.Namespace) -> int:
     about = {'world': options.world, 'seed': options.seed,
              'duration_s': float(way.motion.time[-1])}
     files = dict[Path, bytes]()
+    simulated: SimulatedGraph | Recording
     if is_graph:
         simulated = graph_of(way, options.node_distance or world.node_distance)
         about |= about_graph(way, simulated)
-        truth = simulated.truth
         files = {path: text.encode() for path, text in zip(
             (options.out, beside['g2o']), graph_texts(simulated), strict=True)}
     else:
-        recording = record(way)
-        about |= write_recording(recording, options.out)
-        truth = recording.truth
+        simulated = record(way)
+        about |= write_recording(simulated, options.out)
     text = json.dumps(about, indent=2)
     files[beside['json']] = f'{text}\n'.encode()
     if options.tum:
-        files[beside['tum']] = tum_text(truth).encode()
+        files[beside['tum']] = tum_text(simulated.truth).encode()
     write_files(files)
+    if options.plot is not None:
+        _draw(simulated, options.plot, next(_lines(about)))
+        written.append(options.plot)
     if options.json:
         print(text)
         return 0
@@ -118,6 +126,15 @@ def execute(options: argparse.Namespace) -> int:
         print(line)
     print('written: ' + ', '.join(map(str, written)))
     return 0
+
+
+def _draw(simulated: SimulatedGraph | Recording, file: Path, title: str) -> None:
+    # matplotlib takes half a second to load
+    from pose_graph_ros.cli import simulation_picture as picture  # noqa: PLC0415
+
+    scene = (picture.scene_of_graph(simulated) if isinstance(simulated, SimulatedGraph)
+             else picture.scene_of_recording(simulated))
+    picture.draw(scene, file, title)
 
 
 def _lines(about: Mapping[str, Any]) -> Iterator[str]:

@@ -117,14 +117,14 @@ def about_graph(way: Course, simulated: SimulatedGraph) -> dict[str, Any]:
     """Return what there is to say of a graph."""
     true = simulated.graph(simulated.truth.poses)
     n, closures = len(simulated.truth), len(simulated.group)
-    ends = simulated.edges.rows(simulated.edges.kind != simulated.edges.kind[0])
+    loops = simulated.loops
     return {
         'distance_m': float(way.motion.distance[-1]), 'nodes': n,
         'edges': n - 1 + closures, 'observed_nodes': len(simulated.observed),
         'measured_numbers': _measured_numbers(simulated),
         'chi2_of_the_truth': true.energies().chi2,
         **_closures(simulated.group, simulated.missing_groups, 'ids', np.column_stack(
-            (ends.i, ends.j))),
+            (loops.i, loops.j))),
         'wrong_observed_nodes': simulated.observed.node[simulated.wrong].tolist(),
         **_disturbances(way.setup, int(way.truth.stamps_ns[0]))}
 

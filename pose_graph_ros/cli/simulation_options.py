@@ -74,7 +74,7 @@ def add_sensors(parser: argparse.ArgumentParser) -> None:
     poses.add_argument('--global-pose-sigma', metavar='M,RAD', type=_numbers(2),
                        help='white errors; implies --global-pose 1 (default: 0.1,0.02)')
     loops = parser.add_argument_group('loop closures on /loop_closure')
-    loops.add_argument('--closures', metavar='RATE', type=number(0.0),
+    loops.add_argument('--closures', metavar='RATE', type=number(0.0, 1.0),
                        help='share of the stretches driven before in which a closure is found, '
                             '0 to 1; stretches are of 25 m (drive), 5 m (hall), 1 m (grid) '
                             '(default: 1; grid: 0.5)')
@@ -195,25 +195,28 @@ def _present(values: dict[str, Any]) -> dict[str, Any]:
     return {name: value for name, value in values.items() if value is not None}
 
 
-def number(least: float = -math.inf, *, whole: bool = False) -> Callable[[str], Any]:
+def number(
+    least: float = -math.inf, most: float = math.inf, *, whole: bool = False,
+) -> Callable[[str], Any]:
     """
     Return what reads a finite number, and raises ArgumentTypeError if it cannot.
 
     Parameters
     ----------
-    least : float, smallest number that is accepted
+    least, most : float, smallest and largest number that is accepted
     whole : bool, whether it must be an integer
 
     """
     kind = 'a whole number' if whole else 'a number'
     expected = kind if least == -math.inf else f'{kind} of at least {least:g}'
+    expected += '' if most == math.inf else f' and at most {most:g}'
 
     def read(text: str) -> Any:
         try:
             value = int(text) if whole else float(text)
         except ValueError:
             value = math.nan
-        if not (math.isfinite(value) and value >= least):
+        if not (math.isfinite(value) and least <= value <= most):
             raise argparse.ArgumentTypeError(f'expected {expected}, got {text!r}')
         return value
     return read

@@ -150,9 +150,25 @@ def test_a_graph_and_its_truth_have_the_same_ids_and_constraints(tmp_path: Path)
     pairs = set(zip(truth.graph.edges.i.tolist(), truth.graph.edges.j.tolist(), strict=True))
     false = [tuple(each['ids']) for each in said['false_closures']]
     assert set(false) <= pairs
+    assert len(set(false)) == len(false)
     assert len(false) >= 10
     tum = read_trajectory(tmp_path / 'graph_truth.tum')
     np.testing.assert_allclose(tum.poses, truth.graph.poses, atol=1e-12)
+
+
+@pytest.mark.parametrize('out', ['bag', 'graph.g2o'])
+def test_a_map_is_drawn(out: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    words = ('--world', 'grid', '--duration', '300', '--fix', '--jump', '/gps/fix:50:9,9',
+             '--closures', '1', '--false-rate', '0.5')
+    simulate(tmp_path / out, *words, '--plot', tmp_path / 'map.svg')
+    text = (tmp_path / 'map.svg').read_text(encoding='utf-8')
+    for name in ('odometry', 'truth', 'true closures', 'false closures', 'moved by a jump',
+                 'grid, seed 1'):
+        assert name in text
+    capsys.readouterr()
+    assert main(['simulate', str(tmp_path / 'other'), '--plot', 'map.txt']) == 2
+    assert capsys.readouterr().err == (
+        'error: --plot map.txt: the name must end in .png, .pdf, .svg\n')
 
 
 def test_json_is_the_file_beside_it(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -178,6 +194,7 @@ def test_the_outage_and_the_jump_of_the_drive_can_be_taken_away(tmp_path: Path) 
     (['--jump', '/odom:5:1'], "expected TOPIC:AT:DX,DY[,RAD][:FOR], got '/odom:5:1'"),
     (['--delay', '/odom:nan'], 'expected a number that is not negative, got nan'),
     (['--duration', '5'], 'argument --duration: expected a number of at least 10'),
+    (['--closures', '2'], "expected a number of at least 0 and at most 1, got '2'"),
     (['--seed', '-1'], "argument --seed: expected a whole number of at least 0, got '-1'"),
     (['--false-groups', '2:1'], "expected groups of at least 2, got '2:1'"),
     (['--fix-correlated', '1'], "expected 2 numbers with commas between them, got '1'"),
@@ -197,7 +214,6 @@ def test_words_that_cannot_be_read_are_named(
 @pytest.mark.parametrize(('out', 'words', 'expected'), [
     ('bag', ['--world', 'hall', '--outage', '/gps/fix:1:2'],
      'error: --outage /gps/fix: nothing is simulated there, expected one of /odom, /loop_closure'),
-    ('bag', ['--closures', '2'], 'error: rate of closures: expected 0 to 1, got 2.0'),
     ('bag', ['--no-fix', '--fix-sigma', '1'], 'error: --no-fix: expected no other option'),
     ('bag', ['--node-distance', '1'], 'error: --node-distance: only a graph has nodes'),
     ('bag', ['--false-rate', '0.1', '--false-groups', '9:9'], 'error: 9 groups of 9 false'),

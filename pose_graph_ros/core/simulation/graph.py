@@ -48,6 +48,11 @@ class SimulatedGraph:
     missing_groups: int
     """Of false closures, for which there were no places."""
 
+    @property
+    def loops(self) -> Edges:
+        """Loop closures."""
+        return self.edges.rows(self.edges.kind == EdgeKind.LOOP_CLOSURE)
+
     def graph(self, poses: FloatArray) -> Graph:
         """Return the graph with some poses, shape (N, 3); its first node is fixed if need be."""
         graph = Graph()
@@ -126,8 +131,9 @@ def _closures(way: Course, path: Path, node_distance: float) -> tuple[Edges, Int
     if settings is None:
         return Edges(), np.empty(0, dtype=np.int64), 0
     settings = replace(settings, first_s=0.0)
-    if settings.false.spacing < node_distance:
-        settings = replace(settings, false=replace(settings.false, spacing=node_distance))
+    # so that no two closures of a group have the same ends
+    spacing = max(settings.false.spacing, 1.5 * node_distance)
+    settings = replace(settings, false=replace(settings.false, spacing=spacing))
     old, new = revisits(streams['closures'], path, np.arange(len(path.poses)), settings)
     found = streams['rate'].random(len(old)) < settings.rate
     old, new = old[found], new[found]
