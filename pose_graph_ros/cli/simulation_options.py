@@ -91,8 +91,8 @@ def add_sensors(parser: argparse.ArgumentParser) -> None:
 
 def _add_disturbances(parser: argparse.ArgumentParser) -> None:
     group = parser.add_argument_group(
-        'disturbances', 'each may be repeated; times are seconds since the start. The drive '
-        'has an outage and a jump of /gps/fix, which yours replace; "/gps/fix:none" removes them.')
+        'disturbances', 'each may be repeated; times are seconds since the start. The drive has '
+        'an outage and a jump\nof /gps/fix, which yours replace; "/gps/fix:none" removes them')
     for name, grammar, kind, text in (
             ('--outage', 'TOPIC:FROM:TO', _outage, 'nothing is measured in between'),
             ('--jump', 'TOPIC:AT:DX,DY[,RAD][:FOR]', _jump,
