@@ -32,6 +32,8 @@ from pose_graph_ros.adapters.sources import source_list
 from pose_graph_ros.adapters.verdict_messages import states_in
 from pose_graph_ros.cli import options as shared
 from pose_graph_ros.cli.results import collect_drive, write_results
+from pose_graph_ros.cli.run.document import document, write_document
+from pose_graph_ros.cli.run.from_node import GRAPH, node_run, RECORDED
 from pose_graph_ros.cli.simulate import simulate_drive, write_drive
 from pose_graph_ros.core.exceptions import PoseGraphError
 from pose_graph_ros.core.geometry.trajectory import Trajectory
@@ -83,20 +85,25 @@ def execute(options: argparse.Namespace) -> int:
     signal.signal(signal.SIGTERM, signal.default_int_handler)  # also stop the processes on SIGTERM
     converged = _run(bag_path, inputs, values, options)
     seconds = time.monotonic() - start
-    path = _last(options.out / 'corrected', '/path')
+    path = _last(options.out / RECORDED, '/path')
     poses = {stamp_ns(item): planar_pose(item.pose) for item in path.poses}
     corrected = Trajectory(np.array(list(poses), dtype=np.int64),
                            np.array([pose for pose in poses.values() if pose is not None]))
-    diagnostics = _last(options.out / 'corrected', '/diagnostics').status[0]
-    verdicts = _last(options.out / 'corrected', VERDICTS)
+    diagnostics = _last(options.out / RECORDED, '/diagnostics').status[0]
+    verdicts = _last(options.out / RECORDED, VERDICTS)
     with open_bag(bag_path) as bag:
         drive = collect_drive(bag, inputs, values, corrected, truth,
                               states={} if verdicts is None else states_in(verdicts))
     table = write_results(drive, options.out, title, {
         'bag': bag_path.name, 'topics': dict(inputs.topics), 'rate': options.rate,
         'seconds': seconds, 'node': {item.key: item.value for item in diagnostics.values}})
+    run = node_run(title, drive, options.out, (inputs, values), converged=converged,
+                   seconds=seconds)
+    write_document(document(run), options.out)
     print(f'\n{table}\n')
-    print(f'written to {options.out}/: path.tum, corrected/ (rosbag2), drive.png, summary.json')
+    print(f'written to {options.out}/: path.tum, corrected/ (rosbag2), drive.png, summary.json, '
+          f'{GRAPH}, run.json')
+    print(f'a page of it: pose-graph report {options.out}')
     return 0 if converged else 1
 
 
@@ -123,8 +130,8 @@ def _run(
     if find_spec('tf2_msgs') is None:  # make demo does not build it for the simulated drive
         node_command += ['-p', 'publish_tf:=false']
     player = [sys.executable, '-m', 'pose_graph_ros.ros.player', str(bag.resolve()),
-              str((options.out / 'corrected').resolve()), '--rate', str(options.rate),
-              '--hold-out', str(inputs.hold_out)]
+              str((options.out / RECORDED).resolve()), '--rate', str(options.rate),
+              '--hold-out', str(inputs.hold_out), '--graph', str((options.out / GRAPH).resolve())]
     for name, topic in inputs.topics.items():
         player += ['--input', name, inputs.kinds[name].value, values[f'{name}.topic'], topic]
     with tempfile.TemporaryDirectory(prefix='pose_graph_') as log, \

@@ -38,7 +38,7 @@ from pose_graph_ros.core.measurements import (
 from pose_graph_ros.core.odometry.hidden_nodes import HiddenNodes
 from pose_graph_ros.core.refiner import Refiner
 from pose_graph_ros.core.relocation import relocate
-from pose_graph_ros.core.residuals.source_residuals import collect, SourceResiduals
+from pose_graph_ros.core.residuals import components
 from pose_graph_ros.core.smoother.incremental import IncrementalSmoother
 from pose_graph_ros.core.smoother.results import Refinement
 from pose_graph_ros.core.sources import constraint_names
@@ -157,9 +157,9 @@ class PoseGraphBackend:
         """Return a copy of the graph for display; None before the first odometry."""
         return graph_view.view(self.graph, self._judge.drawn_rows())
 
-    def residuals(self) -> dict[str, SourceResiduals]:
-        """Return the residuals of each source, with their expectation; linear in the graph."""
-        return collect(self._smoother, self._nodes, self._factors)
+    def residuals(self) -> components.Analysis:
+        """Return the residuals of each source with what they show; linear in the graph."""
+        return components.analyse(self._smoother, self._nodes, self._factors, self._reweighting)
 
     def largest_energies(self, n: int) -> list[constraint_names.ConstraintEnergy]:
         """Return the n constraints with the largest energies, with names, in descending order."""

@@ -17,9 +17,11 @@ import time
 from diagnostic_msgs.msg import DiagnosticArray
 from geometry_msgs.msg import PoseWithCovarianceStamped
 from nav_msgs.msg import Odometry, Path as PathMessage
+from rcl_interfaces.srv import SetParameters
 import rclpy
 from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
 from rclpy.node import Node
+from rclpy.parameter import Parameter
 from rclpy.qos import QoSDurabilityPolicy, QoSProfile
 from rclpy.serialization import deserialize_message
 from std_srvs.srv import Trigger
@@ -49,6 +51,7 @@ APPEAR_TIMEOUT, PREPARE_TIMEOUT, STALL_TIMEOUT, ANSWER_TIMEOUT = 30.0, 600.0, 20
 NOT_CONVERGED = 3  # exit code if all was played and recorded, without convergence at the end
 # Time without a path after which the last one has come; longer than the node's `path_period` [s].
 PATH_SILENCE = 1.0
+MOST_DIAGNOSTICS = 2000  # largest number of diagnostics that are recorded
 
 
 class PlayError(Exception):
@@ -80,7 +83,10 @@ class Player(Node):
         self.path = b''  # the newest path
         self._path_at = -float('inf')
         self.diagnostics: dict[str, str] = {}  # the newest values of the node's diagnostics
-        self._diagnostics_raw = self._verdicts = b''
+        self._diagnostics: list[tuple[int, bytes]] = []   # with their times of arrival [ns]
+        self._newest_diagnostics = 0, b''
+        self._n_diagnostics, self._stride = 0, 1
+        self._verdicts = b''
         self._record('pose', PoseWithCovarianceStamped, Kind.GLOBAL_POSE.message_type)
         self._record('odometry/filtered', Odometry, Kind.ODOMETRY.message_type)
         if TFMessage is not None:
@@ -109,7 +115,17 @@ class Player(Node):
         for status in deserialize_message(raw, DiagnosticArray).status:
             if status.name.partition(':')[0].rpartition('/')[2] == NODE_NAME:
                 self.diagnostics = {value.key: value.value for value in status.values}
-                self._diagnostics_raw = raw
+                self._keep_diagnostics(raw)
+
+    def _keep_diagnostics(self, raw: bytes) -> None:
+        """Keep the newest message, and of the others every second one, or fewer of very many."""
+        self._newest_diagnostics = time.time_ns(), raw
+        if self._n_diagnostics % self._stride == 0:
+            self._diagnostics.append(self._newest_diagnostics)
+        self._n_diagnostics += 1
+        if len(self._diagnostics) > MOST_DIAGNOSTICS:
+            del self._diagnostics[1::2]
+            self._stride *= 2
 
     @property
     def processed(self) -> int:
@@ -209,18 +225,34 @@ class Player(Node):
             ANSWER_TIMEOUT, 'no path came after the optimisation')
         return bool(response.success), str(response.message)
 
+    def save_graph(self, path: Path) -> None:
+        """Have the node save its graph to a file, whatever its parameter graph_file is."""
+        parameters = self.create_client(SetParameters, f'{NODE_NAME}/set_parameters')
+        save = self.create_client(Trigger, f'{NODE_NAME}/save_graph')
+        self._spin_until(lambda: parameters.service_is_ready() and save.service_is_ready(),
+                         APPEAR_TIMEOUT, 'the node does not offer to save its graph')
+        asked = parameters.call_async(SetParameters.Request(parameters=[
+            Parameter('graph_file', value=str(path)).to_parameter_msg()]))
+        self._spin_until(asked.done, ANSWER_TIMEOUT, 'no answer to setting graph_file')
+        answer = save.call_async(Trigger.Request())
+        self._spin_until(answer.done, ANSWER_TIMEOUT, 'no answer from ~/save_graph')
+        if not answer.result().success:
+            raise PlayError(f'~/save_graph: {answer.result().message}')
+
     def write(self, folder: Path) -> None:
-        """Write a rosbag2 of all; of path, verdicts and diagnostics the last message."""
+        """Write a rosbag2 of all; of path and verdicts the last message."""
         path_topic, verdicts_topic = map(self.resolve_topic_name, ('path', VERDICTS))
         with BagWriter(folder, overwrite=True, latched=[path_topic, verdicts_topic]) as writer:
             for topic, type_name, arrived_ns, raw in self.recorded:
                 writer.write(topic, type_name, arrived_ns, raw)
             writer.write(path_topic, 'nav_msgs/msg/Path', time.time_ns(), self.path)
-            for topic, raw in ((verdicts_topic, self._verdicts),
-                               ('/diagnostics', self._diagnostics_raw)):
-                if raw != b'':
+            verdicts = [] if self._verdicts == b'' else [(time.time_ns(), self._verdicts)]
+            diagnostics = self._diagnostics + [self._newest_diagnostics] * (
+                self._n_diagnostics > 0 and self._diagnostics[-1] != self._newest_diagnostics)
+            for topic, messages in ((verdicts_topic, verdicts), ('/diagnostics', diagnostics)):
+                for arrived_ns, raw in messages:
                     writer.write(
-                        topic, 'diagnostic_msgs/msg/DiagnosticArray', time.time_ns(), raw)
+                        topic, 'diagnostic_msgs/msg/DiagnosticArray', arrived_ns, raw)
 
 
 def _progress(done: int, total: int) -> None:
@@ -239,6 +271,7 @@ def main(args: list[str] | None = None) -> int:
                         metavar=('SOURCE', 'TYPE', 'NODE_TOPIC', 'BAG_TOPIC'))
     parser.add_argument('--hold-out', type=int, default=0)
     parser.add_argument('--rate', type=float, default=20.0)
+    parser.add_argument('--graph', type=Path, help='file that the node saves its graph to')
     options = parser.parse_args(args)
     inputs = Inputs({source: topic for source, _, _, topic in options.input},
                     {source: Kind(kind) for source, kind, _, _ in options.input},
@@ -248,6 +281,8 @@ def main(args: list[str] | None = None) -> int:
         player = Player(inputs, {source: topic for source, _, topic, _ in options.input})
         published = player.play(options.bag, options.rate)
         success, answer = player.request_final_optimization()
+        if options.graph is not None:
+            player.save_graph(options.graph)
         player.write(options.out)
         print('published: ' + ', '.join(f'{key} {count}' for key, count in published.items()))
         n_poses = len(deserialize_message(player.path, PathMessage).poses)

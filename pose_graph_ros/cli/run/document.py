@@ -32,9 +32,9 @@ def document(run: Run) -> dict[str, Any]:
     frame = places.Frame(run.start_ns, np.round(path.poses[0, :2], 3) + 0.0)
     covariances = run.backend.path_covariances(run.estimate)
     run.errors = places.errors(drive, covariances, frame)
-    residuals = run.backend.residuals()
+    analysis = run.backend.residuals()
     in_use = {source: each.in_use for source, each in run.backend.reports().items()}
-    analyses = analyse(residuals, run.kinds, in_use)
+    analyses = analyse(analysis, run.kinds, in_use)
     lines, at_ns = places.lines(drive, frame)
     return {
         'version': VERSION, 'title': run.title, 'subtitle': run.subtitle,
@@ -50,7 +50,7 @@ def document(run: Run) -> dict[str, Any]:
         'closures': places.closures(drive, run.verdicts, run.refused, frame),
         'states': list(places.STATES), 'errors': run.errors, 'error_table': _error_table(run),
         'sources': [source_entry(each, frame) for each in analyses.values()],
-        'springs': springs(run.backend, path, residuals, run.verdicts, frame),
+        'springs': springs(run.backend, path, analysis.residuals, run.verdicts, frame),
         'updates': _updates(run, frame), 'sparsity': _sparsity(run.backend.graph),
         'texts': frame.texts}
 
@@ -144,7 +144,8 @@ def _updates(run: Run, frame: places.Frame) -> dict[str, Any] | None:
     stamps, nodes, milliseconds, chi2, iterations = zip(*updates, strict=True)
     return {'t': frame.seconds(np.array(stamps)), 'nodes': list(nodes),
             'ms': rounded(milliseconds, 2), 'chi2': [number(each, 6) for each in chi2],
-            'iterations': list(iterations), 'count': run.recorder.log.count,
+            'iterations': None if min(iterations) < 0 else list(iterations),
+            'count': run.recorder.log.count,
             'period': number(1e3 / float(run.values['frequency']))}
 
 

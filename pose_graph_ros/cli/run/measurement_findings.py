@@ -16,8 +16,8 @@ Texts = tuple[str, str, str]
 
 # Number of stretches, groups and gaps that are told one by one.
 MOST_TOLD = 3
-# Doubted fixes belong to one stretch if this time or less is between them [s].
-STRETCH_S = 10.0
+# Doubted fixes belong to one stretch if at most so many others are between them.
+MOST_BETWEEN = 2
 # Loop closures belong to one group if both their ends are this near in time [s].
 GROUP_S = 20.0
 # Stretches and groups of at least so many measurements are more than bad luck.
@@ -48,20 +48,16 @@ def _seconds(run: Run, stamp_ns: int) -> float:
     return (stamp_ns - run.start_ns) * 1e-9
 
 
-def _split(times: Sequence[float], apart: float) -> list[list[int]]:
-    """Return the indices of increasing times in parts that are farther apart [s]."""
-    ends = np.flatnonzero(np.diff(times) > apart) + 1
-    return [part.tolist() for part in np.split(np.arange(len(times)), ends)]
-
-
 def _stretches(run: Run, source: str, verdicts: Sequence[Verdict]) -> Iterator[Texts]:
     """Yield the stretches of fixes that are doubted."""
-    every = [each for each in verdicts if each.kind is Judged.FIX]
-    doubted = sorted((each for each in every if each.state is State.DOUBTED),
-                     key=lambda each: each.stamp_ns)
+    every = sorted((each for each in verdicts if each.kind is Judged.FIX),
+                   key=lambda each: each.stamp_ns)
+    places = np.flatnonzero([each.state is State.DOUBTED for each in every])
+    doubted = [every[place] for place in places.tolist()]
     if len(doubted) == 0:
         return
-    parts = _split([_seconds(run, each.stamp_ns) for each in doubted], STRETCH_S)
+    ends = np.flatnonzero(np.diff(places) > 1 + MOST_BETWEEN) + 1
+    parts = [part.tolist() for part in np.split(np.arange(len(places)), ends)]
     parts.sort(key=len, reverse=True)
     long = [part for part in parts if len(part) >= MANY]
     for part in long[:MOST_TOLD]:

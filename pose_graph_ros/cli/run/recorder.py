@@ -28,6 +28,7 @@ class Update(NamedTuple):
     milliseconds: float
     chi2: float
     iterations: int
+    """-1 if unknown."""
 
 
 class UpdateLog:

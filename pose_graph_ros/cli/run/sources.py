@@ -11,7 +11,8 @@ import numpy as np
 from pose_graph_ros.adapters.sources import Kind
 from pose_graph_ros.cli.run.lines import number, rounded
 from pose_graph_ros.cli.run.places import Frame
-from pose_graph_ros.core.residuals.scale import fit, RowFit, ScaleFit
+from pose_graph_ros.core.residuals.components import Analysis
+from pose_graph_ros.core.residuals.scale import RowFit, ScaleFit
 from pose_graph_ros.core.residuals.source_residuals import SourceResiduals, spread
 from pose_graph_ros.core.residuals.whiteness import Whiteness, whiteness
 from pose_graph_ros.core.sources.gauss_markov import CorrelatedErrors
@@ -30,10 +31,16 @@ class SourceAnalysis(NamedTuple):
 
     residuals: SourceResiduals
     kind: Kind
+    at_estimate: ScaleFit
     fit: ScaleFit
+    """The same where all sources are weighed by what their residuals show."""
     whiteness: Whiteness | None
     in_use: CorrelatedErrors | None
     """Statistics of its errors that the graph is built with; None for white errors."""
+    correlated: bool
+    """Whether its errors are correlated, and the graph takes them for independent."""
+    suspects: tuple[str, ...]
+    """Other sources of which this is so, so that their errors may show in its residuals."""
 
     @property
     def row_names(self) -> tuple[str, str, str]:
@@ -44,11 +51,12 @@ class SourceAnalysis(NamedTuple):
     def is_wrong(self) -> bool:
         """Whether the claimed covariances are much too small or too large, beyond chance."""
         ratio, low, high = self.fit.ratio, self.fit.low, self.fit.high
-        return (ratio > max(WRONG, high) or ratio < min(1.0 / WRONG, low))
+        return bool(ratio > max(WRONG, high) or (
+            ratio < min(1.0 / WRONG, low) and not self.correlated and len(self.suspects) == 0))
 
 
 def analyse(
-    residuals: Mapping[str, SourceResiduals], kinds: Mapping[str, Kind],
+    analysis: Analysis, kinds: Mapping[str, Kind],
     in_use: Mapping[str, CorrelatedErrors | None],
 ) -> dict[str, SourceAnalysis]:
     """
@@ -56,7 +64,6 @@ def analyse(
 
     Parameters
     ----------
-    residuals : mapping
     kinds : mapping, kinds of the sources by the parameters
     in_use : mapping, statistics of the errors of sources in the map
 
@@ -64,32 +71,36 @@ def analyse(
     guesses = {'odometry': Kind.ODOMETRY, 'loop_closure': Kind.LOOP_CLOSURE, 'turn': Kind.GYRO,
                'map': Kind.GLOBAL_POSE}
     return {source: SourceAnalysis(
-        each, kinds.get(source, guesses[each.kind]), fit(each), whiteness(each),
-        in_use.get(source)) for source, each in residuals.items()}
+        each, kinds.get(source, guesses[each.kind]), analysis.at_estimate[source],
+        analysis.together[source], whiteness(each), in_use.get(source),
+        source in analysis.correlated, tuple(sorted(analysis.correlated - {source})))
+        for source, each in analysis.residuals.items()}
 
 
 def source_entry(analysis: SourceAnalysis, frame: Frame) -> dict[str, Any]:
     """Return the entry of a source in run.json."""
-    residuals, found = analysis.residuals, analysis.fit
+    residuals, found, present = analysis.residuals, analysis.fit, analysis.at_estimate
     used = residuals.rows(residuals.used)
     unused = residuals.rows(~residuals.used)
     far = unused.distances[np.isfinite(unused.distances)]
-    expected = {row.coordinate: row.expected for row in found.rows}
+    expected = {row.coordinate: row.expected for row in present.rows}
     normalised = np.full((len(used.ids), 3), np.nan)
     for row, size in expected.items():
         here = used.measured[:, row] & (size > 0.0)
         normalised[here, row] = used.errors[here, row] / (used.sigmas[here, row] * size)
-    rows = [row.coordinate for row in found.rows]
+    rows = [row.coordinate for row in present.rows]
     some = spread(len(used.ids), MOST_SERIES)
     values = normalised[np.isfinite(normalised)]
     return {
         'name': residuals.source, 'kind': analysis.kind.value,
         'count': len(residuals.ids), 'used': len(used.ids),
-        'rows': [_row(row, analysis.row_names) for row in found.rows],
-        'energy': {'expected': number(found.energy_expected), 'found': number(found.energy_found),
-                   'quantile95_share': number(found.within)},
+        'rows': [_row(*pair, analysis.row_names) for pair in zip(
+            present.rows, found.rows, strict=True)],
+        'energy': {'expected': number(present.energy_expected),
+                   'found': number(present.energy_found),
+                   'quantile95_share': number(present.within)},
         'ratio': number(found.ratio), 'low': number(found.low), 'high': number(found.high),
-        'redundancy': number(found.redundancy), 'independent': number(found.independent),
+        'redundancy': number(present.redundancy), 'independent': number(found.independent),
         'verdict': verdict(analysis),
         'unused': {'count': len(unused.ids),
                    'median_distance': number(float(np.median(far))) if len(far) > 0 else None},
@@ -102,11 +113,13 @@ def source_entry(analysis: SourceAnalysis, frame: Frame) -> dict[str, Any]:
         'scale': number(float(np.median(used.scale))) if len(used.ids) > 0 else 1.0}
 
 
-def _row(row: RowFit, names: tuple[str, str, str]) -> dict[str, Any]:
+def _row(row: RowFit, together: RowFit, names: tuple[str, str, str]) -> dict[str, Any]:
+    """Return what one coordinate shows at the estimate, and together with the other sources."""
     return {'name': names[row.coordinate], 'unit': 'rad' if row.coordinate == 2 else 'm',
             'count': row.n, 'sigma': number(row.sigma),
             'expected': number(row.expected), 'found': number(row.found),
-            'ratio': number(row.ratio), 'low': number(row.low), 'high': number(row.high)}
+            'ratio': number(together.ratio), 'low': number(together.low),
+            'high': number(together.high)}
 
 
 def _autocorrelation(analysis: SourceAnalysis) -> dict[str, Any] | None:
@@ -131,6 +144,9 @@ def verdict(analysis: SourceAnalysis) -> str:
                 f'its covariances cannot be checked: {found.n_used} measurements are as few as '
                 f'{found.independent:.2g} independent ones')
     sizes = claim(analysis)
+    if not analysis.is_wrong and analysis.correlated:
+        return (f'its errors go on from one measurement to the next but are treated as '
+                f'independent, so that the path follows them; {sizes} or more')
     if not analysis.is_wrong:
         return f'agrees with its covariances: {sizes}, {found.ratio:.2g} times'
     variance = found.ratio**2

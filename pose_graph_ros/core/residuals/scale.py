@@ -9,12 +9,16 @@ the sum of redundancies is the factor on the variances (K.-R. Koch, "Parameter e
 hypothesis testing in linear models", 1999, section 3.6: the estimate of a variance component).
 A square counts up to where 99.9 % of them are, so that one wrong measurement does not decide.
 
-Its uncertainty is that of a mean of n independent squares, where n is not the number of residuals:
+Its uncertainty is that of a mean of n independent squares. Let S' be the covariance of all N
+normalised residuals of a coordinate, of which a share r is left by the fit. Then n is the smallest
+of three numbers:
 
-- neighbours are correlated. The mean of N squares varies as that of `N / (1 + 2 sum rho_k^2)`
-  independent ones (M. S. Bartlett, "On the theoretical specification and sampling properties of
-  autocorrelated time-series", 1946), rho_k the autocorrelation of the residuals themselves;
-- the fit takes a part of them, so n is not above the sum of redundancies either.
+- `N / c`, with `c = 1 + 2 sum rho_k^2` and rho_k the autocorrelation of the residuals: the mean
+  of N squares varies as that of so many independent ones (M. S. Bartlett, "On the theoretical
+  specification and sampling properties of autocorrelated time-series", 1946);
+- `N r`, the trace of S', as the residuals are not in more dimensions than these;
+- `N r^2 c`, the trace of S'^2: half the Fisher information on the logarithm of the factor, as the
+  fit follows a source the more, the better it is taken to be.
 
 Where next to nothing is left, as of odometry that alone determines the poses, n is small, and
 nothing is said.
@@ -172,13 +176,13 @@ def _quantiles(freedom: FloatArray | BoolArray, probability: float) -> FloatArra
 def _independent(residuals: SourceResiduals, row: int) -> float:
     """Return the effective number of independent squares of one coordinate."""
     measured = residuals.measured[:, row]
-    if not np.any(measured):
+    known = residuals.rows(measured & np.all(np.isfinite(residuals.taken), axis=(1, 2)))
+    if len(known.ids) == 0:
         return 0.0
     values = residuals.errors[measured, row] / residuals.sigmas[measured, row]
-    n = len(values)
-    known = residuals.rows(measured & np.all(np.isfinite(residuals.taken), axis=(1, 2)))
-    left = n * float(np.mean(_left(known)[:, row])) if len(known.ids) > 0 else 0.0
-    return min(n / (1.0 + 2.0 * squared_correlations(values)), left)
+    n, left = len(values), float(np.mean(_left(known)[:, row]))
+    correlated = 1.0 + 2.0 * squared_correlations(values)
+    return min(n / correlated, n * left, n * left**2 * correlated)
 
 
 def squared_correlations(values: FloatArray) -> float:

@@ -25,8 +25,9 @@ import numpy as np
 
 from pose_graph_ros.core.geometry import se2
 from pose_graph_ros.core.geometry.se2 import BoolArray, FloatArray, IntArray
-from pose_graph_ros.core.graph.constraints import EdgeKind, Edges, ObservedNodes
+from pose_graph_ros.core.graph.constraints import EdgeKind
 from pose_graph_ros.core.graph.graph import Graph
+from pose_graph_ros.core.graph.reweighting import Reweighting
 from pose_graph_ros.core.odometry.hidden_nodes import HiddenNodes
 from pose_graph_ros.core.smoother.incremental import IncrementalSmoother
 from pose_graph_ros.core.sources.factor_builder import FactorBuilder
@@ -94,8 +95,25 @@ class SourceResiduals(NamedTuple):
         return np.asarray(np.sqrt(np.einsum('mi,mij,mj->m', self.errors, joint, self.errors)))
 
 
+class Scales(NamedTuple):
+    """Factors on the claimed sigmas that a graph uses, without those of a robust loss, by row."""
+
+    edges: FloatArray
+    observed: FloatArray
+
+
+def scales_in_use(graph: Graph, reweighting: Reweighting) -> Scales:
+    """Return the factors that a graph uses."""
+    weights = graph.weights
+    for table, saved, rows_of in zip(
+            weights, reweighting.saved(), (graph.edge_rows, graph.observed_rows), strict=True):
+        rows = rows_of(saved.rows)
+        table[rows[rows >= 0]] = saved.shares[rows >= 0]
+    return Scales(*(np.where(weight > 0.0, weight, 1.0)**-0.5 for weight in weights))
+
+
 def collect(
-    smoother: IncrementalSmoother, nodes: HiddenNodes, factors: FactorBuilder,
+    smoother: IncrementalSmoother, nodes: HiddenNodes, factors: FactorBuilder, scales: Scales,
 ) -> dict[str, SourceResiduals]:
     """
     Return the residuals of each source that has constraints in the graph.
@@ -107,21 +125,26 @@ def collect(
     smoother : IncrementalSmoother
     nodes : HiddenNodes
     factors : FactorBuilder, knows the sources of the constraints
+    scales : Scales
 
     """
     graph, covariances = smoother.graph, smoother.covariances()
     found: dict[str, SourceResiduals] = {}
     for source, (stamps, held) in factors.held().items():
+        observed, edges = held.ids[~held.is_edge], held.ids[held.is_edge]
         parts = [
-            _of_observed(graph, held.ids[~held.is_edge], covariances),
-            _of_biased(graph, held.ids[held.is_edge], covariances, _total(factors, source))]
+            _of_observed(graph, observed, covariances,
+                         scales.observed[graph.observed_rows(observed)]),
+            _of_biased(graph, edges, covariances, scales.edges[graph.edge_rows(edges)],
+                       _total(factors, source))]
         order = np.concatenate((np.flatnonzero(~held.is_edge), np.flatnonzero(held.is_edge)))
         columns = map(np.concatenate, zip(*parts, strict=True))
         found[source] = _sorted(_made(
             source, 'map', stamps[order], *columns, held.ids[order], held.is_edge[order]))
     for (source, kind), ids in _edges_by_source(graph, nodes, factors).items():
         if source not in found:
-            found[source] = _sorted(_of_edges(smoother, nodes, source, kind, ids))
+            found[source] = _sorted(_of_edges(
+                smoother, nodes, (source, kind), ids, scales.edges[graph.edge_rows(ids)]))
     return {source: each for source, each in found.items() if len(each.ids) > 0}
 
 
@@ -159,7 +182,9 @@ def _total(factors: FactorBuilder, source: str) -> float:
 _Columns = tuple[FloatArray, BoolArray, FloatArray, FloatArray, BoolArray, FloatArray]
 
 
-def _of_observed(graph: Graph, ids: IntArray, covariances: FloatArray) -> _Columns:
+def _of_observed(
+    graph: Graph, ids: IntArray, covariances: FloatArray, scale: FloatArray,
+) -> _Columns:
     """Return the columns from `errors` to `scale` of observed nodes, in map axes."""
     observed = graph.observed_at(ids)
     errors = graph.observed_errors(observed)
@@ -167,14 +192,13 @@ def _of_observed(graph: Graph, ids: IntArray, covariances: FloatArray) -> _Colum
     information = turn @ observed.information @ np.swapaxes(turn, 1, 2)
     measured = np.diagonal(observed.information, axis1=1, axis2=2) > 0.0
     errors = np.einsum('kij,kj->ki', turn, errors) * measured
-    covariance, scale = _weighted(_inverse(information, measured), observed)
-    return (errors, measured, covariance,
+    return (errors, measured, _inverse(information, measured) * scale[:, None, None]**2,
             _taken(graph, observed.node, observed.offset[:, :2], covariances),
             observed.weight > 0.0, scale)
 
 
 def _of_biased(
-    graph: Graph, ids: IntArray, covariances: FloatArray, total: float,
+    graph: Graph, ids: IntArray, covariances: FloatArray, scale: FloatArray, total: float,
 ) -> _Columns:
     """Return the same of edges to a bias; the bias is a part of the error."""
     edges = graph.edges_at(ids)
@@ -182,9 +206,8 @@ def _of_biased(
     measured = np.diagonal(edges.information, axis1=1, axis2=2) > 0.0
     errors = (graph.edge_errors(edges) - factor * states) * measured
     variance = (factor / (1.0, 1.0, STRETCH))**2 * measured
-    covariance, scale = _weighted(
-        _inverse(edges.information, measured) + variance[:, :, None] * np.eye(3), edges)
-    return (errors, measured, covariance,
+    covariance = _inverse(edges.information, measured) + variance[:, :, None] * np.eye(3)
+    return (errors, measured, covariance * scale[:, None, None]**2,
             _taken(graph, edges.i, edges.bias[:, :2], covariances), edges.weight > 0.0,
             np.sqrt(total) * scale)
 
@@ -201,21 +224,22 @@ def _taken(
 
 
 def _of_edges(
-    smoother: IncrementalSmoother, nodes: HiddenNodes, source: str, kind: str, ids: IntArray,
+    smoother: IncrementalSmoother, nodes: HiddenNodes, name: tuple[str, str], ids: IntArray,
+    scale: FloatArray,
 ) -> SourceResiduals:
-    """Return the residuals of edges between poses."""
+    """Return the residuals of edges between poses, given their source and kind."""
     graph = smoother.graph
     edges = graph.edges_at(ids)
     measured = np.diagonal(edges.information, axis1=1, axis2=2) > 0.0
-    covariance, _ = _weighted(_inverse(edges.information, measured), edges)
     taken = np.full((len(ids), 3, 3), np.nan)
     some = spread(len(ids), MOST_EDGES)
     taken[some] = smoother.edge_innovations(edges.rows(some)).covariances
     later = np.searchsorted(nodes.ids, np.maximum(edges.i, edges.j))
     return SourceResiduals(
-        source, kind, nodes.stamps_ns[np.clip(later, 0, len(nodes) - 1)],
-        graph.edge_errors(edges) * measured, measured, covariance, taken, edges.weight > 0.0,
-        _scales(edges.weight), ids, np.ones(len(ids), dtype=bool))
+        *name, nodes.stamps_ns[np.clip(later, 0, len(nodes) - 1)],
+        graph.edge_errors(edges) * measured, measured,
+        _inverse(edges.information, measured) * scale[:, None, None]**2, taken,
+        edges.weight > 0.0, scale, ids, np.ones(len(ids), dtype=bool))
 
 
 def spread(n: int, most: int) -> IntArray:
@@ -229,19 +253,6 @@ def spread(n: int, most: int) -> IntArray:
     """
     return np.arange(n) if n <= most else np.unique(
         np.round(np.linspace(0, n - 1, most)).astype(np.int64))
-
-
-def _weighted(
-    covariance: FloatArray, constraints: Edges | ObservedNodes,
-) -> tuple[FloatArray, FloatArray]:
-    """Return covariances as the graph uses them, and the factor on sigmas."""
-    scale = _scales(constraints.weight)
-    return covariance * scale[:, None, None]**2, scale
-
-
-def _scales(weight: FloatArray) -> FloatArray:
-    """Return the factors on sigmas that weights stand for, 1 for those that are not used."""
-    return np.asarray(np.where(weight > 0.0, weight, 1.0)**-0.5)
 
 
 def _inverse(matrices: FloatArray, measured: BoolArray) -> FloatArray:
