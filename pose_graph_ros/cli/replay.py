@@ -171,7 +171,7 @@ def run_measurements(
             begin = time.perf_counter()
             report = backend.update()
             recorder.log.add(Update(
-                int(backend.node_stamps_ns[-1]), backend.graph.n_nodes,
+                int(backend.node_stamps_ns[-1]), len(backend.node_stamps_ns),
                 1e3 * (time.perf_counter() - begin), report.chi2, report.iterations))
             next_update = backend.graph.n_nodes + UPDATE_EVERY
     return backend, backend.optimize()

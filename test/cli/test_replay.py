@@ -11,6 +11,7 @@ from typing import Any
 from circle_bag import circle, fixes, odometry, VARIANCES
 import numpy as np
 import pytest
+from run_schema import problems
 from tum_files import read_tum
 
 from pose_graph_ros.adapters.bag_inputs import choose_inputs
@@ -87,6 +88,14 @@ def test_global_poses_correct_the_path_and_all_files_are_written(
     assert (content['loop_closures'], content['fixes_used'], content['odometry']) == (1, 40, 400)
     assert content['truth'] is True
     assert content['hidden_nodes'] == read_g2o(out / 'graph.g2o').graph.n_nodes
+    told = json.loads((out / 'run.json').read_text(encoding='utf-8'))
+    assert list(problems(told)) == []
+    assert told['subtitle'] == 'replay of bag'
+    assert {each['name']: each['used'] for each in told['sources']} == {
+        'odom': content['hidden_nodes'] - 1, 'global_pose': 40, 'loop_closure': 1}
+    assert told['updates']['nodes'][-1] <= content['hidden_nodes']
+    assert [row['rms'] for row in told['error_table']] == pytest.approx(
+        [row['rms'] for row in content['errors']], rel=1e-4)
     # the path is as long as the drive, at its place, and better than odometry at its best
     corrected = read_tum(out / 'path.tum')
     expected = path.at(corrected.stamps_ns)

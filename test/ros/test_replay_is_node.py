@@ -12,6 +12,7 @@ import sys
 import numpy as np
 import pytest
 from rosbags.typesys import get_typestore, Stores
+from run_schema import problems
 from tum_files import read_tum
 
 from pose_graph_ros.adapters.bag_writer import BagWriter
@@ -81,6 +82,19 @@ def test_the_same_bag_gives_the_same_path(bag: Path, tmp_path: Path) -> None:
             assert rows[row['name']][key] == pytest.approx(row[key], rel=1e-6)
     assert by_node['node']['processed'] == str(by_node['odometry'] + taken
                                                + by_node['loop_closures'])
+    told, offline = (json.loads((tmp_path / name / 'run.json').read_text())
+                     for name in ('node', 'replay'))
+    assert list(problems(told)) == []
+    assert told['subtitle'] == 'the node over DDS'
+    for table in ('fixes', 'closures'):
+        for mine, other in zip(told[table], offline[table], strict=True):
+            assert (mine['state'], mine['id']) == (other['state'], other['id'])
+    for mine, other in zip(told['sources'], offline['sources'], strict=True):
+        assert (mine['name'], mine['used']) == (other['name'], other['used'])
+        assert mine['energy']['found'] == pytest.approx(other['energy']['found'], rel=0.02)
+    assert 0 < len(told['updates']['t']) <= told['updates']['count']
+    assert 0 <= told['updates']['t'][0] < told['updates']['t'][-1] <= told['duration']
+
     with open_bag(tmp_path / 'node' / 'corrected') as corrected:
         assert {'/path', '/pose', '/odometry/filtered', '/diagnostics'} <= set(corrected.topics)
         assert corrected.topics['/path'].count == 1

@@ -1,0 +1,223 @@
+# Copyright 2026 The pose_graph_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""run.json: its form, its numbers, and what it says of runs whose faults are known."""
+
+from functools import cache
+from itertools import pairwise
+import json
+from typing import Any
+
+from honest_drive import HonestDrive
+import numpy as np
+import pytest
+from run_schema import problems
+
+from pose_graph_ros.adapters.parameters import checked
+from pose_graph_ros.adapters.sources import Kind
+from pose_graph_ros.cli.evaluation import Drive, evaluate
+from pose_graph_ros.cli.replay import run_measurements
+from pose_graph_ros.cli.run.content import Run
+from pose_graph_ros.cli.run.document import document
+from pose_graph_ros.cli.run.lines import number, rounded, simplified
+from pose_graph_ros.cli.run.recorder import (
+    Arrivals,
+    MOST_SILENCES,
+    MOST_UPDATES,
+    Recorder,
+    Update,
+    UpdateLog,
+)
+from pose_graph_ros.core.geometry.se2 import FloatArray
+
+WHITE = ('global_pose.correlation_time', 0.0)
+SECOND = 10**9
+
+
+@cache
+def run_of(*settings: tuple[str, Any], **of_drive: Any) -> dict[str, Any]:
+    """Return run.json of a drive of which all is known."""
+    drive = HonestDrive(**{'seed': 1, 'seconds': 240.0, 'closures': 20} | of_drive)
+    values, recorder = checked(dict(settings)), Recorder()
+    backend, report = run_measurements(drive.measurements(), values, recorder)
+    estimate, stamps = backend.estimate(), drive.truth.stamps_ns
+    assert estimate is not None
+    fixes = drive.fix_at[:len(drive.fix_at) * drive.fixes]
+    compared = Drive(
+        drive.odometry, stamps[fixes], drive.positions[:len(fixes)],
+        np.zeros(len(fixes), dtype=bool), estimate.path, drive.truth, stamps[drive.closure_at],
+        fix_sources=['global_pose'] * len(fixes),
+        loop_sources=['loop_closure'] * len(drive.closure_at))
+    kinds = {'odom': Kind.ODOMETRY, 'global_pose': Kind.GLOBAL_POSE,
+             'loop_closure': Kind.LOOP_CLOSURE}
+    # as it is read from the file
+    return dict(json.loads(json.dumps(document(Run(
+        'a drive', 'made up', compared, backend, estimate, backend.verdicts(), recorder, values,
+        kinds, backend.counts, evaluate(compared), report)), allow_nan=False)))
+
+
+def texts(found: dict[str, Any], *levels: str) -> list[str]:
+    """Return the findings of some levels, without the times of updates, which the machine has."""
+    return [each['text'] for each in found['findings']
+            if each['level'] in levels and each['anchor'] != 'updates']
+
+
+def source(found: dict[str, Any], name: str) -> dict[str, Any]:
+    return next(dict(each) for each in found['sources'] if each['name'] == name)
+
+
+@pytest.mark.parametrize('of_drive', [
+    {}, {'tau': 20.0}, {'fixes': False}, {'closures': 0}, {'false_closures': 5}], ids=str)
+def test_it_has_the_form_that_is_documented(of_drive: dict[str, Any]) -> None:
+    found = run_of(**of_drive)
+    assert list(problems(found)) == []
+    assert len(found['springs']) == 10
+    for table in (*found['fixes'], *found['closures']):
+        assert set(table['state']) <= set(range(len(found['states'])))
+        assert all(-1 <= why < len(found['texts']) for why in table['why'])
+    for each in found['sparsity']:
+        assert sum(cell[2] for cell in each['cells']) == each['nonzeros']
+    anchors = {'map', 'errors', 'updates', *(f'source-{each["name"]}' for each in
+                                             found['sources'])}
+    assert {each['anchor'] for each in found['findings']} <= anchors
+
+
+def test_times_and_places_are_those_of_the_run() -> None:
+    found, drive = run_of(), HonestDrive(seed=1, seconds=240.0, closures=20)
+    assert int(found['start_ns']) == drive.truth.stamps_ns[0]
+    assert found['start'] == '2023-11-14T22:13:20.000Z'
+    assert found['duration'] == pytest.approx(240.0)
+    path = found['lines']['corrected']
+    at = int(found['start_ns']) + np.round(np.array(path['t']) * SECOND).astype(np.int64)
+    places = np.column_stack((path['x'], path['y'])) + found['offset']
+    truth = drive.truth.at(np.minimum(at, drive.truth.stamps_ns[-1]))
+    assert np.max(np.hypot(*(places - truth[:, :2]).T)) < 1.0
+    fixes = found['fixes'][0]
+    np.testing.assert_allclose(
+        np.column_stack((fixes['x'], fixes['y'])) + found['offset'], drive.positions, atol=0.006)
+    nearest = np.array(path['t'])[fixes['at']]
+    assert np.max(np.abs(nearest - fixes['t'])) < 1.0
+    # the springs are where their nodes are
+    for spring in found['springs']:
+        if spring['from'] is not None:
+            node = int(np.argmin(np.abs(np.array(path['t']) - spring['from']['t'])))
+            assert path['x'][node] == pytest.approx(spring['from']['x'], abs=0.02)
+
+
+@pytest.mark.parametrize('seed', range(5))
+def test_nothing_is_wrong_with_an_honest_drive(seed: int) -> None:
+    for settings in ((), (WHITE,)):
+        assert texts(run_of(*settings, seed=seed), 'warning', 'notice') == []
+
+
+def test_fixes_that_claim_too_much_are_found_with_their_factor() -> None:
+    found = run_of(times=3.0)
+    warning, = texts(found, 'warning')
+    assert warning.startswith('global_pose: claims 0.5 m, found 1.')
+    assert 'set global_pose.covariance_scale to' in warning
+    assert float(warning.rpartition(' ')[2]) == pytest.approx(9.0, rel=0.3)
+    assert source(found, 'global_pose')['ratio'] == pytest.approx(3.0, rel=0.15)
+    assert 'times too small' in source(found, 'global_pose')['verdict']
+    for other in ('odom', 'loop_closure'):
+        assert 'times too' not in source(found, other)['verdict']
+
+
+def test_odometry_that_drifts_more_than_it_claims_is_found() -> None:
+    found = run_of(odometry_times=3.0, closures=0)
+    assert source(found, 'odom')['ratio'] == pytest.approx(3.0, rel=0.25)
+    notice, = texts(found, 'notice')
+    assert notice.startswith('odom: claims')
+    assert 'the estimate allows for it' in notice
+    assert texts(found, 'warning') == []
+
+
+def test_correlated_errors_taken_for_white_are_found() -> None:
+    found = run_of(WHITE, tau=20.0, closures=0)
+    assert 'set global_pose.correlation_time to -1' in ' '.join(texts(found, 'warning'))
+    curve = source(found, 'global_pose')['autocorrelation']
+    assert 1.0 < curve['time'] < 40.0     # at least, as the path follows the errors
+    assert curve['in_use'] is None
+    # left to itself, the engine finds them and allows for them
+    found = run_of(tau=20.0, closures=0)
+    assert texts(found, 'warning') == []
+    assert any('found by itself and allowed for' in text for text in texts(found, 'good'))
+    assert source(found, 'global_pose')['autocorrelation']['in_use'] > 10.0
+
+
+def test_an_outage_is_found_with_its_time() -> None:
+    warning, = texts(run_of(outage=(100.0, 130.0)), 'warning')
+    assert warning.startswith('global_pose: no messages from 99.5 to 130.5 s (31 s at most)')
+
+
+def test_false_closures_are_found() -> None:
+    found = run_of(false_closures=5)
+    warning, = texts(found, 'warning')
+    assert warning.startswith('loop_closure: 5 of 20 closures contradict the others')
+    drive = HonestDrive(seed=1, seconds=240.0, closures=20, false_closures=5)
+    doubted = np.array(found['closures'][0]['state']) == found['states'].index('doubted')
+    assert np.array_equal(doubted, drive.is_false)
+    reasons = [found['texts'][why] for why in np.array(found['closures'][0]['why'])[doubted]]
+    assert all(reason.startswith('Doubted and not used') for reason in reasons)
+    assert source(found, 'loop_closure')['unused']['count'] == 5
+
+
+def test_without_anything_in_the_map_that_is_said() -> None:
+    notice, = texts(run_of(fixes=False), 'notice')
+    assert notice.startswith('nothing was measured in the map')
+
+
+def test_a_line_keeps_within_the_tolerance_of_all_points() -> None:
+    generator = np.random.default_rng(1)
+    for n in (2, 3, 700, 5000):
+        points = np.cumsum(generator.normal(size=(n, 2)), axis=0)
+        for tolerance in (0.0, 0.5, 5.0):
+            kept = simplified(points, tolerance)
+            assert (kept[0], kept[-1]) == (0, n - 1)
+            assert distance_from_line(points, kept) <= tolerance + 1e-9
+    straight = np.column_stack((np.arange(500.0), np.zeros(500)))
+    assert simplified(straight).tolist() == [0, 499]
+    assert len(simplified(points, 0.01, most=300)) <= 300
+    assert simplified(np.zeros((4, 2))).tolist() == [0, 3]
+
+
+def distance_from_line(points: FloatArray, kept: np.ndarray) -> float:
+    """The slow way: each point from the part of the line that it belongs to."""
+    largest = 0.0
+    for first, last in pairwise(kept.tolist()):
+        along = points[last] - points[first]
+        for point in points[first + 1:last]:
+            share = np.clip((point - points[first]) @ along / max(along @ along, 1e-18), 0.0, 1.0)
+            largest = max(largest, float(np.hypot(*(point - points[first] - share * along))))
+    return largest
+
+
+def test_numbers_are_short_and_finite() -> None:
+    assert rounded([1.23456, np.nan, -0.0001]) == [1.235, None, 0.0]
+    assert (number(1234.567), number(np.inf), number(None)) == (1235.0, None, None)
+
+
+def test_of_many_updates_the_slowest_are_kept() -> None:
+    log, count = UpdateLog(), 9 * MOST_UPDATES + 7
+    for k in range(count):
+        log.add(Update(k, k, 500.0 if k == 12_345 else 1.0, 0.0, 1))
+    kept = log.updates
+    assert log.count == count
+    assert MOST_UPDATES // 2 <= len(kept) <= MOST_UPDATES
+    assert kept[-1].nodes == count - 1
+    slowest = max(kept, key=lambda each: each.milliseconds)
+    assert slowest.milliseconds == 500.0
+    assert abs(slowest.nodes - 12_345) < 16
+    assert np.all(np.diff([each.stamp_ns for each in kept]) > 0)
+
+
+def test_the_longest_silences_are_kept() -> None:
+    arrivals, stamp = Arrivals(), 0
+    for k in range(5000):
+        stamp += SECOND // 10 + (k % 100 == 50) * (k + 100) * SECOND // 10
+        arrivals.add(stamp)
+    arrivals.add(stamp - SECOND)    # a late one is no silence
+    assert len(arrivals.silences) == MOST_SILENCES
+    gaps = arrivals.gaps(1.0, 8.0)
+    assert np.all(np.diff(gaps[:, 0]) > 0.0)
+    lengths = gaps[:, 1] - gaps[:, 0]
+    assert lengths[-1] == pytest.approx((4950 + 100) * 0.1 + 0.1)
+    assert len(Arrivals().gaps(1.0, 8.0)) == 0
