@@ -10,6 +10,7 @@ import os
 from pathlib import Path
 import re
 import shutil
+import subprocess
 from typing import Any
 
 import numpy as np
@@ -102,7 +103,9 @@ class Opened:
 
 
 def executable() -> str:
-    found = next(filter(None, map(shutil.which, BROWSERS)), None)
+    # (Ubuntu's chromium-browser only says that there is a snap)
+    found = next((path for path in filter(None, map(shutil.which, BROWSERS)) if subprocess.run(
+        [path, '--version'], capture_output=True, check=False).returncode == 0), None)
     if found is None:
         missing('no browser; do: apt install chromium (on Ubuntu, google-chrome from its maker)')
     return str(found)

@@ -62,7 +62,9 @@ function showMap() {
     onPick: (u, v, within) => {
       const item = pick(layers, view, u, v, within);
       lookAtItem(item);
-      if (item) lookAtTime(item.times[item.times.length - 1]);
+      if (!item) return;
+      lookAtTime(item.times[item.times.length - 1]);
+      bringIntoView(document.getElementById('panel'));
     },
     onHover: (u, v) => hover(layers, view, surface, lines.corrected, label, u, v),
   });
@@ -108,6 +110,13 @@ function centreOn(item, view, surface, box) {
   const half = Math.max(1.4 * apart, Math.min(0.06 * whole, 60), 2);
   const size = Math.min(surface.canvas.clientWidth, surface.canvas.clientHeight);
   view.flyTo(x, y, size / 2 / half);
+}
+
+/** Scroll as little as needed, if nearly nothing of an element can be seen. */
+function bringIntoView(node) {
+  if (node.getBoundingClientRect().top > window.innerHeight - 120) {
+    node.scrollIntoView({behavior: CALM.matches ? 'auto' : 'smooth', block: 'nearest'});
+  }
 }
 
 /** The pointer on the map marks the time at which the robot was there. */

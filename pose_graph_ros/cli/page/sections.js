@@ -109,7 +109,7 @@ function showErrors() {
     name: 'corrected path'});
   const top = (column) => (extent(column || []) || [0, 0])[1];
   const log = top(errors.odometry) > 5 * top(errors.position);
-  const time = {label: `time [${clockUnit()}]`, time: true, domain: [0, DATA.duration]};
+  const time = {label: `time [${clockUnit()}]`, time: true, domain: [0, DATA.duration || 1]};
   const charts = make('div', {class: 'charts wide'});
   host.append(charts);
   makeChart(charts, {title: 'Position', marks, x: time, height: 260,
@@ -194,7 +194,7 @@ function showUpdates() {
   }
   const charts = make('div', {class: 'charts wide'});
   host.append(charts);
-  const x = {label: `time of the drive [${clockUnit()}]`, time: true, domain: [0, DATA.duration]};
+  const x = {label: `time of the drive [${clockUnit()}]`, time: true, domain: [0, DATA.duration || 1]};
   const wide = (column) => {
     const found = extent((column || []).filter((value) => value > 0));
     return found !== null && found[1] > 20 * found[0];

@@ -35,6 +35,7 @@ function showSource(source) {
   make('p', {class: 'numbers'}, numbers.join(' · ')));
   if ((source.rows || []).length > 0) card.append(ratioTable(source));
   else card.append(nothing('None of them is in the graph, so there are no residuals.'));
+  if (!source.series || source.series.t.length === 0) return card;
   const charts = make('div', {class: 'charts'});
   showHistogram(charts, source);
   showSeries(charts, source);
@@ -77,8 +78,16 @@ function ratioPicture({ratio, low, high}) {
 
 const COMPONENTS = ['path', 'odometry', 'held-out'];
 
+function noChart(host, title, why) {
+  host.append(make('figure', {class: 'chart'}, make('figcaption', {}, title), nothing(why)));
+}
+
 function showHistogram(host, {histogram}) {
-  if (!histogram || histogram.count.length === 0) return;
+  if (!histogram || histogram.count.length === 0) {
+    noChart(host, 'How large they are', 'The optimum follows this source wherever it leads, so that '
+      + 'its residuals say nothing.');
+    return;
+  }
   const {edges, count} = histogram;
   const total = count.reduce((sum, value) => sum + value, 0);
   const [x, y] = [[], []];
@@ -98,7 +107,6 @@ function showHistogram(host, {histogram}) {
 }
 
 function showSeries(host, {series, rows}) {
-  if (!series || series.t.length === 0) return;
   const named = (rows || []).length === series.rows.length;
   const marks = series.rows.map((y, k) => ({
     kind: 'dots', x: series.t, y, colour: COMPONENTS[k % COMPONENTS.length],
@@ -107,13 +115,17 @@ function showSeries(host, {series, rows}) {
   const rules = [-2, 2].map((at) => ({
     kind: 'rule', of: 'y', at, colour: 'muted', dash: [5, 4]}));
   makeChart(host, {title: 'Over time', marks: [...rules, ...marks],
-    x: {label: `time [${clockUnit()}]`, time: true, domain: [0, DATA.duration]},
+    x: {label: `time [${clockUnit()}]`, time: true, domain: [0, DATA.duration || 1]},
     y: {label: 'residual [sigma]', zero: true},
     note: 'Dashed: 2 sigma, where 95 % should be within.'});
 }
 
 function showAutocorrelation(host, {autocorrelation: found}) {
-  if (!found || found.lag.length === 0) return;
+  if (!found || found.lag.length === 0) {
+    noChart(host, 'How long they keep their direction', 'There are too few residuals, or they say '
+      + 'nothing.');
+    return;
+  }
   const {lag, value, band, fitted} = found;
   const marks = [];
   if (known(band)) {
