@@ -12,7 +12,7 @@ function makePanel(host, {onCentre}) {
   const show = (item) => {
     if (!item) {
       panel.replaceChildren(make('p', {class: 'hint'},
-        'Click a fix, a closure or a spring on the map to see what is known of it.'));
+        'Click or tap a fix, a closure or a spring on the map to see what is known of it.'));
       return;
     }
     panel.replaceChildren(

@@ -131,11 +131,11 @@ function errorTable(rows) {
   if (!rows || rows.length === 0) return [];
   const shown = Object.keys(ERROR_COLUMNS).filter((name) => rows.some((row) => known(row[name])));
   const cell = (row, name) => {
-    if (name === 'count') return number(row[name], 6);
-    return row.unit === 'deg' ? `${number(row[name])}°` : length(row[name]);
+    if (name === 'count' || !known(row[name])) return number(row[name], 6);
+    return row[name].toFixed(2) + (row.unit === 'deg' ? '°' : '');
   };
-  return [make('div', {class: 'card table'}, make('table', {class: 'errors'},
-    make('thead', {}, make('tr', {}, make('th', {scope: 'col'}, 'distance'), shown.map(
+  return [make('div', {class: 'card table scrolls'}, make('table', {class: 'errors'},
+    make('thead', {}, make('tr', {}, make('th', {scope: 'col'}, 'distance [m]'), shown.map(
       (name) => make('th', {scope: 'col'}, ERROR_COLUMNS[name])))),
     make('tbody', {}, rows.map((row) => make('tr', {}, make('th', {scope: 'row'}, row.name),
       shown.map((name) => make('td', {}, cell(row, name))))))))];

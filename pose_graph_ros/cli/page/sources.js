@@ -46,15 +46,15 @@ function showSource(source) {
 
 /** A table of what was expected and found, with a picture of the ratio and its interval. */
 function ratioTable({name, rows}) {
-  const head = ['component', 'expected', 'found', 'ratio', 'it should be in'];
-  return make('table', {class: 'ratios'},
+  const head = ['component', 'expected', 'found', 'ratio', '95 % interval'];
+  return make('div', {class: 'scrolls'}, make('table', {class: 'ratios'},
     make('caption', {class: 'unseen'}, `Residuals of ${name}, in units of their claimed sigma`),
     make('thead', {}, make('tr', {}, head.map((text) => make('th', {scope: 'col'}, text)))),
     make('tbody', {}, rows.map((row) => make('tr', {},
       make('th', {scope: 'row'}, row.name, make('small', {}, ` ${counted(row.count, 'residual')}`)),
       make('td', {}, number(row.expected)), make('td', {}, number(row.found)),
       make('td', {class: 'ratio'}, make('b', {}, number(row.ratio)), ratioPicture(row)),
-      make('td', {}, known(row.low) ? `${number(row.low)} to ${number(row.high)}` : '–')))));
+      make('td', {}, known(row.low) ? `${number(row.low, 2)} – ${number(row.high, 2)}` : '–'))))));
 }
 
 /** The ratio on a logarithmic axis from 1/5 to 5: a dot, the band where it should be, and 1. */
