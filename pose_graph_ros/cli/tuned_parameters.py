@@ -74,6 +74,41 @@ def odometry_parameters(source: str, found: Fit, values: Mapping[str, Any]) -> I
                     note='the sigmas are those of this odometry')
 
 
+def closure_parameters(
+    odometry: str, closures: Sequence[str], found: Fit, values: Mapping[str, Any],
+) -> Iterator[Tuned]:
+    """
+    Yield the parameters of odometry and of loop closures by factors on their sigmas.
+
+    Parameters
+    ----------
+    odometry : str, the primary source
+    closures : sequence of str, sources of loop closures
+    found : Fit
+    values : mapping, all parameters before
+
+    """
+    by_role = {each.parameter.role: each for each in found.found}
+    own, of_closures = by_role[Role.ODOMETRY], by_role[Role.CLOSURE]
+    scale = values[f'{odometry}.sigma_scale'] or 1.0
+    if values[f'{odometry}.noise'] == 'model':
+        for leaf in ODOMETRY:
+            at = scale * values[f'{odometry}.{leaf}']
+            one = _one(f'{odometry}.{leaf}', own, values,
+                       lambda factor, at=at: min(at * factor, LARGEST_SIGMA))
+            yield replace(one, note=f'all four by one factor; {one.note}')
+    else:
+        at = scale**2 * values[f'{odometry}.covariance_scale']
+        yield _one(f'{odometry}.covariance_scale', own, values, lambda factor: at * factor**2)
+    if not own.kept:
+        yield Tuned(f'{odometry}.sigma_scale', values[f'{odometry}.sigma_scale'], 1.0,
+                    note='the sigmas are those of this odometry')
+    for source in closures:
+        one = _one(f'{source}.sigma_scale', of_closures, values, float)
+        # their constraints have noise of odometry up to the hidden nodes as well, which is shared
+        yield one if of_closures.value >= 1.0 else one.kept('kept: not below 1')
+
+
 def source_parameters(
     source: SourceOfPoses, index: int, found: Fit, values: Mapping[str, Any],
 ) -> Iterator[Tuned]:

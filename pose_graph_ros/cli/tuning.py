@@ -24,12 +24,15 @@ from pose_graph_ros.adapters.parameters import checked
 from pose_graph_ros.adapters.sources import backend_config, ODOMETRY_KINDS
 from pose_graph_ros.cli.tuned_parameters import (
     changed,
+    closure_parameters,
     odometry_parameters,
     source_parameters,
     Tuned,
 )
 from pose_graph_ros.cli.tuning_drive import Key, LEAST, Run, SourceOfPoses, TuningDrive
 from pose_graph_ros.core.geometry.trajectory import Trajectory
+from pose_graph_ros.core.measurements import LoopClosure
+from pose_graph_ros.core.tuning.closure_fit import ClosureProblem, fit_closures, MOST_NODES
 from pose_graph_ros.core.tuning.drive_rows import timeline
 from pose_graph_ros.core.tuning.estimation import estimate
 from pose_graph_ros.core.tuning.fit import Fit
@@ -103,7 +106,7 @@ class Tuning:
         show: Callable[[str], None],
     ) -> None:
         self._drive, self._inputs, self._values, self._show = drive, inputs, values, show
-        self._config = backend_config(values)
+        self._config, self._path = backend_config(values), path
         self._odometry = {}
         for name in inputs.of(*ODOMETRY_KINDS):
             found = timeline(drive.odometry(name), self._config.odometry_source(name))
@@ -116,10 +119,13 @@ class Tuning:
         self._start_ns, self._duration = int(stamps[0]), float(stamps[-1] - stamps[0]) * 1e-9
         self._sources = [each for each in drive.sources_of_poses(inputs, values)
                          if each.measured.has_positions or each.measured.has_headings]
+        self._closures: list[tuple[str, LoopClosure]] = []
         if not any(each.measured.has_positions for each in self._sources):
-            raise BagError(
-                f'{path}: nothing to tune by: at least {LEAST} valid fixes or global poses are '
-                f'needed; used are {_topics(inputs)}')
+            self._sources, self._closures = [], drive.closures()
+            if len(self._closures) < LEAST:
+                raise BagError(
+                    f'{path}: nothing to tune by: at least {LEAST} valid fixes, global poses or '
+                    f'loop closures are needed; used are {_topics(inputs)}')
 
     def tune(self, folds: int, deadline: float, truth: Trajectory | None) -> Outcome:
         """
@@ -161,7 +167,7 @@ class Tuning:
                 break
             after, to_truth = self._after(parts, group, truth)
             one, other = self._summaries(before, after, doubted)
-            is_worse = other.rms > WORSE_RMS * one.rms or not other.nlpd < one.nlpd + WORSE_NLPD
+            is_worse = _is_worse(one, other)
             if first is None:
                 first = (after, to_truth)
             if not is_worse:
@@ -200,6 +206,8 @@ class Tuning:
             count += 1
             if count % 100 == 0:
                 self._show(f'{text}: {count} evaluations')
+        if len(self._closures) > 0:
+            return self._estimate_by_closures(without, tick)
         sources = [self._without(each, without) for each in self._sources]
         fits = estimate(self._odometry, {
             each.name: each.measured for each in sources}, self._config, tick)
@@ -210,6 +218,22 @@ class Tuning:
                 for k, source in enumerate(sources):
                     tuned += source_parameters(source, k, found, self._values)
         return tuned, fits
+
+    def _estimate_by_closures(
+        self, without: Collection[Key], tick: Callable[[], None],
+    ) -> tuple[list[Tuned], dict[str, Fit]]:
+        """Do the same by loop closures alone."""
+        run, primary = self._drive.run(self._values, without), next(iter(self._odometry))
+        if run is None or run.graph.n_nodes > MOST_NODES:
+            raise BagError(f'{self._path}: too many hidden nodes to tune by loop closures; '
+                           f'expected at most {MOST_NODES}')
+        problem = ClosureProblem(run.graph, tick)
+        if np.sum(problem.is_closure) < LEAST // 2:
+            raise BagError(f'{self._path}: nothing to tune by: only '
+                           f'{int(np.sum(problem.is_closure))} loop closures are believed')
+        found = fit_closures(problem)
+        sources = list(dict.fromkeys(name for name, _ in self._closures))
+        return list(closure_parameters(primary, sources, found, self._values)), {primary: found}
 
     def _without(self, source: SourceOfPoses, without: Collection[Key]) -> SourceOfPoses:
         """Return a source without some measurements."""
@@ -236,6 +260,11 @@ class Tuning:
             (source.name, stamp) for source in self._sources if source.measured.has_positions
             for stamp in source.measured.stamps_ns[fold_of(
                 source.measured.stamps_ns, self._start_ns, stretch, folds) == k].tolist())
+        if len(self._closures) > 0:
+            stamps = np.array([each.stamp_ns for _, each in self._closures], dtype=np.int64)
+            folded = fold_of(stamps, self._start_ns, stretch, folds) == k
+            held_out = frozenset((name, each.stamp_ns) for (name, each), out in zip(
+                self._closures, folded.tolist(), strict=True) if out)
         text = f'part {k + 1} of {folds} held out'
         tuned, _ = self._estimate(held_out | frozenset(doubted), text)
         self._show(f'{text}: running with the settings before')
@@ -259,7 +288,11 @@ class Tuning:
     def _errors(
         self, run: Run | None, values: Mapping[str, Any], held_out: Collection[Key],
     ) -> list[Errors]:
-        return [] if run is None else self._drive.errors(run, values, self._inputs, held_out)
+        if run is None:
+            return []
+        if len(self._closures) > 0:
+            return [self._drive.closure_errors(run, held_out)]
+        return self._drive.errors(run, values, self._inputs, held_out)
 
     def _summaries(
         self, before: Sequence[Sequence[Errors]], after: Sequence[Sequence[Errors]],
@@ -283,9 +316,17 @@ class Tuning:
 
     def _measured(self) -> str:
         """Return how much was measured, in words."""
-        counts = ', '.join(f'{len(each.measured.stamps_ns)} of {each.name}'
-                           for each in self._sources)
+        counts = ', '.join([f'{len(each.measured.stamps_ns)} of {each.name}'
+                            for each in self._sources] or [f'{len(self._closures)} closures'])
         return f'{self._duration:.0f} s of odometry, {counts}'
+
+
+def _is_worse(one: Summary, other: Summary) -> bool:
+    """Tell whether the errors after are worse than those before."""
+    if not other.rms <= WORSE_RMS * one.rms:
+        return True
+    # of loop closures there is no density
+    return bool(np.isfinite(one.nlpd)) and not other.nlpd < one.nlpd + WORSE_NLPD
 
 
 def _to_truth(run: Run | None, truth: Trajectory | None) -> float:

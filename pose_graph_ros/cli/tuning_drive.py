@@ -16,8 +16,10 @@ from pose_graph_ros.adapters.message_reader import MessageReader
 from pose_graph_ros.adapters.sources import backend_config, Kind
 from pose_graph_ros.cli.replay import measurements_of, run_measurements
 from pose_graph_ros.core.config import MeasurementSource
+from pose_graph_ros.core.geometry import se2
 from pose_graph_ros.core.geometry.se2 import FloatArray
 from pose_graph_ros.core.geometry.trajectory import Trajectory
+from pose_graph_ros.core.graph.graph import Graph
 from pose_graph_ros.core.judgement.texts import states_by_stamps
 from pose_graph_ros.core.judgement.verdicts import State
 from pose_graph_ros.core.measurements import (
@@ -71,6 +73,7 @@ class Run(NamedTuple):
     """By which the engine multiplies the variances that a source claims."""
     doubted: frozenset[Key]
     """Measurements that contradict the others."""
+    graph: Graph
 
 
 class TuningDrive:
@@ -147,7 +150,8 @@ class TuningDrive:
         doubted = frozenset(
             (name, stamp) for (name, stamp, _), state
             in states_by_stamps(backend.verdicts()).items() if state is State.DOUBTED)
-        return Run(estimate.path, backend.path_covariances(estimate), factors, doubted)
+        return Run(estimate.path, backend.path_covariances(estimate), factors, doubted,
+                   backend.graph)
 
     def errors(
         self, run: Run, values: Mapping[str, Any], inputs: Inputs, held_out: Collection[Key],
@@ -168,6 +172,18 @@ class TuningDrive:
             parts.append(errors_at(run.path, run.covariances, source.measured.rows(chosen),
                                    run.factors.get(source.name, 1.0)))
         return parts
+
+    def closure_errors(self, run: Run, held_out: Collection[Key]) -> Errors:
+        """Return the errors of a path at closures, in the frames of their references."""
+        chosen = [each for name, each in self.closures()
+                  if (name, each.stamp_ns) in held_out and each.reference_ns is not None]
+        stamps = np.array([(each.reference_ns, each.stamp_ns) for each in chosen],
+                          dtype=np.int64).reshape(-1, 2)
+        inside = np.all(run.path.covers(stamps), axis=1)
+        ends = run.path.at(stamps[inside])
+        measured_poses = np.array([each.pose for each in chosen]).reshape(-1, 3)[inside]
+        errors = measured_poses[:, :2] - se2.between(ends[:, 0], ends[:, 1])[:, :2]
+        return Errors(stamps[inside, 1], errors, np.full((len(errors), 2, 2), np.nan))
 
 
 def _source_of_poses(

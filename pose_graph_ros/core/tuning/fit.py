@@ -19,7 +19,7 @@ is best for the next measurement is too sure of itself over longer times.
 
 from collections.abc import Callable, Sequence
 import math
-from typing import NamedTuple
+from typing import NamedTuple, Protocol
 
 import numpy as np
 from scipy.optimize import minimize
@@ -31,10 +31,10 @@ from pose_graph_ros.core.tuning.problem import bounds, Parameter, Problem, Role
 RISE = 3.84
 # The same that makes a setting unlikely enough to be changed (99 %).
 CHANGE_RISE = 6.63
-# By how much correlated errors, which have two parameters more, must be more likely (99 %).
-CORRELATED_RISE = 9.2
+# By how much correlated errors, which have two parameters more, must be more likely (97.5 %).
+CORRELATED_RISE = 7.4
 # What keeps its setting by itself; correlated errors are there or not as a whole.
-DECIDABLE = Role.ODOMETRY, Role.WHITE, Role.HEADING
+DECIDABLE = Role.ODOMETRY, Role.WHITE, Role.HEADING, Role.CLOSURE
 # Number of parameters whose settings are tried before all the others are taken to be lost.
 TRIALS = 2
 # Steps of the logarithms for second derivatives.
@@ -99,6 +99,32 @@ class Fit(NamedTuple):
                      and each.parameter.index == index), default)
 
 
+class AnyProblem(Protocol):
+    """A cost as a function of the logarithms of parameters; see `Problem`."""
+
+    n_evaluations: int
+    n_beyond: int
+
+    def value(self, parameters: Sequence[Parameter], x: FloatArray) -> float:
+        """
+        Return the cost.
+
+        Parameters
+        ----------
+        parameters : sequence of Parameter, P of them
+        x : ndarray, shape (P,), their logarithms
+
+        """
+
+
+class Minimum(NamedTuple):
+    """Parameters, their logarithms and the cost."""
+
+    parameters: Sequence[Parameter]
+    x: FloatArray
+    cost: float
+
+
 def fit(problem: Problem, parameters: Sequence[Parameter], white_share: float = 0.05) -> Fit:
     """
     Return the most likely parameters, with their intervals.
@@ -117,6 +143,21 @@ def fit(problem: Problem, parameters: Sequence[Parameter], white_share: float = 
         problem.thin(STRIDES)
         best = _unrestricted(problem, parameters, white_share)
         ratio = max(ratio, _contradiction(problem, *best[:2]))
+    return decided(problem, best, ratio, int(np.sum(problem.rows.source >= 0)))
+
+
+def decided(problem: AnyProblem, best: Minimum, ratio: float, n_measurements: int) -> Fit:
+    """
+    Return the fit after settings that are likely enough are kept.
+
+    Parameters
+    ----------
+    problem : Problem
+    best : Minimum, over all parameters
+    ratio : float, by which thresholds are raised
+    n_measurements : int, for the result
+
+    """
     parameters, x, cost = best
     kept: list[Parameter] = []
     while True:
@@ -129,7 +170,7 @@ def fit(problem: Problem, parameters: Sequence[Parameter], white_share: float = 
         accepted = False
         for _, k in sorted(losses)[:TRIALS]:
             each, others = parameters[k], [*parameters[:k], *parameters[k + 1:]]
-            rest, held = _minimum(problem, others, np.delete(x, k), hold=[*kept, each])
+            rest, held = minimum(problem, others, np.delete(x, k), hold=[*kept, each])
             accepted = held - cost <= CHANGE_RISE * ratio
             if accepted:
                 parameters, x, cost = others, rest, held
@@ -145,23 +186,14 @@ def fit(problem: Problem, parameters: Sequence[Parameter], white_share: float = 
           for each in _intervals(problem, best.parameters, best.x, [], ratio)
           if each.parameter in kept)]
     problem.value([*parameters, *kept], _with_settings(x, kept))
-    return Fit(tuple(found), cost, int(np.sum(problem.rows.source >= 0)), problem.n_beyond,
-               problem.n_evaluations, ratio)
-
-
-class _Minimum(NamedTuple):
-    """Parameters, their logarithms and the cost."""
-
-    parameters: Sequence[Parameter]
-    x: FloatArray
-    cost: float
+    return Fit(tuple(found), cost, n_measurements, problem.n_beyond, problem.n_evaluations, ratio)
 
 
 def _unrestricted(
     problem: Problem, parameters: Sequence[Parameter], white_share: float,
-) -> _Minimum:
+) -> Minimum:
     """Return the minimum over all parameters, with correlated errors where there are any."""
-    best = _Minimum(parameters, *_minimum(problem, parameters, _begin(problem, parameters)))
+    best = Minimum(parameters, *minimum(problem, parameters, _begin(problem, parameters)))
     for each in parameters:
         if each.role is Role.WHITE:
             more = _correlated(problem, best, each, white_share)
@@ -188,11 +220,21 @@ def _begin(problem: Problem, parameters: Sequence[Parameter]) -> FloatArray:
     return begin
 
 
-def _minimum(
-    problem: Problem, parameters: Sequence[Parameter], x: FloatArray, *,
+def minimum(
+    problem: AnyProblem, parameters: Sequence[Parameter], x: FloatArray, *,
     hold: Sequence[Parameter] = (),
 ) -> tuple[FloatArray, float]:
-    """Return where the cost is least, from near there with some settings held, and the cost."""
+    """
+    Return where the cost is least, from near there with some settings held, and the cost.
+
+    Parameters
+    ----------
+    problem : Problem
+    parameters : sequence of Parameter, P of them
+    x : ndarray, shape (P,), logarithms to begin with
+    hold : sequence of Parameter, whose settings stay
+
+    """
     def value(free: FloatArray) -> float:
         return problem.value([*parameters, *hold], _with_settings(free, hold))
     if len(parameters) == 0:
@@ -207,8 +249,8 @@ def _minimum(
 
 
 def _correlated(
-    problem: Problem, best: _Minimum, white: Parameter, white_share: float,
-) -> _Minimum:
+    problem: Problem, best: Minimum, white: Parameter, white_share: float,
+) -> Minimum:
     """Return the minimum with correlated errors of a source."""
     parameters, x = best.parameters, best.x
     at = list(parameters).index(white)
@@ -228,11 +270,11 @@ def _correlated(
         trials = [np.concatenate((begin, [size, share, tau])) for size in sizes.tolist()
                   for share in (-3.5, -1.0) for tau in taus]
         costs = [problem.value(more, trial) for trial in trials]
-        found.append(_Minimum(more, *_minimum(problem, more, trials[int(np.argmin(costs))])))
+        found.append(Minimum(more, *minimum(problem, more, trials[int(np.argmin(costs))])))
     return min(found, key=lambda each: each.cost)
 
 
-def _hessian(problem: Problem, parameters: Sequence[Parameter], x: FloatArray) -> FloatArray:
+def _hessian(problem: AnyProblem, parameters: Sequence[Parameter], x: FloatArray) -> FloatArray:
     """Return the second derivatives of half the cost, shape (P, P), made positive definite."""
     n = len(x)
     steps = STEP * np.eye(n)
@@ -276,7 +318,7 @@ def _contradiction(
 
 
 def _intervals(
-    problem: Problem, parameters: Sequence[Parameter], x: FloatArray, kept: Sequence[Parameter],
+    problem: AnyProblem, parameters: Sequence[Parameter], x: FloatArray, kept: Sequence[Parameter],
     ratio: float,
 ) -> list[Found]:
     """Return the parameters with their intervals, along the valleys of the cost."""

@@ -50,6 +50,8 @@ class Role(Enum):
     """Its white variance in units of the correlated one."""
     TAU = 'tau'
     """Its time constant [s]."""
+    CLOSURE = 'closure'
+    """Factor on the sigmas of loop closures."""
     HEADING = 'heading'
     """Variance of its headings, in units of the claimed one."""
 
@@ -182,7 +184,7 @@ _COLUMNS = {Role.WHITE: lk.WHITE, Role.SHARE: lk.WHITE, Role.CORRELATED: lk.CORR
             Role.TAU: lk.TAU, Role.HEADING: lk.WHITE_HEADING}
 
 
-def bounds(problem: Problem, each: Parameter) -> tuple[float, float]:
+def bounds(problem: object, each: Parameter) -> tuple[float, float]:
     """Return the bounds of the logarithm of a parameter."""
     at = math.log(each.setting)
     if each.role is Role.ODOMETRY:
@@ -191,6 +193,7 @@ def bounds(problem: Problem, each: Parameter) -> tuple[float, float]:
         return math.log(SHARES[0]), math.log(SHARES[1])
     if each.role is not Role.TAU:
         return at - VARIANCE_RANGE, at + VARIANCE_RANGE
+    assert isinstance(problem, Problem), 'no other has time constants'
     seconds = problem.rows.seconds[problem.rows.source == each.index]
     period = float(np.median(np.diff(seconds))) if len(seconds) > 1 else 1.0
     shortest = SHORTEST_TAU * max(period, 1e-3)
