@@ -61,7 +61,9 @@ class PlainGraph:
     def hold_parts(self) -> list[int]:
         """Fix the first node of each part without a fixed one; return these nodes."""
         part = components(self.edges.i, self.edges.j, self.n_nodes)
-        held = np.setdiff1d(part, part[self.fixed])
+        is_held = np.zeros(self.n_nodes, dtype=bool)
+        is_held[part[self.fixed]] = True
+        held = np.flatnonzero((part == np.arange(self.n_nodes)) & ~is_held)
         self.fixed[held] = True
         return [*map(int, held)]
 

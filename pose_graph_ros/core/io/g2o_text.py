@@ -9,7 +9,6 @@ number of the first line that is wrong and the reason.
 
 from collections.abc import Iterable
 from dataclasses import dataclass, field
-import gzip
 from itertools import chain
 from pathlib import Path
 from typing import NoReturn
@@ -99,6 +98,8 @@ def read_text(path: Path) -> str:
     try:
         content = path.read_bytes()
         if content.startswith(_GZIP):
+            import gzip  # noqa: PLC0415
+
             content = gzip.decompress(content)
         return content.decode('utf-8')
     except (OSError, EOFError, UnicodeDecodeError) as error:
