@@ -393,3 +393,22 @@ def test_a_file_that_cannot_be_written_is_one_line_of_error(
     err = capsys.readouterr().err
     assert len(err.splitlines()) == 1
     assert 'out.g2o' in err
+
+
+@pytest.mark.parametrize('method', ['selection', 'gnc', 'gnc-gm'])
+def test_each_method_finds_single_wrong_closures(
+    method: str, tmp_path: Path, capsys: pytest.CaptureFixture[str],
+) -> None:
+    drive = laps(3, n_wrong=6)
+    path, out = tmp_path / 'laps.g2o', tmp_path / 'out.g2o'
+    write_g2o(drive.graph, path)
+    assert main(['solve', str(path), '--robust', method, '-o', str(out), '--json']) == 0
+    values = json.loads(capsys.readouterr().out)
+    wrong = drive.graph.edges_at(drive.closures[~drive.right])
+    assert set(map(tuple, values['doubted'])) == set(zip(
+        wrong.i.tolist(), wrong.j.tolist(), strict=True))
+    assert values['robust'] == {
+        'method': method, 'closures': len(drive.closures), 'doubted': 6,
+        'scale': values['robust']['scale']}
+    assert values['certificate']['verdict'] == 'certified'
+    assert drive.error(read_g2o(out).graph.poses) < 0.5

@@ -73,7 +73,12 @@ class PlainGraph:
 
     def energies(self) -> Energies:
         """Return the energies of all edges."""
-        error = errors(self.poses, self.edges)
+        # what overflows is infinite
+        with np.errstate(over='ignore', invalid='ignore'):
+            error = errors(self.poses, self.edges)
+            return self._energies(error)
+
+    def _energies(self, error: FloatArray) -> Energies:
         return Energies(np.einsum('mi,mij,mj->m', error, self.edges.information, error),
                         np.empty(0), np.empty(0))
 

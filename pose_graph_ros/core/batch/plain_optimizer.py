@@ -73,6 +73,8 @@ class PlainOptimizer:
         """
         graph = self._graph
         before, chi2 = graph.poses, graph.energies().chi2
+        if not chi2 < np.inf:
+            return None
         try:
             graph.poses = self._chordal()
             result = self._minimize(TRUSTED_ITERATIONS, Start.CHORDAL)
@@ -117,6 +119,8 @@ class PlainOptimizer:
             error, by_i, by_j = linearized(graph.poses, graph.edges)
             weighted = np.einsum('mij,mj->mi', graph.edges.information, error)
             after = float(np.einsum('mi,mi->', weighted, error))
+            if not after < np.inf:
+                return None
             if after <= chi2 * (1.0 + ROUNDING):
                 comparable = uphill == 0
                 chi2, best, uphill = after, graph.poses, 0
@@ -131,7 +135,7 @@ class PlainOptimizer:
                 graph.set_poses(best)
                 chord, length, previous, factors = False, np.inf, np.inf, None
                 continue
-            elif uphill == UPHILL_STEPS or not after < np.inf:
+            elif uphill == UPHILL_STEPS:
                 return None
             else:
                 uphill += 1

@@ -35,6 +35,8 @@ from pose_graph_ros.core.graph.constraints import Edges, ObservedNodes
 from pose_graph_ros.core.graph.kinds import NodeKind
 from pose_graph_ros.core.sparse.components import components
 
+# Largest distance whose squares are certain not to overflow [m].
+LARGEST = 1e100
 # Relative difference up to which information counts as isotropic.
 ISOTROPIC = 1e-9
 
@@ -161,7 +163,10 @@ def formulate(graph: Constrained) -> Formulation:
         at[edges.i] + own[edges.i] * _complex(edges.mean), _complex(observed.mean) - origin))
     offset = np.concatenate((np.zeros(len(edges)), _complex(observed.offset)))
     information = np.concatenate((edges.weighted_information, observed.weighted_information))
-    kappa, tau = _kappa_tau(information)
+    with np.errstate(over='ignore', invalid='ignore'):
+        kappa, tau = _kappa_tau(information)
+    if not (np.all(np.isfinite(tau)) and np.all(np.abs(arm_i) < LARGEST)):
+        raise NotCoveredError('the numbers are too large')
     form = Formulation(
         start, number[end], own_i * turn * own[end].conj(), arm_i, at[end] + own[end] * offset,
         kappa, tau, number, poses.copy(), _is_below(information, kappa, tau), origin)

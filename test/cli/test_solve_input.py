@@ -1,0 +1,121 @@
+# Copyright 2026 The pose_graph_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""What `pose-graph solve` says of files that are wrong, or written in another way than usual."""
+
+import gzip
+import json
+from pathlib import Path
+import re
+
+import numpy as np
+import pytest
+
+from pose_graph_ros.cli.main import main
+from pose_graph_ros.core.io.g2o import read_g2o
+
+I = '1 0 0 1 0 1'   # noqa: E741
+FIRST = f'VERTEX_SE2 0 0 0 0\nEDGE_SE2 0 1 1 0 0 {I}\n'
+LARGEST = 2**63 - 1
+# Text behind two good lines, and what is said.
+WRONG = {
+    'truncated': ('EDGE_SE2 1 2 1 0 0 1 0 0 1 0', ':3: EDGE_SE2 is followed by 11 .*got 10'),
+    'nan': (f'EDGE_SE2 1 2 1 0 nan {I}', ':3: EDGE_SE2 holds a number that is not finite'),
+    'indefinite': ('EDGE_SE2 1 2 1 0 0 1 2 0 1 0 1', ':3: .* not positive semidefinite'),
+    'twice': ('VERTEX_SE2 0 1 0 0', ':3: vertex 0 is in the file twice'),
+    'id': (f'EDGE_SE2 1 {LARGEST + 1} 1 0 0 {I}', ':3: EDGE_SE2: .*too large'),
+    'itself': (f'EDGE_SE2 1 1 1 0 0 {I}', ':3: .* from a node to itself'),
+    'landmark': ('LANDMARK 0 0 1 1 5 0', ':3: LANDMARK is followed by 7 numbers, got 6'),
+    'fix': ('FIX 4', ':3: FIX 4: there is no such vertex'),
+}
+
+
+@pytest.mark.parametrize('name', WRONG)
+def test_a_wrong_file_is_one_line_that_names_it(
+    name: str, tmp_path: Path, capsys: pytest.CaptureFixture[str],
+) -> None:
+    path, (line, said) = tmp_path / 'graph.g2o', WRONG[name]
+    path.write_text(FIRST + line, encoding='ascii')
+    assert main(['solve', str(path)]) == 2
+    captured = capsys.readouterr()
+    assert captured.out == ''
+    assert re.fullmatch(f'error: {re.escape(str(path))}{said}.*\n', captured.err)
+
+
+@pytest.mark.parametrize('content', [
+    b'', b'\xff\xfe', gzip.compress(FIRST.encode())[:30], b'{"a": 1}', None])
+def test_what_is_no_graph_is_one_line(
+    content: bytes | None, tmp_path: Path, capsys: pytest.CaptureFixture[str],
+) -> None:
+    path = tmp_path / 'graph.g2o'
+    if content is None:
+        path.mkdir()
+    else:
+        path.write_bytes(content)
+    assert main(['solve', str(path)]) == 2
+    error = capsys.readouterr().err
+    assert error.startswith(f'error: {path}')
+    assert error.count('\n') == 1
+
+
+def solved(path: Path, capsys: pytest.CaptureFixture[str], *options: str) -> dict[str, object]:
+    assert main(['solve', str(path), '--json', *options]) == 0
+    values: dict[str, object] = json.loads(capsys.readouterr().out)
+    return values
+
+
+def test_line_ends_and_compression_change_nothing(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str],
+) -> None:
+    text = FIRST + f'EDGE_SE2 1 2 1 0 1 {I}\nEDGE_SE2 2 0 -1.7 0.2 -1 {I}\n'
+    results = []
+    for name, content in (('unix.g2o', text.encode()), ('old.g2o', text.replace(
+            '\n', '\r\n').encode()), ('packed.g2o.gz', gzip.compress(text.encode()))):
+        path = tmp_path / name
+        path.write_bytes(content)
+        values = solved(path, capsys)
+        results.append((values['chi2'], values['hidden_nodes'], values['edges']))
+    assert results[0][0] > 0.01
+    assert results[1:] == results[:2]
+
+
+@pytest.mark.parametrize('ids', [(0, 7, 5), (-5, -4, -9), (LARGEST, LARGEST - 1, 0)])
+def test_ids_are_any_integers(
+    ids: tuple[int, ...], tmp_path: Path, capsys: pytest.CaptureFixture[str],
+) -> None:
+    path, out = tmp_path / 'graph.g2o', tmp_path / 'out.g2o'
+    a, b, c = ids
+    path.write_text(f'EDGE_SE2 {a} {b} 1 0 0 {I}\nEDGE_SE2 {b} {c} 1 0 0 {I}\n'
+                    f'EDGE_SE2 {a} {c} 2 1 0 {I}\n', encoding='ascii')
+    assert solved(path, capsys, '-o', str(out))['chi2'] == pytest.approx(1.0 / 4.0, abs=0.1)
+    assert sorted(ids) == read_g2o(out).ids.tolist()
+
+
+def test_numbers_that_overflow_are_not_said_to_have_converged(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str],
+) -> None:
+    path = tmp_path / 'huge.g2o'
+    path.write_text(''.join(f'EDGE_SE2 {i} {j} {x} 0 0 {I}\n' for i, j, x in (
+        (0, 1, '1e200'), (1, 2, '1e200'), (0, 2, '-1e200'))), encoding='ascii')
+    assert main(['solve', str(path)]) == 1
+    assert 'failed after 0 iterations' in capsys.readouterr().out
+
+
+def test_landmarks_of_isam(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    root = '10 0 0 10 0 10'
+    seen = ((0, 0, 1.0, 1.0), (1, 0, 0.1, 1.0), (2, 1, 1.0, -1.0))
+    path, same = tmp_path / 'isam.txt', tmp_path / 'same.g2o'
+    chain = ''.join(f'{{}} {k} {k + 1} 1 0 0 {{}}\n' for k in range(2))
+    path.write_text(chain.format(*('ODOMETRY', root) * 2) + ''.join(
+        f'LANDMARK {i} {k} {x} {y} 5 1 4\n' for i, k, x, y in seen), encoding='ascii')
+    # the information is the square of that root
+    same.write_text(chain.format(*('EDGE_SE2', '100 0 0 100 0 100') * 2) + ''.join(
+        f'EDGE_SE2_XY {i} {k + 3} {x} {y} 25 5 17\n' for i, k, x, y in seen), encoding='ascii')
+    assert main(['solve', str(path), '--json']) == 0
+    captured = capsys.readouterr()
+    values = json.loads(captured.out)
+    assert values['edge2'] == 'isam'
+    assert 'LANDMARK is a tag of iSAM' in captured.err
+    assert 'landmark 0 of iSAM is node 3 here' in captured.err
+    assert values['chi2'] > 1e-3
+    assert values['chi2'] == pytest.approx(solved(same, capsys)['chi2'], rel=1e-9)
+    np.testing.assert_array_equal(read_g2o(path, 'isam').graph.is_pose, [True] * 3 + [False] * 2)
