@@ -35,7 +35,8 @@ examples:
   pose-graph solve graph.graph --edge2 toro --start best
   pose-graph solve graph.g2o --marginals newest
   pose-graph solve graph.g2o --marginals all -o covariances.csv --json
-  pose-graph solve graph.g2o --robust --no-certificate -o optimised.g2o
+  pose-graph solve graph.g2o --robust -o optimised.g2o
+  pose-graph solve graph.g2o --robust gnc --closure-sigma 0 0 --json
 
 exit code: 0 converged, 1 not converged, 2 wrong input
 """
@@ -44,7 +45,8 @@ exit code: 0 converged, 1 not converged, 2 wrong input
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Add the arguments of this tool."""
     parser.epilog = EXAMPLES
-    parser.add_argument('graph', type=Path, help='g2o file')
+    parser.add_argument('graph', type=Path,
+                        help='g2o, TORO or iSAM file, also compressed by gzip')
     parser.add_argument('-o', '--out', metavar='FILE', type=Path, action='append', default=[],
                         help='optimised g2o file, or marginals if the name ends in .csv; may be '
                              'repeated')
