@@ -35,6 +35,7 @@ SUMMARY = ('title', 'subtitle', 'start', 'duration', 'facts', 'findings', 'error
 OF_SOURCES = ('series', 'histogram')
 OF_REPLAY = ('begin', 'until', 'stamps', 'edge2', 'params_file', 'truth')
 """Options that are of use for a bag or a g2o file alone, with inputs and parameters."""
+PAGES = ('.html', '.htm')
 BAG_SUFFIXES = ('.mcap', '.db3', '.bag', '.g2o')
 
 
@@ -58,13 +59,13 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def execute(options: argparse.Namespace) -> int:
     """Run the tool; return the exit code."""
+    if options.out is not None and options.out.suffix not in PAGES:
+        raise ConfigError(f'--out {options.out}: the name must end in {" or ".join(PAGES)}')
     code, file = 0, _file(options)
     if file is None:
         code, file = _replay(options), options.folder / FILE
     data = read_document(file)
     page = options.out or file.parent / 'report.html'
-    if page.suffix not in ('.html', '.htm'):
-        raise ConfigError(f'--out {page}: the name must end in .html')
     page.parent.mkdir(parents=True, exist_ok=True)
     page.write_text(render(data), encoding='utf-8')
     if options.json:
@@ -90,9 +91,12 @@ def summary(data: dict[str, Any]) -> dict[str, Any]:
 def _file(options: argparse.Namespace) -> Path | None:
     """Return the run.json that is asked for; None if something is to be replayed."""
     first: Path = options.runs[0]
-    if len(options.runs) == 1 and first.is_dir() and (first / FILE).is_file():
+    for path in options.runs if len(options.runs) > 1 else ():
+        if (path / FILE).is_file() or path.suffix == '.json':
+            raise FileFormatError(f'{path}: expected one run, or several bags')
+    if first.is_dir() and (first / FILE).is_file():
         file = first / FILE
-    elif len(options.runs) == 1 and first.suffix == '.json':
+    elif first.suffix == '.json':
         file = first
     elif first.is_dir() and (first / 'summary.json').is_file():
         raise FileFormatError(f'{first}: no {FILE}, so it was made by an earlier version: '

@@ -16,6 +16,10 @@ KEYS = {
     'states': list, 'texts': list, 'error_table': list, 'sources': list, 'springs': list,
     'sparsity': list}
 """Keys of run.json that are never null, with their types."""
+ENTRIES = {'facts': ('label', 'value'), 'findings': ('level', 'text'), 'sources': ('name', 'rows'),
+           'springs': ('name', 'energy'), 'fixes': ('t', 'x', 'y', 'state'),
+           'closures': ('t0', 't1', 'state'), 'sparsity': ('size', 'cells')}
+"""What the entries of these lists have at least."""
 OTHERS = ('start', 'duration', 'datum', 'errors', 'updates')
 
 
@@ -47,6 +51,11 @@ def read_document(path: Path) -> dict[str, Any]:
         if not isinstance(data.get(key), kind):
             raise FileFormatError(f'{path}: {key}: expected {kind.__name__}, got '
                                   f'{type(data.get(key)).__name__}')
+    for key, names in ENTRIES.items():
+        for at, entry in enumerate(data[key]):
+            missing = [name for name in names if not isinstance(entry, dict) or name not in entry]
+            if len(missing) > 0:
+                raise FileFormatError(f'{path}: {key}[{at}]: no {missing[0]}')
     for key in OTHERS:
         if key not in data:
             raise FileFormatError(f'{path}: no {key}')

@@ -1,0 +1,171 @@
+# Copyright 2026 The pose_graph_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""The tool `pose-graph report`: of folders, files and bags, and what it says of wrong ones."""
+
+import json
+import os
+from pathlib import Path
+import re
+import time
+
+from circle_bag import fixes, odometry
+import numpy as np
+import pytest
+from run_schema import problems
+
+from pose_graph_ros.cli.bag_messages import write_bag
+from pose_graph_ros.cli.main import main
+
+FALSE_LOOPS = Path(__file__).parents[3] / 'shared' / 'data' / 'false_loops'
+
+
+def run(*words: object) -> int:
+    return main(['report', *map(str, words)])
+
+
+@pytest.fixture(scope='module')
+def bag(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp('report') / 'circle'
+    write_bag(folder, (*odometry(), *fixes(np.zeros(2))))
+    return folder
+
+
+@pytest.fixture(scope='module')
+def folder(bag: Path) -> Path:
+    """Return the folder of a replay, of which the test must change nothing."""
+    out = bag.parent / 'replayed'
+    assert main(['replay', str(bag), '-o', str(out)]) == 0
+    return out
+
+
+def data_of(page: Path) -> dict[str, object]:
+    """Return the data in a page."""
+    found = re.search(r'<script[^>]*id="data"[^>]*>(.*?)</script>', page.read_text('utf-8'), re.S)
+    assert found is not None
+    return dict(json.loads(found[1]))
+
+
+def test_the_page_has_the_data_of_the_run(
+    folder: Path, capsys: pytest.CaptureFixture[str],
+) -> None:
+    assert run(folder) == 0
+    printed = capsys.readouterr().out
+    page = folder / 'report.html'
+    assert printed.endswith(f'written: {page} ({1e-6 * page.stat().st_size:.1f} MB)\n')
+    data = json.loads((folder / 'run.json').read_text('utf-8'))
+    assert data_of(page) == data
+    assert all(each['text'] in printed for each in data['findings'])
+    again = folder.parent / 'deep' / 'again.html'
+    assert run(folder / 'run.json', '-o', again) == 0
+    assert again.read_bytes() == page.read_bytes()
+
+
+def test_json_has_the_findings_without_the_large_tables(
+    folder: Path, capsys: pytest.CaptureFixture[str],
+) -> None:
+    page = folder.parent / 'page.html'
+    assert run(folder, '--json', '-o', page) == 0
+    found = json.loads(capsys.readouterr().out)
+    assert set(found) == {
+        'title', 'subtitle', 'start', 'duration', 'facts', 'findings', 'error_table', 'sources',
+        'springs', 'page', 'bytes'}
+    assert (found['page'], found['bytes']) == (str(page), page.stat().st_size)
+    assert all('series' not in each and 'rows' in each for each in found['sources'])
+
+
+def test_a_bag_is_replayed_first(
+    bag: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str],
+) -> None:
+    assert run(bag, '--run', tmp_path / 'out', '--hold-out', 4, '--until', 30) == 0
+    printed = capsys.readouterr().out
+    assert str(tmp_path / 'out' / 'report.html') in printed
+    assert 'counts' not in printed  # that is what the replay says
+    data = json.loads((tmp_path / 'out' / 'run.json').read_text('utf-8'))
+    assert list(problems(data)) == []
+    assert data['errors']['against'] == 'held-out fixes'
+    assert data['duration'] == pytest.approx(30.0, abs=0.2)
+    assert sum(data['fixes'][0]['held_out']) == len(data['errors']['t'])
+    assert 0.0 < max(data['errors']['position']) < 0.5
+
+
+@pytest.mark.skipif(not FALSE_LOOPS.is_dir(), reason=f'no {FALSE_LOOPS}')
+def test_wrong_closures_of_a_recording_are_told(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str],
+) -> None:
+    assert run(FALSE_LOOPS / 'B25b_0.150.g2o', '--stamps', FALSE_LOOPS / 'B25b_timestamps.txt',
+               '--run', tmp_path, '--json') == 0
+    found = json.loads(capsys.readouterr().out)
+    assert found['findings'][0]['level'] == 'warning'
+    assert re.match(r'loop_closure: \d+ of 350 closures contradict the others',
+                    found['findings'][0]['text'])
+    assert list(problems(json.loads((tmp_path / 'run.json').read_text('utf-8')))) == []
+
+
+def test_the_page_is_shown_in_a_browser(
+    folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    shown = tmp_path / 'shown'
+    browser = tmp_path / 'browser'
+    browser.write_text(f'#!/bin/sh\necho "$1" > {shown}\n', encoding='utf-8')
+    browser.chmod(0o755)
+    monkeypatch.setenv('BROWSER', f'{browser} %s')
+    assert run(folder, '--open', '-o', tmp_path / 'page.html') == 0
+    end = time.monotonic() + 10.0
+    while not (shown.exists() and shown.read_text('utf-8').endswith('\n')):
+        assert time.monotonic() < end
+        time.sleep(0.01)
+    assert shown.read_text('utf-8').strip() == (tmp_path / 'page.html').as_uri()
+
+
+@pytest.mark.parametrize(('content', 'said'), [
+    ('', ':1: not JSON: '), ('[1,\n', ':2: not JSON: '), ('[]', 'not the run.json of a replay'),
+    ('{"version": 1, "title": NaN}', 'expected finite numbers, got NaN'),
+    ('{"version": 2}', 'expected version 1, got 2: replay the bag again'),
+    ('{"version": 1, "title": 3}', 'title: expected str, got int')])
+def test_what_is_no_run_is_refused_in_one_line(
+    content: str, said: str, tmp_path: Path, capsys: pytest.CaptureFixture[str],
+) -> None:
+    file = tmp_path / 'run.json'
+    file.write_text(content, encoding='utf-8')
+    assert run(tmp_path) == 2
+    out, err = capsys.readouterr()
+    assert (out, err.count('\n')) == ('', 1)
+    assert err.startswith(f'error: {file}')
+    assert said in err
+    assert not (tmp_path / 'report.html').exists()
+
+
+def test_a_run_with_an_entry_that_lacks_something_is_refused(
+    folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str],
+) -> None:
+    data = json.loads((folder / 'run.json').read_text('utf-8'))
+    del data['sources'][1]['rows']
+    (tmp_path / 'run.json').write_text(json.dumps(data), encoding='utf-8')
+    assert run(tmp_path) == 2
+    assert capsys.readouterr().err == f'error: {tmp_path}/run.json: sources[1]: no rows\n'
+
+
+def test_folders_that_are_no_runs_and_wrong_options_are_named(
+    folder: Path, bag: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str],
+) -> None:
+    (tmp_path / 'old').mkdir()
+    (tmp_path / 'old' / 'summary.json').write_text('{}', encoding='utf-8')
+    (tmp_path / 'empty').mkdir()
+    (tmp_path / 'words.txt').write_text('words', encoding='utf-8')
+    for words, said in (
+            ([tmp_path / 'old'], 'made by an earlier version: replay the bag again'),
+            ([tmp_path / 'empty'], 'expected the folder of a replay or a demo with run.json'),
+            ([tmp_path / 'words.txt'], 'expected run.json, or a file with the suffix .mcap'),
+            ([tmp_path / 'missing'], 'missing: does not exist'),
+            ([folder, folder], 'expected one run, or several bags'),
+            ([folder, '--odom', '/odom'], '--odom: '), ([folder, '--from', 3], '--from: '),
+            ([folder, '-o', 'page.png'], '--out page.png: the name must end in .html'),
+            ([bag, '--run', bag], 'this is a bag; name another folder'),
+            ([bag, '--run', tmp_path / 'out', '--odom', '/nope'], 'no topic /nope (--odom)')):
+        assert run(*words) == 2
+        out, err = capsys.readouterr()
+        assert (out, err.count('\n')) == ('', 1)
+        assert said in err
+    if os.getuid() != 0:
+        (tmp_path / 'empty').chmod(0o500)
+        assert run(folder, '-o', tmp_path / 'empty' / 'page.html') == 2
