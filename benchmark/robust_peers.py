@@ -25,7 +25,8 @@ from pose_graph_ros.core.geometry.se2 import BoolArray, FloatArray, IntArray
 from pose_graph_ros.core.geometry.trajectory import Trajectory
 from pose_graph_ros.core.graph.constraints import Edges
 from pose_graph_ros.core.graph.graph import Graph, GraphUpdate
-from pose_graph_ros.core.io.g2o import read_g2o, write_g2o
+from pose_graph_ros.core.io.g2o import read_g2o
+from pose_graph_ros.core.io.g2o_writing import write_g2o
 from pose_graph_ros.core.judgement.floors import floored, FLOORS
 from pose_graph_ros.core.solver_config import SolverConfig
 
