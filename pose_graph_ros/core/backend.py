@@ -161,9 +161,11 @@ class PoseGraphBackend:
         """Return the residuals of each source with what they show; linear in the graph."""
         return components.analyse(self._smoother, self._nodes, self._factors, self._reweighting)
 
-    def largest_energies(self, n: int) -> list[constraint_names.ConstraintEnergy]:
-        """Return the n constraints with the largest energies, with names, in descending order."""
-        return constraint_names.largest(self.graph, self._nodes, self._factors, n)
+    def largest_energies(
+        self, n: int, start_ns: int = 0,
+    ) -> list[constraint_names.ConstraintEnergy]:
+        """Return the n constraints with the largest energies: see `constraint_names.largest`."""
+        return constraint_names.largest(self.graph, self._nodes, self._factors, n, start_ns)
 
     def verdicts(self, most_believed: int | None = None) -> list[vd.Verdict]:
         """Return all verdicts, but of those that are believed only the newest of each source."""

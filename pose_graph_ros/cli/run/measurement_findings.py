@@ -140,8 +140,8 @@ def _odometry(run: Run, source: str, verdicts: Sequence[Verdict]) -> Iterator[Te
                if each.kind is Judged.ODOMETRY and not each.state.in_graph]
     for each in doubted[:MOST_TOLD]:
         at = _seconds(run, each.stamp_ns)
-        yield ('warning', f'{source}: odometry is wrong before {at:.1f} s: {sentence(each)}',
-               'map')
+        yield ('warning', f'{source}: odometry is wrong before {at:.1f} s: '
+               f'{sentence(each, run.start_ns)}', 'map')
     if len(doubted) > MOST_TOLD:
         yield ('warning', f'{source}: odometry is doubted in {len(doubted) - MOST_TOLD} more '
                'places', 'map')

@@ -133,7 +133,7 @@ def fixes(
         found.append({
             'source': source, 't': frame.seconds(stamps), 'x': x, 'y': y, 'state': states,
             'why': [-1 if verdict is None or state in (BELIEVED, HELD_OUT)
-                    else frame.text(sentence(verdict))
+                    else frame.text(sentence(verdict, frame.start_ns))
                     for verdict, state in zip(each, states, strict=True)],
             'held_out': held_out.astype(int).tolist(),
             'id': None if not any(each) else [
@@ -170,7 +170,8 @@ def closures(
             reason = refused.get(key, '')
             states.append(_NUMBERS[verdict.state] if verdict is not None
                           else REFUSED if reason != '' else BELIEVED)
-            why.append(frame.text(reason if verdict is None else sentence(verdict)))
+            why.append(frame.text(reason if verdict is None
+                                  else sentence(verdict, frame.start_ns)))
             ids.append('' if verdict is None else verdict.id)
             far.append(np.nan if verdict is None else verdict.distance)
         first, last = drive.corrected.stamps_ns[[0, -1]]

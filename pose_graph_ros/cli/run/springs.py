@@ -34,7 +34,7 @@ def springs(
     names = {(each.edge, each.number): each.id for each in verdicts}
     stamps = backend.node_stamps_ns
     found = []
-    for rank, each in enumerate(backend.largest_energies(MOST), 1):
+    for rank, each in enumerate(backend.largest_energies(MOST, frame.start_ns), 1):
         place = residual = sigma = expected = None
         source = residuals.get(each.source)
         at = [] if source is None else np.flatnonzero(

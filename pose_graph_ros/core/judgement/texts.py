@@ -60,17 +60,26 @@ def joined(names: Sequence[str]) -> str:
     return ', '.join(names[:MOST_NAMED]) + (f' and {more} more' if more > 0 else '')
 
 
-def sentence(verdict: Verdict) -> str:
-    """Return state and reason of a verdict as a sentence."""
-    since, far = seconds(verdict.since_ns), _far(verdict.distance)
+def sentence(verdict: Verdict, start_ns: int | None = None) -> str:
+    """
+    Return state and reason of a verdict as a sentence.
+
+    Parameters
+    ----------
+    verdict : Verdict
+    start_ns : int, optional
+        Start of the drive [ns]: its times are since then, `12.3 s`; else they are stamps.
+
+    """
+    since, far = _time(verdict.since_ns, start_ns), _far(verdict.distance)
+    reason = _jump(verdict, start_ns) or far
     supported = '' if len(verdict.supported_by) == 0 else (
         f'; {joined(verdict.supported_by)} {_agree(verdict.supported_by)} with it')
     contradicted = '' if len(verdict.contradicted_by) == 0 else (
         f'; it contradicts {joined(verdict.contradicted_by)}')
     if verdict.left:
         how = 'doubted' if verdict.kind is Judged.ODOMETRY else 'unused'
-        return (f'Left the window {how} at {since}: {_jump(verdict) or far}{contradicted}'
-                f'{supported}.')
+        return f'Left the window {how} at {since}: {reason}{contradicted}{supported}.'
     if verdict.decision is not Decision.AUTO:
         used = 'Used' if verdict.decision is Decision.IN else 'Not used'
         return f'{used} since {since}, as a person has decided: {far}{contradicted}{supported}.'
@@ -84,17 +93,21 @@ def sentence(verdict: Verdict) -> str:
             return (f'Waits since {since} and is not used: too little is known yet to believe or '
                     f'to doubt it; {far}{supported}{contradicted}.')
         case State.DOUBTED:
-            return (f'Doubted and not used since {since}: {_jump(verdict) or far}{contradicted}'
-                    f'{supported}.')
+            return f'Doubted and not used since {since}: {reason}{contradicted}{supported}.'
 
 
-def _jump(verdict: Verdict) -> str:
+def _time(stamp_ns: int, start_ns: int | None) -> str:
+    return seconds(stamp_ns) if start_ns is None else f'{(stamp_ns - start_ns) * 1e-9:.1f} s'
+
+
+def _jump(verdict: Verdict, start_ns: int | None) -> str:
     """Return by how much odometry is wrong, and where; nothing of other constraints."""
     if verdict.kind is not Judged.ODOMETRY or verdict.reference_ns is None:
         return ''
     x, y, theta = verdict.residual.tolist()
     return (f'it is wrong by {math.hypot(x, y):.2f} m and {abs(theta):.2f} rad, somewhere '
-            f'between {seconds(verdict.reference_ns)} and {seconds(verdict.stamp_ns)}')
+            f'between {_time(verdict.reference_ns, start_ns)} and '
+            f'{_time(verdict.stamp_ns, start_ns)}')
 
 
 def _agree(names: Sequence[str]) -> str:

@@ -50,6 +50,16 @@ def test_a_sentence_says_state_and_reason() -> None:
         'Not used since 1700.500, as a person has decided')
 
 
+def test_times_may_be_those_of_the_drive() -> None:
+    start = 1_600_000_000_000
+    assert sentence(CLOSURE, start).startswith('Doubted and not used since 100.5 s: it was')
+    wrong = replace(CLOSURE, kind=Judged.ODOMETRY, contradicted_by=())
+    assert sentence(wrong, start) == (
+        'Doubted and not used since 100.5 s: it is wrong by 5.00 m and 0.20 rad, somewhere '
+        'between 0.0 s and 95.2 s.')
+    assert 'between 1600.000 and 1695.250.' in sentence(wrong)
+
+
 @pytest.mark.parametrize(('state', 'decision', 'distance'), list(product(
     State, Decision, (math.nan, 0.5))))
 def test_every_state_has_a_sentence_of_its_own(
