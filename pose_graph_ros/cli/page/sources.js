@@ -98,7 +98,7 @@ function showHistogram(host, {histogram}) {
   }
   makeChart(host, {
     title: 'How large they are',
-    note: 'Larger ones are counted in the outermost bars.', x: {label: 'residual [sigma]', domain: [edges[0],
+    note: 'Larger ones are counted in the outermost bars.', x: {label: 'residual / expected', domain: [edges[0],
       edges[edges.length - 1]]}, y: {label: 'count', format: (value) => number(value, 4)},
     marks: [
       {kind: 'bars', edges, y: count, colour: 'path', name: 'found', x: []},
@@ -116,7 +116,7 @@ function showSeries(host, {series, rows}) {
     kind: 'rule', of: 'y', at, colour: 'muted', dash: [5, 4]}));
   makeChart(host, {title: 'Over time', marks: [...rules, ...marks],
     x: {label: `time [${clockUnit()}]`, time: true, domain: [0, DATA.duration || 1]},
-    y: {label: 'residual [sigma]', zero: true},
+    y: {label: 'residual / expected', zero: true},
     note: 'Dashed: 2 sigma, where 95 % should be within.'});
 }
 
