@@ -20,7 +20,7 @@ import numpy as np
 from pose_graph_ros.cli.graph_input import read_file
 from pose_graph_ros.cli.solve_starts import METHODS, Problem, Solution, solve, STARTS
 from pose_graph_ros.core.batch.outcome import Status
-from pose_graph_ros.core.exceptions import PoseGraphError
+from pose_graph_ros.core.exceptions import ConfigError, PoseGraphError
 from pose_graph_ros.core.geometry.se2 import FloatArray, IntArray
 from pose_graph_ros.core.io.g2o import EDGE2_ORDERS
 from pose_graph_ros.core.solver_config import CLOSURE_FLOORS
@@ -45,7 +45,7 @@ exit code: 0 converged, 1 not converged, 2 wrong input
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Add the arguments of this tool."""
     parser.epilog = EXAMPLES
-    parser.add_argument('graph', type=Path,
+    parser.add_argument('graph', type=Path, nargs='?',  # see `_arguments`
                         help='g2o, TORO or iSAM file, also compressed by gzip')
     parser.add_argument('-o', '--out', metavar='FILE', type=Path, action='append', default=[],
                         help='optimised g2o file, or marginals if the name ends in .csv; may be '
@@ -60,7 +60,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
                         help='covariances of these nodes as CSV: the last output, or -o FILE.csv '
                              '(default, with such a file: all)')
     parser.add_argument('--json', action='store_true', help='print JSON (docs/tools.md)')
-    parser.add_argument('--robust', nargs='?', choices=METHODS, const=METHODS[0],
+    parser.add_argument('--robust', nargs='?', metavar='|'.join(METHODS), const=METHODS[0],
                         help='decide which loop closures to believe, and leave the others out, by '
                              'comparing sets of them (selection, the default), or by graduated '
                              'non-convexity with the surrogate for truncated least squares (gnc) '
@@ -83,8 +83,20 @@ def _sigma(text: str) -> float:
     return value
 
 
+def _arguments(options: argparse.Namespace) -> None:
+    """Complete the arguments: in `--robust FILE`, what follows the option is the file."""
+    if options.robust not in (None, *METHODS):
+        if options.graph is not None:
+            raise ConfigError(
+                f'--robust: expected {", ".join(METHODS)} or nothing, got {options.robust!r}')
+        options.graph, options.robust = Path(options.robust), METHODS[0]
+    if options.graph is None:
+        raise ConfigError('expected the file of a graph')
+
+
 def execute(options: argparse.Namespace) -> int:
     """Run the tool; return the exit code."""
+    _arguments(options)
     file, order = read_file(options.graph, options.edge2)
     tables = [path for path in options.out if path.suffix == '.csv']
     which = options.marginals or ('all' if len(tables) > 0 else None)

@@ -356,7 +356,22 @@ def test_there_is_a_robust_answer_wherever_there_is_a_graph(
 ) -> None:
     path = write(tmp_path / 'graph.g2o', LOOSE[name][0])
     assert main(['solve', str(path), '--robust']) == 0
-    assert 'converged' in capsys.readouterr().out
+    told = capsys.readouterr().out
+    assert 'converged' in told
+    assert main(['solve', '--robust', str(path)]) == 0
+    timed = r'[\d.e-]+ s'
+    assert re.sub(timed, '', capsys.readouterr().out) == re.sub(timed, '', told)
+
+
+@pytest.mark.parametrize(('words', 'said'), [
+    (['--robust', 'best', 'graph.g2o'],
+     "--robust: expected selection, gnc, gnc-gm or nothing, got 'best'"),
+    (['--robust', 'gnc'], 'expected the file of a graph'), ([], 'expected the file of a graph')])
+def test_a_method_that_is_none_and_a_missing_file_are_told(
+    words: list[str], said: str, capsys: pytest.CaptureFixture[str],
+) -> None:
+    assert main(['solve', *words]) == 2
+    assert capsys.readouterr().err == f'error: {said}\n'
 
 
 @pytest.mark.parametrize(('text', 'said'), [
