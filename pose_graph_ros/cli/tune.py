@@ -13,6 +13,7 @@ import argparse
 from collections.abc import Mapping
 from dataclasses import asdict
 import json
+import os
 from pathlib import Path
 import sys
 import time
@@ -79,6 +80,9 @@ def execute(options: argparse.Namespace) -> int:
         raise BagError(f'{options.out}: is a folder; expected a file to write')
     if not options.out.resolve().parent.is_dir():
         raise BagError(f'{options.out}: there is no folder {options.out.resolve().parent}')
+    where = options.out if options.out.exists() else options.out.resolve().parent
+    if not os.access(where, os.W_OK):
+        raise BagError(f'{options.out}: cannot be written: no permission')
     with open_bags(options.bags) as bag:
         inputs = choose_inputs(bag, source_list(values), shared.wanted_topics(options))
         truth = None if options.truth is None else read_truth(bag, options.truth)

@@ -14,6 +14,7 @@ from pose_graph_ros.core.tuning.problem import Role
 
 ODOMETRY = ('sigma_distance', 'sigma_lateral', 'sigma_heading_distance', 'sigma_heading_turn')
 LARGEST_SIGMA = 10.0  # of odometry, by the range of its parameters
+APART = 1.3  # ratio of the factors of positions and headings that both need a number
 DIGITS = 3  # that numbers have in the file
 UNDECIDED = 'kept: the data do not tell'
 AGREES = 'kept: as good as any'
@@ -151,7 +152,7 @@ def _sizes(
         return
     scale, override = f'{source.name}.covariance_scale', f'{source.name}.covariance_override'
     apart = size is not None and heading is not None and source.is_constant and (
-        heading.value != size.value)
+        max(heading.value, size.value) > APART * min(heading.value, size.value))
     if source.is_scalable and not apart:
         at_scale = values[scale]
         one = _one(scale, leading, values, lambda ratio: at_scale * ratio)

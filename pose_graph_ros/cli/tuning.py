@@ -211,10 +211,13 @@ class Tuning:
         sources = [self._without(each, without) for each in self._sources]
         fits = estimate(self._odometry, {
             each.name: each.measured for each in sources}, self._config, tick)
+        if len(fits) == 0:
+            raise BagError(f'{self._path}: nothing to tune by: no fix or global pose was measured '
+                           'while there was odometry')
         tuned: list[Tuned] = []
         for name, found in fits.items():
             tuned += odometry_parameters(name, found, self._values)
-            if len(tuned) > 0 and name == next(iter(fits)):
+            if name == next(iter(fits)):
                 for k, source in enumerate(sources):
                     tuned += source_parameters(source, k, found, self._values)
         return tuned, fits

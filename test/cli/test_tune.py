@@ -5,14 +5,17 @@
 import contextlib
 import io
 import json
+import os
 from pathlib import Path
 from typing import Any
 
 from helpers.noisy_drive import made, write
+import numpy as np
 import pytest
 import yaml
 
 from pose_graph_ros.cli.main import main
+from pose_graph_ros.core.measurements import OdometrySample, Position
 
 
 @pytest.fixture(scope='module')
@@ -68,3 +71,52 @@ def test_wrong_input_is_one_line(
     assert message in error
     assert error.startswith('error: ')
     assert error.count('\n') == 1
+
+
+DATA = Path(os.environ.get(
+    'POSE_GRAPH_DATA', Path(__file__).resolve().parents[3] / 'shared' / 'data')) / 'robot'
+HUSKY, PLAZA = DATA / 'husky_test1_ros2', DATA / 'plaza1'
+
+
+def facts_of(capsys: pytest.CaptureFixture[str], *args: str) -> dict[str, Any]:
+    capsys.readouterr()
+    assert main(['tune', '--folds', '2', '--json', *args]) == 0
+    return dict(json.loads(capsys.readouterr().out))
+
+
+@pytest.mark.skipif(not HUSKY.exists(), reason=f'no recording at {HUSKY}')
+@pytest.mark.untraced
+@pytest.mark.timeout(400)
+def test_husky_is_better_at_fixes_held_out(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str],
+) -> None:
+    args = str(HUSKY), '--odom', '/husky_velocity_controller/odom', '--fix', '/fix'
+    facts = facts_of(capsys, *args, '-o', str(tmp_path / 'tuned.yaml'))
+    assert facts['after']['rms'] < facts['before']['rms']
+    rms = []
+    for more in ((), ('--params-file', str(tmp_path / 'tuned.yaml'))):
+        assert main(['replay', *args, '--hold-out', '5', '--json', '-o', str(tmp_path / 'out'),
+                     *more]) == 0
+        rms += [row['rms'] for row in json.loads(capsys.readouterr().out)['errors']
+                if row['name'] == 'corrected path to fixes held out']
+    assert rms[1] < 0.9 * rms[0]
+
+
+@pytest.mark.skipif(not PLAZA.exists(), reason=f'no recording at {PLAZA}')
+@pytest.mark.untraced
+@pytest.mark.timeout(400)
+def test_plaza_is_nearer_to_the_truth(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str],
+) -> None:
+    odometry, truth = (np.loadtxt(PLAZA / name, delimiter=',', skiprows=1)
+                       for name in ('odom.csv', 'gt.csv'))
+    odometry = odometry[:2500]
+    times = np.arange(odometry[0, 0] + 0.37, odometry[-1, 0], 5.0)
+    positions = np.column_stack([np.interp(times, truth[:, 0], truth[:, k]) for k in (1, 2)])
+    positions += np.random.default_rng(1).normal(0.0, 2.0, positions.shape)
+    write(tmp_path / 'bag',
+          [OdometrySample(round(row[0] * 1e9), row[1:4]) for row in odometry],
+          [Position(round(time * 1e9), position, np.eye(2), np.zeros(2))
+           for time, position in zip(times, positions, strict=True)], claimed=2.0)
+    facts = facts_of(capsys, str(tmp_path / 'bag'), '-o', str(tmp_path / 'tuned.yaml'))
+    assert facts['after']['rms'] < facts['before']['rms']

@@ -264,11 +264,11 @@ def _correlated(
     taus = np.arange(low, high + 0.1, math.log(3.0)).tolist()
     found = []
     # white errors may have been explained by noise of odometry: begin with less of that, too
-    begins = [(rest, np.array([variance, variance - 1.0])), *(
-        (settings + factor * odometry, np.arange(-8.0, 9.5, 1.5)) for factor in (-1.0, 0.0, 1.0))]
-    for begin, sizes in begins:
-        trials = [np.concatenate((begin, [size, share, tau])) for size in sizes.tolist()
-                  for share in (-3.5, -1.0) for tau in taus]
+    begins = [[(rest, np.array([variance, variance - 1.0]))], [
+        (settings + factor * odometry, np.arange(-8.0, 9.5, 1.5)) for factor in (-1.0, 0.0, 1.0)]]
+    for some in begins:
+        trials = [np.concatenate((begin, [size, share, tau])) for begin, sizes in some
+                  for size in sizes.tolist() for share in (-3.5, -1.0) for tau in taus]
         costs = [problem.value(more, trial) for trial in trials]
         found.append(Minimum(more, *minimum(problem, more, trials[int(np.argmin(costs))])))
     return min(found, key=lambda each: each.cost)
