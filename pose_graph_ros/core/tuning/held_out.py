@@ -21,6 +21,8 @@ from pose_graph_ros.core.tuning.drive_rows import Measured
 
 # Length of a stretch [s]; in time constants of the errors, and in periods of the source.
 SHORTEST, IN_TAU, IN_PERIODS = 10.0, 2.0, 5.0
+# Longest one, but for the periods [s]: over more, only the drift of odometry would count.
+LONGEST = 60.0
 # Least number of stretches that are held out together.
 LEAST_STRETCHES = 2
 # A measurement is wrong if it is so many times the median error away from all paths.
@@ -91,7 +93,7 @@ def stretch_length(duration: float, period: float, tau: float, folds: int) -> fl
     folds : int
 
     """
-    wanted = max(SHORTEST, IN_TAU * tau, IN_PERIODS * period)
+    wanted = max(SHORTEST, min(IN_TAU * tau, LONGEST), IN_PERIODS * period)
     return min(wanted, duration / (LEAST_STRETCHES * folds))
 
 
