@@ -16,6 +16,7 @@ from pose_graph_ros.adapters.parameters import checked
 from pose_graph_ros.adapters.sources import Kind
 from pose_graph_ros.cli.evaluation import Drive, evaluate
 from pose_graph_ros.cli.replay import run_measurements
+from pose_graph_ros.cli.run import places
 from pose_graph_ros.cli.run.content import Run
 from pose_graph_ros.cli.run.document import document
 from pose_graph_ros.cli.run.lines import number, rounded, simplified
@@ -101,6 +102,24 @@ def test_times_and_places_are_those_of_the_run() -> None:
         if spring['from'] is not None:
             node = int(np.argmin(np.abs(np.array(path['t']) - spring['from']['t'])))
             assert path['x'][node] == pytest.approx(spring['from']['x'], abs=0.02)
+
+
+def test_of_very_many_measurements_those_that_are_not_believed_stay(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    whole = run_of(false_closures=5)
+    monkeypatch.setattr(places, 'MOST_OF_SOURCE', 20)
+    part = run_of(('frequency', 10.0), false_closures=5)
+    assert list(problems(part)) == []
+    for name in ('fixes', 'closures'):
+        table, all_of_it = part[name][0], whole[name][0]
+        assert all_of_it['left_out'] == 0
+        assert len(table['state']) == 20
+        assert table['left_out'] == len(all_of_it['state']) - 20 > 0
+        rows = [list(zip(each['state'], each['why'], each['id'], each['d'], strict=True))
+                for each in (table, all_of_it)]
+        assert sum(row[0] > 0 for row in rows[0]) == sum(row[0] > 0 for row in rows[1])
+        assert {row[2:] for row in rows[0]} <= {row[2:] for row in rows[1]}
 
 
 @pytest.mark.parametrize('seed', range(5))

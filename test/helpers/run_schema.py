@@ -36,11 +36,11 @@ SCHEMA = {
               'truth': Maybe(PATH)},
     'ellipses': Columns(t=NUMBER, x=NUMBER, y=NUMBER, xx=NUMBER, xy=NUMBER, yy=NUMBER),
     'fixes': [Columns(
-        source=None, t=NUMBER, x=NUMBER, y=NUMBER, state=COUNT, why=NUMBER, held_out=COUNT,
-        id=Maybe(TEXT), d=Maybe(NUMBER), at=NUMBER)],
+        source=None, left_out=None, t=NUMBER, x=NUMBER, y=NUMBER, state=COUNT, why=NUMBER,
+        held_out=COUNT, id=Maybe(TEXT), d=Maybe(NUMBER), at=NUMBER)],
     'closures': [Columns(
-        source=None, t0=NUMBER, t1=NUMBER, x0=NUMBER, y0=NUMBER, x1=NUMBER, y1=NUMBER,
-        state=COUNT, why=NUMBER, id=TEXT, d=Maybe(NUMBER))],
+        source=None, left_out=None, t0=NUMBER, t1=NUMBER, x0=NUMBER, y0=NUMBER, x1=NUMBER,
+        y1=NUMBER, state=COUNT, why=NUMBER, id=TEXT, d=Maybe(NUMBER))],
     'states': [TEXT], 'texts': [TEXT],
     'errors': Maybe(Columns(
         against=None, t=NUMBER, position=NUMBER, heading=Maybe(NUMBER), sigma=Maybe(NUMBER),
@@ -110,7 +110,8 @@ def _table_problems(value: Any, columns: Mapping[str, Any], where: str) -> Itera
     sizes = set()
     for name, kind in columns.items():
         if kind is None:
-            yield from problems(value[name], TEXT, f'{where}.{name}')
+            yield from problems(
+                value[name], COUNT if name == 'left_out' else TEXT, f'{where}.{name}')
         elif value[name] is not None or not isinstance(kind, Maybe):
             yield from problems(value[name], [kind], f'{where}.{name}')
             sizes.add(len(value[name]))

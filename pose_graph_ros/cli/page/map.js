@@ -72,6 +72,12 @@ function showMap() {
   const updates = showLayers(side, layers, surface);
   makePanel(side, {onCentre: choose});
   showTime(host.querySelector('.map-main'), lines.corrected);
+  for (const [kind, tables] of [['fixes', DATA.fixes || []], ['closures', DATA.closures || []]]) {
+    for (const {source, left_out: leftOut} of tables.filter((table) => table.left_out > 0)) {
+      host.append(make('p', {class: 'note'}, `${source}: ${number(leftOut, 9)} more ${
+        kind} are not shown, nearly all of which are believed.`));
+    }
+  }
   const lists = make('div', {class: 'lists'});
   host.append(lists);
   listRejected(lists, 'closure', DATA.closures || [],

@@ -23,6 +23,8 @@ BELIEVED, REFUSED, HELD_OUT = 0, 4, 5
 _NUMBERS = {state: STATES.index(state.value) for state in State}
 # Most points of a path, of a series of errors, and ellipses.
 MOST_POSES, MOST_ERRORS, MOST_ELLIPSES = 10_000, 2000, 200
+# Most fixes, and most loop closures, of a source; half of them are kept for those not believed.
+MOST_OF_SOURCE = 20_000
 
 
 @dataclass(slots=True)
@@ -129,9 +131,14 @@ def fixes(
         each = [known.get((source, stamp)) for stamp in stamps.tolist()]
         states = [HELD_OUT if out else BELIEVED if verdict is None else _NUMBERS[verdict.state]
                   for out, verdict in zip(held_out.tolist(), each, strict=True)]
+        shown = _shown(states)
+        left_out = len(rows) - len(shown)
+        rows, stamps, held_out = rows[shown], stamps[shown], held_out[shown]
+        each, states = [each[k] for k in shown.tolist()], [states[k] for k in shown.tolist()]
         x, y = frame.places(drive.fix_positions[rows])
         found.append({
-            'source': source, 't': frame.seconds(stamps), 'x': x, 'y': y, 'state': states,
+            'source': source, 'left_out': left_out,
+            't': frame.seconds(stamps), 'x': x, 'y': y, 'state': states,
             'why': [-1 if verdict is None or state in (BELIEVED, HELD_OUT)
                     else frame.text(sentence(verdict, frame.start_ns))
                     for verdict, state in zip(each, states, strict=True)],
@@ -164,12 +171,15 @@ def closures(
         rows = rows[np.argsort(drive.loop_stamps_ns[rows, 1], kind='stable')]
         ends = np.sort(drive.loop_stamps_ns[rows], axis=1)
         keys = [(source, later, earlier) for earlier, later in drive.loop_stamps_ns[rows].tolist()]
-        states, why, ids, far = list[int](), list[int](), list[str](), list[float]()
-        for key in keys:
+        states = [_NUMBERS[known[key].state] if key in known
+                  else REFUSED if key in refused else BELIEVED for key in keys]
+        shown = _shown(states)
+        left_out = len(rows) - len(shown)
+        rows, ends = rows[shown], ends[shown]
+        why, ids, far = list[int](), list[str](), list[float]()
+        for key in [keys[k] for k in shown.tolist()]:
             verdict = known.get(key)
             reason = refused.get(key, '')
-            states.append(_NUMBERS[verdict.state] if verdict is not None
-                          else REFUSED if reason != '' else BELIEVED)
             why.append(frame.text(reason if verdict is None
                                   else sentence(verdict, frame.start_ns)))
             ids.append('' if verdict is None else verdict.id)
@@ -178,8 +188,10 @@ def closures(
         places = drive.corrected.at(np.clip(ends, first, last))[:, :, :2]
         (x0, y0), (x1, y1) = frame.places(places[:, 0]), frame.places(places[:, 1])
         found.append({
-            'source': source, 't0': frame.seconds(ends[:, 0]), 't1': frame.seconds(ends[:, 1]),
-            'x0': x0, 'y0': y0, 'x1': x1, 'y1': y1, 'state': states, 'why': why, 'id': ids,
+            'source': source, 'left_out': left_out,
+            't0': frame.seconds(ends[:, 0]), 't1': frame.seconds(ends[:, 1]),
+            'x0': x0, 'y0': y0, 'x1': x1, 'y1': y1,
+            'state': [states[k] for k in shown.tolist()], 'why': why, 'id': ids,
             'd': rounded(far, 2)})
     return found
 
@@ -218,6 +230,14 @@ def errors(drive: Drive, covariances: FloatArray, frame: Frame) -> dict[str, Any
             'heading': heading,
             'sigma': None if not np.any(np.isfinite(sigma)) else rounded(sigma[at]),
             'odometry': rounded(by_odometry)}
+
+
+def _shown(states: Sequence[int]) -> IntArray:
+    """Return which measurements are in run.json: of very many that are believed, only some."""
+    believed = np.isin(states, (BELIEVED, HELD_OUT))
+    others, rest = np.flatnonzero(~believed), np.flatnonzero(believed)
+    others = others[spread(len(others), MOST_OF_SOURCE // 2)]
+    return np.sort(np.append(others, rest[spread(len(rest), MOST_OF_SOURCE - len(others))]))
 
 
 def _nearest(stamps: IntArray, at_ns: IntArray) -> list[int]:
