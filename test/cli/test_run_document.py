@@ -108,14 +108,14 @@ def test_of_very_many_measurements_those_that_are_not_believed_stay(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     whole = run_of(false_closures=5)
-    monkeypatch.setattr(places, 'MOST_OF_SOURCE', 20)
+    monkeypatch.setattr(places, 'MOST_OF_SOURCE', 16)
     part = run_of(('frequency', 10.0), false_closures=5)
     assert list(problems(part)) == []
     for name in ('fixes', 'closures'):
         table, all_of_it = part[name][0], whole[name][0]
         assert all_of_it['left_out'] == 0
-        assert len(table['state']) == 20
-        assert table['left_out'] == len(all_of_it['state']) - 20 > 0
+        assert len(table['state']) == 16
+        assert table['left_out'] == len(all_of_it['state']) - 16 > 0
         rows = [list(zip(each['state'], each['why'], each['id'], each['d'], strict=True))
                 for each in (table, all_of_it)]
         assert sum(row[0] > 0 for row in rows[0]) == sum(row[0] > 0 for row in rows[1])
