@@ -42,8 +42,10 @@ class UpdateLog:
         """Number of all updates."""
 
     def add(self, update: Update) -> None:
-        """Add an update, which is later than the others."""
+        """Add an update, which is later than the others; the first one only loads the solver."""
         self.count += 1
+        if self.count == 1:
+            return
         self._open = update if self._open is None else _joined(self._open, update)
         self._n_open += 1
         if self._n_open < self._stride:

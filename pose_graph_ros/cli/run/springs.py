@@ -10,9 +10,11 @@ import numpy as np
 from pose_graph_ros.cli.run.lines import number, rounded
 from pose_graph_ros.cli.run.places import Frame
 from pose_graph_ros.core.backend import PoseGraphBackend
+from pose_graph_ros.core.geometry.se2 import FloatArray
 from pose_graph_ros.core.geometry.trajectory import Trajectory
 from pose_graph_ros.core.judgement.verdicts import Verdict
 from pose_graph_ros.core.residuals.source_residuals import SourceResiduals
+from pose_graph_ros.core.sources.constraint_names import ConstraintEnergy
 
 MOST = 10
 
@@ -44,11 +46,18 @@ def springs(
             residual, sigma = one.errors[0], one.sigmas[0] * one.measured[0]
             left = float(one.redundancies[0])
             expected = left if np.isfinite(left) else None
-        ends = [{'node': node, 't': frame.seconds(stamps[[node]])[0],
-                 **dict(zip('xy', (axis[0] for axis in frame.places(path.poses[node, :2])),
-                            strict=True))}
-                for node in each.nodes if node < len(path)]
-        if len(ends) == 1 and residual is not None and each.kind != 'heading':
+        ends: list[dict[str, Any]] = []
+        for node in each.nodes:
+            if node < len(path):
+                x, y = frame.places(path.poses[node, :2])
+                ends.append({'node': node, 't': frame.seconds(stamps[[node]])[0],
+                             'x': x[0], 'y': y[0]})
+        if len(ends) == 0 and each.stamp_ns >= 0 and path.covers(each.stamp_ns):
+            # a bias is shown where the robot was
+            x, y = frame.places(path.at(each.stamp_ns)[:2])
+            ends = [{'node': None, 't': frame.seconds(np.array([each.stamp_ns]))[0],
+                     'x': x[0], 'y': y[0]}]
+        elif len(ends) == 1 and residual is not None and each.kind != 'heading':
             # from where the estimate has it to where it was measured
             x, y = frame.places(path.poses[each.nodes[0], :2] + residual[:2])
             place = {'node': None, 't': ends[0]['t'], 'x': x[0], 'y': y[0]}
@@ -60,5 +69,28 @@ def springs(
             'from': ends[0] if len(ends) > 0 else None,
             'to': ends[1] if len(ends) > 1 else place,
             'residual': None if residual is None else rounded(residual, 4),
-            'sigma': None if sigma is None else rounded(sigma, 4), 'text': each.name})
+            'sigma': None if sigma is None else rounded(sigma, 4),
+            'text': _text(each, ends, residual)})
     return found
+
+
+def _text(
+    each: ConstraintEnergy, ends: Sequence[Mapping[str, Any]], residual: FloatArray | None,
+) -> str:
+    """
+    Return what a constraint is and how far it is off.
+
+    Parameters
+    ----------
+    residual : ndarray, shape (3,), or None if unknown
+
+    """
+    times = ' to '.join(f'{end["t"]:.1f}' for end in sorted(ends, key=lambda end: end['t']))
+    at = f' at {times} s' if len(ends) > 0 else ''
+    if each.kind == 'bias':
+        return f'error of {each.source}{at}: it changes faster than its correlation time says'
+    off = '' if residual is None else (
+        f': {np.hypot(*residual[:2]):.2g} m' + ('' if residual[2] == 0.0 else
+                                                f' and {abs(residual[2]):.2g} rad') + ' off')
+    name = each.name.partition(' at ')[0] if len(ends) > 0 else each.name
+    return f'{name}{at}{off}'

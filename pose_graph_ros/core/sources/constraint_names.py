@@ -38,6 +38,8 @@ class ConstraintEnergy:
     """Its id in the graph."""
     nodes: tuple[int, ...] = ()
     """Numbers of the hidden nodes of the path that it has, in the order of the name."""
+    stamp_ns: int = -1
+    """Of the measurement, or when the bin of a bias begins [ns]; -1 for edges between poses."""
 
 
 def largest(
@@ -70,7 +72,8 @@ def largest(
         named.append(ConstraintEnergy(
             float(energies[row]), float(table.energies[number]), int(table.freedom[number]),
             *names, edge, int(ids[number]),
-            _numbers(graph, nodes, table.integers[number], edge=edge)))
+            _numbers(graph, nodes, table.integers[number], edge=edge),
+            _stamp_ns(graph, factors, table.integers[number], int(ids[number]), edge=edge)))
     return named
 
 
@@ -81,6 +84,15 @@ def _numbers(
     rows = integers[[tb.END_I, tb.END_J] if edge else [tb.OBS_NODE]]
     ids = graph.node_ids[rows[graph.is_pose[rows]]]
     return tuple(np.searchsorted(nodes.ids, ids).tolist())
+
+
+def _stamp_ns(
+    graph: Graph, factors: FactorBuilder, integers: IntArray, number: int, *, edge: bool,
+) -> int:
+    """Return the stamp of a measurement or of a bias, given its row and id; -1 for others."""
+    node = int(graph.node_ids[integers[tb.END_I if edge else tb.OBS_NODE]])
+    origin = factors.origin(number, edge=edge) or factors.bias_origin(node)
+    return -1 if origin is None else origin.stamp_ns
 
 
 def queued(queue: Queue, nodes: HiddenNodes) -> list[str]:
