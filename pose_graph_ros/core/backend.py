@@ -41,7 +41,7 @@ from pose_graph_ros.core.relocation import relocate
 from pose_graph_ros.core.residuals import components
 from pose_graph_ros.core.smoother.incremental import IncrementalSmoother
 from pose_graph_ros.core.smoother.results import Refinement
-from pose_graph_ros.core.sources import constraint_names
+from pose_graph_ros.core.sources import constraint_names as cn
 from pose_graph_ros.core.sources.constraint_queue import Queue, QueuedEdge
 from pose_graph_ros.core.sources.factor_builder import FactorBuilder
 from pose_graph_ros.core.sources.pipeline import MeasurementPipeline
@@ -141,7 +141,7 @@ class PoseGraphBackend:
 
     def set_aside(self, n: int) -> list[str]:
         """Return the names of the newest n constraints that were set aside."""
-        return constraint_names.queued(self._quarantine.newest(n), self._nodes)[-n:]
+        return cn.queued(self._quarantine.newest(n), self._nodes)[-n:]
 
     @property
     def revision(self) -> int:
@@ -161,11 +161,9 @@ class PoseGraphBackend:
         """Return the residuals of each source with what they show; linear in the graph."""
         return components.analyse(self._smoother, self._nodes, self._factors, self._reweighting)
 
-    def largest_energies(
-        self, n: int, start_ns: int = 0,
-    ) -> list[constraint_names.ConstraintEnergy]:
-        """Return the n constraints with the largest energies: see `constraint_names.largest`."""
-        return constraint_names.largest(self.graph, self._nodes, self._factors, n, start_ns)
+    def largest_energies(self, n: int) -> list[cn.ConstraintEnergy]:
+        """Return the n constraints with the largest energies, with names, in descending order."""
+        return cn.largest(self.graph, self._nodes, self._factors, n)
 
     def verdicts(self, most_believed: int | None = None) -> list[vd.Verdict]:
         """Return all verdicts, but of those that are believed only the newest of each source."""
@@ -289,7 +287,7 @@ class PoseGraphBackend:
         """Return the report of an update, and the constraints for which it had no time."""
         return isolation.update(
             self._add_queue, self._settle, self._pipeline, self._quarantine,
-            lambda one: constraint_names.queued(one, self._nodes)[0])
+            lambda one: cn.queued(one, self._nodes)[0])
 
     def _settle(self) -> bool:
         """Set all weights that wait; tell whether an update without new constraints succeeds."""

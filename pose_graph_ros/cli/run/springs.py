@@ -36,7 +36,7 @@ def springs(
     names = {(each.edge, each.number): each.id for each in verdicts}
     stamps = backend.node_stamps_ns
     found = []
-    for rank, each in enumerate(backend.largest_energies(MOST, frame.start_ns), 1):
+    for rank, each in enumerate(backend.largest_energies(MOST), 1):
         place = residual = sigma = expected = None
         source = residuals.get(each.source)
         at = [] if source is None else np.flatnonzero(
@@ -62,7 +62,8 @@ def springs(
             x, y = frame.places(path.poses[each.nodes[0], :2] + residual[:2])
             place = {'node': None, 't': ends[0]['t'], 'x': x[0], 'y': y[0]}
         found.append({
-            'rank': rank, 'name': names.get((each.edge, each.number), each.name),
+            'rank': rank, 'name': names.get((each.edge, each.number), _name(
+                each, frame.start_ns)),
             'source': each.source, 'kind': each.kind.replace('_', ' '),
             'energy': number(each.energy), 'expected': number(
                 float(each.freedom) if expected is None else expected),
@@ -72,6 +73,14 @@ def springs(
             'sigma': None if sigma is None else rounded(sigma, 4),
             'text': _text(each, ends, residual)})
     return found
+
+
+def _name(each: ConstraintEnergy, start_ns: int) -> str:
+    """Return the name of a constraint, with the time since the start of the drive [ns]."""
+    if each.stamp_ns < 0:
+        return each.name
+    what, _, rest = each.name.partition(' at ')
+    return f'{what} at {(each.stamp_ns - start_ns) * 1e-9:.1f} s{rest.partition(" s")[2]}'
 
 
 def _text(

@@ -43,7 +43,7 @@ class ConstraintEnergy:
 
 
 def largest(
-    graph: Graph, nodes: HiddenNodes, factors: FactorBuilder, n: int, start_ns: int = 0,
+    graph: Graph, nodes: HiddenNodes, factors: FactorBuilder, n: int,
 ) -> list[ConstraintEnergy]:
     """
     Return the constraints with the largest weighted energies, in descending order.
@@ -52,7 +52,6 @@ def largest(
     ----------
     factors : FactorBuilder, knows the sources of the constraints
     n : int, number of constraints at most; those without energy are left out
-    start_ns : int, the times in names are since then [ns]
 
     """
     tables = constraint_tables(graph)
@@ -66,8 +65,7 @@ def largest(
     for row in rows.tolist():
         edge = row < graph.n_edges
         number, table = (row, tables[0]) if edge else (row - graph.n_edges, tables[1])
-        names = _names(number, table, graph, nodes, factors, edge=edge,
-                       start_ns=start_ns)
+        names = _names(number, table, graph, nodes, factors, edge=edge)
         ids = graph.edge_ids if edge else graph.observed_ids
         named.append(ConstraintEnergy(
             float(energies[row]), float(table.energies[number]), int(table.freedom[number]),
@@ -108,15 +106,14 @@ def queued(queue: Queue, nodes: HiddenNodes) -> list[str]:
 
 def _names(
     row: int, table: ConstraintTable, graph: Graph, nodes: HiddenNodes, factors: FactorBuilder, *,
-    edge: bool, start_ns: int,
+    edge: bool,
 ) -> tuple[str, str, str]:
     """Return source, kind and name of a constraint, given its row in the graph."""
     number = int((graph.edge_ids if edge else graph.observed_ids)[row])
     integers, origin = table.integers[row], factors.origin(number, edge=edge)
     if not edge or integers[tb.EDGE_KIND] == EdgeKind.BIAS:
         node = int(graph.node_ids[integers[tb.END_I if edge else tb.OBS_NODE]])
-        return _measurement_name(origin, node, table.numbers[row], nodes, factors,
-                                 start_ns=start_ns)
+        return _measurement_name(origin, node, table.numbers[row], nodes, factors)
     kind = EdgeKind(int(integers[tb.EDGE_KIND]))
     ends = graph.node_ids[integers[[tb.END_I, tb.END_J]]]
     i, j = np.searchsorted(nodes.ids, ends).tolist()
@@ -129,7 +126,7 @@ def _names(
 
 def _measurement_name(
     origin: ConstraintOrigin | None, node: int, numbers: FloatArray, nodes: HiddenNodes,
-    factors: FactorBuilder, *, start_ns: int,
+    factors: FactorBuilder,
 ) -> tuple[str, str, str]:
     """
     Return source, kind and name of a constraint that was made from a measurement in the map.
@@ -147,4 +144,4 @@ def _measurement_name(
     if origin is None:
         return '', kind, f'{kind}{where}'
     what = f'error of {origin.source}' if kind == 'bias' else origin.source
-    return origin.source, kind, f'{what} at {(origin.stamp_ns - start_ns) * 1e-9:.3f} s{where}'
+    return origin.source, kind, f'{what} at {origin.stamp_ns * 1e-9:.3f} s{where}'

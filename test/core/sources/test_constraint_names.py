@@ -129,12 +129,6 @@ def test_the_largest_are_the_first_of_all() -> None:
     backend = driven()
     every = backend.largest_energies(10_000)
     assert backend.largest_energies(5) == every[:5]
-    at = [re.search(r' at (\S+) s', each.name) for each in every]
-    later = [re.search(r' at (\S+) s', each.name)
-             for each in backend.largest_energies(10_000, 250_000_000)]
-    assert any(at)
-    assert [each and float(each[1]) for each in later] == [
-        each and pytest.approx(float(each[1]) - 0.25) for each in at]
     assert backend.largest_energies(0) == []
     assert PoseGraphBackend().largest_energies(5) == []
 
