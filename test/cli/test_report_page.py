@@ -306,6 +306,7 @@ def test_entries_of_lists_centre_the_map(show, real, width) -> None:
     middle = [0.5 * (spring['from'][axis] + spring['to'][axis]) for axis in ('x', 'y')]
     assert opened.view()[:2] == pytest.approx(middle, abs=0.01)
     assert spring['name'] in opened.panel()
+    assert page.locator('.springs .entry:disabled').count() == 0
     assert opened.overflow() <= 0
 
 

@@ -168,7 +168,8 @@ function showSprings(map) {
     make('span', {class: 'rank'}, rank), make('span', {class: 'entry-name'}, name),
     make('span', {class: 'kind'}, kind), bar,
     make('span', {class: 'energy'}, make('b', {}, number(energy)), ` / ${number(expected)}`),
-    text && text !== name ? make('span', {class: 'entry-why'}, text) : null);
+    text && text !== name ? make('span', {class: 'entry-why'},
+      text.startsWith(name) ? text.slice(name.length).replace(/^[:,]? /, '') : text) : null);
     followers.item.push((chosen) => button.classList.toggle('chosen', sameItem(chosen, item)));
     return make('li', {}, button);
   })));
