@@ -79,8 +79,9 @@ def test_solve_loads_what_it_needs(tmp_path: Path) -> None:
         'pose_graph_ros.adapters', 'pose_graph_ros.ros', 'pose_graph_ros.core.smoother'))}
 
 
-@pytest.mark.parametrize('words', [[], ['no_such_tool'], ['compare'], ['solve', 'a', '--edge2', 'b'],
-                                   ['replay', 'bag', '--hold-out', 'some']])
+@pytest.mark.parametrize('words', [
+    [], ['no_such_tool'], ['compare'], ['solve', 'a', '--edge2', 'b'],
+    ['replay', 'bag', '--hold-out', 'some']])
 def test_wrong_words_are_refused(words: list[str], capsys: pytest.CaptureFixture[str]) -> None:
     with pytest.raises(SystemExit) as ended:
         main(words)
