@@ -11,7 +11,7 @@ import numpy.typing as npt
 
 from pose_graph_ros.core.geometry import se2
 from pose_graph_ros.core.geometry.se2 import BoolArray, FloatArray, IntArray
-from pose_graph_ros.core.graph.constraints import Edges, ObservedNodes
+from pose_graph_ros.core.graph.constraints import are_definite, Edges, ObservedNodes
 from pose_graph_ros.core.graph.graph_update import Energies, GraphRows
 from pose_graph_ros.core.graph.kinds import EdgeKind, NodeKind
 from pose_graph_ros.core.sparse.components import components
@@ -42,11 +42,17 @@ class PlainGraph:
 
     @classmethod
     def is_covered(cls, rows: GraphRows) -> bool:
-        """Tell whether a graph has nothing but poses and edges between them, all with weight 1."""
+        """
+        Tell whether a graph has nothing but poses and edges between them, all with weight 1.
+
+        Each edge has to measure all coordinates. Otherwise a pose may not be determined, and the
+        factors of H, without pivoting, need not show that it is singular.
+        """
         return (len(rows.observed) == len(rows.priors) == 0
                 and bool(np.all(rows.node_kind == NodeKind.POSE))
                 and bool(np.all(rows.edges.kind <= EdgeKind.LOOP_CLOSURE))
                 and bool(np.all(rows.edges.weight == 1.0))
+                and bool(np.all(are_definite(rows.edges.information)))
                 and np.array_equal(rows.node_ids, np.arange(len(rows.poses))))
 
     @property

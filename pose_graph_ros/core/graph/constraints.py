@@ -332,12 +332,7 @@ def _check_ends(edges: Edges, kind: npt.NDArray[Any], ids: Ids) -> None:
 
 def _check_information(name: str, matrix: FloatArray) -> None:
     """Raise unless matrices are symmetric and positive semidefinite, whatever units they have."""
-    diagonal = np.diagonal(matrix, axis1=1, axis2=2)
-    root = np.sqrt(np.where(diagonal > 0.0, diagonal, 1.0))
-    with np.errstate(over='ignore'):
-        scaled = matrix / root[:, :, None] / root[:, None, :]
-    # correlations beyond 1 are invalid however large they are, and might overflow
-    scaled = np.clip(scaled, -2.0, 2.0)
+    diagonal, scaled = np.diagonal(matrix, axis1=1, axis2=2), _scaled(matrix)
     skew = np.max(np.abs(scaled - np.swapaxes(scaled, 1, 2)), axis=(1, 2), initial=0.0)
     _refuse_rows(skew > SEMIDEFINITE_TOLERANCE, f'{name} is not symmetric', matrix)
     smallest = np.zeros(len(matrix))
@@ -347,6 +342,21 @@ def _check_information(name: str, matrix: FloatArray) -> None:
     negative = np.any(diagonal < 0.0, axis=-1) | (smallest < -SEMIDEFINITE_TOLERANCE)
     _refuse_rows(negative | ~np.any(matrix, axis=(1, 2)),
                  f'{name} is not positive semidefinite, or zero', matrix)
+
+
+def are_definite(information: FloatArray) -> BoolArray:
+    """Tell which matrices, shape (M, 3, 3), are clearly positive definite, whatever their unit."""
+    return _are_definite(_scaled(information))
+
+
+def _scaled(matrix: FloatArray) -> FloatArray:
+    """Return matrices with 1 in place of each positive number on the diagonal."""
+    diagonal = np.diagonal(matrix, axis1=1, axis2=2)
+    root = np.sqrt(np.where(diagonal > 0.0, diagonal, 1.0))
+    with np.errstate(over='ignore'):
+        scaled = matrix / root[:, :, None] / root[:, None, :]
+    # correlations beyond 1 are invalid however large they are, and might overflow
+    return np.clip(scaled, -2.0, 2.0)
 
 
 def _are_definite(scaled: FloatArray) -> BoolArray:
