@@ -11,6 +11,7 @@ that is nearly chi2; if it is not, a lower one is searched for.
 
 import argparse
 import json
+import math
 from pathlib import Path
 import time
 from typing import Any, TYPE_CHECKING
@@ -143,7 +144,7 @@ def execute(options: argparse.Namespace) -> int:
                    'certificate': None if certificate is None else certificate.values()}
         if rows is not None and len(tables) == 0:
             values['marginals'] = lines
-        print(json.dumps(values, indent=2))
+        print(json.dumps(_finite(values), indent=2, allow_nan=False))
     elif rows is not None and len(tables) == 0:
         print('\n'.join(lines))
     return 0 if solution.result.status is Status.CONVERGED else 1
@@ -195,6 +196,15 @@ def _values(
              'status': each.status.value} for name, each in solution.tried],
         'held': held.tolist(),
         'doubted': np.stack((ids[edges.i], ids[edges.j]), axis=1).tolist()}
+
+
+def _finite(value: Any) -> Any:
+    """Return values for JSON, which has no infinity: None in its place."""
+    if isinstance(value, dict):
+        return {key: _finite(each) for key, each in value.items()}
+    if isinstance(value, list):
+        return [_finite(each) for each in value]
+    return None if isinstance(value, float) and not math.isfinite(value) else value
 
 
 def _chosen_rows(problem: Problem, which: str) -> IntArray:

@@ -97,8 +97,10 @@ def with_certificate(
         return solution, Report(
             None, reason, time.monotonic() - begin, solution.result.chi2)
 
-    if solution.result.status is Status.FAILED or not solution.determined:
+    if not solution.determined:
         return none('the constraints do not determine the poses')
+    if solution.result.status is Status.FAILED:
+        return none(f'the optimisation failed: {solution.result.reason}')
     try:
         formulation = formulate(graph)
         by = solution.optimizer

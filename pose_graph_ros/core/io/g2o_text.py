@@ -168,9 +168,10 @@ def _raise_first(path: Path, found: dict[str, tuple[list[list[str]], list[int]]]
                 f'{where}: {tag} is followed by {n_ids + n_numbers} numbers, got {len(words) - 1}')
         try:
             for word in words[1:1 + n_ids]:
-                np.int64(int(word))
+                if not -2**63 <= int(word) < 2**63:
+                    raise ValueError(f'expected ids of at most 64 bits, got {word}')
             numbers = [float(word) for word in words[1 + n_ids:]]
-        except (ValueError, OverflowError) as error:
+        except ValueError as error:
             raise FileFormatError(f'{where}: {tag}: {error}') from error
         if not np.all(np.isfinite(numbers)):
             raise FileFormatError(f'{where}: {tag} holds a number that is not finite')
