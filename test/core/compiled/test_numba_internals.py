@@ -37,7 +37,7 @@ def test_programs_say_so_in_one_line(module: str, program: str) -> None:
     if program != 'error':
         pytest.importorskip('rclpy')
     code = (f'import sys, numba; numba.__version__ = "{UPPER}.1"\n'
-            f'from pose_graph_ros.{module} import main; sys.exit(main(["solve", "a.g2o"]))')
+            f'from pose_graph_ros.{module} import main; sys.exit(main(["replay", "a"]))')
     done = subprocess.run([sys.executable, '-c', code], capture_output=True, text=True,
                           check=False, timeout=240)
     assert done.returncode == 2
