@@ -166,6 +166,7 @@ class Problem:
         """Find the heading at the first position under which the first ones are most likely."""
         first = self._first
         at = np.flatnonzero(self.rows.source >= 0)
+        at = at[at >= first]    # before the first position, headings have no cost
         end = int(at[min(FIRST_MEASUREMENTS, len(at)) - 1]) + 1 if len(at) > 0 else first
         some = Problem(DriveRows(self.rows.stamps_ns[:end], self.rows.source[:end],
                                  self.rows.rows[:end]), self.noise, self.errors)
