@@ -180,8 +180,11 @@ def test_false_closures_are_found() -> None:
 
 
 def test_without_anything_in_the_map_that_is_said() -> None:
-    notice, = texts(run_of(fixes=False), 'notice')
-    assert notice.startswith('nothing was measured in the map')
+    found = run_of(fixes=False)
+    first, second = texts(found, 'notice')
+    assert first.startswith('nothing was measured in the map')
+    assert 'may be in another frame' in second
+    assert not any('odometry alone' in text for text in texts(found, 'good', 'notice'))
 
 
 def test_a_line_keeps_within_the_tolerance_of_all_points() -> None:
@@ -240,3 +243,12 @@ def test_the_longest_silences_are_kept() -> None:
     lengths = gaps[:, 1] - gaps[:, 0]
     assert lengths[-1] == pytest.approx((4950 + 100) * 0.1 + 0.1)
     assert len(Arrivals().gaps(1.0, 8.0)) == 0
+
+
+def test_a_message_without_a_stamp_begins_no_silence() -> None:
+    recorder = Recorder()
+    for stamp in (0, *range(1_700_000_000 * SECOND, 1_700_000_010 * SECOND, SECOND)):
+        recorder.add_measurement('odom', stamp)
+    arrivals = recorder.arrivals['odom']
+    assert (arrivals.count, arrivals.first_ns) == (10, 1_700_000_000 * SECOND)
+    assert len(arrivals.gaps(0.5, 8.0)) == 0

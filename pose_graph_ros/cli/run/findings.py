@@ -58,8 +58,8 @@ def _whole(run: Run) -> Iterator[Finding]:
                                  f'{reason}): the path is not at the minimum', 'updates')
     if estimate.alignment is AlignmentState.UNALIGNED:
         yield Finding(
-            'warning', 'the angle between odometry and map is unknown, as fixes come from too '
-            'short a path: drive farther, or set alignment.minimum_baseline', 'map')
+            'warning', 'the angle between odometry and map is unknown, as fixes are too few or '
+            'from too short a path: drive farther, or set alignment.minimum_baseline', 'map')
     elif estimate.alignment is AlignmentState.LOCAL:
         yield Finding('notice', 'nothing was measured in the map, so the path begins at its '
                                 'origin, and nothing but loop closures bounds its drift', 'map')
@@ -159,12 +159,16 @@ def _path(run: Run) -> Iterator[Finding]:
     rms = math.sqrt(float(np.mean(far**2)))
     odometry = np.array([np.nan if each is None else each for each in errors['odometry']])
     text = f'the path is {rms:.2g} m rms from the {errors["against"]}'
+    if errors['against'] == 'truth' and run.estimate.alignment is not AlignmentState.ALIGNED:
+        # odometry by itself is laid over the truth, so it would look better than the path
+        yield Finding('notice', f'{text}, which may be in another frame, as the path is not '
+                                'aligned with the map', 'errors')
+        return
     if np.any(np.isfinite(odometry)):
         text += f', odometry alone {math.sqrt(float(np.nanmean(odometry**2))):.2g} m'
     yield Finding('good', text, 'errors')
-    if (errors['sigma'] is None or errors['against'] != 'truth'
-            or run.estimate.alignment is not AlignmentState.ALIGNED):
-        return  # the truth is in another frame
+    if errors['sigma'] is None or errors['against'] != 'truth':
+        return
     sigma = np.array([np.nan if each is None else each for each in errors['sigma']])
     known = np.isfinite(sigma) & (sigma > 0.0)
     if not np.any(known):

@@ -126,13 +126,15 @@ class Recorder:
 
     def add_measurement(self, source: str, stamp_ns: int) -> None:
         """
-        Add a measurement that was read, in the order of arrival.
+        Add a measurement in the order of arrival; one without a stamp does not count.
 
         Parameters
         ----------
         stamp_ns : int
 
         """
+        if stamp_ns <= 0:
+            return
         arrivals = self.arrivals.get(source)
         if arrivals is None:
             arrivals = self.arrivals[source] = Arrivals()
