@@ -174,7 +174,8 @@ def _facts(
         'parameters': [_plain(asdict(each)) | {'changed': each.changes}
                        for each in outcome.tuned],
         'before': _summary(outcome.before), 'after': _summary(outcome.after),
-        'to_truth': dict(zip(('before', 'after'), outcome.to_truth, strict=False)) or None,
+        'to_truth': _plain(dict(zip(
+            ('before', 'after'), outcome.to_truth, strict=False))) or None,
         'folds': outcome.folds, 'folds_done': outcome.folds_done, 'stretch_s': outcome.stretch,
         'doubted': outcome.n_doubted, 'contradiction': outcome.contradiction,
         'is_cut': drive.is_cut, 'seconds': seconds}

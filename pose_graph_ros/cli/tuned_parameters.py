@@ -60,16 +60,18 @@ def odometry_parameters(source: str, found: Fit, values: Mapping[str, Any]) -> I
     """
     own = [each for each in found.found if each.parameter.role is Role.ODOMETRY]
     scale = math.sqrt(values[f'{source}.covariance_scale'])
-    changed = False
+    before, changed = values[f'{source}.sigma_scale'], any(not each.kept for each in own)
     for each in sorted(own, key=lambda one: one.parameter.index):
         if each.parameter.index == lk.GIVEN:
             yield _one(f'{source}.covariance_scale', each, values, lambda sigma: sigma**2)
-            changed = changed or not each.kept
             continue
-        yield _one(f'{source}.{ODOMETRY[each.parameter.index]}', each, values,
+        one = _one(f'{source}.{ODOMETRY[each.parameter.index]}', each, values,
                    lambda sigma: min(sigma / scale, LARGEST_SIGMA))
-        changed = changed or not each.kept
-    before = values[f'{source}.sigma_scale']
+        if each.kept and changed and before not in (0.0, 1.0):
+            # the sigma stays, and sigma_scale becomes 1
+            one = replace(one, after=_rounded(min(before * one.before, LARGEST_SIGMA)),
+                          note=f'times sigma_scale; {one.note}')
+        yield one
     if changed:
         yield Tuned(f'{source}.sigma_scale', before, 1.0,
                     note='the sigmas are those of this odometry')

@@ -54,7 +54,7 @@ WORSE_RMS, WORSE_NLPD = 1.002, 0.05
 class Verdict(Enum):
     """What came of a tuning."""
 
-    BETTER = 'held-out errors are lower after tuning'
+    BETTER = 'held-out errors are lower, or at least no higher, after tuning'
     SAME = 'nothing is changed: the settings are as good as any'
     WORSE = 'held-out errors are higher after tuning: what makes them higher is not changed'
 
@@ -337,6 +337,8 @@ def _to_truth(run: Run | None, truth: Trajectory | None) -> float:
     if run is None or truth is None:
         return float('nan')
     inside = run.path.covers(truth.stamps_ns)
+    if not np.any(inside):
+        return float('nan')
     errors = run.path.at(truth.stamps_ns[inside])[:, :2] - truth.poses[inside, :2]
     return float(np.sqrt(np.mean(np.sum(errors**2, axis=1))))
 

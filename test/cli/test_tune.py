@@ -14,8 +14,15 @@ import numpy as np
 import pytest
 import yaml
 
+from pose_graph_ros.adapters.parameters import checked
+from pose_graph_ros.cli.bag_messages import fix_messages, odometry_messages, write_bag
 from pose_graph_ros.cli.main import main
+from pose_graph_ros.cli.tuned_parameters import changed, ODOMETRY, odometry_parameters
+from pose_graph_ros.core.geometry.geodesy import TangentPlane
+from pose_graph_ros.core.geometry.trajectory import Trajectory
 from pose_graph_ros.core.measurements import OdometrySample, Position
+from pose_graph_ros.core.tuning.fit import Fit, Found
+from pose_graph_ros.core.tuning.problem import Parameter, Role
 
 
 @pytest.fixture(scope='module')
@@ -71,6 +78,37 @@ def test_wrong_input_is_one_line(
     assert message in error
     assert error.startswith('error: ')
     assert error.count('\n') == 1
+
+
+def test_a_sigma_that_is_kept_stays_when_its_factor_becomes_a_part_of_it() -> None:
+    values = checked({'odom.sigma_scale': 2.0})
+    sigmas = [2.0 * values[f'odom.{name}'] for name in ODOMETRY]
+    found = [Found(Parameter(Role.ODOMETRY, k, sigma), 3.0 * sigma if k == 0 else sigma,
+                   0.9 * sigma, 4.0 * sigma, k > 0) for k, sigma in enumerate(sigmas)]
+    after = changed(odometry_parameters('odom', Fit(tuple(found), 0.0, 1, 0, 1, 1.0), values))
+    assert after.pop('odom.sigma_scale') == 1.0
+    expected = [3.0 * sigmas[0], *sigmas[1:]]
+    assert after == pytest.approx({
+        f'odom.{name}': sigma for name, sigma in zip(ODOMETRY, expected, strict=True)}, rel=0.01)
+
+
+def test_a_truth_at_other_times_is_null_in_json(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str],
+) -> None:
+    odometry, fixes = made(4, 40)
+    path = Trajectory(np.array([each.stamp_ns for each in odometry]),
+                      np.array([each.pose for each in odometry]))
+    geodetic = TangentPlane(50.7, 7.1, 60.0).to_geodetic(
+        np.array([each.position for each in fixes]), 60.0)
+    write_bag(tmp_path / 'bag', (
+        *odometry_messages('/odom', 'odom', path, (0.0,) * 6),
+        *odometry_messages('/truth', 'map', Trajectory(path.stamps_ns + 10**12, path.poses),
+                           (0.0,) * 6),
+        *fix_messages('/fix', np.array([each.stamp_ns for each in fixes]), geodetic, 1.0)))
+    assert main(['tune', str(tmp_path / 'bag'), '--odom', '/odom', '--truth', '/truth', '--json',
+                 '--budget', '1', '-o', str(tmp_path / 'tuned.yaml')]) in (0, 1)
+    facts = json.loads(capsys.readouterr().out, parse_constant=pytest.fail)
+    assert facts['to_truth'] == {'before': None, 'after': None}
 
 
 DATA = Path(os.environ.get(
