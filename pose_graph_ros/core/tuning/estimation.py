@@ -14,7 +14,7 @@ from pose_graph_ros.core.tuning.drive_rows import drive_rows, Measured, odometry
 from pose_graph_ros.core.tuning.fit import Fit, fit
 from pose_graph_ros.core.tuning.problem import Parameter, Problem, Role
 
-# Number of measurements of each source that are used; of more, every second or so.
+# Number of measurements of each source that are used; of more, every second, third, ...
 MOST = 2000
 # Least path by odometry that can tell of its noise [m].
 LEAST_PATH = 5.0
