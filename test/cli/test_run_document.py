@@ -20,6 +20,7 @@ from pose_graph_ros.cli.run import places
 from pose_graph_ros.cli.run.content import Run
 from pose_graph_ros.cli.run.document import document
 from pose_graph_ros.cli.run.lines import number, rounded, simplified
+from pose_graph_ros.cli.run.measurement_findings import silences
 from pose_graph_ros.cli.run.recorder import (
     Arrivals,
     MOST_SILENCES,
@@ -252,3 +253,21 @@ def test_a_message_without_a_stamp_begins_no_silence() -> None:
     arrivals = recorder.arrivals['odom']
     assert (arrivals.count, arrivals.first_ns) == (10, 1_700_000_000 * SECOND)
     assert len(arrivals.gaps(0.5, 8.0)) == 0
+
+
+def test_a_silence_of_one_of_two_odometries_does_not_hide_the_motion() -> None:
+    recorder = Recorder()
+    for k in range(100):
+        recorder.add_measurement('wheels', (k + 1) * SECOND // 10)
+        if not 40 < k < 80:
+            recorder.add_measurement('visual', (k + 1) * SECOND // 10)
+            recorder.add_measurement('gyro', (k + 1) * SECOND // 10)
+    kinds = {'wheels': Kind.ODOMETRY, 'visual': Kind.ODOMETRY, 'gyro': Kind.GYRO}
+    told = {text.partition(':')[0]: text.rpartition('; ')[2]
+            for _, text, _ in silences(recorder, kinds, 0)}
+    assert told == {
+        'visual': 'the motion there is that of other odometry, as far as it goes on',
+        'gyro': 'the heading there is that of other sources'}
+    del kinds['wheels'], recorder.arrivals['wheels']
+    (_, text, _), _ = silences(recorder, kinds, 0)
+    assert text.endswith('the motion there is not known')

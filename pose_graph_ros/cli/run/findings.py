@@ -110,7 +110,8 @@ def _covariances(run: Run, analysis: SourceAnalysis) -> Iterator[Finding]:
 def _advice(run: Run, analysis: SourceAnalysis) -> str:
     """Return the parameter that makes the sigmas of a source right, with its value."""
     source, ratio = analysis.residuals.source, analysis.fit.ratio
-    if analysis.kind in (Kind.ODOMETRY, Kind.TWIST, Kind.LOOP_CLOSURE):
+    # other odometry than the primary one has no sigma_scale that is used
+    if analysis.kind is Kind.LOOP_CLOSURE or source == run.estimate.primary:
         return f'{source}.sigma_scale to {ratio:.2g}'
     factor = ratio**2 * float(run.values.get(f'{source}.covariance_scale', 1.0))
     return f'{source}.covariance_scale to {factor:.2g}'

@@ -2,12 +2,13 @@
 # SPDX-License-Identifier: Apache-2.0
 """Findings on measurements: what is doubted or refused, where and why, and what is missing."""
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 
 import numpy as np
 
 from pose_graph_ros.adapters.sources import Kind
 from pose_graph_ros.cli.run.content import Run
+from pose_graph_ros.cli.run.recorder import Recorder
 from pose_graph_ros.core.judgement.texts import number_of, sentence
 from pose_graph_ros.core.judgement.verdicts import Judged, State, Verdict
 
@@ -40,7 +41,7 @@ def found(run: Run) -> Iterator[Texts]:
         yield from _stretches(run, source, own)
         yield from _groups(run, source, own)
         yield from _odometry(run, source, own)
-    yield from _gaps(run)
+    yield from silences(run.recorder, run.kinds, run.start_ns)
     yield from _refusals(run)
 
 
@@ -151,22 +152,37 @@ def _odometry(run: Run, source: str, verdicts: Sequence[Verdict]) -> Iterator[Te
                f'{source}.maximum_speed allows; the motion there is taken as unknown', 'map')
 
 
-def _gaps(run: Run) -> Iterator[Texts]:
-    """Yield silences of odometry, and of fixes and global poses."""
-    for source, arrivals in run.recorder.arrivals.items():
-        kind = run.kinds.get(source)
+def silences(
+    recorder: Recorder, kinds: Mapping[str, Kind], start_ns: int,
+) -> Iterator[Texts]:
+    """
+    Yield silences of odometry, and of fixes and global poses.
+
+    Parameters
+    ----------
+    recorder : Recorder
+    kinds : mapping, of the sources
+    start_ns : int, from which times count [ns]
+
+    """
+    for source, arrivals in recorder.arrivals.items():
+        kind = kinds.get(source)
         if kind not in (Kind.ODOMETRY, Kind.TWIST, Kind.GYRO, Kind.FIX, Kind.GLOBAL_POSE):
             continue
         moves = kind in (Kind.ODOMETRY, Kind.TWIST, Kind.GYRO)
-        gaps = arrivals.gaps(*GAPS[moves]) - run.start_ns * 1e-9
+        gaps = arrivals.gaps(*GAPS[moves]) - start_ns * 1e-9
         if len(gaps) == 0:
             continue
         lengths = gaps[:, 1] - gaps[:, 0]
         told = gaps[np.sort(np.argsort(-lengths, kind='stable')[:MOST_TOLD])]
         where = ', '.join(f'{begin:.1f} to {end:.1f} s' for begin, end in told.tolist())
         more = f' and {len(gaps) - len(told)} more' if len(gaps) > len(told) else ''
-        what = ('the motion there is not known' if moves else
-                'the path follows odometry there, and its covariance grows')
+        others = any(each.is_odometry and name != source and name in recorder.arrivals
+                     for name, each in kinds.items())
+        what = ('the path follows odometry there, and its covariance grows' if not moves else
+                'the heading there is that of other sources' if kind is Kind.GYRO else
+                'the motion there is that of other odometry, as far as it goes on' if others else
+                'the motion there is not known')
         level = 'warning' if moves or np.max(lengths) > LONG_GAP else 'notice'
         yield (level, f'{source}: no messages from {where}{more} ({np.max(lengths):.3g} s at '
                f'most); {what}', f'source-{source}')
