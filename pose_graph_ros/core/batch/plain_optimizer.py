@@ -33,6 +33,8 @@ from pose_graph_ros.core.sparse.block_matrix import BlockFactors, BlockPattern, 
 SMALLEST_ROTATION = 1e-6
 # Relative rounding error of chi2.
 ROUNDING = 1e-9
+# What overflows has no finite chi2, and is no result.
+_quiet = np.errstate(over='ignore', invalid='ignore', divide='ignore')
 
 
 class PlainOptimizer:
@@ -64,6 +66,7 @@ class PlainOptimizer:
         self._last: BlockFactors | None = None
         self._pattern = BlockPattern(rows, columns, self.places)
 
+    @_quiet
     def from_chordal_start(self) -> BatchResult | None:
         """
         Return the result of moving the poses to a minimum from a chordal start.
@@ -85,6 +88,7 @@ class PlainOptimizer:
             return None
         return result
 
+    @_quiet
     def from_present_poses(self) -> BatchResult | None:
         """Return the result of moving the poses to the near minimum; None as above."""
         before = self._graph.poses

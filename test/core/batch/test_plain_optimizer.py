@@ -2,6 +2,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """The optimiser without compiled kernels against the one with them."""
 
+from dataclasses import replace
+
 from hypothesis import given, settings, strategies as st
 import numpy as np
 import pytest
@@ -124,6 +126,26 @@ def test_edges_that_do_not_measure_all_coordinates_are_not_covered(seed: int) ->
         fix=[0]))
     assert not PlainGraph.is_covered(graph.rows())
     assert optimize_from_linear_start(graph, CONFIG).status is Status.FAILED
+
+
+@pytest.mark.filterwarnings('error')
+@pytest.mark.parametrize('start', ['from_chordal_start', 'from_present_poses'])
+def test_what_overflows_is_no_result_and_no_warning(start: str) -> None:
+    graph = noisy_graph(0, n=8)
+    edges = graph.edges
+    refused = 0
+    for seed in range(40):
+        rng = np.random.default_rng(seed)
+        scale = 10.0 ** rng.uniform(-140.0, 140.0, (len(edges), 1, 1))
+        mean = edges.mean * [*10.0 ** rng.uniform(0.0, 90.0, 2), 1.0]
+        plain = PlainGraph(graph.rows().with_edges(replace(
+            edges, information=scale * edges.information, mean=mean)))
+        before = plain.poses.copy()
+        if getattr(PlainOptimizer(plain, CONFIG), start)() is None:
+            refused += 1
+            np.testing.assert_array_equal(plain.poses, before)
+        assert np.all(np.isfinite(plain.poses))
+    assert refused > 0
 
 
 def test_parts_are_held_as_nodes_are_numbered() -> None:
