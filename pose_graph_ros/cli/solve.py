@@ -54,7 +54,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument('--start', choices=STARTS, default='chordal',
                         help='start from the constraints, from the poses in the file, from '
                              'composed odometry, or from each, and take the lowest minimum '
-                             '(default: %(default)s)')
+                             '(default: %(default)s); with --robust, from the poses of its '
+                             'decision')
     parser.add_argument('--certificate', action=argparse.BooleanOptionalAction, default=True,
                         help='prove whether the minimum is the global one (default: yes)')
     parser.add_argument('--marginals', metavar='{all,newest,ID[,ID...]}',

@@ -33,6 +33,23 @@ assert scipy.sparse.linalg.splu(scipy.sparse.eye_array(3).tocsc()).solve(np.ones
 """
 
 
+# As where SciPy has its extension modules in another place.
+ELSEWHERE = """
+import sys
+import numpy as np
+from pose_graph_ros.core.sparse import superlu
+superlu.EXTENSION_SUFFIXES = ('.elsewhere',)
+diagonal = np.arange(3, dtype=np.int32)
+factors = superlu.Factors(np.full(3, 2.0), diagonal, np.arange(4, dtype=np.int32), ordered=False)
+assert factors.is_positive and factors.solve(np.ones(3)).tolist() == [0.5] * 3
+assert sys.modules['scipy.sparse.linalg'].splu
+"""
+
+
+def test_superlu_is_that_of_an_imported_scipy_if_it_is_not_found() -> None:
+    subprocess.run([sys.executable, '-c', ELSEWHERE], check=True)
+
+
 def test_superlu_is_loaded_without_the_rest_of_scipy() -> None:
     subprocess.run([sys.executable, '-c', ALONE], check=True)
 
