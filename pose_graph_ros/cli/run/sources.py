@@ -140,7 +140,7 @@ def verdict(analysis: SourceAnalysis) -> str:
     if found.says_nothing:
         return ('its covariances cannot be checked: the path follows it, so that its residuals '
                 f'are {100.0 * found.redundancy:.2g} % of what its errors are'
-                if found.redundancy < 0.5 else
+                if found.redundancy < 0.1 else
                 f'its covariances cannot be checked: {found.n_used} measurements are as few as '
                 f'{found.independent:.2g} independent ones')
     sizes = claim(analysis)

@@ -74,7 +74,8 @@ def analyse(
     """
     scales = scales_in_use(smoother.graph, reweighting)
     residuals = collect(smoother, nodes, factors, scales)
-    at_estimate = {source: fit(each) for source, each in residuals.items()}
+    at_estimate = {source: fit(each, factors.errors_in_use(source))
+                   for source, each in residuals.items()}
     white = {source: None if np.any(each.is_edge) else whiteness(each)
              for source, each in residuals.items() if each.kind == 'map'}
     correlated = frozenset(
@@ -92,7 +93,8 @@ def analyse(
                 other, now, changes, scales):
             break
         now = collect(other, nodes, factors, scales)
-        together = {source: fit(each) for source, each in now.items()}
+        together = {source: fit(each, factors.errors_in_use(source))
+                    for source, each in now.items()}
     return Analysis(residuals, at_estimate, together, correlated)
 
 

@@ -20,6 +20,11 @@ of three numbers:
 - `N r^2 c`, the trace of S'^2: half the Fisher information on the logarithm of the factor, as the
   fit follows a source the more, the better it is taken to be.
 
+Of errors that the graph knows to be correlated, with the time constant tau, the residuals have a
+slow part s and a white one, in units of the claimed variance. The slow part is as good as T / tau
+independent ones in the time T, also where these few happen to be small, so that n is at most
+`r^2 / (s^2 tau / T + (r^2 - s^2) / N)`.
+
 Where next to nothing is left, as of odometry that alone determines the poses, n is small, and
 nothing is said.
 """
@@ -32,6 +37,7 @@ from scipy.special import chdtri
 
 from pose_graph_ros.core.geometry.se2 import BoolArray, FloatArray
 from pose_graph_ros.core.residuals.source_residuals import SourceResiduals
+from pose_graph_ros.core.sources.gauss_markov import CorrelatedErrors
 
 # Number of independent residuals below which nothing is said.
 LEAST_INDEPENDENT = 10.0
@@ -90,8 +96,16 @@ class ScaleFit(NamedTuple):
         return math.isnan(self.ratio)
 
 
-def fit(residuals: SourceResiduals) -> ScaleFit:
-    """Return how large the residuals of the used constraints of a source are."""
+def fit(residuals: SourceResiduals, errors: CorrelatedErrors | None = None) -> ScaleFit:
+    """
+    Return how large the residuals of the used constraints of a source are.
+
+    Parameters
+    ----------
+    residuals : SourceResiduals
+    errors : CorrelatedErrors, optional, what the graph is built with, if they are not white
+
+    """
     used = residuals.rows(residuals.used)
     n = len(used.ids)
     known = np.flatnonzero(np.all(np.isfinite(used.taken), axis=(1, 2)))
@@ -102,8 +116,8 @@ def fit(residuals: SourceResiduals) -> ScaleFit:
     mean_freedom = float(np.mean(freedom))
     redundancy = float(np.mean(expected)) / mean_freedom
     scale = float(np.median(used.scale))
-    rows = _rows(used, used.rows(known))
-    independent = sum(_independent(used, row) for row in range(_COORDINATES))
+    rows = _rows(used, used.rows(known), errors)
+    independent = sum(_independent(used, row, errors) for row in range(_COORDINATES))
     ratio, low, high = _ratio(
         float(np.mean(_bounded(energies, redundancy * freedom, freedom))),
         float(np.mean(expected)), independent, redundancy)
@@ -113,7 +127,9 @@ def fit(residuals: SourceResiduals) -> ScaleFit:
         scale * ratio, low, high)
 
 
-def _rows(used: SourceResiduals, known: SourceResiduals) -> tuple[RowFit, ...]:
+def _rows(
+    used: SourceResiduals, known: SourceResiduals, errors: CorrelatedErrors | None,
+) -> tuple[RowFit, ...]:
     """Return the fit of each coordinate; `known` are those whose expectation is known."""
     rows = []
     sigmas, left = used.sigmas, _left(known)
@@ -127,7 +143,7 @@ def _rows(used: SourceResiduals, known: SourceResiduals) -> tuple[RowFit, ...]:
         one = np.ones(len(squares))
         ratio, low, high = _ratio(
             float(np.mean(_bounded(squares, share * one, one))), share,
-            _independent(used, row), share)
+            _independent(used, row, errors), share)
         rows.append(RowFit(
             row, len(squares), float(np.sqrt(np.mean(sigma**2))), math.sqrt(share),
             float(np.sqrt(np.mean(squares))), ratio, low, high))
@@ -173,7 +189,9 @@ def _quantiles(freedom: FloatArray | BoolArray, probability: float) -> FloatArra
     return np.asarray(values[np.clip(freedom.astype(np.int64), 1, _COORDINATES) - 1])
 
 
-def _independent(residuals: SourceResiduals, row: int) -> float:
+def _independent(
+    residuals: SourceResiduals, row: int, errors: CorrelatedErrors | None,
+) -> float:
     """Return the effective number of independent squares of one coordinate."""
     measured = residuals.measured[:, row]
     known = residuals.rows(measured & np.all(np.isfinite(residuals.taken), axis=(1, 2)))
@@ -182,7 +200,13 @@ def _independent(residuals: SourceResiduals, row: int) -> float:
     values = residuals.errors[measured, row] / residuals.sigmas[measured, row]
     n, left = len(values), float(np.mean(_left(known)[:, row]))
     correlated = 1.0 + 2.0 * squared_correlations(values)
-    return min(n / correlated, n * left, n * left**2 * correlated)
+    found = min(n / correlated, n * left, n * left**2 * correlated)
+    if errors is None or left <= 0.0:
+        return found
+    stamps = residuals.stamps_ns[measured]
+    slow = max(left - errors.white / (errors.white + errors.correlated), 0.0)
+    stretches = min(max(float(stamps[-1] - stamps[0]) * 1e-9 / errors.tau, 1.0), float(n))
+    return min(found, left**2 / (slow**2 / stretches + (left**2 - slow**2) / n))
 
 
 def squared_correlations(values: FloatArray) -> float:

@@ -14,6 +14,7 @@ from pose_graph_ros.core.residuals.components import Analysis
 from pose_graph_ros.core.residuals.scale import fit, squared_correlations
 from pose_graph_ros.core.residuals.source_residuals import SourceResiduals
 from pose_graph_ros.core.residuals.whiteness import whiteness
+from pose_graph_ros.core.sources.gauss_markov import CorrelatedErrors
 
 
 def made(errors: np.ndarray, sigma: float, taken: float = 0.0) -> SourceResiduals:
@@ -120,3 +121,13 @@ def test_correlated_errors_that_are_taken_for_white_are_named() -> None:
     found = analysed({'global_pose.correlation_time': 0.0}, tau=20.0, seconds=200.0)
     assert found.correlated == {'global_pose'}
     assert found.together == found.at_estimate
+
+
+def test_a_few_time_constants_of_slow_errors_tell_little_even_if_they_are_small() -> None:
+    source = made(0.3 * np.random.default_rng(1).normal(size=(200, 2)), 1.0)
+    white, slow = fit(source), fit(source, CorrelatedErrors(50.0, 0.9, 0.1))
+    assert not white.says_nothing
+    duration = float(np.ptp(source.stamps_ns)) * 1e-9
+    assert slow.independent < 2.5 * max(duration / 50.0, 1.0)
+    nearly_white = fit(source, CorrelatedErrors(1e-3, 1e-6, 1.0))
+    assert nearly_white.independent == pytest.approx(white.independent, rel=0.05)
