@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from pose_graph_ros.core.batch.outcome import BatchResult, Status
+from pose_graph_ros.core.batch.outcome import BatchResult, Start, Status
 from pose_graph_ros.core.batch.plain_graph import PlainGraph
 from pose_graph_ros.core.batch.plain_optimizer import PlainOptimizer
 from pose_graph_ros.core.geometry.se2 import FloatArray
@@ -155,6 +155,9 @@ def _solve_from(problem: Problem, start: str, poses: FloatArray) -> Solution:
     reason = re.sub(r'hidden node (\d+)', lambda node: f'hidden node {problem.ids[int(node[1])]}',
                     result.reason)
     names = {'file': 'present poses', 'odometry': 'odometry'}
+    if result.status is Status.FAILED and start == 'chordal':
+        # the poses are those before, but all linear starts were tried
+        names[start] = Start.CHORDAL.value
     return Solution(replace(result, reason=reason), names.get(start, result.start.value),
                     determined)
 
