@@ -58,7 +58,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def _folds(text: str) -> int:
     """Return a number of folds."""
-    value = int(text)
+    value = int(text) if text.isdecimal() else 0
     if not 2 <= value <= 50:
         raise argparse.ArgumentTypeError(f'expected a number from 2 to 50, got {text}')
     return value
@@ -66,7 +66,10 @@ def _folds(text: str) -> int:
 
 def _budget(text: str) -> float:
     """Return a time [s]."""
-    value = float(text)
+    try:
+        value = float(text)
+    except ValueError:
+        value = 0.0
     if not value > 0.0:
         raise argparse.ArgumentTypeError(f'expected a positive number, got {text}')
     return value

@@ -80,6 +80,16 @@ def test_wrong_input_is_one_line(
     assert error.count('\n') == 1
 
 
+@pytest.mark.parametrize('args', [
+    ('--folds', 'x'), ('--folds', '1'), ('--budget', 'x'), ('--budget', 'nan')])
+def test_numbers_that_are_none_are_told(
+    args: tuple[str, str], capsys: pytest.CaptureFixture[str],
+) -> None:
+    with pytest.raises(SystemExit, match='2'):
+        main(['tune', 'bag', *args])
+    assert f'argument {args[0]}: expected a ' in capsys.readouterr().err
+
+
 def test_a_sigma_that_is_kept_stays_when_its_factor_becomes_a_part_of_it() -> None:
     values = checked({'odom.sigma_scale': 2.0})
     sigmas = [2.0 * values[f'odom.{name}'] for name in ODOMETRY]
