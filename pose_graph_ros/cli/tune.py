@@ -87,7 +87,8 @@ def execute(options: argparse.Namespace) -> int:
     if not os.access(where, os.W_OK):
         raise BagError(f'{options.out}: cannot be written: no permission')
     with open_bags(options.bags) as bag:
-        inputs = choose_inputs(bag, source_list(values), shared.wanted_topics(options))
+        inputs = choose_inputs(
+            bag, source_list(values), shared.wanted_topics(options), truth=options.truth)
         truth = None if options.truth is None else read_truth(bag, options.truth)
         drive = TuningDrive(WatchedBag(bag, 'reading'), inputs, values)
         path = str(bag.path)

@@ -9,11 +9,11 @@ import numpy as np
 import numpy.typing as npt
 
 from pose_graph_ros.core.geometry.se2 import FloatArray, IntArray
-from pose_graph_ros.core.residuals.source_residuals import spread
 
 TOLERANCE = 0.015
 """Distance between a line and the points that are left out [m]."""
 _CHUNK = 512  # a point is kept in every so many, so that few rounds are needed
+_STRETCH = 20 * _CHUNK  # number of points that are looked at together
 
 
 def rounded(values: npt.ArrayLike, digits: int = 3) -> list[Any]:
@@ -51,8 +51,8 @@ def simplified(points: FloatArray, tolerance: float = TOLERANCE, most: int = 20_
     """
     Return which points a line needs, shape (K,), increasing.
 
-    This is the method of Douglas and Peucker, for all parts of the line at once. If more than
-    `most` points are needed, the tolerance is doubled until they are not.
+    This is the method of Douglas and Peucker, for all parts of a stretch at once. While more than
+    `most` points are needed, those that are left are simplified again with twice the tolerance.
 
     Parameters
     ----------
@@ -61,25 +61,35 @@ def simplified(points: FloatArray, tolerance: float = TOLERANCE, most: int = 20_
     most : int, at least 2
 
     """
+    kept = _needed(points, tolerance)
+    while len(kept) > most:
+        tolerance = max(2.0 * tolerance, 1e-3)
+        kept = kept[_needed(points[kept], tolerance)]
+    return kept
+
+
+def _needed(points: FloatArray, tolerance: float) -> IntArray:
+    """Return which points a line needs, stretch by stretch, as memory grows with their length."""
     n = len(points)
     if n <= 2:
         return np.arange(n)
+    return np.unique(np.concatenate([
+        begin + _needed_in_stretch(points[begin:begin + _STRETCH + 1], tolerance)
+        for begin in range(0, n - 1, _STRETCH)]))
+
+
+def _needed_in_stretch(points: FloatArray, tolerance: float) -> IntArray:
+    n = len(points)
+    kept = np.unique(np.append(np.arange(0, n, _CHUNK), n - 1))
     while True:
-        kept = np.unique(np.append(np.arange(0, n, _CHUNK), n - 1))
-        while True:
-            part = np.clip(np.searchsorted(kept, np.arange(n), side='right') - 1, 0, len(kept) - 2)
-            far = _distances(points, points[kept][part], points[kept][part + 1])
-            largest = np.maximum.reduceat(far, kept[:-1])
-            candidates = np.flatnonzero((far > tolerance) & (far == largest[part]))
-            _, first = np.unique(part[candidates], return_index=True)
-            if len(first) == 0:
-                break
-            kept = np.union1d(kept, candidates[first])
-        if len(kept) <= most:
+        part = np.clip(np.searchsorted(kept, np.arange(n), side='right') - 1, 0, len(kept) - 2)
+        far = _distances(points, points[kept][part], points[kept][part + 1])
+        largest = np.maximum.reduceat(far, kept[:-1])
+        candidates = np.flatnonzero((far > tolerance) & (far == largest[part]))
+        _, first = np.unique(part[candidates], return_index=True)
+        if len(first) == 0:
             return kept
-        tolerance = max(2.0 * tolerance, 1e-3)
-        if len(kept) > 2 * most and n // _CHUNK > most:
-            return spread(n, most)
+        kept = np.union1d(kept, candidates[first])
 
 
 def _distances(points: FloatArray, begin: FloatArray, end: FloatArray) -> FloatArray:
