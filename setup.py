@@ -17,8 +17,8 @@ from distutils.command.install_data import install_data  # isort: skip  (setupto
 
 PACKAGE = 'pose_graph_ros'
 # those for `ros2 run`
-EXECUTABLES = ('pose_graph_node', 'replay', 'solve', 'compare', 'compile_kernels', 'draw',
-               'marginalize', 'report', 'simulate', 'tune')
+EXECUTABLES = ('pose_graph_node', 'replay', 'solve', 'compare', 'compile_kernels', 'demo',
+               'draw', 'marginalize', 'parameters', 'report', 'simulate', 'tune')
 LIBEXEC = Path('lib', PACKAGE)
 HERE = Path(__file__).resolve().parent
 
@@ -68,8 +68,10 @@ setup(
             'solve = pose_graph_ros.cli.main:solve',
             'compare = pose_graph_ros.cli.main:compare',
             'compile_kernels = pose_graph_ros.cli.main:compile_kernels',
+            'demo = pose_graph_ros.cli.main:demo',
             'draw = pose_graph_ros.cli.main:draw',
             'marginalize = pose_graph_ros.cli.main:marginalize',
+            'parameters = pose_graph_ros.cli.main:parameters',
             'report = pose_graph_ros.cli.main:report',
             'simulate = pose_graph_ros.cli.main:simulate',
             'tune = pose_graph_ros.cli.main:tune',

@@ -24,8 +24,8 @@ pytest.importorskip('setuptools')
 
 PACKAGE = 'pose_graph_ros'
 EXECUTABLES = (
-    'compare', 'compile_kernels', 'draw', 'marginalize', 'pose_graph_node', 'replay', 'report',
-    'simulate', 'solve', 'tune')
+    'compare', 'compile_kernels', 'demo', 'draw', 'marginalize', 'parameters', 'pose_graph_node',
+    'replay', 'report', 'simulate', 'solve', 'tune')
 TREE = Path(__file__).resolve().parents[1]
 # whoever adds a file to one of the folders wants it to be installed
 SHARED_FILES = ('package.xml', *(

@@ -76,6 +76,11 @@ def compile_kernels(args: list[str] | None = None) -> int:
     return _alone('compile-kernels', args)
 
 
+def demo(args: list[str] | None = None) -> int:
+    """Run `demo` as a separate program; return the exit code."""
+    return _alone('demo', args)
+
+
 def draw(args: list[str] | None = None) -> int:
     """Run `draw` as a separate program; return the exit code."""
     return _alone('draw', args)
@@ -84,6 +89,11 @@ def draw(args: list[str] | None = None) -> int:
 def marginalize(args: list[str] | None = None) -> int:
     """Run `marginalize` as a separate program; return the exit code."""
     return _alone('marginalize', args)
+
+
+def parameters(args: list[str] | None = None) -> int:
+    """Run `parameters` as a separate program; return the exit code."""
+    return _alone('parameters', args)
 
 
 def simulate(args: list[str] | None = None) -> int:
