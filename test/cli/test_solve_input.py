@@ -43,7 +43,8 @@ def test_a_wrong_file_is_one_line_that_names_it(
 
 
 @pytest.mark.parametrize('content', [
-    b'', b'\xff\xfe', gzip.compress(FIRST.encode())[:30], b'{"a": 1}', None])
+    b'', b'\xff\xfe', gzip.compress(FIRST.encode(), mtime=0)[:30], b'{"a": 1}', None],
+    ids=['empty', 'no text', 'half of a compressed file', 'JSON', 'folder'])
 def test_what_is_no_graph_is_one_line(
     content: bytes | None, tmp_path: Path, capsys: pytest.CaptureFixture[str],
 ) -> None:
