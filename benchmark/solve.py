@@ -47,8 +47,8 @@ the file, starts, optimises and writes the result. For each file the script has 
 chordal, poses of the file) and the optimiser (Gauss-Newton, Levenberg-Marquardt) with which it is
 fastest of those with which it reaches the optimum of its own error to 1e-6. Ours is the known one
 to 1e-6 in each run. Times in ms, least / median of {repeats} runs, with one thread. The ratio is
-that of the least times, GTSAM's over ours with the certificate; above 1 ours is faster. The
-machine was busy with other work, which the processor time feels less than the wall time.
+that of the least times, GTSAM's over ours with the certificate; above 1 ours is faster.
+Other work on the machine is felt less by the processor time than by the wall time.
 
 | file | wall, ours | no certificate | GTSAM | ratio | processor, ours | no certificate | GTSAM \
 | ratio | GTSAM's way |
