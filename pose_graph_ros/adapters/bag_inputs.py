@@ -5,9 +5,10 @@
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 import logging
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 from pose_graph_ros.adapters.bags import Bag, BagError, BagMessage, MessageError, Span, WHOLE
+from pose_graph_ros.adapters.message_reader import MessageReader
 from pose_graph_ros.adapters.sources import CLOSURES, Kind, KNOWN_SOURCES, ODOMETRY_KINDS, Source
 
 logger = logging.getLogger(__name__)
@@ -174,3 +175,18 @@ def read_static_frames(reader: Bag) -> list[BagMessage]:
             continue
         good.append(message)
     return good
+
+
+def reader_of(bag: Bag, values: Mapping[str, Any]) -> MessageReader:
+    """
+    Return a new reader for the messages of a bag, which knows its static transforms.
+
+    Parameters
+    ----------
+    values : mapping, all parameters of the node
+
+    """
+    reader = MessageReader(values)
+    for message in read_static_frames(bag):
+        reader.frames.receive(message.decode())
+    return reader

@@ -10,7 +10,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from pose_graph_ros.adapters.bag_inputs import Inputs, read_static_frames, STATIC_FRAMES
+from pose_graph_ros.adapters.bag_inputs import Inputs, reader_of, STATIC_FRAMES
 from pose_graph_ros.adapters.bag_writer import BagWriter, message_types
 from pose_graph_ros.adapters.bags import Bag, BagMessage, MessageError, Span
 from pose_graph_ros.adapters.conversions import frame
@@ -76,9 +76,7 @@ class _Corrector:
         self._stamps, self._covariances = estimate.path.stamps_ns.tolist(), covariances
         self._newest_ns = 0
         # from the first message on again, as it remembers the stamps before
-        self._reader = MessageReader(values)
-        for message in read_static_frames(bag):
-            self._reader.frames.receive(message.decode())
+        self._reader = reader_of(bag, values)
 
     def outputs(self, message: BagMessage) -> Iterator[tuple[str, bytes]]:
         """Yield topics and serialised messages; none outside the path."""

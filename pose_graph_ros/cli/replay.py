@@ -25,7 +25,7 @@ from pose_graph_ros.adapters.bag_inputs import (
     choose_inputs,
     Inputs,
     read_inputs,
-    read_static_frames,
+    reader_of,
 )
 from pose_graph_ros.adapters.bag_sequence import open_bags
 from pose_graph_ros.adapters.bag_writer import BagWriter
@@ -108,9 +108,7 @@ def run(bag: Bag, inputs: Inputs, values: Mapping[str, Any]) -> Replayed:
     values : mapping, all parameters of the node
 
     """
-    reader = MessageReader(values)
-    for message in read_static_frames(bag):
-        reader.frames.receive(message.decode())
+    reader = reader_of(bag, values)
     refused: Counter[tuple[str, str]] = Counter()
     recorder = Recorder()
     backend, report = run_measurements(

@@ -10,10 +10,9 @@ from typing import Any
 
 import numpy as np
 
-from pose_graph_ros.adapters.bag_inputs import Inputs, read_inputs, read_static_frames
+from pose_graph_ros.adapters.bag_inputs import Inputs, read_inputs, reader_of
 from pose_graph_ros.adapters.bag_poses import POSE_TYPES, poses_on
 from pose_graph_ros.adapters.bags import Bag, BagError, MessageError, Span, WHOLE
-from pose_graph_ros.adapters.message_reader import MessageReader
 from pose_graph_ros.adapters.sources import Kind, ODOMETRY_KINDS
 from pose_graph_ros.cli.evaluation import Drive, evaluate, format_table, summary
 from pose_graph_ros.cli.picture import draw_drive
@@ -123,9 +122,7 @@ def collect_drive(
         If `truth_topic` is missing or of an unsupported type.
 
     """
-    reader = MessageReader(values)
-    for frames in read_static_frames(bag):
-        reader.frames.receive(frames.decode())
+    reader = reader_of(bag, values)
     if origin is not None:
         reader.datum.keep(origin)
     preferred = inputs.of(*ODOMETRY_KINDS)[0]

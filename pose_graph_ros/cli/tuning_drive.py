@@ -10,9 +10,8 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from pose_graph_ros.adapters.bag_inputs import Inputs, read_static_frames
+from pose_graph_ros.adapters.bag_inputs import Inputs, reader_of
 from pose_graph_ros.adapters.bags import Bag
-from pose_graph_ros.adapters.message_reader import MessageReader
 from pose_graph_ros.adapters.sources import backend_config, Kind
 from pose_graph_ros.cli.replay import measurements_of, run_measurements
 from pose_graph_ros.core.config import MeasurementSource
@@ -87,9 +86,7 @@ class TuningDrive:
     """
 
     def __init__(self, bag: Bag, inputs: Inputs, values: Mapping[str, Any]) -> None:
-        reader = MessageReader(values)
-        for message in read_static_frames(bag):
-            reader.frames.receive(message.decode())
+        reader = reader_of(bag, values)
         self.refused: Counter[tuple[str, str]] = Counter()
         stream = measurements_of(bag, inputs, reader, self.refused)
         measurements = list(islice(stream, MOST_MEASUREMENTS))
