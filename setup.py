@@ -4,8 +4,9 @@
 Installation by `pip install .`, `pip install -e .` and `colcon build`.
 
 colcon obeys setup.cfg, which sends the executables to lib/pose_graph_ros, where `ros2 run` looks
-for them. pip does not and puts them into bin; there the two classes below add launchers to
-lib/pose_graph_ros, so that the package works alike after each of the three.
+for them; a launcher there gives `pose-graph` the name `pose_graph` as well. pip puts executables
+into bin; there the two classes below add the launcher of the node, so that the package works alike
+after each of the three.
 """
 
 from glob import glob
@@ -16,9 +17,7 @@ from setuptools import Distribution, find_packages, setup
 from distutils.command.install_data import install_data  # isort: skip  (setuptools provides it)
 
 PACKAGE = 'pose_graph_ros'
-# those for `ros2 run`
-EXECUTABLES = ('pose_graph_node', 'replay', 'solve', 'compare', 'compile_kernels', 'demo',
-               'draw', 'marginalize', 'parameters', 'report', 'simulate', 'tune')
+LAUNCHER = 'dev/pose_graph'
 LIBEXEC = Path('lib', PACKAGE)
 HERE = Path(__file__).resolve().parent
 
@@ -32,7 +31,7 @@ class DataDistribution(Distribution):
 
 
 class InstallData(install_data):
-    """Install the data files and, where scripts do not go to lib/pose_graph_ros, launchers."""
+    """Install the data files and, where scripts do not go to lib/pose_graph_ros, a launcher."""
 
     def run(self) -> None:
         super().run()
@@ -40,10 +39,10 @@ class InstallData(install_data):
             return
         folder = Path(self.install_dir) / LIBEXEC
         folder.mkdir(parents=True, exist_ok=True)
-        for name in EXECUTABLES:
-            self.copy_file(str(HERE / 'dev' / 'launcher.sh'), str(folder / name))
-            (folder / name).chmod(0o755)
-            self.outfiles.append(str(folder / name))
+        node = folder / 'pose_graph_node'
+        self.copy_file(str(HERE / LAUNCHER), str(node))
+        node.chmod(0o755)
+        self.outfiles.append(str(node))
 
 
 setup(
@@ -58,23 +57,13 @@ setup(
     data_files=[
         ('share/ament_index/resource_index/packages', [f'resource/{PACKAGE}']),
         (f'share/{PACKAGE}', ['package.xml']),
+        (str(LIBEXEC), [LAUNCHER]),
         (f'share/{PACKAGE}/config', sorted(glob('config/*'))),
         (f'share/{PACKAGE}/launch', sorted(glob('launch/*.launch.py'))),
     ],
     entry_points={
         'console_scripts': [
             'pose_graph_node = pose_graph_ros.ros.main:main',
-            'replay = pose_graph_ros.cli.main:replay',
-            'solve = pose_graph_ros.cli.main:solve',
-            'compare = pose_graph_ros.cli.main:compare',
-            'compile_kernels = pose_graph_ros.cli.main:compile_kernels',
-            'demo = pose_graph_ros.cli.main:demo',
-            'draw = pose_graph_ros.cli.main:draw',
-            'marginalize = pose_graph_ros.cli.main:marginalize',
-            'parameters = pose_graph_ros.cli.main:parameters',
-            'report = pose_graph_ros.cli.main:report',
-            'simulate = pose_graph_ros.cli.main:simulate',
-            'tune = pose_graph_ros.cli.main:tune',
             'pose-graph = pose_graph_ros.cli.main:main',
         ],
     },

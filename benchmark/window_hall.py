@@ -143,7 +143,7 @@ def run(course: Drive, passes: int, config: ThinningConfig) -> Record:
         smoother.extend(course.odometry[k - 1], information)
         if k in course.closures:
             smoother.update(GraphUpdate(edges=_closure(k, *course.closures[k], thinned)))
-        places = thinning.places(smoother, config)
+        places = thinning.places(smoother, config, k + 1)
         if places is not None:
             for group in groups(smoother.graph, places):
                 if removed(smoother, sparse_removal(smoother.graph, group.nodes)) is None:

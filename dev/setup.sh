@@ -37,7 +37,7 @@ checksum() { # text, files...: what a step depends on
 
 environment_checksum() { checksum "$ROOT $MODE ${ROS_DISTRO:-}" requirements.lock dev/setup.sh; }
 package_checksum() {
-    checksum '' setup.py setup.cfg package.xml pyproject.toml dev/launcher.sh resource config launch
+    checksum '' setup.py setup.cfg package.xml pyproject.toml dev/pose_graph resource config launch
 }
 tf2_checksum() { checksum '' dev/tf2_msgs dev/build_tf2_msgs.py; }
 tools_checksum() { checksum '' requirements-test.lock; }

@@ -7,6 +7,7 @@ Start the node with its parameter file, and optionally RViz.
 """
 
 from pathlib import Path
+from sys import argv
 
 from ament_index_python.packages import (
     get_package_prefix,
@@ -15,6 +16,7 @@ from ament_index_python.packages import (
 )
 from launch import LaunchContext, LaunchDescription, LaunchDescriptionEntity
 from launch.actions import DeclareLaunchArgument, LogInfo, OpaqueFunction
+from launch.logging import get_logger
 from launch_ros.actions import Node
 
 from pose_graph_ros.adapters import launch_arguments
@@ -33,10 +35,12 @@ def generate_launch_description() -> LaunchDescription:
 
 def _nodes(context: LaunchContext, names: list[str]) -> list[LaunchDescriptionEntity]:
     """Return the node and RViz, by the arguments as they are given."""
+    for sentence in launch_arguments.unknown(
+            context.argv, names, included=all(Path(__file__).name not in item for item in argv)):
+        get_logger(PACKAGE).warning(sentence)
     given = {name: context.launch_configurations[name] for name in names}
     # what comes later takes precedence
     parameters = [launch_arguments.parameter_file(given), launch_arguments.parameters(given)]
-    remappings = launch_arguments.remappings(given)
     node = Node(
         package=PACKAGE,
         executable='pose_graph_node',
@@ -44,7 +48,7 @@ def _nodes(context: LaunchContext, names: list[str]) -> list[LaunchDescriptionEn
         namespace=given['namespace'],
         output='screen',
         parameters=parameters,
-        remappings=remappings,
+        remappings=launch_arguments.remappings(given),
         ros_arguments=['--log-level', given['log_level']],
     )
     if not launch_arguments.switch(given, 'rviz'):
@@ -62,6 +66,6 @@ def _nodes(context: LaunchContext, names: list[str]) -> list[LaunchDescriptionEn
         output='screen',
         arguments=['-d', given['rviz_config']],
         parameters=parameters,
-        remappings=remappings,
+        remappings=launch_arguments.display_remappings(given),
     )
     return [node, rviz]

@@ -75,3 +75,27 @@ def test_the_stories_of_the_design_name_only_what_there_is() -> None:
 
 def test_the_readme_fits_on_two_screens() -> None:
     assert len((ROOT / 'README.md').read_text(encoding='utf-8').splitlines()) <= README_LINES
+
+
+@pytest.mark.parametrize('page', ['README.md', 'docker/Dockerfile'])
+def test_what_ubuntu_lacks_is_left_out_of_rosdep_and_installed_by_pip(page: str) -> None:
+    text = (ROOT / page).read_text(encoding='utf-8')
+    (keys,) = re.findall(r"--skip-keys '([^']+)'", text)
+    (line,) = re.findall(r"pip install --break-system-packages .*", text)
+    package = (ROOT / 'package.xml').read_text(encoding='utf-8')
+    requirements = (ROOT / 'setup.py').read_text(encoding='utf-8')
+    for key in keys.split():
+        assert f'>{key}<' in package, key
+        name = key.removeprefix('python3-').removesuffix('-pip')
+        (requirement,) = re.findall(rf"'({name}>=[^']+)'", requirements)
+        assert f"'{requirement}'" in line, 'rosdep would fail: PEP 668'
+    assert re.findall(r'>(python3-\S+-pip)<', package) == [
+        key for key in keys.split() if key.endswith('-pip')], 'pip keys'
+
+
+def test_the_container_copies_what_the_package_is_made_of() -> None:
+    ignored = (ROOT / '.dockerignore').read_text(encoding='utf-8').split()
+    needed = {'pose_graph_ros', 'launch', 'config', 'resource', 'dev', 'package.xml', 'setup.py',
+              'setup.cfg', 'LICENSE'}
+    assert not needed & set(ignored)
+    assert all((ROOT / name).exists() for name in needed)

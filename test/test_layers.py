@@ -45,7 +45,8 @@ CORE = {
         'core.marginalization', 'core.batch', 'core.smoother', 'core.odometry'},
     'core.trajectories': {'core.geometry'},
     'core.residuals': {
-        'core.geometry', 'core.graph', 'core.smoother', 'core.odometry', 'core.sources'},
+        'core.geometry', 'core.graph', 'core.batch', 'core.smoother', 'core.odometry',
+        'core.sources'},
     'core.simulation': {'core.geometry', 'core.graph'},
     'core.tuning': {
         'core.compiled', 'core.geometry', 'core.graph', 'core.odometry', 'core.sources'},
@@ -54,15 +55,15 @@ CORE['core.io'] = set(CORE)
 # The modules on top of the packages: the facade, what it hands out, and who drives it.
 TOP = {'core.estimate', 'core.newest_estimate', 'core.prediction', 'core.transaction',
        'core.isolation', 'core.forgetting', 'core.refiner', 'core.relocation',
-       'core.error_tuner', 'core.thinner', 'core.backend', 'core.warm_up',
+       'core.error_tuner', 'core.passed_fixes', 'core.thinner', 'core.backend', 'core.warm_up',
        'core.helper_process'}
 # Third-party libraries of `core`.
 LIBRARIES = {'numpy', 'scipy', 'numba', 'pyproj'}
 ROS = {'rclpy', 'rosidl_runtime_py', 'ament_index_python', 'launch', 'launch_ros'}
 
 # What the node decides without ROS, so that it can be tested without.
-LOGIC = ('announcements', 'decisions', 'input', 'liveness', 'log', 'memory', 'pose_continuity',
-         'refusals', 'set_pose_input', 'slew', 'time_jump', 'worker')
+LOGIC = ('announcements', 'decisions', 'delays', 'input', 'liveness', 'log', 'memory',
+         'pose_continuity', 'refusals', 'set_pose_input', 'slew', 'time_jump', 'worker')
 
 MOST_LINES = 450
 

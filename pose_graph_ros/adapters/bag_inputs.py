@@ -5,6 +5,7 @@
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 import logging
+import re
 from typing import Any, NamedTuple
 
 from pose_graph_ros.adapters.bags import Bag, BagError, BagMessage, MessageError, Span, WHOLE
@@ -15,6 +16,8 @@ logger = logging.getLogger(__name__)
 
 OPTIONS = tuple(KNOWN_SOURCES)
 """Sources with a command line option for their topic; without it their topic is guessed."""
+TRUTH = re.compile(r'(?:/|_|\b)(?:ground_?truth|truth|gt)(?:/|_|\b)', re.IGNORECASE)
+"""What names of topics with the truth have in them: these are no inputs unless they are named."""
 STATIC_FRAMES = '/tf_static', 'tf2_msgs/msg/TFMessage'  # topic and type of static transforms
 
 
@@ -54,7 +57,8 @@ def choose_inputs(
 
     Guesses are made for `odom`, `fix`, `imu` and `gyro`, if the bag has one of their type, for
     `loop_closure`, if its usual topic is in the bag, and for `global_pose`, if one topic of poses
-    is left and no source of fixes has a topic. Fixes are not guessed if global poses are wanted.
+    is left and no source of fixes has a topic. Fixes are not guessed if global poses are wanted,
+    and topics that are named as the truth, such as `/ground_truth` or `/gt/pose`, never.
 
     Parameters
     ----------
@@ -123,7 +127,7 @@ def _guess(
     """Return the topic of a source for which none was given; None if there is no candidate."""
     kind, option = kinds[name], f'--{_option(name)}'
     free = [topic for topic, info in reader.topics.items()
-            if info.type == kind.message_type and topic != truth
+            if info.type == kind.message_type and topic != truth and not TRUTH.search(topic)
             and (kind is Kind.GYRO or topic not in topics.values())]
     if kind is Kind.LOOP_CLOSURE:
         usual = '/' + KNOWN_SOURCES[CLOSURES][1]

@@ -5,7 +5,8 @@ Read bags without a ROS installation.
 
 A bag is a rosbag2 folder, one of its .mcap or .db3 files, or a ROS 1 .bag file. A bag that cannot
 be read raises `BagError`, whose message begins with the path. The caller decodes each message, so
-that one that cannot be decoded (`MessageError`) does not end the iteration.
+that one that cannot be decoded (`MessageError`) does not end the iteration. A rosbag2 that was cut
+short or damaged is read as far as it goes, with a warning (`damaged_bags`).
 """
 
 from abc import ABC, abstractmethod
@@ -13,6 +14,7 @@ from collections import Counter
 from collections.abc import Callable, Collection, Iterator
 from dataclasses import dataclass, field
 from functools import partial
+import glob
 import logging
 from pathlib import Path
 from typing import Any, NamedTuple, Self
@@ -23,6 +25,7 @@ from rosbags.rosbag2 import Reader as Rosbag2Reader
 from rosbags.typesys import get_types_from_idl, get_types_from_msg, get_typestore, Stores
 from rosbags.typesys.store import Typestore
 
+from pose_graph_ros.adapters.damaged_bags import salvage, Salvaged
 from pose_graph_ros.adapters.odometry_cdr import LITTLE_ENDIAN, read_odometry
 from pose_graph_ros.core.exceptions import PoseGraphError
 
@@ -30,6 +33,7 @@ logger = logging.getLogger(__name__)
 
 BAG_FILE_SUFFIXES = ('.mcap', '.db3', '.bag')
 IDL_SEPARATOR = '=' * 80 + '\n'
+JOURNALS = ('.db3-wal', '.db3-journal')
 ODOMETRY = 'nav_msgs/msg/Odometry'
 
 
@@ -118,6 +122,11 @@ class Bag(ABC):
         """Iterate over the messages of topics that the bag has."""
 
 
+def _absolute(connection: Connection) -> str:
+    """Return the topic of a connection with a slash, which recorders of ROS 1 may leave out."""
+    return '/' + connection.topic.removeprefix('/')
+
+
 class BagReader(Bag):
     """
     An open bag, a context manager; made by `open_bag`.
@@ -128,13 +137,13 @@ class BagReader(Bag):
 
     """
 
-    def __init__(self, path: Path, reader: Rosbag1Reader | Rosbag2Reader) -> None:
+    def __init__(self, path: Path, reader: Rosbag1Reader | Rosbag2Reader | Salvaged) -> None:
         self.path = path
-        self._reader = reader
+        self._reader: Rosbag1Reader | Rosbag2Reader | Salvaged = reader
         self._decoders: dict[str, Callable[[bytes], Any]] = {}
         self.topics = {}
-        for name in sorted({connection.topic for connection in reader.connections}):
-            connections = [c for c in reader.connections if c.topic == name]
+        for name in sorted({_absolute(c) for c in reader.connections}):
+            connections = [c for c in reader.connections if _absolute(c) == name]
             types = ' | '.join(sorted({c.msgtype for c in connections}))
             self.topics[name] = TopicInfo(types, sum(c.msgcount for c in connections))
         self.start_ns, self.end_ns = reader.start_time, reader.end_time
@@ -146,10 +155,11 @@ class BagReader(Bag):
         self._reader.close()  # messages that were read before can still be decoded
 
     def _messages(self, topics: Collection[str], span: Span) -> Iterator[BagMessage]:
-        connections = [c for c in self._reader.connections if c.topic in topics]
+        connections = [c for c in self._reader.connections if _absolute(c) in topics]
         if len(connections) == 0:  # rosbags reads all topics if it is given none
             return
         seen: Counter[str] = Counter()
+        last_ns: int | None = None
         source = self._reader.messages(connections, *span)
         while True:
             try:
@@ -157,16 +167,24 @@ class BagReader(Bag):
             except StopIteration:
                 break
             except Exception as error:  # the parsers can raise anything on a damaged file
-                raise BagError(
-                    f'{self.path}: damaged after {seen.total()} messages: {one_line(error)}',
-                ) from error
-            seen[connection.topic] += 1
+                text = f'damaged after {seen.total()} messages: {one_line(error)}'
+                if isinstance(self._reader, Rosbag1Reader | Salvaged) or (
+                        rest := salvage(Path(self.path), text)) is None:
+                    raise BagError(f'{self.path}: {text}') from error
+                self._reader.close()
+                self._reader = rest
+                source = rest.messages(
+                    [each for each in rest.connections if _absolute(each) in topics],
+                    span.begin_ns if last_ns is None else last_ns + 1, span.end_ns)
+                continue
+            seen[_absolute(connection)] += 1
+            last_ns = recorded_ns
             yield BagMessage(
-                connection.topic, connection.msgtype, recorded_ns, bytes(raw), connection,
+                _absolute(connection), connection.msgtype, recorded_ns, bytes(raw), connection,
                 self._decoder(connection))
-        if span != WHOLE:
+        if span != WHOLE or isinstance(self._reader, Salvaged):
             return
-        for topic in sorted({c.topic for c in connections}):
+        for topic in sorted({_absolute(c) for c in connections}):
             if seen[topic] != self.topics[topic].count:
                 logger.warning('%s: %s should have %d messages, %d were found',
                                self.path, topic, self.topics[topic].count, seen[topic])
@@ -196,6 +214,8 @@ def open_bag(path: str | Path) -> BagReader:
     if not path.exists():
         raise BagError(f'{path}: does not exist')
     if path.is_dir() and not (path / 'metadata.yaml').exists():
+        if (rest := salvage(path, 'the recording was not ended, it has no metadata.yaml')):
+            return BagReader(path, rest)
         inside = sorted(p.name for p in path.iterdir() if p.suffix in BAG_FILE_SUFFIXES)
         hint = f'; name a file in it: {", ".join(inside)}' if inside else ''
         raise BagError(f'{path}: no rosbag2 folder, it has no metadata.yaml{hint}')
@@ -203,11 +223,18 @@ def open_bag(path: str | Path) -> BagReader:
         raise BagError(
             f'{path}: no bag, expected a rosbag2 folder or a file ending in '
             f'{", ".join(BAG_FILE_SUFFIXES)}')
+    files = path.iterdir() if path.is_dir() else path.parent.glob(f'{glob.escape(path.name)}-*')
+    if any(each.name.endswith(JOURNALS) and each.stat().st_size > 0 for each in files) and (
+            rest := salvage(path, 'the recording was not ended, it has a journal')):
+        return BagReader(path, rest)
     try:
         reader: Rosbag1Reader | Rosbag2Reader = (
             Rosbag1Reader(path) if path.suffix == '.bag' else Rosbag2Reader(path))
         reader.open()
     except Exception as error:  # the parsers can raise anything on a damaged file
+        if path.suffix != '.bag' and (
+                rest := salvage(path, f'damaged or cut short: {one_line(error)}')):
+            return BagReader(path, rest)
         raise BagError(
             f'{path}: damaged, cut short or not supported: {one_line(error)}') from error
     return BagReader(path, reader)

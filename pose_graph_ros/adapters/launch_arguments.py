@@ -2,31 +2,26 @@
 # SPDX-License-Identifier: Apache-2.0
 """The arguments of the launch file, and what they mean for the node; no ROS, and no launch."""
 
-from collections.abc import Mapping
+from collections.abc import Collection, Iterable, Mapping
+from difflib import get_close_matches
 from pathlib import Path
+import re
 
-from pose_graph_ros.adapters.sources import Kind, KNOWN_SOURCES
+from pose_graph_ros.adapters.parameter_names import LIKENESS
+from pose_graph_ros.adapters.sources import Kind, KNOWN_SOURCES, OUTPUTS
 from pose_graph_ros.core.exceptions import ConfigError
 
 AS_IN_FILE = 'as in params_file'
 """Default of arguments that set a parameter only if they are given."""
 SWITCHES = {'true': True, '1': True, 'false': False, '0': False}
 
-# Topic of the node and type of the messages by argument.
-OUTPUTS = {
-    'path': ('path', 'nav_msgs/Path'),
-    'pose': ('pose', 'geometry_msgs/PoseWithCovarianceStamped'),
-    'filtered_odometry': ('odometry/filtered', 'nav_msgs/Odometry'),
-}
-
 
 def arguments(share: Path) -> dict[str, tuple[str, str]]:
     """Return default and description by name, given the folder of the installed package."""
     config = share / 'config'
     inputs = {
-        source: (AS_IN_FILE, f'topic of {kind.message_type.replace("/msg/", "/")}; sets '
-                 f'{source}.topic' + (
-                     f', if sources lists {source}' if kind in (Kind.IMU, Kind.GYRO) else ''))
+        source: (AS_IN_FILE, f'topic of the input, {kind.message_type}; sets {source}.topic' + (
+            f', if sources lists {source}' if kind in (Kind.IMU, Kind.GYRO) else ''))
         for source, (kind, _) in KNOWN_SOURCES.items()}
     return {
         'params_file': (str(config / 'pose_graph.yaml'), 'yaml file of parameters'),
@@ -41,8 +36,10 @@ def arguments(share: Path) -> dict[str, tuple[str, str]]:
                       'lifecycle manager does'),
         'rviz': ('false', 'true or false: start RViz as well, if it is installed'),
         'rviz_config': (str(config / 'pose_graph.rviz'), 'configuration of RViz'),
+        'sources': (AS_IN_FILE, 'names of the sources, such as [odom, fix, gyro]'),
         **inputs,
-        **{name: (topic, f'topic of {type_name}') for name, (topic, type_name) in OUTPUTS.items()},
+        **{name: (AS_IN_FILE, f'topic of the output, {type_name}; sets outputs.{name}, by default '
+                              f'{topic}') for name, (topic, type_name, _) in OUTPUTS.items()},
     }
 
 
@@ -74,16 +71,49 @@ def parameter_file(given: Mapping[str, str]) -> str:
     return str(path)
 
 
-def parameters(given: Mapping[str, str]) -> dict[str, bool | str]:
+def unknown(typed: Iterable[str], own: Collection[str], *, included: bool) -> list[str]:
+    """
+    Return what to say of arguments that the launch file does not have, which launch ignores.
+
+    Parameters
+    ----------
+    typed : iterable of str, the arguments of the command line, as `name:=value`
+    own : collection of str, names of those of this launch file
+    included : bool
+        Whether another launch file was started, which may have arguments of its own: then only
+        those that resemble one of this file are told.
+
+    """
+    said = []
+    for name in (each.partition(':=')[0] for each in typed if ':=' in each):
+        nearest = get_close_matches(name, own, 1, LIKENESS)
+        if name not in own and (len(nearest) > 0 or not included):
+            said.append(f'argument {name} is not known and has no effect: ' + (
+                f'did you mean {nearest[0]}?' if len(nearest) > 0 else '--show-args lists all'))
+    return said
+
+
+def parameters(given: Mapping[str, str]) -> dict[str, bool | str | list[str]]:
     """Return the parameters that arguments set; they take precedence over the parameter file."""
     own = {name for name, text in given.items() if text not in ('', AS_IN_FILE)}
-    values: dict[str, bool | str] = {
+    values: dict[str, bool | str | list[str]] = {
         name: switch(given, name) for name in ('use_sim_time', 'autostart') if name in own}
-    return values | {f'{name}.topic': given[name] for name in KNOWN_SOURCES if name in own}
+    if 'sources' in own:
+        values['sources'] = names = re.findall(r'[^\s,\[\]\'"]+', given['sources'])
+        if len(names) == 0:
+            raise ConfigError(f'argument sources: expected names, got {given["sources"]!r}')
+    # not by remaps: one of /odometry/filtered would move the input as well as the output
+    return values | {f'{name}.topic': given[name] for name in KNOWN_SOURCES if name in own} | {
+        f'outputs.{name}': given[name] for name in OUTPUTS if name in own}
 
 
 def remappings(given: Mapping[str, str]) -> list[tuple[str, str]]:
     """Return the remaps of topics by the arguments, for the node and for RViz."""
-    outputs = [(topic, given[name]) for name, (topic, _) in OUTPUTS.items()]
-    return outputs + [(f'/{topic}', topic) for topic in ('tf', 'tf_static')
-                      if switch(given, 'remap_tf')]
+    return [(f'/{topic}', topic) for topic in ('tf', 'tf_static') if switch(given, 'remap_tf')]
+
+
+def display_remappings(given: Mapping[str, str]) -> list[tuple[str, str]]:
+    """Return the remaps of topics by the arguments for RViz, which has no parameters of them."""
+    return remappings(given) + [
+        (topic, given[name]) for name, (topic, *_) in OUTPUTS.items()
+        if given[name] not in ('', AS_IN_FILE)]

@@ -12,11 +12,8 @@ from pose_graph_ros.adapters.rates import GyroReader, TwistReader, VELOCITY_READ
 from pose_graph_ros.adapters.sources import Kind, NANOSECONDS, Source, source_list
 from pose_graph_ros.adapters.static_frames import StaticFrames
 from pose_graph_ros.core.measurements import Answer, Measurement, OdometrySample, rejected
-from pose_graph_ros.core.odometry.stamp_guard import StampGuard
+from pose_graph_ros.core.odometry.time_keeper import TimeKeeper
 
-# Distance from the previous odometry stamps beyond which the stamp guard refuses a stamp [ns]. The
-# poses of odometry are accumulated, so the motion of the few refused messages is not lost.
-LEAP_NS = 60 * NANOSECONDS
 # Largest valid stamp: the seconds have 31 bits, of which one hour is left for offsets [ns].
 LARGEST_STAMP_NS = (2**31 - 3600) * NANOSECONDS
 
@@ -29,6 +26,7 @@ class MessageReader:
     ----------
     values : mapping, all checked parameters
     frames : StaticFrames, optional, static transforms that are known already
+    keeper : TimeKeeper, optional, that knows the time already
 
     Raises
     ------
@@ -37,9 +35,16 @@ class MessageReader:
 
     """
 
-    def __init__(self, values: Mapping[str, Any], frames: StaticFrames | None = None) -> None:
+    def __init__(
+        self, values: Mapping[str, Any], frames: StaticFrames | None = None,
+        keeper: TimeKeeper | None = None,
+    ) -> None:
         self.sources = {source.name: source for source in source_list(values)}  # sources by name
-        self._guards = {name: StampGuard(LEAP_NS, behind=True) for name in self.sources}
+        threshold_ns = round(values['clock_jump_threshold'] * NANOSECONDS)
+        self.keeper = keeper or TimeKeeper(
+            [name for name, source in self.sources.items() if source.kind.is_odometry],
+            threshold_ns)
+        """The one judge of stamps."""
         self._map_frame = frame(values['map_frame'])
         base_frame = frame(values['base_link_frame'])
         self.frames = StaticFrames() if frames is None else frames
@@ -58,9 +63,10 @@ class MessageReader:
 
         Sources, topics, frames, datum, static transforms and counts stay.
         """
+        self.keeper.threshold_ns = round(values['clock_jump_threshold'] * NANOSECONDS)
         for source in source_list(values):
             before = self.sources[source.name]
-            self._guards[source.name].shift(source.time_offset_ns - before.time_offset_ns)
+            self.keeper.shift(source.name, source.time_offset_ns - before.time_offset_ns)
             self.sources[source.name] = source
             if (reader := self._velocities.get(source.name)) is not None:
                 reader.source = source
@@ -68,29 +74,20 @@ class MessageReader:
                 self.fixes[source.name].source = source
 
     def read(self, name: str, message: Message) -> OdometrySample | Measurement | Answer:
-        """
-        Return the measurement in a message, or the reason for rejecting it.
-
-        Parameters
-        ----------
-        name : str, name of the source
-        message : Message, of the type of the source
-
-        """
-        source = self.sources[name]
-        measurement = self._read(source, message)
+        """Return the measurement in a message of a source, or the reason for rejecting it."""
+        measurement = self.convert(name, message)
         if isinstance(measurement, Answer):
             return measurement
-        stamp_ns = measurement.stamp_ns
-        if stamp_ns > LARGEST_STAMP_NS:
-            return rejected('stamp_out_of_range', f'{stamp_ns} ns')
-        # the engine rejects stamps of zero or less
-        if ((source.kind.is_odometry or source.kind is Kind.GYRO) and stamp_ns > 0
-                and not self._guards[name].accepts(stamp_ns)):
-            return rejected('stamp_leap', f'{1e-9 * stamp_ns:.3f} s is far from those before')
+        return self.keeper.judge(name, measurement).refusal or measurement
+
+    def convert(self, name: str, message: Message) -> OdometrySample | Measurement | Answer:
+        """Return the same without a judgement of its stamp."""
+        measurement = self._convert(self.sources[name], message)
+        if not isinstance(measurement, Answer) and measurement.stamp_ns > LARGEST_STAMP_NS:
+            return rejected('stamp_out_of_range', f'{measurement.stamp_ns} ns')
         return measurement
 
-    def _read(self, source: Source, message: Message) -> OdometrySample | Measurement | Answer:
+    def _convert(self, source: Source, message: Message) -> OdometrySample | Measurement | Answer:
         name, offset_ns = source.name, source.time_offset_ns
         match source.kind:
             case Kind.ODOMETRY:

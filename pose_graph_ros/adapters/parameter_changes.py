@@ -90,7 +90,10 @@ def require_together(values: Mapping[str, Any]) -> None:
     settings of a source must not contradict each other.
     """
     frames = [frame(values[name]) for name in FRAMES]
-    if '' in frames or len(set(frames)) < len(frames):
+    if '' in frames:
+        raise ConfigError(f'parameter {FRAMES[frames.index("")]}: expected the name of a frame, '
+                          "got ''")
+    if len(set(frames)) < len(frames):
         raise ConfigError(f'parameters {", ".join(FRAMES)}: expected three different names, got '
                           f'{", ".join(map(repr, frames))}')
     datum_of(values)

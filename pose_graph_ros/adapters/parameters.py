@@ -21,6 +21,7 @@ from pose_graph_ros.adapters.sources import (
     Kind,
     KNOWN_SOURCES,
     ODOMETRY_KINDS,
+    OUTPUTS,
     source_names,
 )
 from pose_graph_ros.core import config
@@ -82,6 +83,9 @@ PARAMETERS: tuple[Parameter, ...] = (
               change=Change.UNCONFIGURED),
     Parameter('publish_tf', True, '', 'Whether to publish the transform from `map_frame` to '
               '`odom_frame` on /tf.'),
+    Parameter('wait_for_map', False, '', 'Whether pose, odometry, path and transform are held '
+              'back until it is known where the odometry frame lies in the map, if `sources` '
+              'lists one that tells: fixes or global poses.'),
     Parameter('transform_time_offset', 0.0, 's', 'Time added to the stamp of the published '
               'transform.', 0.0, 10.0),
     Parameter('transform_slew_linear', 0.0, 'm/s', 'Maximum linear speed at which corrections '
@@ -104,7 +108,8 @@ PARAMETERS: tuple[Parameter, ...] = (
     Parameter('graph_file', '', '', 'File that `~/save_graph` writes and `~/load_graph` reads, '
               'such as graph.g2o. Files with the suffixes .json and .tum are stored next to it.'),
     Parameter('load_graph_on_start', False, '', 'Whether to continue with the graph in '
-              '`graph_file`. If it cannot be loaded, the node is not configured.',
+              '`graph_file`, once there is one. If it cannot be loaded, the node is not '
+              'configured.',
               change=Change.UNCONFIGURED),
     Parameter('datum', [], 'deg, deg, rad', 'Latitude and longitude of the origin of the map and, '
               'optionally, the angle from east to its x axis. If unset, the first fix is the '
@@ -154,6 +159,8 @@ PARAMETERS: tuple[Parameter, ...] = (
     Parameter('alignment.baseline_in_sigmas', _ALIGNMENT.baseline_in_sigmas, '', 'Minimum length '
               'that the positions must span for the alignment, in standard deviations of a '
               'position.', 1.0, 100.0),
+    *(Parameter(f'outputs.{name}', topic, '', f'Topic of the {content}.',
+                change=Change.UNCONFIGURED) for name, (topic, _, content) in OUTPUTS.items()),
 )
 
 _ALL = tuple(Kind)
@@ -257,8 +264,9 @@ SOURCE_PARAMETERS: tuple[Parameter, ...] = (
               'their residuals and from how well neighbours agree, and at least 1.', 0.0, 1e3,
               kinds=(Kind.LOOP_CLOSURE,)),
     Parameter('sigma_scale', _ODOMETRY.sigma_scale, '', 'Factor on the standard deviations of the '
-              'primary odometry. If 0, it is at least 1, and more where global poses or fixes '
-              'with a `correlation_time` of -1 show that odometry drifts more than it claims.',
+              'primary odometry. If 0, it is 1, but more or less where global poses or fixes '
+              'with a `correlation_time` of -1 show that odometry drifts more or less than it '
+              'claims.',
               0.0, 1e3, kinds=_WHEELS),
     *(Parameter('robust_loss', loss.value, '', 'Robust loss applied to the errors. The last four '
                 'are bounded: very wrong measurements have no influence, and the start matters.',
@@ -292,8 +300,8 @@ OF_SOURCES = frozenset(parameter.name for parameter in SOURCE_PARAMETERS)
 # Names of sources are prefixes of parameters and of counts in the diagnostics.
 _NAME = re.compile(r'[A-Za-z][A-Za-z0-9_]*')
 _TOPIC = re.compile(r'(~?/)?[A-Za-z_][A-Za-z0-9_]*(/[A-Za-z_][A-Za-z0-9_]*)*')
-_TAKEN = {'solver', 'worker', 'received', 'alignment', 'window', 'thinning', 'qos_overrides',
-          'use_sim_time', 'start_type_description_service'} | {
+_TAKEN = {'solver', 'worker', 'received', 'alignment', 'window', 'thinning', 'outputs',
+          'qos_overrides', 'use_sim_time', 'start_type_description_service'} | {
               parameter.name for parameter in PARAMETERS}
 
 
@@ -404,7 +412,8 @@ def checked_value(parameter: Parameter, value: Any) -> Any:
         raise _wrong(parameter, type(default).__name__, value)
     if len(parameter.choices) > 0 and value not in parameter.choices:
         raise _wrong(parameter, f'one of {", ".join(parameter.choices)}', value)
-    if parameter.name.endswith('.topic') and _TOPIC.fullmatch(str(value)) is None:
+    if (parameter.name.endswith('.topic') or parameter.name.startswith('outputs.')) and (
+            _TOPIC.fullmatch(str(value)) is None):
         raise _wrong(parameter, 'the name of a topic', value)
     return value
 

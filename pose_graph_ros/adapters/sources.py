@@ -43,6 +43,8 @@ MESSAGE_TYPES = {
     Kind.FIX: 'sensor_msgs/msg/NavSatFix', Kind.IMU: 'sensor_msgs/msg/Imu',
     Kind.LOOP_CLOSURE: _POSE, Kind.TWIST: 'geometry_msgs/msg/TwistWithCovarianceStamped',
     Kind.GYRO: 'sensor_msgs/msg/Imu'}
+IN_MAP = (Kind.FIX, Kind.GLOBAL_POSE)
+"""Kinds of sources of positions in the map."""
 ODOMETRY_KINDS = (Kind.ODOMETRY, Kind.TWIST)
 
 SET_POSE = 'set_pose'  # name under which poses that a user sets are counted
@@ -53,6 +55,18 @@ KNOWN_SOURCES = {
     CLOSURES: (Kind.LOOP_CLOSURE, 'loop_closure'), 'gyro': (Kind.GYRO, 'imu/data')}
 """Default kind and topic of the predefined sources."""
 DEFAULT_SOURCES = ('odom', 'global_pose', 'fix')
+
+
+OUTPUTS = {
+    'path': ('path', 'nav_msgs/msg/Path', 'corrected path'),
+    'pose': ('pose', _POSE, 'newest pose'),
+    'filtered_odometry': ('odometry/filtered', MESSAGE_TYPES[Kind.ODOMETRY],
+                          'newest pose and twist'),
+    'filtered_fix': ('gps/filtered', MESSAGE_TYPES[Kind.FIX], 'newest pose on the Earth'),
+    'graph': ('graph', 'visualization_msgs/msg/MarkerArray', 'markers of the graph'),
+    'verdicts': ('~/verdicts', 'diagnostic_msgs/msg/DiagnosticArray', 'verdicts'),
+    'diagnostics': ('/diagnostics', 'diagnostic_msgs/msg/DiagnosticArray', 'diagnostics')}
+"""Default topic, type and content of the outputs."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -120,8 +134,8 @@ def backend_config(values: Mapping[str, Any]) -> config.BackendConfig:
             raise ConfigError(
                 f'parameter {source.name}.{_SETTINGS.get(setting, setting)}: {rest}') from error
     if len(odometry) == 0:
-        raise ConfigError('parameter sources: expected at least one of type odometry, got '
-                          f'{values["sources"]}')
+        raise ConfigError('parameter sources: expected at least one of type odometry or '
+                          f'twist, got {values["sources"]}')
     return config.BackendConfig(
         nodes=config.NodePolicy(
             minimum_travel_distance=values['minimum_travel_distance'],

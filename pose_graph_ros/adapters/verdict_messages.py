@@ -92,4 +92,5 @@ def read_decision(message: Message) -> tuple[str, Decision] | Answer:
         return name, Decision(text)
     except ValueError:
         choices = ', '.join(decision.value for decision in Decision)
-        return rejected('unknown_decision', f'{name}: expected one of {choices}, got {text!r}')
+        return rejected('unknown_decision', f'expected one of {choices} as the value for the key '
+                                            f'{name!r}, got {text!r}')

@@ -8,13 +8,18 @@ import numpy as np
 
 from pose_graph_ros.cli.solve_starts import METHODS
 from pose_graph_ros.core.batch import gnc
-from pose_graph_ros.core.batch.optimizer import optimize_from_linear_start, Status
-from pose_graph_ros.core.batch.truncated import Choice, TruncatedProblem
+from pose_graph_ros.core.batch.optimizer import (
+    optimize,
+    optimize_from_linear_start,
+    SAME_MINIMUM,
+    Status,
+)
+from pose_graph_ros.core.batch.truncated import Choice, CONFIG, TruncatedProblem
 from pose_graph_ros.core.geometry.se2 import BoolArray, FloatArray, IntArray
 from pose_graph_ros.core.graph.constraints import EdgeKind, Edges
 from pose_graph_ros.core.graph.graph import Graph, GraphUpdate
 from pose_graph_ros.core.judgement import selection
-from pose_graph_ros.core.judgement.floors import floored, forward
+from pose_graph_ros.core.judgement.floors import floored, FLOORS, forward
 from pose_graph_ros.core.judgement.residual_scale import give_scale
 from pose_graph_ros.core.solver_config import SolverConfig
 
@@ -38,64 +43,126 @@ class BelievedEdges:
     """Of all nodes, shape (N, 3) [m, m, rad]."""
     scale: float
     """Factor on the sigmas of closures that those believed show, at least 1."""
+    cost: float
+    """Truncated cost of the poses, with the sigmas of the file times `scale`."""
+    cost_of_all: float | None
+    """The same at the minimum of chi2 with all closures, if it was computed."""
 
 
 def believe(
-    graph: Graph, sigmas: FloatArray, method: str = METHODS[0],
+    graph: Graph, sigmas: FloatArray, method: str = METHODS[0], *, given: bool = False,
 ) -> BelievedEdges | None:
     """
     Return which edges of a graph to believe, and poses at which they agree; None if it fails.
 
-    Edges between neighbouring rows are odometry, which is believed. Where odometry does not join
-    all nodes, some closures are taken as known that do; several such sets are tried.
+    Edges between neighbouring poses are odometry, which is believed. Where odometry does not join
+    all poses, some closures are taken as known that do; several such sets are tried. The truncated
+    cost is never above that of the minimum with all closures, or of the given poses.
 
     Parameters
     ----------
     graph : Graph, it is not changed
     sigmas : ndarray, shape (3,), least sigmas of closures for the decision [m, m, rad]
     method : str, one of `METHODS`
+    given : bool, whether the poses of the graph mean anything
 
     """
     edges = forward(graph.edges)
+    place = np.cumsum(graph.is_pose)
     is_motion = edges.kind <= EdgeKind.LOOP_CLOSURE
-    is_closure = is_motion & (np.abs(edges.j - edges.i) != 1)
+    is_closure = is_motion & (np.abs(place[edges.j] - place[edges.i]) != 1)
     kind = np.where(is_closure, EdgeKind.LOOP_CLOSURE, np.where(
         is_motion, EdgeKind.ODOMETRY, edges.kind)).astype(np.uint8)
-    given, softened = edges.information, floored(edges, sigmas).information
-    information = np.where(is_closure[:, None, None], softened, given)
-    edges = replace(edges, information=information, kind=kind)
+    edges = replace(edges, kind=kind)
+    softened = replace(edges, information=np.where(
+        is_closure[:, None, None], floored(edges, sigmas).information, edges.information))
     closures = np.flatnonzero(is_closure & (edges.weight > 0.0) & (edges.i != edges.j))
     parts = _Parts(graph.n_nodes)
-    parts.join(edges.rows(~is_closure))
-    n_parts, best, best_rows = parts.count, None, closures
+    parts.join(edges.rows(is_motion & ~is_closure))
+    parts.count -= int(np.sum(~graph.is_pose))
+    n_parts, best, rows, lowered = parts.count, None, closures, 1.0
     for k in range(TRIES if n_parts > 1 else 1):
         known = _joining(edges, closures, parts.copy(), k)
-        rows = closures[~np.isin(closures, known)]
-        choice = _choice(graph, edges, rows, method)
+        problem = _from_odometry(graph, softened, closures[~np.isin(closures, known)])
+        choice = None if problem is None else _choice(problem, method)
+        if problem is not None and choice is not None and (
+                best is None or choice.cost < best.cost):
+            best, rows, lowered = choice, problem.rows, problem.lowered()
+    plain = _minimum_of_all(graph, edges, closures)
+    starts = [poses for poses in (plain, graph.poses.copy() if given else None)
+              if poses is not None]
+    for start in starts:
+        problem = TruncatedProblem(_filled(graph, softened), closures, start)
+        problem.limits *= lowered
+        choice = problem.near_start()
         if choice is not None and (best is None or choice.cost < best.cost):
-            best, best_rows = choice, rows
+            best, rows = choice, closures
     if best is None:
         return None
-    doubted = best_rows[~best.believed]
-    believed = ~np.isin(closures, doubted)
-    copy = Graph()
-    copy.fill(graph.rows()._replace(edges=replace(edges, information=given)))
-    copy.apply(GraphUpdate(remove_edges=doubted.tolist()))
+    believed = ~np.isin(closures, rows[~best.believed])
+    copy = _filled(graph, edges)
+    copy.apply(GraphUpdate(remove_edges=closures[~believed].tolist()))
     copy.set_poses(best.poses)
     scale = give_scale(copy, closures[believed])
-    return BelievedEdges(closures, believed, n_parts, copy.poses.copy(), scale)
+    optimize(copy, CONFIG)
+    result = BelievedEdges(closures, believed, n_parts, copy.poses.copy(), scale, np.inf, None)
+    # who asks for more than the usual sigmas wants to believe what costs more by those of the file
+    return _not_worse(
+        result, graph, edges, starts if np.all(sigmas <= FLOORS) else [], plain)
 
 
-def _choice(
-    graph: Graph, edges: Edges, closures: IntArray, method: str,
-) -> Choice | None:
-    """Return a set of closures, from the start that all other constraints give."""
+def _not_worse(
+    result: BelievedEdges, graph: Graph, edges: Edges, starts: list[FloatArray],
+    plain: FloatArray | None,
+) -> BelievedEdges:
+    """Return the result, or what is better by the sigmas that it has found, near other poses."""
+    closures, information = result.closures, edges.information.copy()
+    information[closures] *= result.scale**-2.0
+    scaled = replace(edges, information=information)
+    problem = TruncatedProblem(_filled(graph, scaled), closures, result.poses)
+    result = replace(result, cost=problem.cost_at(result.poses), cost_of_all=(
+        None if plain is None else problem.cost_at(plain)))
+    for start in starts:
+        if problem.cost_at(start) < result.cost * (1.0 - SAME_MINIMUM):
+            problem = TruncatedProblem(_filled(graph, scaled), closures, start)
+            choice = problem.near_start()
+            if choice is not None and choice.cost < result.cost:
+                result = replace(result, believed=choice.believed, poses=choice.poses,
+                                 cost=choice.cost)
+    return result
+
+
+def _filled(graph: Graph, edges: Edges) -> Graph:
     copy = Graph()
     copy.fill(graph.rows()._replace(edges=edges))
+    return copy
+
+
+def _minimum_of_all(graph: Graph, edges: Edges, closures: IntArray) -> FloatArray | None:
+    """
+    Return the poses of a minimum of chi2 with all closures from a linear start, shape (N, 3).
+
+    None if there is none, or if so many edges between random nodes make the factorisation nearly
+    dense, which right ones never do.
+    """
+    copy = _filled(graph, edges)
+    problem = TruncatedProblem(copy, closures, graph.poses.copy())
+    if (problem.factorisation(np.ones(len(closures))) > selection.MOST_NUMBERS * graph.n_nodes
+            or optimize_from_linear_start(copy, CONFIG).status is Status.FAILED):
+        return None
+    return copy.poses.copy()
+
+
+def _from_odometry(graph: Graph, edges: Edges, closures: IntArray) -> TruncatedProblem | None:
+    """Return the problem with the start that all other constraints give."""
+    copy = _filled(graph, edges)
     copy.apply(GraphUpdate(remove_edges=closures.tolist()))
     if optimize_from_linear_start(copy, SolverConfig()).status is Status.FAILED:
         return None
-    problem = TruncatedProblem(copy, closures, start=copy.poses.copy())
+    return TruncatedProblem(copy, closures, start=copy.poses.copy())
+
+
+def _choice(problem: TruncatedProblem, method: str) -> Choice | None:
     if method in SURROGATES:
         return gnc.select(problem, SURROGATES[method], patient=True)
     return selection.best(problem)

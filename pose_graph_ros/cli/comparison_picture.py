@@ -14,6 +14,7 @@ from scipy.stats import chi2
 
 from pose_graph_ros.cli.picture import BLUE, GREEN, GREY, GRID, INK, ORANGE, thinned, VERMILION
 from pose_graph_ros.core.geometry.se2 import FloatArray
+from pose_graph_ros.core.judgement.texts import short
 from pose_graph_ros.core.trajectories.comparison import Comparison
 from pose_graph_ros.core.trajectories.sequence import Key
 from pose_graph_ros.core.trajectories.statistics import PROBABILITY
@@ -78,7 +79,8 @@ def _draw_map(
         ate = result.statistics()['ate']
         path = thinned(result.estimate)
         axes.plot(path[:, 0], path[:, 1], color=COLOURS[k % len(COLOURS)], linewidth=1.4,
-                  label=_short(name) + ('' if ate is None else f', ATE {ate.rmse:.3g} m rms'))
+                  label=_short(name) + (
+                      '' if ate is None else f', ATE {short(ate.rmse, 3)} m rms'))
     axes.set_aspect('equal', adjustable='datalim')
     axes.set_xlabel('x [m]')
     axes.set_ylabel('y [m]')

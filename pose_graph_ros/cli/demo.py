@@ -31,9 +31,9 @@ from pose_graph_ros.adapters.conversions import planar_pose, stamp_ns
 from pose_graph_ros.adapters.sources import source_list
 from pose_graph_ros.adapters.verdict_messages import states_in
 from pose_graph_ros.cli import options as shared
-from pose_graph_ros.cli.results import collect_drive, write_results
+from pose_graph_ros.cli.results import collect_drive, with_refused, write_results
 from pose_graph_ros.cli.run.document import document, write_document
-from pose_graph_ros.cli.run.from_node import GRAPH, node_run, RECORDED
+from pose_graph_ros.cli.run.from_node import GRAPH, node_run, RECORDED, restored
 from pose_graph_ros.cli.simulate import simulate_drive, write_drive
 from pose_graph_ros.core.exceptions import PoseGraphError
 from pose_graph_ros.core.geometry.trajectory import Trajectory
@@ -91,13 +91,15 @@ def execute(options: argparse.Namespace) -> int:
                            np.array([pose for pose in poses.values() if pose is not None]))
     diagnostics = _last(options.out / RECORDED, '/diagnostics').status[0]
     verdicts = _last(options.out / RECORDED, VERDICTS)
+    engine = restored(options.out, values)
     with open_bag(bag_path) as bag:
-        drive = collect_drive(bag, inputs, values, corrected, truth,
-                              states={} if verdicts is None else states_in(verdicts))
+        drive = with_refused(collect_drive(
+            bag, inputs, values, corrected, truth,
+            states={} if verdicts is None else states_in(verdicts)), engine[0])
     table = write_results(drive, options.out, title, {
         'bag': bag_path.name, 'topics': dict(inputs.topics), 'rate': options.rate,
         'seconds': seconds, 'node': {item.key: item.value for item in diagnostics.values}})
-    run = node_run(title, drive, options.out, (inputs, values), converged=converged,
+    run = node_run(title, drive, options.out, (inputs, values), engine, converged=converged,
                    seconds=seconds)
     write_document(document(run), options.out)
     print(f'\n{table}\n')

@@ -5,11 +5,12 @@ Compute the distances of the corrected path and of odometry alone from the truth
 
 Paths are interpolated at the stamps of the truth or of the fixes; stamps outside a path are
 ignored. Odometry has its own frame, so it is first aligned with the truth (or the fixes) by the
-best rigid motion, which is the most favourable comparison for it.
+best rigid motion, which is the most favourable comparison for it. So is the truth with the path:
+its map may begin elsewhere, as where only a part of a recording is replayed.
 """
 
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -38,17 +39,23 @@ class Drive:
     """Whether a fix is doubted or waits, shape (M,); None if all are believed."""
     loop_states: Sequence[State] = ()
     """Of the loop closures; none if all are believed."""
+    fix_refused: npt.NDArray[np.bool_] | None = None
+    """Whether a fix is not in the graph, shape (M,); None if all are."""
     fix_sources: Sequence[str] = ()
     """Names of the sources of the fixes; none if unknown."""
     loop_sources: Sequence[str] = ()
     """The same of the loop closures."""
+    truth_moved: tuple[float, float] | None = None
+    """How far the truth was moved to fit the path [m, rad]; None if it was not."""
 
     @property
     def fix_kinds(self) -> dict[str, npt.NDArray[np.bool_]]:
-        """Which fixes are used, doubted and held out, shape (M,) each."""
-        unused = np.zeros_like(self.fix_held_out) if self.fix_unused is None else self.fix_unused
-        return {'used': ~self.fix_held_out & ~unused, 'doubted': ~self.fix_held_out & unused,
-                'held out': self.fix_held_out}
+        """Which fixes are used, doubted and held out, shape (M,) each; others are refused."""
+        nothing = np.zeros_like(self.fix_held_out)
+        refused = nothing if self.fix_refused is None else self.fix_refused
+        doubted = nothing if self.fix_unused is None else self.fix_unused
+        rest = ~self.fix_held_out & ~refused
+        return {'used': rest & ~doubted, 'doubted': rest & doubted, 'held out': self.fix_held_out}
 
     def loops(self, *states: State) -> npt.NDArray[np.bool_]:
         """Return which loop closures are in one of some states, shape (L,)."""
@@ -81,6 +88,19 @@ class ErrorRow:
     p95: float
     maximum: float
     unit: str = 'm'
+
+
+def place_truth(drive: Drive) -> Drive:
+    """Return a drive with the truth moved rigidly to where it fits the corrected path best."""
+    truth = drive.truth
+    if truth is None or not np.any(inside := drive.corrected.covers(truth.stamps_ns)):
+        return drive
+    before = truth.poses[inside, :2]
+    pose = fit_similarity(before, drive.corrected.at(truth.stamps_ns[inside])[:, :2]).pose
+    placed = Trajectory(truth.stamps_ns, se2.compose(pose, truth.poses))
+    shift = np.mean(placed.poses[inside, :2] - before, axis=0)
+    return replace(drive, truth=placed, truth_moved=(
+        float(np.hypot(*shift)), abs(float(pose[2]))))
 
 
 def place_odometry(drive: Drive) -> Trajectory:
@@ -192,5 +212,6 @@ def summary(
         'odometry': len(drive.odometry), 'poses': len(drive.corrected),
         **{f'fixes_{kind.replace(" ", "_")}': int(np.sum(chosen))
            for kind, chosen in drive.fix_kinds.items()},
+        'fixes_refused': 0 if drive.fix_refused is None else int(np.sum(drive.fix_refused)),
         'loop_closures': len(drive.loop_stamps_ns), 'truth': drive.truth is not None,
         'errors': [asdict(row) for row in rows], **extra}

@@ -103,7 +103,7 @@ def write_exports(
         else:
             continue
         written.append(folder / f'path.{name}')
-        _write(written[-1], lines)
+        write_lines(written[-1], lines)
     require_datum(exports, known=placed)
     return written
 
@@ -122,6 +122,7 @@ def _on_earth(
     return lines(estimate.path.stamps_ns, datum.geodetic(estimate.path.poses[:, :2])[:, :2], title)
 
 
-def _write(path: Path, lines: Iterator[str]) -> None:
+def write_lines(path: Path, lines: Iterator[str]) -> None:
+    """Write a text file."""
     with path.open('w', encoding='utf-8') as file:
         file.writelines(f'{line}\n' for line in lines)

@@ -1,7 +1,7 @@
 # Copyright 2026 The pose_graph_ros authors
 # SPDX-License-Identifier: Apache-2.0
 """
-A g2o file as measurements over time: odometry and loop closures, as if a robot sent them.
+A g2o, TORO or iSAM file as odometry and loop closures over time, as if a robot sent them.
 
 An edge from each vertex to the next one is odometry; its other edges are loop closures, which come
 when the later one of their ends is reached. The vertices are a second apart, or have given stamps.
@@ -12,13 +12,14 @@ from pathlib import Path
 
 import numpy as np
 
+from pose_graph_ros.cli.graph_input import read_file
 from pose_graph_ros.core.exceptions import FileFormatError
 from pose_graph_ros.core.geometry import covariance, se2
 from pose_graph_ros.core.geometry.se2 import FloatArray, IntArray
 from pose_graph_ros.core.graph.constraints import Edges
-from pose_graph_ros.core.io.g2o import read_g2o
 from pose_graph_ros.core.measurements import LoopClosure, OdometrySample
 
+GRAPH_SUFFIXES = ('.g2o', '.graph')
 SECOND = 1_000_000_000
 
 
@@ -34,10 +35,10 @@ def read_measurements(
     Parameters
     ----------
     stamps : Path, optional, text file with a line for each vertex that begins with its stamp [s]
-    edge2 : str, optional, format of the tag EDGE2; see `read_g2o`
+    edge2 : str, optional, format of the tag EDGE2; by default it is found out
 
     """
-    file = read_g2o(path, edge2)
+    file, _ = read_file(path, edge2)
     edges, n = file.graph.edges, file.graph.n_nodes
     stamps_ns = SECOND * np.arange(1, n + 1) if stamps is None else _read_stamps(stamps, n)
     steps = np.flatnonzero(np.abs(edges.i - edges.j) == 1)

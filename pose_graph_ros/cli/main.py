@@ -9,9 +9,13 @@ module of the tool that is used is imported: the imports of all take seconds.
 
 import argparse
 from collections.abc import Callable
+import gc
 import importlib
 import os
+import signal
 import sys
+import threading
+from types import FrameType
 
 from pose_graph_ros import __version__
 from pose_graph_ros.core.exceptions import PoseGraphError
@@ -30,6 +34,8 @@ SUMMARIES = {
     'compile-kernels': 'compile the solver for later starts',
 }
 """Tools and what they do."""
+COMPILER = os.path.join('llvmlite', 'binding')
+RETRY = 0.01  # after which an interrupt is tried again [s]
 
 
 def main(args: list[str] | None = None) -> int:
@@ -51,70 +57,6 @@ def main(args: list[str] | None = None) -> int:
     return guarded(run)
 
 
-def replay(args: list[str] | None = None) -> int:
-    """Run `replay` as a separate program; return the exit code."""
-    return _alone('replay', args)
-
-
-def solve(args: list[str] | None = None) -> int:
-    """Run `solve` as a separate program; return the exit code."""
-    return _alone('solve', args)
-
-
-def compare(args: list[str] | None = None) -> int:
-    """Run `compare` as a separate program; return the exit code."""
-    return _alone('compare', args)
-
-
-def report(args: list[str] | None = None) -> int:
-    """Run `report` as a separate program; return the exit code."""
-    return _alone('report', args)
-
-
-def compile_kernels(args: list[str] | None = None) -> int:
-    """Run `compile-kernels` as a separate program; return the exit code."""
-    return _alone('compile-kernels', args)
-
-
-def demo(args: list[str] | None = None) -> int:
-    """Run `demo` as a separate program; return the exit code."""
-    return _alone('demo', args)
-
-
-def draw(args: list[str] | None = None) -> int:
-    """Run `draw` as a separate program; return the exit code."""
-    return _alone('draw', args)
-
-
-def marginalize(args: list[str] | None = None) -> int:
-    """Run `marginalize` as a separate program; return the exit code."""
-    return _alone('marginalize', args)
-
-
-def parameters(args: list[str] | None = None) -> int:
-    """Run `parameters` as a separate program; return the exit code."""
-    return _alone('parameters', args)
-
-
-def simulate(args: list[str] | None = None) -> int:
-    """Run `simulate` as a separate program; return the exit code."""
-    return _alone('simulate', args)
-
-
-def tune(args: list[str] | None = None) -> int:
-    """Run `tune` as a separate program; return the exit code."""
-    return _alone('tune', args)
-
-
-def _alone(tool: str, args: list[str] | None) -> int:
-    def run() -> int:
-        parser = argparse.ArgumentParser(prog=tool.replace('-', '_'))
-        _complete(parser, tool)
-        options = parser.parse_args(args)
-        return int(options.execute(options))
-    return guarded(run)
-
-
 def _complete(parser: argparse.ArgumentParser, tool: str) -> None:
     """Import the module of a tool, and add its description and arguments to a parser."""
     module = importlib.import_module(f'pose_graph_ros.cli.{tool.replace("-", "_")}')
@@ -130,6 +72,12 @@ def guarded(run: Callable[[], int]) -> int:
 
     Errors that the user can correct are printed on one line; the code is then 2.
     """
+    # whoever handles signals otherwise, or calls this in another thread, goes on with that
+    ours = threading.current_thread() is threading.main_thread() and (
+        signal.getsignal(signal.SIGINT) is signal.default_int_handler)
+    if ours:
+        signal.signal(signal.SIGINT, _interrupt)
+        signal.signal(signal.SIGALRM, _interrupt)
     try:
         return run()
     except BrokenPipeError:  # the reader of the output, such as head, has ended
@@ -140,6 +88,23 @@ def guarded(run: Callable[[], int]) -> int:
         return 2
     except KeyboardInterrupt:
         return 130
+    finally:
+        if ours:
+            signal.setitimer(signal.ITIMER_REAL, 0.0)
+            signal.signal(signal.SIGALRM, signal.SIG_DFL)
+            signal.signal(signal.SIGINT, signal.default_int_handler)
+
+
+def _interrupt(_: int, frame: FrameType | None) -> None:
+    """Raise KeyboardInterrupt; later, where the compiler would swallow it."""
+    while frame is not None:
+        # LLVM calls Python back, and an exception there is printed and forgotten
+        if COMPILER in frame.f_code.co_filename:
+            signal.setitimer(signal.ITIMER_REAL, RETRY)
+            return
+        frame = frame.f_back
+    gc.freeze()     # the compiler has made so many objects that to look at them takes seconds
+    raise KeyboardInterrupt
 
 
 if __name__ == '__main__':

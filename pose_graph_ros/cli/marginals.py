@@ -1,17 +1,21 @@
 # Copyright 2026 The pose_graph_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""Marginal covariances of the nodes of a graph as CSV; part of the tool `pose-graph solve`."""
+"""Marginal covariances of the nodes of a graph; part of the tool `pose-graph solve`."""
+
+from typing import NamedTuple
 
 import numpy as np
 
 from pose_graph_ros.cli.solve_starts import CONFIG, Problem
 from pose_graph_ros.core.batch.optimizer import optimize
 from pose_graph_ros.core.exceptions import PoseGraphError
-from pose_graph_ros.core.geometry.se2 import IntArray
+from pose_graph_ros.core.geometry.se2 import FloatArray, IntArray
 from pose_graph_ros.core.graph.constraints import upper
+from pose_graph_ros.core.graph.graph import Graph
 from pose_graph_ros.core.smoother.incremental import IncrementalSmoother
 
-HEADER = 'id,x,y,theta,cov_xx,cov_xy,cov_xtheta,cov_yy,cov_ytheta,cov_thetatheta'
+COLUMNS = ('id', 'x', 'y', 'theta', 'cov_xx', 'cov_xy', 'cov_xtheta', 'cov_yy', 'cov_ytheta',
+           'cov_thetatheta')
 
 
 def chosen_rows(problem: Problem, which: str) -> IntArray:
@@ -42,28 +46,59 @@ def chosen_rows(problem: Problem, which: str) -> IntArray:
     return rows
 
 
-def csv_lines(problem: Problem, rows: IntArray) -> list[str]:
+class Marginals(NamedTuple):
+    """Poses and covariances in map axes of some nodes."""
+
+    rows: list[dict[str, float | None]]
+    """One for each node, with the names of `COLUMNS`; None for the heading of a point."""
+    relative_error: float
+    """Bound of what rounding changes of a covariance: the condition number times epsilon."""
+
+    def lines(self) -> list[str]:
+        """Return lines of CSV."""
+        return [','.join(COLUMNS), *(','.join(
+            '' if row[name] is None else repr(row[name]) for name in COLUMNS)
+            for row in self.rows)]
+
+
+def marginals(problem: Problem, rows: IntArray) -> Marginals:
     """
-    Return lines of CSV with poses and covariances in map axes [m, rad], those of points shorter.
+    Return the covariances of nodes of a graph that the batch optimiser has solved.
 
     Parameters
     ----------
-    rows : ndarray of int, shape (K,), of nodes in a graph that the batch optimiser has solved
+    problem : Problem
+    rows : ndarray of int, shape (K,), of nodes
 
     """
     graph = problem.engine
     # H at the optimum; the last step before it was linearised one step away
     optimize(graph, CONFIG)
-    smoother = IncrementalSmoother(graph=graph)
-    few = 10 * len(rows) < graph.n_nodes
-    covariances = (np.array([smoother.covariance(int(row)) for row in rows]) if few
-                   else smoother.covariances()[rows])
-    lines = [HEADER]
+    covariances = IncrementalSmoother(graph=graph).covariances()
+    table = []
     for row, pose, numbers in zip(rows.tolist(), graph.poses[rows].tolist(),
-                                  upper(covariances).tolist(), strict=True):
-        texts = [*map(repr, (*pose, *numbers))]
+                                  upper(covariances[rows]).tolist(), strict=True):
+        values: list[float | None] = [*pose, *numbers]
         if not graph.is_pose[row]:
-            # a point has no heading
-            texts = ['' if k in {2, 5, 7, 8} else text for k, text in enumerate(texts)]
-        lines.append(','.join((str(problem.ids[row]), *texts)))
-    return lines
+            values = [None if k in {2, 5, 7, 8} else value for k, value in enumerate(values)]
+        table.append(dict(zip(COLUMNS, [int(problem.ids[row]), *values], strict=True)))
+    return Marginals(table, float(np.finfo(float).eps) * _condition(graph, covariances))
+
+
+def _condition(graph: Graph, covariances: FloatArray) -> float:
+    """
+    Return a bound of the condition number of H with a diagonal of ones.
+
+    The trace of its inverse, each variance times what constraints add to H there.
+    """
+    known = np.zeros((graph.n_nodes, 3))
+    edges, observed = graph.edges_by_row, graph.observed_by_row
+    for table, ends in ((edges, (edges.i, edges.j)), (observed, (observed.node,))):
+        information = table.weighted_information
+        position = information[:, 0, 0] + information[:, 1, 1]
+        arm = np.sum(table.mean[:, :2]**2, axis=1) if table is edges else 0.0
+        for end in ends:
+            for column, share in enumerate((
+                    position, position, information[:, 2, 2] + arm * position)):
+                np.add.at(known[:, column], end, share)
+    return max(float(np.sum(known * np.einsum('mii->mi', covariances))), 1.0)

@@ -35,10 +35,15 @@ def add_inputs(parser: argparse.ArgumentParser, *, hold_out: bool = True) -> Non
                        'gyro'),
             ('--truth', 'Odometry, PoseStamped or PoseWithCovarianceStamped in the map, only used '
                         'for comparison')):
-        group.add_argument(option, metavar='TOPIC', help=text)
+        group.add_argument(option, metavar='TOPIC', type=_topic, help=text)
     if hold_out:
         parser.add_argument('--hold-out', metavar='N', type=int, default=0,
                             help='keep every N-th fix out of the graph and use it for comparison')
+
+
+def _topic(text: str) -> str:
+    """Return a topic with the slash that recorders of ROS 1 may leave out."""
+    return '/' + text.removeprefix('/')
 
 
 def add_parameters(parser: argparse.ArgumentParser) -> None:

@@ -42,11 +42,18 @@ from pose_graph_ros.adapters.sources import (
 from pose_graph_ros.cli import options as shared
 from pose_graph_ros.cli.corrected_bag import LATCHED, write_corrected
 from pose_graph_ros.cli.evaluation import Drive, evaluate
-from pose_graph_ros.cli.exports import add_exports, covariances, require_datum, write_exports
-from pose_graph_ros.cli.g2o_inputs import read_measurements
+from pose_graph_ros.cli.exports import (
+    add_exports,
+    covariances,
+    require_datum,
+    write_exports,
+    write_lines,
+)
+from pose_graph_ros.cli.g2o_inputs import GRAPH_SUFFIXES, read_measurements
 from pose_graph_ros.cli.judgement import judgement, judgement_lines
+from pose_graph_ros.cli.live import LivePoses
 from pose_graph_ros.cli.progress import WatchedBag
-from pose_graph_ros.cli.results import collect_drive, write_results
+from pose_graph_ros.cli.results import collect_drive, with_refused, write_results
 from pose_graph_ros.cli.run.content import Run
 from pose_graph_ros.cli.run.document import document, write_document
 from pose_graph_ros.cli.run.recorder import Recorder, Update
@@ -57,7 +64,7 @@ from pose_graph_ros.core.geometry.geodesy import MapOrigin
 from pose_graph_ros.core.geometry.trajectory import Trajectory
 from pose_graph_ros.core.io.g2o import EDGE2_ORDERS
 from pose_graph_ros.core.io.g2o_writing import write_g2o
-from pose_graph_ros.core.judgement.texts import Key, states_by_stamps
+from pose_graph_ros.core.judgement.texts import Key, short, states_by_stamps
 from pose_graph_ros.core.judgement.verdicts import State, Verdict
 from pose_graph_ros.core.measurements import Answer, LoopClosure, Measurement, OdometrySample
 
@@ -99,20 +106,23 @@ class Replayed(NamedTuple):
         return states_by_stamps(verdicts) | refused
 
 
-def run(bag: Bag, inputs: Inputs, values: Mapping[str, Any]) -> Replayed:
+def run(
+    bag: Bag, inputs: Inputs, values: Mapping[str, Any], live: LivePoses | None = None,
+) -> Replayed:
     """
     Return a new engine after adding all messages of a bag and a full optimisation.
 
     Parameters
     ----------
     values : mapping, all parameters of the node
+    live : LivePoses, optional, as in `run_measurements`
 
     """
     reader = reader_of(bag, values)
     refused: Counter[tuple[str, str]] = Counter()
     recorder = Recorder()
     backend, report = run_measurements(
-        measurements_of(bag, inputs, reader, refused), values, recorder)
+        measurements_of(bag, inputs, reader, refused), values, recorder, live)
     return Replayed(
         backend, report, refused, reader.datum, recorder, values, inputs.kinds)
 
@@ -144,7 +154,7 @@ def measurements_of(
 
 def run_measurements(
     measurements: Iterable[tuple[str, OdometrySample | Measurement]], values: Mapping[str, Any],
-    recorder: Recorder | None = None,
+    recorder: Recorder | None = None, live: LivePoses | None = None,
 ) -> tuple[PoseGraphBackend, UpdateReport]:
     """
     Return a new engine after adding measurements, and the report of the full optimisation.
@@ -154,6 +164,7 @@ def run_measurements(
     measurements : iterable, sources and measurements, in the order of their arrival
     values : mapping, all parameters of the node
     recorder : Recorder, optional, what is told of the run as it goes on
+    live : LivePoses, optional, receives the poses as of each moment; updates are as it wants them
 
     """
     backend = PoseGraphBackend(backend_config(values))
@@ -165,26 +176,35 @@ def run_measurements(
             backend.add_odometry(measurement, source)
         else:
             recorder.add_answer(source, measurement, backend.add_measurement(measurement, source))
-        if backend.graph.n_nodes >= next_update:
+        if backend.graph.n_nodes >= next_update if live is None else live.is_due(
+                measurement, backend.graph.n_nodes):
             begin = time.thread_time()  # of this process, however busy the machine is
             report = backend.update()
             recorder.log.add(Update(
                 int(backend.node_stamps_ns[-1]), len(backend.node_stamps_ns),
                 1e3 * (time.thread_time() - begin), report.chi2, report.iterations))
             next_update = backend.graph.n_nodes + UPDATE_EVERY
+            if live is not None:
+                live.updated(backend)
+        if live is not None:
+            live.add(measurement, source)
     return backend, backend.optimize()
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Add the arguments of this tool."""
     parser.add_argument('bags', metavar='BAG', type=Path, nargs='+',
-                        help='rosbag2 folder, .mcap, .db3, ROS 1 .bag; or one .g2o file')
+                        help='rosbag2 folder, .mcap, .db3, ROS 1 .bag; or one .g2o or .graph file')
     parser.add_argument('-o', '--out', metavar='DIR', type=Path, default=Path('replay'),
                         help='folder for the results (default: %(default)s)')
     add_exports(parser)
     parser.add_argument('--bag', metavar='OUT', type=Path, dest='new_bag',
                         help='new rosbag2 folder with all messages, the corrected path, odometry '
-                             'in the map and the transform from map to odom')
+                             'in the map and the transform from map to odom; its poses know all '
+                             'that came later')
+    parser.add_argument('--live', action='store_true',
+                        help='also write live.csv: the poses that a robot would have had at each '
+                             'moment, with their covariances')
     parser.add_argument('--json', action='store_true',
                         help='print the contents of summary.json instead of a text')
     add_sources(parser)
@@ -195,15 +215,20 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def add_sources(parser: argparse.ArgumentParser) -> None:
     """Add the options that say which part of a bag is read, and how a .g2o file is."""
-    parser.add_argument('--from', metavar='SECONDS', type=_seconds, dest='begin', default=None,
-                        help='leave out what was recorded before, counted from the first message')
-    parser.add_argument('--until', metavar='SECONDS', type=_seconds,
-                        help='leave out what was recorded from then on')
+    add_span(parser)
     parser.add_argument('--stamps', metavar='FILE', type=Path,
                         help='text file with the stamps [s] of the vertices of a .g2o file '
                              '(default: a second apart)')
     parser.add_argument('--edge2', choices=EDGE2_ORDERS,
                         help='format of the tag EDGE2 in a .g2o file')
+
+
+def add_span(parser: argparse.ArgumentParser) -> None:
+    """Add the options that say which part of a bag is read."""
+    parser.add_argument('--from', metavar='SECONDS', type=_seconds, dest='begin', default=None,
+                        help='leave out what was recorded before, counted from the first message')
+    parser.add_argument('--until', metavar='SECONDS', type=_seconds,
+                        help='leave out what was recorded from then on')
 
 
 def _seconds(text: str) -> float:
@@ -216,14 +241,14 @@ def _seconds(text: str) -> float:
 
 def execute(options: argparse.Namespace) -> int:
     """Run the tool; return the exit code."""
-    if any(path.suffix == '.g2o' for path in options.bags):
+    if any(path.suffix in GRAPH_SUFFIXES for path in options.bags):
         return _execute_g2o(options)
     values = shared.parameter_values(options)
     wanted = shared.wanted_topics(options)
     with ExitStack() as stack:
         bag = stack.enter_context(open_bags(options.bags))
         inputs = choose_inputs(
-            bag, source_list(values), wanted, options.hold_out, _span(bag, options),
+            bag, source_list(values), wanted, options.hold_out, span_of(bag, options),
             truth=options.truth)
         require_datum(options.export, known=len(values['datum']) > 0 or len(
             inputs.of(Kind.FIX)) > 0)
@@ -232,26 +257,31 @@ def execute(options: argparse.Namespace) -> int:
         if not options.json:
             print('\n'.join(f'{source}: {topic}' for source, topic in inputs.topics.items()))
         start = time.monotonic()
-        result = run(WatchedBag(bag, 'optimising'), inputs, values)
+        live = LivePoses(values['frequency']) if options.live else None
+        result = run(WatchedBag(bag, 'optimising'), inputs, values, live)
         seconds = time.monotonic() - start
         estimate = result.backend.estimate()
         if estimate is None:
             topics = ' or '.join(inputs.topics[name] for name in inputs.of(*ODOMETRY_KINDS))
-            raise BagError(f'{bag.path}: no usable odometry on {topics}')
+            names = set(inputs.of(*ODOMETRY_KINDS))
+            why = ', '.join(f'{answer} {count}' for (source, answer), count in sorted(
+                (result.backend.counts + result.refused).items()) if source in names)
+            raise BagError(f'{bag.path}: no usable odometry on {topics}: {why or "no messages"}')
         verdicts = result.backend.verdicts()
-        drive = collect_drive(
+        drive = with_refused(collect_drive(
             WatchedBag(bag, 'comparing'), inputs, values, estimate.path, options.truth,
-            origin=result.origin, states=result.states(verdicts))
+            origin=result.origin, states=result.states(verdicts)),
+            result.backend)
         facts: dict[str, Any] = {'bags': [str(path) for path in options.bags]}
         if writer is not None:
             copied = write_corrected(
                 writer, WatchedBag(bag, 'writing the bag'), inputs, values, estimate=estimate,
                 covariances=covariances(result.backend, estimate))
             facts['new_bag'] = copied._asdict()
-    return _report(options, drive, result, verdicts, facts | {'seconds': seconds})
+    return _report(options, drive, result, verdicts, facts | {'seconds': seconds}, live=live)
 
 
-def _span(bag: Bag, options: argparse.Namespace) -> Span:
+def span_of(bag: Bag, options: argparse.Namespace) -> Span:
     """Return the time of recording that the options ask for; raises `BagError` if it is empty."""
     limits = [None if seconds is None else bag.start_ns + round(seconds * 1e9)
               for seconds in (options.begin, options.until)]
@@ -264,9 +294,9 @@ def _span(bag: Bag, options: argparse.Namespace) -> Span:
 
 def _execute_g2o(options: argparse.Namespace) -> int:
     """Replay a g2o file."""
-    if len(options.bags) > 1 or options.new_bag or options.begin or options.until:
-        raise BagError(f'{options.bags[0]}: expected one .g2o file alone, without --bag, --from '
-                       'and --until')
+    if len(options.bags) > 1 or options.new_bag or options.live or options.begin or options.until:
+        raise BagError(f'{options.bags[0]}: expected one .g2o file alone, without --bag, --live, '
+                       '--from and --until')
     require_datum(options.export, known=False)
     path, = options.bags
     values = shared.parameter_values(options, {'odom.noise': 'twist'})
@@ -300,7 +330,7 @@ def _execute_g2o(options: argparse.Namespace) -> int:
 
 def _report(
     options: argparse.Namespace, drive: Drive, result: Replayed, verdicts: Sequence[Verdict],
-    facts: Mapping[str, Any],
+    facts: Mapping[str, Any], *, live: LivePoses | None = None,
 ) -> int:
     """Write the results and print a summary; return the exit code."""
     backend, report = result.backend, result.report
@@ -325,6 +355,9 @@ def _report(
         facts['seconds'], result.reasons())), options.out)
     exported = write_exports(options.export, options.out, title, backend=backend,
                              estimate=estimate, datum=result.datum)
+    if live is not None:
+        exported.append(options.out / 'live.csv')
+        write_lines(exported[-1], live.lines())
     if options.json:
         print((options.out / 'summary.json').read_text(encoding='utf-8'), end='')
     else:
@@ -346,15 +379,15 @@ def _lines(
            f'observed nodes in {facts["seconds"]:.2f} s; {report.status.value}, chi2 '
            f'{report.chi2:.6g}; {estimate.alignment.value}')
     if estimate.odometry_scale != 1.0:
-        yield (f'{estimate.primary}: weighed with {estimate.odometry_scale:.3g} times the sigmas '
-               'that it claims')
+        yield (f'{estimate.primary}: weighed with {short(estimate.odometry_scale, 3)} times the '
+               'sigmas that it claims')
     for source, fit in sorted(backend.reports().items()):
-        text = f'{source}: squared residual {fit.energy:.3g} sigma^2'
+        text = f'{source}: squared residual {short(fit.energy, 3)} sigma^2'
         if fit.errors.significant:
-            text += (f'; errors of {fit.errors.sigma_correlated:.3g} m with a time constant of '
-                     f'{fit.errors.tau:.3g} s')
+            text += (f'; errors of {short(fit.errors.sigma_correlated, 3)} m with a time constant '
+                     f'of {short(fit.errors.tau, 3)} s')
         if fit.in_use is not None:
-            text += f'; treated as correlated over {fit.in_use.tau:.3g} s'
+            text += f'; treated as correlated over {short(fit.in_use.tau, 3)} s'
         if fit.wrongly_white:
             text += f', but are treated as white: see {source}.correlation_time'
         yield text

@@ -36,14 +36,15 @@ OF_SOURCES = ('series', 'histogram')
 OF_REPLAY = ('begin', 'until', 'stamps', 'edge2', 'params_file', 'truth')
 """Options that are of use for a bag or a g2o file alone, with inputs and parameters."""
 PAGES = ('.html', '.htm')
-BAG_SUFFIXES = ('.mcap', '.db3', '.bag', '.g2o')
+BAG_SUFFIXES = ('.mcap', '.db3', '.bag', '.g2o', '.graph')
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Add the arguments of this tool."""
     parser.epilog = EXAMPLES
     parser.add_argument('runs', metavar='RUN', type=Path, nargs='+',
-                        help='folder of a replay or a demo, run.json, bags, or a .g2o file')
+                        help='folder of a replay or a demo, run.json, bags, or a .g2o or '
+                             '.graph file')
     parser.add_argument('-o', '--out', metavar='FILE', type=Path,
                         help='the page (default: report.html in the folder of the run)')
     parser.add_argument('--run', metavar='DIR', type=Path, default=Path('report'), dest='folder',
@@ -125,6 +126,6 @@ def _replay(options: argparse.Namespace) -> int:
         raise BagError(f'--run {options.folder}: this is a bag; name another folder')
     words = argparse.Namespace(**vars(options))
     words.bags, words.out, words.json = options.runs, options.folder, False
-    words.export, words.new_bag = Exports(), None
+    words.export, words.new_bag, words.live = Exports(), None, False
     with redirect_stdout(io.StringIO()):
         return replay.execute(words)

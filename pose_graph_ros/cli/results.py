@@ -3,6 +3,7 @@
 """Write the results of a run: corrected path, picture, summary and table of errors."""
 
 from collections.abc import Mapping
+from dataclasses import replace
 import json
 from pathlib import Path
 from types import MappingProxyType
@@ -14,8 +15,8 @@ from pose_graph_ros.adapters.bag_inputs import Inputs, read_inputs, reader_of
 from pose_graph_ros.adapters.bag_poses import POSE_TYPES, poses_on
 from pose_graph_ros.adapters.bags import Bag, BagError, MessageError, Span, WHOLE
 from pose_graph_ros.adapters.sources import Kind, ODOMETRY_KINDS
-from pose_graph_ros.cli.evaluation import Drive, evaluate, format_table, summary
-from pose_graph_ros.cli.picture import draw_drive
+from pose_graph_ros.cli.evaluation import Drive, evaluate, format_table, place_truth, summary
+from pose_graph_ros.core.backend import PoseGraphBackend
 from pose_graph_ros.core.compiled.growing_array import GrowingArray
 from pose_graph_ros.core.geometry import se2
 from pose_graph_ros.core.geometry.geodesy import MapOrigin
@@ -108,6 +109,8 @@ def collect_drive(
     """
     Return the corrected path together with the measurements of the bag that went into the graph.
 
+    The truth is moved to where it fits the path best.
+
     Parameters
     ----------
     values : mapping, all parameters of the node
@@ -160,14 +163,28 @@ def collect_drive(
     if np.any(arms):  # from the antenna to the robot, with the heading of the corrected path
         turn = corrected.at(stamps[inside]) * (0.0, 0.0, 1.0)
         positions[inside] -= se2.transform(turn, arms[inside])
-    return Drive(
+    return place_truth(Drive(
         odometry=odometry.path(), fix_stamps_ns=stamps, fix_positions=positions,
         fix_held_out=fixes.held_out.values, corrected=corrected,
         truth=None if truth_topic is None else read_truth(bag, truth_topic, inputs.span),
         loop_stamps_ns=np.array(loops, dtype=np.int64).reshape(-1, 2), loop_states=loop_states,
         fix_unused=unused.values, fix_sources=fix_sources, loop_sources=loop_sources,
         map_axes=('east', 'north') if len(inputs.of(Kind.FIX)) > 0 and not any(values['datum'][2:])
-        else ('x', 'y'))
+        else ('x', 'y')))
+
+
+def with_refused(drive: Drive, backend: PoseGraphBackend) -> Drive:
+    """Return a drive with the measurements in the map that its graph has not, where it could."""
+    estimate = backend.estimate(with_path=False)
+    assert estimate is not None, 'a drive has a hidden node'
+    stamps, begin_ns = drive.fix_stamps_ns, backend.node_stamps_ns[estimate.n_frozen]
+    refused = ~drive.fix_held_out & (stamps >= begin_ns)
+    names = np.array(drive.fix_sources, dtype=str)
+    for source, added in backend.measured().items():
+        at = np.flatnonzero((names == source) & np.isin(stamps, added) & ~drive.fix_held_out)
+        # of several with one stamp the first one was added
+        refused[at[np.unique(stamps[at], return_index=True)[1]]] = False
+    return replace(drive, fix_refused=refused)
 
 
 def read_truth(bag: Bag, topic: str, span: Span = WHOLE) -> Trajectory:
@@ -207,6 +224,9 @@ def write_results(drive: Drive, folder: Path, title: str, facts: Mapping[str, An
     facts : mapping, further entries of the summary
 
     """
+    # matplotlib takes half a second to load, and `--help` needs none of it
+    from pose_graph_ros.cli.picture import draw_drive  # noqa: PLC0415
+
     folder.mkdir(parents=True, exist_ok=True)
     rows = evaluate(drive)
     write_tum(drive.corrected, folder / 'path.tum')

@@ -13,6 +13,7 @@ import argparse
 import json
 import math
 from pathlib import Path
+import sys
 import time
 from typing import Any, TYPE_CHECKING
 
@@ -27,8 +28,10 @@ from pose_graph_ros.core.io.g2o import EDGE2_ORDERS
 from pose_graph_ros.core.solver_config import CLOSURE_FLOORS
 
 if TYPE_CHECKING:
+    from pose_graph_ros.cli.marginals import Marginals
     from pose_graph_ros.cli.solve_robust import Doubt
 
+TOLD = 1e-6  # relative error of covariances from which on it is told
 N_LARGEST = 5  # number of edges, of observed nodes, and of names, that are printed
 EXAMPLES = """\
 examples:
@@ -67,7 +70,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
                              'comparing sets of them (selection, the default), or by graduated '
                              'non-convexity with the surrogate for truncated least squares (gnc) '
                              'or for Geman-McClure (gnc-gm); an edge is odometry if no id of a '
-                             'vertex lies between its two')
+                             'pose lies between its two; sightings of landmarks are believed')
     parser.add_argument('--closure-sigma', nargs=2, type=_sigma, metavar=('M', 'RAD'),
                         default=(CLOSURE_FLOORS[0], CLOSURE_FLOORS[2]),
                         help='least standard deviations of loop closures for this decision '
@@ -94,6 +97,9 @@ def _arguments(options: argparse.Namespace) -> None:
         options.graph, options.robust = Path(options.robust), METHODS[0]
     if options.graph is None:
         raise ConfigError('expected the file of a graph')
+    for path in options.out:
+        if not path.parent.is_dir():
+            raise ConfigError(f'--out: there is no folder {path.parent} for {path.name}')
 
 
 def execute(options: argparse.Namespace) -> int:
@@ -120,7 +126,8 @@ def execute(options: argparse.Namespace) -> int:
     doubt = None if options.robust is None else _doubt(problem, options)
     for line in () if doubt is None else doubt.lines:
         text.add(line)
-    solution = solve(problem, options.start if doubt is None else 'present')
+    decided = doubt is not None and doubt.cost is not None
+    solution = solve(problem, 'present' if decided else options.start)
     seconds = time.monotonic() - begin
     certificate = None
     if options.certificate:
@@ -132,10 +139,10 @@ def execute(options: argparse.Namespace) -> int:
     if certificate is not None:
         for line in certificate.lines():
             text.add(line)
-    lines = [] if rows is None else _csv_lines(problem, solution, rows)
+    table = None if rows is None else _marginals(problem, solution, rows)
     for path in options.out:
         if path in tables:
-            path.write_text('\n'.join(lines) + '\n', encoding='ascii')
+            path.write_text('\n'.join(table.lines() if table else ()) + '\n', encoding='ascii')
         else:
             _write_graph(problem, path)
     if options.json:
@@ -143,11 +150,12 @@ def execute(options: argparse.Namespace) -> int:
         values |= {'chi2_start': before, 'seconds': seconds, 'edge2': order,
                    'robust': _decision(doubt),
                    'certificate': None if certificate is None else certificate.values()}
-        if rows is not None and len(tables) == 0:
-            values['marginals'] = lines
+        if table is not None:
+            values |= {'marginals_relative_error': table.relative_error,
+                       **({} if len(tables) > 0 else {'marginals': table.rows})}
         print(json.dumps(_finite(values), indent=2, allow_nan=False))
-    elif rows is not None and len(tables) == 0:
-        print('\n'.join(lines))
+    elif table is not None and len(tables) == 0:
+        print('\n'.join(table.lines()))
     return 0 if solution.result.status is Status.CONVERGED else 1
 
 
@@ -220,7 +228,8 @@ def _decision(doubt: 'Doubt | None') -> dict[str, Any] | None:
     if doubt is None:
         return None
     return {'method': doubt.method, 'closures': doubt.n_closures,
-            'doubted': len(doubt.doubted), 'scale': doubt.scale}
+            'doubted': len(doubt.doubted), 'scale': doubt.scale,
+            'truncated_cost': doubt.cost, 'truncated_cost_of_all': doubt.cost_of_all}
 
 
 def _doubt(problem: Problem, options: argparse.Namespace) -> 'Doubt':
@@ -236,12 +245,16 @@ def _write_graph(problem: Problem, path: Path) -> None:
     write_g2o(problem.graph, path, problem.ids)
 
 
-def _csv_lines(problem: Problem, solution: Solution, rows: IntArray) -> list[str]:
-    from pose_graph_ros.cli.marginals import csv_lines  # noqa: PLC0415
+def _marginals(problem: Problem, solution: Solution, rows: IntArray) -> 'Marginals':
+    from pose_graph_ros.cli.marginals import marginals  # noqa: PLC0415
 
     if solution.result.status is Status.FAILED or not solution.determined:
         raise PoseGraphError(f'--marginals: {solution.result.reason}')
-    return csv_lines(problem, rows)
+    table = marginals(problem, rows)
+    if table.relative_error > TOLD:
+        print(f'warning: by rounding, covariances may be off by {table.relative_error:.1g} of '
+              f'themselves', file=sys.stderr)
+    return table
 
 
 def _largest(energies: FloatArray, left_out: IntArray) -> IntArray:

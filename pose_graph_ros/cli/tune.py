@@ -4,9 +4,10 @@
 Estimate the noise of odometry and of what measures in the map from bags; write a parameter file.
 
 Parameters are those under which the measurements are the most likely, each with an interval.
-Those that the data do not tell stay as they are. The table shows how well a path predicts fixes
-(global poses) of whole stretches of the drive that were held out, from the tuning too, before and
-after. What makes these worse is not changed. The exit code is 1 if so, 2 for wrong input.
+Those that the data do not tell stay as they are, and none becomes surer than the data prove. The
+table shows how well a path predicts fixes (global poses) of whole stretches of the drive that were
+held out, from the tuning too, before and after. If that is not better, no file is written. The
+exit code is 1 then, 2 for wrong input.
 """
 
 import argparse
@@ -25,6 +26,7 @@ from pose_graph_ros.adapters.bags import BagError
 from pose_graph_ros.adapters.sources import source_list
 from pose_graph_ros.cli import options as shared
 from pose_graph_ros.cli.progress import WatchedBag
+from pose_graph_ros.cli.replay import add_span, span_of
 from pose_graph_ros.cli.results import read_truth
 from pose_graph_ros.cli.tuned_parameters import interval, yaml_text
 from pose_graph_ros.cli.tuning import Outcome, Tuning, Verdict
@@ -51,6 +53,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument('--budget', metavar='SECONDS', type=_budget, default=600.0,
                         help='with less time, fewer parts are held out (default: %(default)g)')
     parser.add_argument('--json', action='store_true', help='print the results as JSON')
+    add_span(parser)
     shared.add_inputs(parser, hold_out=False)
     shared.add_parameters(parser)
     parser.epilog = EXAMPLES
@@ -88,7 +91,8 @@ def execute(options: argparse.Namespace) -> int:
         raise BagError(f'{options.out}: cannot be written: no permission')
     with open_bags(options.bags) as bag:
         inputs = choose_inputs(
-            bag, source_list(values), shared.wanted_topics(options), truth=options.truth)
+            bag, source_list(values), shared.wanted_topics(options), span=span_of(bag, options),
+            truth=options.truth)
         truth = None if options.truth is None else read_truth(bag, options.truth)
         drive = TuningDrive(WatchedBag(bag, 'reading'), inputs, values)
         path = str(bag.path)
@@ -97,14 +101,16 @@ def execute(options: argparse.Namespace) -> int:
         outcome = tuning.tune(options.folds, start + options.budget, truth)
     names = ' '.join(each.name for each in options.bags)
     headline = [f'Noise by `pose-graph tune {names}`', *_notes(outcome, drive)]
-    options.out.write_text(yaml_text(outcome.tuned, headline), encoding='utf-8')
+    is_better = outcome.verdict is Verdict.BETTER
+    if is_better:
+        options.out.write_text(yaml_text(outcome.tuned, headline), encoding='utf-8')
     if options.json:
         print(json.dumps(_facts(options, outcome, drive, time.monotonic() - start), indent=2))
     else:
         print('\n'.join(f'{source}: {topic}' for source, topic in inputs.topics.items()))
         print('\n'.join(_lines(outcome, drive)))
-        print(f'\nwritten: {options.out}')
-    return 1 if outcome.verdict is Verdict.WORSE else 0
+        print(f'\nwritten: {options.out}' if is_better else '\nnothing is written')
+    return 0 if is_better else 1
 
 
 class _Status:
@@ -173,7 +179,8 @@ def _facts(
 ) -> dict[str, Any]:
     """Return the results as plain values for JSON."""
     return {
-        'bags': [str(each) for each in options.bags], 'file': str(options.out),
+        'bags': [str(each) for each in options.bags],
+        'file': str(options.out) if outcome.verdict is Verdict.BETTER else None,
         'verdict': outcome.verdict.name.lower(), 'reason': outcome.verdict.value,
         'parameters': [_plain(asdict(each)) | {'changed': each.changes}
                        for each in outcome.tuned],

@@ -107,9 +107,7 @@ def closure_parameters(
         yield Tuned(f'{odometry}.sigma_scale', values[f'{odometry}.sigma_scale'], 1.0,
                     note='the sigmas are those of this odometry')
     for source in closures:
-        one = _one(f'{source}.sigma_scale', of_closures, values, float)
-        # their constraints have noise of odometry up to the hidden nodes as well, which is shared
-        yield one if of_closures.value >= 1.0 else one.kept('kept: not below 1')
+        yield _one(f'{source}.sigma_scale', of_closures, values, float)
 
 
 def source_parameters(
@@ -208,8 +206,6 @@ def yaml_text(tuned: Sequence[Tuned], headline: Sequence[str]) -> str:
     """
     Return a parameter file with what changes, and comments.
 
-    If nothing changes, it has what was kept: a file without parameters is none for a node.
-
     Parameters
     ----------
     tuned : sequence of Tuned
@@ -217,10 +213,9 @@ def yaml_text(tuned: Sequence[Tuned], headline: Sequence[str]) -> str:
 
     """
     lines = [*(f'# {line}'.rstrip() for line in headline), '/**:', '  ros__parameters:']
-    nothing = not any(each.changes for each in tuned)
     for source in dict.fromkeys(each.source for each in tuned):
         own = [each for each in tuned if each.source == source]
-        if not nothing and not any(each.changes for each in own):
+        if not any(each.changes for each in own):
             lines += [f'    # {each.name}: {_text(each.before)}, {_why(each)}' for each in own]
             continue
         lines.append(f'    {source}:')
@@ -229,8 +224,6 @@ def yaml_text(tuned: Sequence[Tuned], headline: Sequence[str]) -> str:
             if each.changes:
                 lines += [f'      # {_text(each.before)} before; {_why(each)}',
                           f'      {leaf}: {_text(each.after)}']
-            elif nothing and each.after != []:
-                lines += [f'      # {_why(each)}', f'      {leaf}: {_text(each.after)}']
             else:
                 lines.append(f'      # {leaf}: {_text(each.before)}, {_why(each)}')
     return '\n'.join(lines) + '\n'

@@ -33,13 +33,16 @@ from pose_graph_ros.cli.tuning_drive import Key, LEAST, Run, SourceOfPoses, Tuni
 from pose_graph_ros.core.geometry.trajectory import Trajectory
 from pose_graph_ros.core.measurements import LoopClosure
 from pose_graph_ros.core.tuning.closure_fit import ClosureProblem, fit_closures, MOST_NODES
-from pose_graph_ros.core.tuning.drive_rows import timeline
+from pose_graph_ros.core.tuning.drive_rows import drive_rows, timeline
 from pose_graph_ros.core.tuning.estimation import estimate
+from pose_graph_ros.core.tuning.evidence import proven, shown_variances
 from pose_graph_ros.core.tuning.fit import Fit
 from pose_graph_ros.core.tuning.held_out import (
     Errors,
     fold_of,
+    is_better,
     joined,
+    NO_ERRORS,
     stretch_length,
     Summary,
     summary,
@@ -47,16 +50,13 @@ from pose_graph_ros.core.tuning.held_out import (
 )
 from pose_graph_ros.core.tuning.problem import Role
 
-# Held-out errors count as worse from this ratio of the rms, or this difference of the NLPD, on.
-WORSE_RMS, WORSE_NLPD = 1.002, 0.05
-
 
 class Verdict(Enum):
     """What came of a tuning."""
 
-    BETTER = 'held-out errors are lower, or at least no higher, after tuning'
-    SAME = 'nothing is changed: the settings are as good as any'
-    WORSE = 'held-out errors are higher after tuning: what makes them higher is not changed'
+    BETTER = 'held-out errors are lower after tuning'
+    SAME = 'nothing to change: this drive does not prove any other noise'
+    WORSE = 'held-out errors are not lower after tuning'
 
 
 @dataclass(frozen=True, slots=True)
@@ -106,6 +106,7 @@ class Tuning:
         show: Callable[[str], None],
     ) -> None:
         self._drive, self._inputs, self._values, self._show = drive, inputs, values, show
+        self._step, self._steps = 0, 0
         self._config, self._path = backend_config(values), path
         self._odometry = {}
         for name in inputs.of(*ODOMETRY_KINDS):
@@ -138,13 +139,15 @@ class Tuning:
         truth : Trajectory, optional, only for comparison
 
         """
+        self._steps = 2 + 3 * folds
         tuned, fits = self._estimate(frozenset(), 'estimating noise')
         start = time.monotonic()
-        self._show('running with it')
+        self._begin('running with it')
         run = self._drive.run(self._with(tuned))
         seconds = time.monotonic() - start
         doubted = frozenset() if run is None else run.doubted
         if len(doubted) > 0:
+            self._steps += 1
             tuned, fits = self._estimate(doubted, 'estimating noise again')
         fit_seconds = time.monotonic() - start - seconds
         primary = next(iter(fits.values()))
@@ -153,43 +156,31 @@ class Tuning:
         stretch = stretch_length(self._duration, self._period(), tau, folds)
         per_fold = 2.5 * seconds + fit_seconds + 1.0
         n_done = int(np.clip((deadline - time.monotonic()) / per_fold, 1, folds))
-        parts = [self._fold(k, folds, stretch, doubted, truth) for k in range(n_done)]
-        before = [each.before for each in parts]
-        self._show('comparing')
-        groups: list[Callable[[Tuned], bool]] = [
-            lambda _: True, lambda each: each.source not in self._odometry,
-            lambda each: each.source in self._odometry]
-        verdict, best = Verdict.SAME, self._nothing(tuned)
-        best_after: tuple[list[list[Errors]], list[float]] = before, []
-        first: tuple[list[list[Errors]], list[float]] | None = None
-        for group in groups if len(changed(tuned)) > 0 else ():
-            if first is not None and time.monotonic() + n_done * seconds > deadline:
-                break
-            after, to_truth = self._after(parts, group, truth)
-            one, other = self._summaries(before, after, doubted)
-            is_worse = _is_worse(one, other)
-            if first is None:
-                first = (after, to_truth)
-            if not is_worse:
-                verdict = Verdict.BETTER if first[0] is after else Verdict.WORSE
-                best = [each if group(each) else each.kept('kept: held-out errors get worse')
-                        for each in tuned]
-                best_after = (after, to_truth)
-                break
-            verdict = Verdict.WORSE
-        if verdict is Verdict.WORSE and len(changed(best)) == 0:
-            best = [each.kept('kept: held-out errors get worse') if each.changes else each
-                    for each in tuned]
-        one, other = self._summaries(before, best_after[0], doubted)
+        changes = len(changed(tuned)) > 0
+        self._steps -= 3 * folds - (3 if changes else 1) * n_done
+        parts = [self._fold(k, folds, stretch, doubted, truth, is_tuned=changes)
+                 for k in range(n_done)]
+        after = self._after(parts, truth) if changes else [
+            (part.before, part.to_truth) for part in parts]
+        one, other = self._common([part.before for part in parts], [each for each, _ in after],
+                                  doubted)
+        verdict = Verdict.SAME
+        if changes:
+            verdict = Verdict.BETTER if is_better(
+                one, other, self._start_ns, stretch) else Verdict.WORSE
         errors = [float(np.sqrt(np.mean(np.square(each)))) for each in (
             [part.to_truth for part in parts],
-            best_after[1] or [part.to_truth for part in parts])] if truth is not None else []
-        return Outcome(best, verdict, one, other, errors, folds, n_done, stretch,
-                       self._measured(), len(doubted),
+            [each for _, each in after])] if truth is not None else []
+        return Outcome(tuned, verdict, summary(one), summary(other), errors, folds, n_done,
+                       stretch, self._measured(), len(doubted),
                        max(each.contradiction for each in fits.values()))
 
-    def _nothing(self, tuned: Sequence[Tuned]) -> list[Tuned]:
-        return [each.kept(each.note) for each in tuned]
+    def _begin(self, text: str) -> str:
+        """Show what is done next, as which step of all, and return that."""
+        self._step += 1
+        text = f'step {self._step} of {self._steps}: {text}'
+        self._show(text)
+        return text
 
     def _with(self, tuned: Sequence[Tuned]) -> dict[str, Any]:
         """Return all parameters, with those that were tuned."""
@@ -199,7 +190,7 @@ class Tuning:
         self, without: Collection[Key], text: str,
     ) -> tuple[list[Tuned], dict[str, Fit]]:
         """Return what is the most likely without some measurements."""
-        count = 0
+        text, count = self._begin(text), 0
 
         def tick() -> None:
             nonlocal count
@@ -209,13 +200,15 @@ class Tuning:
         if len(self._closures) > 0:
             return self._estimate_by_closures(without, tick)
         sources = [self._without(each, without) for each in self._sources]
-        fits = estimate(self._odometry, {
-            each.name: each.measured for each in sources}, self._config, tick)
+        measured = {each.name: each.measured for each in sources}
+        fits = estimate(self._odometry, measured, self._config, tick)
         if len(fits) == 0:
             raise BagError(f'{self._path}: nothing to tune by: no fix or global pose was measured '
                            'while there was odometry')
+        rows = drive_rows(self._odometry[next(iter(fits))], measured, self._config)
+        shown = shown_variances(rows, len(measured))
         tuned: list[Tuned] = []
-        for name, found in fits.items():
+        for name, found in proven(fits, shown, self._duration).items():
             tuned += odometry_parameters(name, found, self._values)
             if name == next(iter(fits)):
                 for k, source in enumerate(sources):
@@ -234,7 +227,7 @@ class Tuning:
         if np.sum(problem.is_closure) < LEAST // 2:
             raise BagError(f'{self._path}: nothing to tune by: only '
                            f'{int(np.sum(problem.is_closure))} loop closures are believed')
-        found = fit_closures(problem)
+        found = proven({primary: fit_closures(problem)}, (), self._duration)[primary]
         sources = list(dict.fromkeys(name for name, _ in self._closures))
         return list(closure_parameters(primary, sources, found, self._values)), {primary: found}
 
@@ -256,9 +249,9 @@ class Tuning:
 
     def _fold(
         self, k: int, folds: int, stretch: float, doubted: Collection[Key],
-        truth: Trajectory | None,
+        truth: Trajectory | None, *, is_tuned: bool,
     ) -> _Fold:
-        """Return a fold, with the estimate of the noise and the errors before."""
+        """Return a fold, with the estimate of the noise if it is asked for, and its errors."""
         held_out = frozenset(
             (source.name, stamp) for source in self._sources if source.measured.has_positions
             for stamp in source.measured.stamps_ns[fold_of(
@@ -269,24 +262,23 @@ class Tuning:
             held_out = frozenset((name, each.stamp_ns) for (name, each), out in zip(
                 self._closures, folded.tolist(), strict=True) if out)
         text = f'part {k + 1} of {folds} held out'
-        tuned, _ = self._estimate(held_out | frozenset(doubted), text)
-        self._show(f'{text}: running with the settings before')
+        tuned, _ = self._estimate(held_out | frozenset(doubted), text) if is_tuned else ([], {})
+        self._begin(f'{text}: running with the settings before')
         run = self._drive.run(self._values, held_out)
         return _Fold(held_out, tuned, self._errors(run, self._values, held_out),
                      _to_truth(run, truth))
 
     def _after(
-        self, parts: Sequence[_Fold], group: Callable[[Tuned], bool], truth: Trajectory | None,
-    ) -> tuple[list[list[Errors]], list[float]]:
-        """Return the errors of all folds after tuning some parameters, also those to the truth."""
-        after, to_truth = [], []
+        self, parts: Sequence[_Fold], truth: Trajectory | None,
+    ) -> list[tuple[list[Errors], float]]:
+        """Return the errors of all folds after tuning, and those to the truth."""
+        after = []
         for k, part in enumerate(parts):
-            self._show(f'part {k + 1} held out: running with the settings after')
-            values = self._with([each for each in part.tuned if group(each)])
+            self._begin(f'part {k + 1} held out: running with the settings after')
+            values = self._with(part.tuned)
             run = self._drive.run(values, part.held_out)
-            after.append(self._errors(run, values, part.held_out))
-            to_truth.append(_to_truth(run, truth))
-        return after, to_truth
+            after.append((self._errors(run, values, part.held_out), _to_truth(run, truth)))
+        return after
 
     def _errors(
         self, run: Run | None, values: Mapping[str, Any], held_out: Collection[Key],
@@ -297,39 +289,28 @@ class Tuning:
             return [self._drive.closure_errors(run, held_out)]
         return self._drive.errors(run, values, self._inputs, held_out)
 
-    def _summaries(
+    def _common(
         self, before: Sequence[Sequence[Errors]], after: Sequence[Sequence[Errors]],
         doubted: Collection[Key],
-    ) -> tuple[Summary, Summary]:
-        """Return the statistics before and after, of the same positions."""
+    ) -> tuple[Errors, Errors]:
+        """Return the errors before and after at the same positions, which are not wrong."""
         stamps = np.array([stamp for _, stamp in doubted], dtype=np.int64)
-        ones, others = [], []
+        ones, others = [NO_ERRORS], [NO_ERRORS]
         for part, same in zip(before, after, strict=True):
             for one, other in zip(part, same, strict=True):
                 common = np.isin(one.stamps_ns, other.stamps_ns) & ~np.isin(one.stamps_ns, stamps)
                 kept = np.isin(other.stamps_ns, one.stamps_ns[common])
                 ones.append(one.rows(common))
                 others.append(other.rows(kept))
-        if len(ones) == 0:
-            empty = Errors(np.empty(0, np.int64), np.empty((0, 2)), np.empty((0, 2, 2)))
-            return summary(empty), summary(empty)
         first, second = joined(ones), joined(others)
-        right = ~wrong([first, second]) if len(first.stamps_ns) > 0 else np.empty(0, dtype=bool)
-        return summary(first.rows(right)), summary(second.rows(right))
+        right = ~wrong([first, second])
+        return first.rows(right), second.rows(right)
 
     def _measured(self) -> str:
         """Return how much was measured, in words."""
         counts = ', '.join([f'{len(each.measured.stamps_ns)} of {each.name}'
                             for each in self._sources] or [f'{len(self._closures)} closures'])
         return f'{self._duration:.0f} s of odometry, {counts}'
-
-
-def _is_worse(one: Summary, other: Summary) -> bool:
-    """Tell whether the errors after are worse than those before."""
-    if not other.rms <= WORSE_RMS * one.rms:
-        return True
-    # of loop closures there is no density
-    return bool(np.isfinite(one.nlpd)) and not other.nlpd < one.nlpd + WORSE_NLPD
 
 
 def _to_truth(run: Run | None, truth: Trajectory | None) -> float:

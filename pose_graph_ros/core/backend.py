@@ -5,6 +5,7 @@
 from collections import Counter
 from collections.abc import Mapping
 from dataclasses import replace
+from functools import partial
 from typing import Self
 
 import numpy as np
@@ -38,9 +39,9 @@ from pose_graph_ros.core.measurements import (
 from pose_graph_ros.core.odometry.hidden_nodes import HiddenNodes
 from pose_graph_ros.core.refiner import Refiner
 from pose_graph_ros.core.relocation import relocate
-from pose_graph_ros.core.residuals import components
+from pose_graph_ros.core.residuals import components, disagreement
 from pose_graph_ros.core.smoother.incremental import IncrementalSmoother
-from pose_graph_ros.core.smoother.results import Refinement
+from pose_graph_ros.core.smoother.results import DIVERGED, Refinement
 from pose_graph_ros.core.sources import constraint_names as cn
 from pose_graph_ros.core.sources.constraint_queue import Queue, QueuedEdge
 from pose_graph_ros.core.sources.factor_builder import FactorBuilder
@@ -65,8 +66,7 @@ class PoseGraphBackend:
     ----------
     config : BackendConfig, optional
     solve : callable, optimises a whole graph in place; only tests replace it
-    smoother : IncrementalSmoother, optional
-        With an empty graph; only tests pass one. Default: one with the settings in `config`.
+    smoother : IncrementalSmoother, optional, empty; only tests pass one
 
     """
 
@@ -74,15 +74,16 @@ class PoseGraphBackend:
         self, config: BackendConfig | None = None, solve: Solve = optimizer.optimize,
         smoother: IncrementalSmoother | None = None,
     ) -> None:
-        self._config = BackendConfig() if config is None else config
-        self._solve = solve
+        self._config, self._solve = config or BackendConfig(), solve
         self._smoother = smoother or IncrementalSmoother(self._config.smoother)
         self._nodes = HiddenNodes(self._config, self._make_node)
+        self.odometry = self._nodes.streams  # by source, to be read only
         self._newest_node_covariance = np.zeros((3, 3))  # in map axes
         self._reweighting = Reweighting()
         self._judge = Judge(self._smoother, self._reweighting, self._config, self._nodes)
         self._factors = FactorBuilder(self._config, self._reweighting)
         self.gyro_biases = self._factors.gyros.values
+        self.disagreement = lambda: disagreement.find(self._smoother, self._nodes, self._factors)
         self._tuner = ErrorTuner(self._smoother, self._factors, self._reweighting, self._judge)
         self._refiner = Refiner(self._smoother, self._reweighting, self._judge, self._tuner)
         self._pipeline = MeasurementPipeline(self._nodes, self._config)
@@ -90,13 +91,10 @@ class PoseGraphBackend:
         self._quarantine, self._alignment = Queue(), AlignmentMonitor(self._config)
         self._forgetting = Forgetting(self._smoother, self._tuner, self._parts())
         self._settled, self._chi2 = True, 0.0
+        self._waits = False     # whether the queue waits until the graph is solved
 
     def configure(self, config: BackendConfig) -> None:
-        """
-        Change the settings for all later input.
-
-        Raises ConfigError for one that cannot change at run time; see `BackendConfig.changed_to`.
-        """
+        """Change the settings for later input; raises as `BackendConfig.changed_to` does."""
         self._config = self._config.changed_to(config)
         self._nodes.configure(config)
         self._pipeline.configure(config)
@@ -159,7 +157,12 @@ class PoseGraphBackend:
 
     def residuals(self) -> components.Analysis:
         """Return the residuals of each source with what they show; linear in the graph."""
-        return components.analyse(self._smoother, self._nodes, self._factors, self._reweighting)
+        return components.analyse(self._smoother, self._nodes, self._factors, self._reweighting,
+                                  self._judge.closures())
+
+    def measured(self) -> dict[str, IntArray]:
+        """Return the stamps of all measurements in the map in the graph [ns], by source."""
+        return {source: stamps for source, (stamps, _) in self._factors.held().items()}
 
     def largest_energies(self, n: int) -> list[cn.ConstraintEnergy]:
         """Return the n constraints with the largest energies, with names, in descending order."""
@@ -178,15 +181,7 @@ class PoseGraphBackend:
         return self._judge.totals()
 
     def decide(self, name: str, decision: vd.Decision) -> Answer:
-        """
-        Return the answer to a person's decision, with a sentence; the next update applies it.
-
-        Parameters
-        ----------
-        name : str, `Verdict.id`
-        decision : Decision
-
-        """
+        """Return the answer to a decision on a `Verdict.id`; the next update applies it."""
         self._refiner.restart()
         return self._judge.decide(name, decision)
 
@@ -283,11 +278,11 @@ class PoseGraphBackend:
         self._forgetting.step(self._config)
         return report
 
-    def _update(self) -> tuple[UpdateReport, Queue]:
+    def _update(self, *, at_once: bool = False) -> tuple[UpdateReport, Queue]:
         """Return the report of an update, and the constraints for which it had no time."""
         return isolation.update(
-            self._add_queue, self._settle, self._pipeline, self._quarantine,
-            lambda one: cn.queued(one, self._nodes)[0])
+            partial(self._add_queue, at_once=at_once), self._settle, self._pipeline,
+            self._quarantine, lambda one: cn.queued(one, self._nodes)[0])
 
     def _settle(self) -> bool:
         """Set all weights that wait; tell whether an update without new constraints succeeds."""
@@ -297,13 +292,16 @@ class PoseGraphBackend:
             self._factors.commit()
         return transaction.failure == ''
 
-    def _add_queue(self) -> tuple[UpdateReport, Queue]:
-        """Add the constraints in the queue and solve; a failure returns those that it removed."""
+    def _add_queue(self, *, at_once: bool) -> tuple[UpdateReport, Queue]:
+        """Add the constraints in the queue and solve; return those that it could not add."""
         if self.graph.n_nodes == 0:
             return UpdateReport(Status.CONVERGED, '', 0, 0, 0.0), Queue()
+        if self._waits and self._judge.solves_later and not at_once:
+            self._judge.work()
+            return UpdateReport(Status.MAX_ITERATIONS, '', 0, 0, self._chi2), Queue()
         with self._transaction() as transaction:
             T_map_graph = self._alignment.find(
-                self.graph, self._pipeline.queue.observed, self._nodes.primary)
+                self.graph, self._pipeline.queue.observed, self._nodes, self._tuner.odometry_scale)
             queue = transaction.add(self._pipeline.take_ready(aligned=self._alignment.is_aligned))
             if len(queue) == 0 and self._settled:
                 return UpdateReport(Status.CONVERGED, '', 0, 0, self._chi2), Queue()
@@ -313,7 +311,13 @@ class PoseGraphBackend:
             freed = () if T_map_graph is None else self.graph.node_ids[self.graph.fixed].tolist()
             change = self._factors.build(queue, self.graph)._replace(free=freed)
             change = self._judge.before(self._factors.new, change, self._nodes.newest_ns)
-            transaction.solved(self._judge.solve(change))
+            # but what has waited for a whole pause does not wait for another one
+            at_once = at_once or self._waits or T_map_graph is not None
+            transaction.solved(self._judge.solve(change, at_once=at_once))
+        self._waits = transaction.failure == DIVERGED and not at_once
+        if self._waits:
+            self._refiner.restart()
+            return UpdateReport(Status.MAX_ITERATIONS, '', 0, 0, self._chi2), transaction.queue
         if transaction.failure != '':
             self._settled = self._settled and not transaction.moved_back
             return (UpdateReport(Status.FAILED, transaction.failure, 0, 0, self._chi2),
@@ -349,11 +353,12 @@ class PoseGraphBackend:
         """Update chi2 and the covariance of the newest node."""
         # the only part of an update that is linear in the graph: 0.03 ms per 1000 nodes
         self._chi2 = self._smoother.chi2()
-        self._newest_node_covariance = self._smoother.newest_covariance()
+        if not self.graph.has_touched:  # else the solver has failed
+            self._newest_node_covariance = self._smoother.newest_covariance()
 
     def _recheck_alignment(self) -> None:
         """Rotate and optimise the graph anew if the angle between odometry and map is wrong."""
-        poses = self._alignment.recheck(self.graph, self._nodes)
+        poses = self._alignment.recheck(self.graph, self._nodes, self._tuner.odometry_scale)
         if poses is None:
             return
         graph, before = self.graph, self.graph.poses.copy()
@@ -377,7 +382,8 @@ class PoseGraphBackend:
     def optimize(self) -> UpdateReport:
         """Optimise the whole graph with all quarantined constraints; for the end of a stream."""
         self.finish()
-        report = isolation.update_with_all(self._update, self._pipeline, self._quarantine)
+        report = isolation.update_with_all(
+            partial(self._update, at_once=True), self._pipeline, self._quarantine)
         if self.graph.n_nodes == 0:
             return report
         self._forgetting.step(self._config)
@@ -394,13 +400,15 @@ class PoseGraphBackend:
         """Optimise the whole graph; a failure leaves all poses and weights unchanged."""
         result = final_optimization.optimize(
             self.graph, self._reweighting, self._config.final_optimization, self._solve)
+        if result.status is not Status.FAILED and self.graph.has_touched:
+            # the solver has not updated the factorisation of the smoother
+            updated = self._smoother.update(GraphUpdate())
+            if updated.status is Status.FAILED:
+                result = replace(result, status=Status.FAILED, reason=updated.reason)
         if result.status is Status.FAILED:
             self._settled = False
             self.counts['solver', 'failed'] += 1
             return UpdateReport(Status.FAILED, result.reason, 0, 0, self._chi2)
-        if self.graph.has_touched:
-            # the solver has not updated the factorisation of the smoother
-            self._smoother.update(GraphUpdate())
         self._settled = self._refiner.finished = result.status is not Status.MAX_ITERATIONS
         self._chi2 = result.chi2
         self._newest_node_covariance = self._smoother.newest_covariance()
@@ -411,9 +419,9 @@ class PoseGraphBackend:
         if self.graph.n_nodes == 0:
             return None
         return newest_estimate.estimate(
-            self._parts(), self._config.odometry_source(self._nodes.primary).noise,
-            self._newest_node_covariance, self._chi2, self._tuner.odometry_scale,
-            with_path=with_path)
+            self._parts(), self._smoother, self._config.odometry_source(self._nodes.primary),
+            self._newest_node_covariance, self._chi2,
+            scale=self._tuner.odometry_scale, with_path=with_path)
 
     def path_covariances(self, estimate: Estimate) -> FloatArray:
         """Return those at the path of the present estimate; see `newest_estimate`."""
@@ -427,15 +435,7 @@ class PoseGraphBackend:
 
     @classmethod
     def restored(cls, config: BackendConfig | None, saved: SavedGraph) -> Self:
-        """
-        Return a back end that continues a saved graph; see `io.capture.restore`.
-
-        Parameters
-        ----------
-        config : BackendConfig, optional
-        saved : SavedGraph
-
-        """
+        """Return a back end that continues a saved graph; see `io.capture.restore`."""
         backend = cls(config)
         restore(backend._parts(), saved)
         backend._tuner.restored()

@@ -295,19 +295,22 @@ class ErrorTuner:
     def _next_search(self) -> _Search | None:
         for source in self._factors.due_for_estimate():
             constraints = self._factors.constraints(source)
-            steps = self._steps(constraints, self._smoother.graph.weights)
+            steps = self._steps(
+                constraints, self._smoother.graph.weights,
+                correlated=self._factors.errors_in_use(source) is not None)
             return _Search(source, steps, _next_estimate(constraints))
         return None
 
     def _steps(
-        self, constraints: SourceConstraints, by_row: tuple[FloatArray, FloatArray],
+        self, constraints: SourceConstraints, by_row: tuple[FloatArray, FloatArray], *,
+        correlated: bool = False,
     ) -> error_estimate.Search:
         """Search with the measurements of a source whose edges or observed nodes have a weight."""
         weights = self._weights(constraints.held(np.arange(len(constraints))), by_row)
         used = constraints.rows.values[weights > 0.0]
         path = yield from error_estimate.measured_path(
             self._smoother.graph, used[:, 0], used[:, 1], constraints.past)
-        return (yield from error_estimate.search(path))
+        return (yield from error_estimate.search(path, correlated=correlated))
 
     def _weights(
         self, held: Held, by_row: tuple[FloatArray, FloatArray],

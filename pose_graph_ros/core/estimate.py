@@ -6,7 +6,7 @@ from dataclasses import dataclass, replace
 
 from pose_graph_ros.core.alignment.monitor import AlignmentState
 from pose_graph_ros.core.batch.optimizer import Status
-from pose_graph_ros.core.config import OdometryNoise
+from pose_graph_ros.core.config import OdometrySource
 from pose_graph_ros.core.geometry.se2 import FloatArray
 from pose_graph_ros.core.geometry.trajectory import Trajectory
 
@@ -69,8 +69,8 @@ class Estimate:
     """Hidden nodes that are biases: states of time-correlated errors."""
     primary: str
     """Source of the odometry in `T_odom_base`."""
-    noise: OdometryNoise
-    """Noise of that source, by its settings and `odometry_scale`."""
+    odometry: OdometrySource
+    """Settings of that source."""
     odometry_scale: float = 1.0
     """Factor on the sigmas of the primary odometry."""
     n_frozen: int = 0

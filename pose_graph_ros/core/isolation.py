@@ -56,7 +56,7 @@ def update(
     """
     report, failed = add_queue()
     if report.status is not Status.FAILED:
-        return report, Queue()
+        return report, failed
     pipeline.counts['solver', 'failed'] += 1
     if len(failed) == 0 or (len(failed) > 1 and not can_solve()):
         quarantine.extend(failed)

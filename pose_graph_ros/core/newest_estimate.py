@@ -8,17 +8,19 @@ import numpy as np
 
 from pose_graph_ros.core.alignment import estimator
 from pose_graph_ros.core.alignment.monitor import AlignmentState, in_rows, placed
-from pose_graph_ros.core.config import OdometryNoise
+from pose_graph_ros.core.config import OdometrySource
 from pose_graph_ros.core.estimate import Estimate
 from pose_graph_ros.core.geometry import covariance, se2
 from pose_graph_ros.core.geometry.se2 import FloatArray
 from pose_graph_ros.core.geometry.trajectory import Trajectory
 from pose_graph_ros.core.io.capture import Parts
+from pose_graph_ros.core.passed_fixes import Corrected, corrected
+from pose_graph_ros.core.smoother.incremental import IncrementalSmoother
 
 
 def estimate(
-    parts: Parts, noise: OdometryNoise, newest_covariance: FloatArray, chi2: float,
-    scale: float = 1.0, *, with_path: bool,
+    parts: Parts, smoother: IncrementalSmoother, source: OdometrySource,
+    newest_covariance: FloatArray, chi2: float, *, scale: float = 1.0, with_path: bool,
 ) -> Estimate:
     """
     Return the present estimate.
@@ -26,7 +28,8 @@ def estimate(
     Parameters
     ----------
     parts : Parts, with at least one hidden node
-    noise : OdometryNoise, of the primary odometry
+    smoother : IncrementalSmoother, of the graph
+    source : OdometrySource, of the primary odometry
     newest_covariance : ndarray, shape (3, 3), of the newest hidden node, in map axes
     chi2 : float
     scale : float, factor on the sigmas of odometry
@@ -34,12 +37,14 @@ def estimate(
 
     """
     graph, nodes, factors = parts.graph, parts.nodes, parts.factors
-    node = graph.poses_of(nodes.ids[-1])
+    state, sigma = parts.alignment.copy()
+    node = Corrected(graph.poses_of(nodes.ids[-1]), newest_covariance)
+    if state is AlignmentState.ALIGNED:
+        node = corrected(parts, smoother, node)
     motion, motion_noise, odometry = nodes.newest()
     motion, motion_noise = _turned(parts, motion, scale**2 * motion_noise)
-    newest = se2.compose(node, motion)
-    cov = covariance.propagated(node, newest_covariance, motion, motion_noise)
-    state, sigma = parts.alignment.copy()
+    newest = se2.compose(node.pose, motion)
+    cov = covariance.propagated(*node, motion, motion_noise)
     shift = np.zeros(3)
     if state is AlignmentState.UNALIGNED:
         # if the aligning update failed, its measurements are in the quarantine
@@ -60,8 +65,7 @@ def estimate(
         n_priors=graph.n_priors,
         n_edges=graph.n_edges - factors.n_bias_edges,
         n_observed=factors.n_measurements, n_biases=int(np.count_nonzero(graph.is_bias)),
-        primary=nodes.primary, noise=noise if scale == 1.0 else noise.scaled(scale),
-        odometry_scale=scale,
+        primary=nodes.primary, odometry=source, odometry_scale=scale,
         trajectory=None if not with_path else Trajectory(
             nodes.stamps_ns, nodes.poses(graph) + shift).continued(stamp_ns, newest))
 

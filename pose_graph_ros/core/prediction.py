@@ -16,6 +16,9 @@ from pose_graph_ros.core.estimate import Estimate
 from pose_graph_ros.core.geometry.covariance import UNKNOWN_HEADING_VARIANCE
 from pose_graph_ros.core.geometry.scalar_se2 import between_one, compose_one
 from pose_graph_ros.core.geometry.se2 import FloatArray
+from pose_graph_ros.core.measurements import OdometrySample
+from pose_graph_ros.core.odometry.motion import step_variance
+from pose_graph_ros.core.odometry.timeline import JITTER_DISTANCE, JITTER_HEADING
 
 
 class Prediction(NamedTuple):
@@ -27,31 +30,30 @@ class Prediction(NamedTuple):
     """In map axes, shape (3, 3)."""
 
 
-def predict(estimate: Estimate, T_odom_base: FloatArray) -> Prediction:
+def predict(estimate: Estimate, sample: OdometrySample) -> Prediction:
     """
-    Return the estimate propagated to an odometry pose shortly after or before it.
+    Return the estimate propagated to odometry shortly after or before it.
 
-    The path in between is assumed to be straight; it is short because each update makes a new
-    estimate.
-
-    Parameters
-    ----------
-    estimate : Estimate
-    T_odom_base : ndarray, shape (3,) [m, m, rad]
-
+    The path in between is assumed to be straight, and the twist to be uncertain as in the sample;
+    it is short because each update makes a new estimate.
     """
-    x, y, theta = between_one(estimate.T_odom_base.tolist(), T_odom_base.tolist())
+    x, y, theta = between_one(estimate.T_odom_base.tolist(), sample.pose.tolist())
     begin = estimate.T_map_base.tolist()
     end = compose_one(begin, (x, y, theta))
     # noise of the odometry in between, along (a) and across (b) the robot's final heading
-    noise, distance = estimate.noise, math.hypot(x, y)
-    q = min(noise.sigma_heading_distance**2 * distance + noise.sigma_heading_turn**2 * abs(theta),
-            UNKNOWN_HEADING_VARIANCE)
+    odometry, twist = estimate.odometry, sample.twist_variance
+    step, elapsed = (math.hypot(x, y), abs(theta)), abs(sample.stamp_ns - estimate.stamp_ns) * 1e-9
+    if step[0] < JITTER_DISTANCE and step[1] < JITTER_HEADING:
+        elapsed = 0.0   # at rest the twist adds nothing
+    along, across, heading = step_variance(
+        odometry, None if twist is None else tuple(twist.tolist()), step, elapsed)
+    factor = odometry.covariance_scale * estimate.odometry_scale**2
+    q = factor * min(heading, UNKNOWN_HEADING_VARIANCE)
     c, s = math.cos(theta), math.sin(theta)
     sweep_a, sweep_b = s * x - c * y, c * x + s * y
-    aa = q / 3.0 * sweep_a * sweep_a + noise.sigma_distance**2 * distance
+    aa = q / 3.0 * sweep_a * sweep_a + factor * along
     ab = q / 3.0 * sweep_a * sweep_b
-    bb = q / 3.0 * sweep_b * sweep_b + noise.sigma_lateral**2 * distance
+    bb = q / 3.0 * sweep_b * sweep_b + factor * across
     # the same in map axes
     c, s = math.cos(end[2]), math.sin(end[2])
     sweep_x, sweep_y = c * sweep_a - s * sweep_b, s * sweep_a + c * sweep_b

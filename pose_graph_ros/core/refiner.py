@@ -2,7 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """The weights of robust losses, and the refinement of the estimate between two updates."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 
 import numpy as np
 
@@ -12,7 +12,7 @@ from pose_graph_ros.core.graph.graph import GraphUpdate
 from pose_graph_ros.core.graph.reweighting import PART, Reweighting
 from pose_graph_ros.core.judgement.judge import Judge
 from pose_graph_ros.core.smoother.incremental import IncrementalSmoother
-from pose_graph_ros.core.smoother.results import Refinement, UpdateResult
+from pose_graph_ros.core.smoother.results import DIVERGED, Refinement, UpdateResult
 from pose_graph_ros.core.transaction import Transaction
 
 # Maximum number of reweightings in an update.
@@ -20,7 +20,7 @@ IN_UPDATE = 3
 # Limits after an update: of how often weights are changed, and of how many constraints with a loss
 # are looked at in turn without a change.
 REWEIGHTINGS = 100
-LOOKED_AT = 8 * PART
+LOOKED_AT = 2 * PART
 
 
 class Refiner:
@@ -68,19 +68,39 @@ class Refiner:
 
         """
         self._judge.after()
+        if self._judge.solves_later:
+            self._judge.work()  # a part of it also where nobody refines, as in a replay
         settled = result.status is Status.CONVERGED
-        for _ in range(IN_UPDATE if len(self._reweighting) > 0 else 0):
+        for _ in range(IN_UPDATE if self._may_reweight else 0):
             edges, observed = self._reweighting.changes(self._smoother.graph)
             if len(edges) + len(observed) == 0:
                 break
             settled = False
             with begin() as transaction:
-                transaction.solved(self._smoother.update(
-                    GraphUpdate(weigh_edges=edges, weigh_observed=observed)))
+                transaction.solved(self._weigh(edges, observed))
             if transaction.failure != '':
                 break
             result = transaction.result
         return result, settled
+
+    @property
+    def _may_reweight(self) -> bool:
+        return len(self._reweighting) > 0 and not self._judge.solves_later
+
+    def _weigh(self, edges: Mapping[int, float], observed: Mapping[int, float]) -> UpdateResult:
+        """
+        Return the result of an update with new weights.
+
+        If its iterations diverge, a small graph is solved at once, but not again and again; else
+        the graph keeps the old ones, and is solved as a copy later.
+        """
+        update = GraphUpdate(weigh_edges=edges, weigh_observed=observed)
+        result = self._smoother.update(update, fall_back=False)
+        if result.reason == DIVERGED and self._judge.may_solve():
+            return self._smoother.update(update)
+        if result.reason == DIVERGED:
+            self._judge.solve_later(edges, observed)
+        return result
 
     def refine(self) -> Refinement:
         """
@@ -112,15 +132,14 @@ class Refiner:
 
     def _reweight(self, moved: float) -> Refinement:
         graph, size = self._smoother.graph, len(self._reweighting)
-        while (self._unchanged < min(size, LOOKED_AT)
+        while (self._may_reweight and self._unchanged < min(size, LOOKED_AT)
                and self._reweightings < REWEIGHTINGS):
             edges, observed = self._reweighting.changes_of_part(graph, self._cursor)
             if len(edges) + len(observed) > 0:
                 self._unchanged, self._reweightings = 0, self._reweightings + 1
                 before = graph.poses.copy()
-                result = self._smoother.update(
-                    GraphUpdate(weigh_edges=edges, weigh_observed=observed))
-                self.finished = result.status is Status.FAILED
+                result = self._weigh(edges, observed)
+                self.finished = result.status is Status.FAILED and result.reason != DIVERGED
                 by_weights = np.max(np.abs(graph.poses - before)[graph.is_pose, :2], initial=0.0)
                 return Refinement(finished=self.finished, moved=max(moved, float(by_weights)))
             self._unchanged, self._cursor = self._unchanged + PART, (self._cursor + PART) % size

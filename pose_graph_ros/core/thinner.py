@@ -55,7 +55,7 @@ class Thinner:
         self._smoother, self._tuner, self._parts = smoother, tuner, parts
         self._thinning = Thinning()
         self._work: Iterator[None] = iter(())
-        self._newest = 0
+        self._n_made = 0
 
     def step(self, config: ThinningConfig) -> None:
         """Let groups of nodes leave, or of old measurements in the map, if some are due."""
@@ -63,8 +63,8 @@ class Thinner:
             self._work = iter(())
             return
         # a bag is replayed with many new nodes from step to step
-        newest = self._parts.graph.newest_pose
-        new, self._newest = max(newest - self._newest, 1), newest
+        n_made = len(self._parts.nodes)
+        new, self._n_made = max(n_made - self._n_made, 1), n_made
         for _ in range(min(new, MOST_PIECES)):
             if next(self._work, self) is self:
                 self._work = self._steps(config)
@@ -76,7 +76,8 @@ class Thinner:
         parts, smoother = self._parts, self._smoother
         # a fixed node that is frozen stays in the graph, but stands for no others
         first = int(parts.nodes.ids[parts.nodes.n_frozen])
-        places = self._thinning.places(smoother, config, self._held(), first)
+        places = self._thinning.places(
+            smoother, config, len(parts.nodes), self._held(), first)
         if places is None:
             return
         older = parts.graph.node_ids[parts.graph.is_pose][:-config.newest]

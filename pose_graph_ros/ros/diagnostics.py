@@ -15,9 +15,10 @@ from diagnostic_msgs.msg import DiagnosticStatus
 from pose_graph_ros.adapters.sources import Kind
 from pose_graph_ros.core.alignment.monitor import AlignmentState
 from pose_graph_ros.core.batch.optimizer import Status
-from pose_graph_ros.core.judgement.texts import total_values
+from pose_graph_ros.core.judgement.texts import short, total_values
 from pose_graph_ros.core.odometry.agreement import CONTRADICTORY
 from pose_graph_ros.core.odometry.turns import MOST_BIAS
+from pose_graph_ros.core.residuals.disagreement import Disagreement
 from pose_graph_ros.core.sources.constraint_names import ConstraintEnergy
 from pose_graph_ros.core.sources.source_report import LEAST_ENERGY
 from pose_graph_ros.ros.worker import Worker
@@ -58,7 +59,7 @@ def _state(session: 'Session') -> dict[str, object]:
               for (source, answer), count in sorted((status.counts + rejected).items())}
     found |= {f'{source}.bias': f'{bias:.6f}' for source, bias in status.biases.items()}
     found |= {f'{source}.odometry_difference': ': '.join(filter(None, (
-        f'{each.sigmas:.2g} sigmas', each.reason)))
+        f'{short(each.sigmas)} sigmas', each.reason)))
         for source, each in status.differences.items()}
     found |= {f'quarantined.{rank}': name for rank, name in enumerate(status.set_aside, 1)}
     if estimate is not None:
@@ -71,9 +72,9 @@ def _state(session: 'Session') -> dict[str, object]:
             'edges': estimate.n_edges, 'observed_nodes': estimate.n_observed,
             'biases': estimate.n_biases, 'chi2': f'{estimate.chi2:.6g}'})
     for rank, largest in enumerate(session.energies.found, 1):
-        found[f'largest_energy.{rank}'] = f'{largest.name}: {largest.energy:.4g}' + (
+        found[f'largest_energy.{rank}'] = f'{largest.name}: {short(largest.energy, 4)}' + (
             '' if largest.unweighted == largest.energy else
-            f', without its loss {largest.unweighted:.4g}')
+            f', without its loss {short(largest.unweighted, 4)}')
     return found
 
 
@@ -98,6 +99,30 @@ class LargestEnergies:
                 lambda backend: backend.largest_energies(N_ENERGIES), 'the largest energies')
 
 
+class Contradiction:
+    """The source that contradicts the others, searched for while measurements fit badly."""
+
+    def __init__(self) -> None:
+        self.found: Disagreement | None = None
+        self._asked: Future[Disagreement | None] | None = None
+        self._next = 0  # number of measurements from which on it is searched for again
+
+    def update(self, worker: Worker) -> None:
+        """Take the newest answer of the worker, and ask again when there is twice as much."""
+        reports, asked = worker.status.sources.values(), self._asked
+        if asked is not None and asked.done():
+            self._asked = None
+            if not asked.cancelled() and asked.exception() is None:
+                self.found = asked.result()
+        n = sum(report.n for report in reports)
+        if not any(report.fits_badly for report in reports):
+            self.found, self._next = None, 0
+        elif self._asked is None and n >= self._next:
+            self._next = 2 * n
+            self._asked = worker.call(
+                lambda backend: backend.disagreement(), 'the source that contradicts the others')
+
+
 def memory() -> int:
     """Return the resident memory of the process [bytes]; 0 if the system does not provide it."""
     try:
@@ -116,6 +141,8 @@ def _inputs(session: 'Session') -> dict[str, object]:
         found[f'{name}.silence_s'] = 'never received' if silence is None else f'{silence:.1f}'
         if rate > 0.0:
             found[f'{name}.rate_hz'] = f'{rate:.1f}'
+    found |= {f'{name}.delay_s': f'{delay:.3f}'
+              for name, delay in session.input.delays.seconds.items()}
     for name, fixes in reader.fixes.items():
         if fixes.antenna is not None:
             x, y = fixes.antenna.lever_arm
@@ -132,15 +159,15 @@ def _fits(session: 'Session') -> dict[str, object]:
     found: dict[str, object] = {}
     for name, report in session.worker.status.sources.items():
         # 1 if the sigmas are right, less if the estimate depends on this source alone
-        found[f'{name}.squared_residual'] = f'{report.energy:.4g}'
+        found[f'{name}.squared_residual'] = f'{short(report.energy, 4)}'
         errors, in_use = report.errors, report.in_use
         if in_use is not None and report.found:
             found[f'{name}.errors_live'] = (
-                f'{in_use.tau:.2g} s, with {math.sqrt(in_use.correlated):.2g} times the sigma of '
-                f'the messages; found by {name}.correlation_time of -1, and treated so')
+                f'{short(in_use.tau)} s, with {short(math.sqrt(in_use.correlated))} times the '
+                f'sigma of the messages; found by {name}.correlation_time of -1, and treated so')
         elif errors.significant and report.energy >= LEAST_ENERGY:
             found[f'{name}.errors_live'] = (
-                f'{errors.tau:.2g} s, with a sigma of {errors.sigma_correlated:.2g} m'
+                f'{short(errors.tau)} s, with a sigma of {short(errors.sigma_correlated)} m'
                 + (f'; treated as white: set {name}.correlation_time'
                    if report.wrongly_white else ''))
     return found
@@ -179,9 +206,12 @@ def _concerns(session: 'Session') -> Iterator[tuple[bytes, str]]:
     if len(silent) > 0:
         yield warn, (f'{" and ".join(silent)} {"is" if len(silent) == 1 else "are"} silent '
                      'while other sources are not: check the drivers.')
+    yield from ((warn, f'{sentence[0].upper()}{sentence[1:]}.') for sentence in session.doubts)
+    yield from ((warn, f'{text}.') for text in session.input.delays.wrong.values())
     if estimate.alignment is AlignmentState.UNALIGNED:
         yield warn, ('Unaligned: the angle between odometry and map is not known yet. Drive some '
                      'metres while fixes come in.')
+    yield from ((warn, text) for _, text in disagreements(session))
     yield from _doubted_sources(session)
     yield from _doubts(session)
     if estimate.alignment is AlignmentState.LOCAL:
@@ -230,28 +260,33 @@ def _doubts(session: 'Session') -> Iterator[tuple[bytes, str]]:
         if fit.wrongly_white:
             yield warn, (f'The errors of {name} are correlated in time but treated as white, so '
                          f'the covariances are too small: set {name}.correlation_time to about '
-                         f'{fit.errors.tau:.2g} s.')
-    yield from ((warn, text) for text in _wrong_gyros(session))
+                         f'{short(fit.errors.tau)} s.')
     errors = sum(count for (_, reason), count in status.counts.items()
                  if reason == 'internal_error')
     if errors > 0:
         yield warn, f'Running, but {errors} internal errors are in the log: please report them.'
 
 
-def _wrong_gyros(session: 'Session') -> Iterator[str]:
-    """Yield what is probably wrong with gyroscopes."""
+def disagreements(session: 'Session') -> Iterator[tuple[str, str]]:
+    """Yield who disagrees with others, by a key, and what is probably wrong with them."""
     status, estimate = session.worker.status, session.worker.estimate
+    found = session.contradiction.found
+    if found is not None:
+        yield f'{found.source}.contradiction', f'{found.text[0].upper()}{found.text[1:]}.'
     for name, source in session.input.reader.sources.items():
         if source.kind is not Kind.GYRO or estimate is None:
             continue
         counts, bias = status.counts, status.biases.get(name, 0.0)
         used, most = counts[name, 'rotations'], MOST_BIAS * session.values[f'{name}.sigma_bias']
         if used == 0 and counts[name, 'accepted'] >= MANY <= estimate.n_hidden:
-            yield (f'No message of {name} could be used: either their stamps are not in the time '
-                   f'of odometry, or they are farther apart than {name}.maximum_gap.')
+            yield f'{name}.rotations', (
+                f'No message of {name} could be used: either their stamps are not in the time of '
+                f'odometry, or they are farther apart than {name}.maximum_gap.')
         difference = status.differences.get(name)
         if difference is not None and difference.sigmas > CONTRADICTORY and difference.reason:
-            yield f'Of {name} and odometry one is wrong: {difference.reason}.'
+            yield f'{name}.odometry_difference', (
+                f'Of {name} and odometry one is wrong: {difference.reason}.')
         elif abs(bias) > most:
-            yield (f'The bias of {name} is {bias:.2g} rad/s, more than five times its sigma_bias: '
-                   'check its mounting and its unit, rad/s.')
+            yield f'{name}.bias', (
+                f'The bias of {name} is {short(bias)} rad/s, more than five times its sigma_bias: '
+                'check its mounting and its unit, rad/s.')

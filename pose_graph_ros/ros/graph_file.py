@@ -13,7 +13,7 @@ from pose_graph_ros.core.backend import PoseGraphBackend
 from pose_graph_ros.core.config import BackendConfig
 from pose_graph_ros.core.exceptions import ConfigError, FileFormatError
 from pose_graph_ros.core.geometry.geodesy import MapOrigin
-from pose_graph_ros.core.io.graph_files import read_datum, read_graph
+from pose_graph_ros.core.io.graph_files import graph_paths, read_datum, read_graph
 from pose_graph_ros.core.io.saved_graph import datum_refusal, SavedGraph
 
 logger = logging.getLogger(__name__)
@@ -53,6 +53,7 @@ def initial_graph(values: Mapping[str, Any]) -> InitialGraph | None:
     """
     Return the graph that a node starts with; None if it starts with a new one.
 
+    It does, and says so, before a graph was saved: when none of the files is there.
     Only the checksums and the datum are read, as whoever configures the node waits for it.
 
     Parameters
@@ -62,15 +63,19 @@ def initial_graph(values: Mapping[str, Any]) -> InitialGraph | None:
     Raises
     ------
     ConfigError
-        If there is no such graph, its files are damaged, or its datum is another one.
+        If one of the files is missing or damaged, or their datum is another one.
 
     """
     if not values['load_graph_on_start']:
         return None
     path, plane = graph_path(values), datum_of(values).plane
     try:
+        if not path.is_dir() and not any(map(Path.exists, graph_paths(path))):
+            logger.warning('there is no graph in %s yet: starting with an empty one, which '
+                           '~/save_graph writes there', path)
+            return None
         datum = read_datum(path)
-    except FileFormatError as error:
+    except (FileFormatError, OSError) as error:
         raise ConfigError(f'parameter load_graph_on_start: {error}') from error
     if datum is not None and plane is not None:
         refusal = datum_refusal(datum, plane.origin)

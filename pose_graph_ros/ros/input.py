@@ -7,17 +7,25 @@ from collections.abc import Callable, Mapping
 import time
 from typing import Any
 
-from pose_graph_ros.adapters.conversions import Message, stamp_ns
+from pose_graph_ros.adapters.conversions import Message
 from pose_graph_ros.adapters.message_reader import MessageReader
-from pose_graph_ros.adapters.sources import Kind, NANOSECONDS, Source
-from pose_graph_ros.core.measurements import Answer, Measurement, OdometrySample, rejected
+from pose_graph_ros.adapters.sources import Kind
+from pose_graph_ros.core.measurements import (
+    Answer,
+    LoopClosure,
+    Measurement,
+    OdometrySample,
+    rejected,
+    YawRate,
+)
+from pose_graph_ros.ros.delays import Delays
 from pose_graph_ros.ros.liveness import Liveness
 from pose_graph_ros.ros.refusals import Refusals
-from pose_graph_ros.ros.time_jump import Decision, ReceivedMessage, TimeJumpDetector
+from pose_graph_ros.ros.time_jump import Decision, ReceivedMessage, TimeJumps
 
 PAUSED = rejected('paused', 'call ~/pause with false to resume')
 BEFORE_JUMP = rejected('before_clock_jump', 'a message from before the clock was set back')
-LONGEST_DOUBT = 1.0  # messages that are held back are released if no other comes for so long [s]
+LONGEST_DOUBT = 1.0  # messages that are held back are released without odometry for so long [s]
 
 
 class Input:
@@ -33,11 +41,13 @@ class Input:
 
     def __init__(self, values: Mapping[str, Any], warn: Callable[[str], None]) -> None:
         self.reader = MessageReader(values)
-        self.time_jumps = TimeJumpDetector(_threshold_ns(values))
+        self.time_jumps = TimeJumps(self.reader.keeper)
         self._warn = warn
         self._warned: set[tuple[str, str]] = set()
-        self._received_at = 0.0
+        self._odometry_at = 0.0
         self.paused = False  # whether all measurements are rejected
+        self.frames: dict[str, tuple[str, str]] = {}
+        """The frame_id and child_frame_id of the newest message by source."""
         self._clear()
 
     def _clear(self) -> None:
@@ -48,6 +58,7 @@ class Input:
         self.liveness = Liveness([source.name for source in self.reader.sources.values()
                                   if source.kind is Kind.LOOP_CLOSURE])
         self._refusals = Refusals()
+        self.delays = Delays()
         self.silent: list[str] = []  # sources that are silent while others are not
         self.quiet = 0.0  # for how long nothing at all has come, if that is long [s]
         self.refused: dict[str, str] = {}  # what to say of sources that all is refused from
@@ -57,65 +68,68 @@ class Input:
     def configure(self, values: Mapping[str, Any]) -> None:
         """Set the parameters that can change while the node runs."""
         self.reader.configure(values)
-        self.time_jumps.threshold_ns = _threshold_ns(values)
 
     def start_new_graph(self, values: Mapping[str, Any]) -> None:
         """Forget all messages but those of /tf_static; those that are held back stay so."""
-        self.reader = MessageReader(values, self.reader.frames)
+        self.reader = MessageReader(values, self.reader.frames, self.reader.keeper)
         self._clear()
 
-    def receive(self, source: Source, message: Message, primary: str) -> Decision:
-        """
-        Return which messages can be read now, after counting a new one.
-
-        Parameters
-        ----------
-        primary : str
-            Name of the primary odometry, by whose stamps time is judged; empty for any odometry.
-
-        """
-        name = source.name
-        self.received[name] += 1
-        self.liveness.receive(name, time.monotonic())
-        # the stamp is without `time_offset`: a change of that must not look like a jump of time
-        is_primary = source.kind.is_odometry and primary in ('', name)
-        decision = self.time_jumps.receive(
-            ReceivedMessage(name, message, stamp_ns(message), is_primary))
-        self._received_at = time.monotonic()
+    def receive(self, source: str, message: Message) -> Decision:
+        """Return which messages can be used now, after counting a new one."""
+        now = time.monotonic()
+        self.received[source] += 1
+        self.liveness.receive(source, now)
+        measurement = self.read(source, message)
+        if measurement is None:
+            return Decision([])
+        if isinstance(measurement, OdometrySample):
+            self._odometry_at = now
+        decision = self.time_jumps.receive(ReceivedMessage(source, message, measurement))
         if decision.is_old:
-            self.reject(name, BEFORE_JUMP)
+            self.reject(source, BEFORE_JUMP)
+        elif decision.jump_ns == 0 and not isinstance(measurement, LoopClosure):
+            self.delays.receive(
+                source, measurement.stamp_ns, self.reader.keeper.clock,
+                may_be_late=not isinstance(measurement, OdometrySample | YawRate))
+            if source in self.delays.wrong:
+                self.warn_once(source, 'delay', self.delays.wrong[source])
         return decision
 
     def release_overdue(self) -> list[ReceivedMessage]:
-        """Remove and return the messages that were held back if no other has come for long."""
-        overdue = time.monotonic() - self._received_at > LONGEST_DOUBT
+        """Remove and return the messages that were held back if no odometry has come for long."""
+        overdue = time.monotonic() - self._odometry_at > LONGEST_DOUBT
         return self.time_jumps.release() if overdue else []
 
-    def read(self, received: ReceivedMessage) -> OdometrySample | Measurement | None:
-        """Return the measurement of a message; None if it cannot be used."""
+    def read(self, source: str, message: Message) -> OdometrySample | Measurement | None:
+        """Return the measurement of a message; None if it cannot be used, whatever its stamp."""
         try:
-            measurement = self.reader.read(received.source, received.message)
+            measurement = self.reader.convert(source, message)
         except Exception as error:
             measurement = rejected('malformed', f'{type(error).__name__}: {error}')
         if isinstance(measurement, Answer):
-            self.reject(received.source, measurement)
+            self.reject(source, measurement)
             return None
+        self.frames[source] = (
+            message.header.frame_id, getattr(message, 'child_frame_id', ''))
         return measurement
 
     def post(
-        self, source: str, measurement: OdometrySample | Measurement,
+        self, received: ReceivedMessage,
         post: Callable[[str, OdometrySample | Measurement], bool],
     ) -> None:
         """
-        Hand a measurement to the engine, unless the input is paused.
+        Hand a measurement to the engine, unless its stamp is refused or the input is paused.
 
         Parameters
         ----------
-        measurement : OdometrySample or Measurement
+        received : ReceivedMessage
         post : callable, `Worker.post`
 
         """
-        if self.paused:
+        source, _, measurement, refusal = received
+        if refusal is not None:
+            self.reject(source, refusal)
+        elif self.paused:
             self.reject(source, PAUSED)
         elif not post(source, measurement):
             self.reject(source, rejected('inbox_full', 'the solver does not keep up'))
@@ -156,10 +170,14 @@ class Input:
 
     def reject(self, source: str, answer: Answer) -> None:
         """Count a message that cannot be used; log the first for each source and reason."""
-        self.rejected[source, answer.reason] += 1
-        self._details[source, answer.reason] = answer.detail
+        self.count(source, answer)
         self.warn_once(source, answer.reason, f'{source}: {answer.reason}: {answer.detail} '
                                               '(logged once, counted in diagnostics)')
+
+    def count(self, source: str, answer: Answer) -> None:
+        """Count a message that cannot be used."""
+        self.rejected[source, answer.reason] += 1
+        self._details[source, answer.reason] = answer.detail
 
     def warn_once(self, about: str, what: str, sentence: str) -> None:
         """
@@ -174,7 +192,3 @@ class Input:
         if (about, what) not in self._warned:
             self._warned.add((about, what))
             self._warn(sentence)
-
-
-def _threshold_ns(values: Mapping[str, Any]) -> int:
-    return round(values['clock_jump_threshold'] * NANOSECONDS)

@@ -64,8 +64,7 @@ def run(args: list[str] | None = None) -> int:
     try:
         rclpy.init(args=args, signal_handler_options=SignalHandlerOptions.NO)
         node = PoseGraphNode()
-        if node.get_parameter('autostart').value:
-            node.start()
+        node.begin(sys.argv if args is None else args)
     except (ConfigError, InvalidParameterTypeException, InvalidParameterValueException,
             RuntimeError) as error:  # RuntimeError: by rcl, such as for bad arguments
         print(f'pose_graph_node: {error}', file=sys.stderr)

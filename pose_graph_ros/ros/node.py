@@ -19,6 +19,7 @@ from pose_graph_ros.adapters.parameter_changes import (
     plain,
     require_together,
 )
+from pose_graph_ros.adapters.parameter_files import without_effect
 from pose_graph_ros.adapters.parameter_names import is_own
 from pose_graph_ros.adapters.parameter_texts import constraints
 from pose_graph_ros.adapters.parameters import (
@@ -33,7 +34,7 @@ from pose_graph_ros.adapters.parameters import (
     type_parameter,
     unknown,
 )
-from pose_graph_ros.adapters.sources import source_list
+from pose_graph_ros.adapters.sources import KNOWN_SOURCES
 from pose_graph_ros.core.exceptions import ConfigError
 from pose_graph_ros.ros.log import FLUSH_PERIOD, NodeLog
 from pose_graph_ros.ros.services import Services
@@ -59,10 +60,10 @@ class PoseGraphNode(LifecycleNode):
         self.failure = ''  # why the last transition or change of parameters failed
         self._session: Session | None = None
         self._offered: Services | None = None
-        self._given = self._declared()  # the node's own parameters that have a value
         # what a file or the command line gives, also to parameters that are not declared
         self._overrides = {parameter.name: parameter.value for parameter in getattr(
             self, '_parameter_overrides', {}).values()}
+        self._given = self._declared()  # the node's own parameters that have a value
         self._own = {parameter.name: parameter for parameter in all_parameters(self._given)}
         self._warn_of_unknown()
         self.add_on_set_parameters_callback(self._on_set_parameters)
@@ -75,6 +76,15 @@ class PoseGraphNode(LifecycleNode):
         super().destroy_node()
 
     # ---- lifecycle
+
+    def begin(self, arguments: Sequence[str]) -> None:
+        """Tell of parameter files in the arguments that are for others; start by `autostart`."""
+        for sentence in without_effect(arguments, self.get_fully_qualified_name()):
+            self.get_logger().warning(sentence)
+        if self.get_parameter('autostart').value:
+            self.start()
+        else:
+            self.get_logger().info('autostart is false: waiting for the transition configure')
 
     def start(self) -> None:
         """Configure and activate; raises `ConfigError` with the reason if a transition fails."""
@@ -92,16 +102,19 @@ class PoseGraphNode(LifecycleNode):
 
     def on_deactivate(self, state: LifecycleState) -> TransitionCallbackReturn:
         """Stop receiving and publishing; keep the graph."""
-        return self._transition(self._configured.deactivate)
+        return self._transition(
+            self._configured.deactivate, 'inactive: nothing is received; the graph stays')
 
     def on_cleanup(self, state: LifecycleState) -> TransitionCallbackReturn:
         """Discard everything: before the end, or to be unconfigured again, also after an error."""
-        return self._transition(self.close)
+        return self._transition(self.close, 'cleaned up: the graph is discarded')
 
     on_shutdown = on_error = on_cleanup
 
-    def _transition(self, change: Callable[[], None]) -> TransitionCallbackReturn:
-        """Change the state; if that fails, keep the reason, which rclpy does not."""
+    def _transition(
+        self, change: Callable[[], None], done: str = '',
+    ) -> TransitionCallbackReturn:
+        """Change the state, and log that; if it fails, keep the reason, which rclpy does not."""
         try:
             change()
         except ConfigError as error:
@@ -111,6 +124,8 @@ class PoseGraphNode(LifecycleNode):
             self.failure = f'{type(error).__name__}: {error}'
             self.get_logger().error(f'a transition failed:\n{traceback.format_exc()}')
             return TransitionCallbackReturn.ERROR
+        if done != '':
+            self.get_logger().info(done)
         return TransitionCallbackReturn.SUCCESS
 
     @property
@@ -121,7 +136,7 @@ class PoseGraphNode(LifecycleNode):
     def _configure(self) -> None:
         values = checked(self._given)
         require_together(values)
-        check_topics(self, source_list(values), self._overrides)
+        check_topics(self, values, self._overrides)
         self._session = Session(self, values)
         self._offered = Services(self, self._session)
 
@@ -172,17 +187,23 @@ class PoseGraphNode(LifecycleNode):
                 default = None if parameter.default == [] else parameter.default
                 self.declare_parameter(parameter.name, default, _descriptor(parameter))
             value = self.get_parameter(parameter.name).value
-            if value is not None and (
-                    value not in NOTHING or not isinstance(parameter.default, list)):
+            is_list = isinstance(parameter.default, list)
+            if value is not None and not (is_list and value in NOTHING):
                 given[parameter.name] = plain(value)
+            elif is_list and parameter.default != [] and parameter.name in self._overrides:
+                given[parameter.name] = []  # so rcl hands over [], which is not the default
         return given
 
     def _warn_of_unknown(self) -> None:
         """Warn of unknown parameters: rclpy does not, as a file may be for several nodes."""
-        for name in sorted(self._overrides):
+        # pose_graph.yaml has defaults of sources that `sources` may leave out
+        usual = {parameter.name: parameter.default for source, (kind, _) in KNOWN_SOURCES.items()
+                 for parameter in source_parameters(source, kind.value)}
+        for name, value in sorted(self._overrides.items()):
             # those of rclpy are declared, or will be with the publishers and subscriptions
             if not self.has_parameter(name) and not name.startswith(OVERRIDES) and (
-                    is_own(name, self._own, OF_SOURCES)):
+                    is_own(name, self._own, OF_SOURCES)) and (
+                    name not in usual or not is_same(plain(value), usual[name])):
                 self.get_logger().warning(str(unknown(name, self._own)))
 
     def set_parameters_atomically(

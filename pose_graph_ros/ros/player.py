@@ -173,7 +173,7 @@ class Player(Node):
         with open_bag(bag) as reader:
             total = sum(reader.topics[topic].count for topic in self._inputs.topics.values())
             start = first_ns = None
-            shown = 0.0
+            progress = Progress(total)
             for source, message, held_out in read_inputs(reader, self._inputs):
                 if held_out:
                     published['held_out'] += 1
@@ -196,11 +196,7 @@ class Player(Node):
                 if sent - self.processed > WINDOW:
                     self._wait_for(sent - WINDOW // 2)
                 self._executor.spin_once(timeout_sec=0.0)
-                if time.monotonic() - shown > 1.0:
-                    shown = time.monotonic()
-                    _progress(published.total(), total)
-        _progress(published.total(), total)
-        print(file=sys.stderr)
+                progress.show(published.total())
         self._wait_for(sent)
         return published
 
@@ -255,11 +251,38 @@ class Player(Node):
                         topic, 'diagnostic_msgs/msg/DiagnosticArray', arrived_ns, raw)
 
 
-def _progress(done: int, total: int) -> None:
-    """Show progress on one line of a terminal, on few lines elsewhere."""
-    end = '\r' if sys.stderr.isatty() else '\n'
-    print(f'  played {done} of {total} messages ({100.0 * done / max(total, 1):.0f} %)',
-          end=end, file=sys.stderr, flush=True)
+class Progress:
+    """
+    Shows how many messages were played: on one line of a terminal, every ten percent elsewhere.
+
+    Parameters
+    ----------
+    total : int, number of messages
+
+    """
+
+    def __init__(self, total: int) -> None:
+        self._total, self._is_terminal = max(total, 1), sys.stderr.isatty()
+        self._shown, self._shown_at = 0, 0.0
+
+    def show(self, done: int) -> None:
+        """
+        Show a number of messages.
+
+        Parameters
+        ----------
+        done : int
+
+        """
+        percent = 100 * done // self._total
+        if self._is_terminal:
+            is_due = percent >= 100 or time.monotonic() - self._shown_at > 1.0
+        else:
+            is_due = percent // 10 > self._shown // 10
+        if is_due:
+            self._shown, self._shown_at = percent, time.monotonic()
+            print(f'  played {done} of {self._total} messages ({percent} %)', file=sys.stderr,
+                  end='\r' if self._is_terminal and percent < 100 else '\n', flush=True)
 
 
 def main(args: list[str] | None = None) -> int:

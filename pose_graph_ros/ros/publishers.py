@@ -30,10 +30,16 @@ from pose_graph_ros.adapters import output_cdr
 from pose_graph_ros.adapters.conversions import frame, Message
 from pose_graph_ros.adapters.fixes import Datum
 from pose_graph_ros.adapters.markers import markers_cdr
-from pose_graph_ros.adapters.sources import NANOSECONDS
+from pose_graph_ros.adapters.sources import (
+    IN_MAP,
+    NANOSECONDS,
+    OUTPUTS as OUTPUT_TOPICS,
+    source_list,
+)
 from pose_graph_ros.adapters.verdict_messages import verdicts_cdr
 from pose_graph_ros.core.alignment.monitor import AlignmentState
 from pose_graph_ros.core.estimate import Estimate
+from pose_graph_ros.core.geometry.covariance import UNKNOWN_HEADING_VARIANCE
 from pose_graph_ros.core.geometry.trajectory import Trajectory
 from pose_graph_ros.core.graph.graph_view import GraphView
 from pose_graph_ros.core.judgement.verdicts import SourceVerdicts, Verdict
@@ -55,7 +61,10 @@ OUTPUTS = {
     'graph': (MarkerArray, LATCHED_QOS),
     '~/verdicts': (DiagnosticArray, LATCHED_QOS),
     '/diagnostics': (DiagnosticArray, OUTPUT_QOS)}
-"""Messages and quality of service by topic, but for /tf."""
+"""Messages and quality of service by default topic, but for /tf."""
+UNPLACED = np.diag((
+    output_cdr.UNKNOWN_VARIANCE, output_cdr.UNKNOWN_VARIANCE, UNKNOWN_HEADING_VARIANCE))
+"""Covariance of a pose of which only the motion since the start is known."""
 MOST_FROZEN = 20_000
 """Poses that have left the graph in a message; a day at 1 m/s has four times as many."""
 
@@ -78,13 +87,17 @@ class Publishers:
         self.map_frame = frame(values['map_frame'])
         self.odom_frame = frame(values['odom_frame'])
         self.base_frame = frame(values['base_link_frame'])
-        self._publishers = [self._publisher(message_type, topic, qos)
+        given = {topic: values[f'outputs.{name}'] for name, (topic, *_) in OUTPUT_TOPICS.items()}
+        self._publishers = [self._publisher(message_type, given[topic], qos)
                             for topic, (message_type, qos) in OUTPUTS.items()]
         (self._pose, self._odometry, self._fix, self._path, self._graph, self._verdicts,
          self._diagnostics) = self._publishers
         self.transforms: TransformPublisher | None = None
         """None if `publish_tf` is false or tf2_msgs is not installed."""
         self._on_other = on_other
+        self._map_topics = [node.resolve_topic_name(source.topic)
+                            for source in source_list(values) if source.kind in IN_MAP]
+        self._awaits_map = False    # whether there ever was a publisher on one of these
         self._slew = Slew()
         self._aligned = False
         self._newest_ns = 0
@@ -119,6 +132,7 @@ class Publishers:
         elif not values['publish_tf'] and self.transforms is not None:
             self.transforms.close()
             self.transforms = None
+        self._waits = values['wait_for_map']
         self._tf_offset_ns = round(values['transform_time_offset'] * NANOSECONDS)
         self._slew_limits = values['transform_slew_linear'], values['transform_slew_angular']
         self._path_period, self._graph_period = values['path_period'], values['graph_period']
@@ -127,7 +141,7 @@ class Publishers:
         self, estimate: Estimate, odometry: Message, sample: OdometrySample, datum: Datum,
     ) -> None:
         """
-        Publish pose, odometry, fix and transform at an odometry message.
+        Publish pose, odometry, fix and transform at an odometry message, if they are not held.
 
         Parameters
         ----------
@@ -137,7 +151,7 @@ class Publishers:
 
         """
         stamp, plane = sample.stamp_ns, datum.plane
-        if stamp <= self._newest_ns:
+        if stamp <= self._newest_ns or self._holds(estimate):
             return
         self._newest_ns = stamp
         if (self.transforms is not None
@@ -152,7 +166,9 @@ class Publishers:
                   if publisher.get_subscription_count() > 0]
         if len(wanted) == 0:
             return
-        prediction = predict(estimate, sample.pose)
+        prediction = predict(estimate, sample)
+        if self._is_unplaced(estimate):
+            prediction = prediction._replace(covariance=UNPLACED)
         if self._odometry in wanted:
             self._odometry.publish(output_cdr.odometry_cdr(
                 stamp, prediction, odometry, self.map_frame, self.base_frame))
@@ -164,13 +180,26 @@ class Publishers:
             self._fix.publish(messages.fix_message(
                 stamp, prediction, plane, datum.altitude, self.base_frame))
 
+    def _holds(self, estimate: Estimate) -> bool:
+        """Tell whether nothing is to be published of an estimate, as it is not in the map yet."""
+        return (self._waits and len(self._map_topics) > 0
+                and estimate.alignment is not AlignmentState.ALIGNED)
+
+    def _is_unplaced(self, estimate: Estimate) -> bool:
+        """Tell whether a source is to tell where odometry lies; without one, that is the map."""
+        if estimate.alignment is not AlignmentState.LOCAL:
+            return False
+        self._awaits_map = self._awaits_map or any(
+            self._node.count_publishers(topic) > 0 for topic in self._map_topics)
+        return self._awaits_map
+
     def jump(self) -> None:
         """Let the next transform be published without limits: the robot was put elsewhere."""
         self._slew.forget()
 
     def path_is_due(self, estimate: Estimate) -> bool:
         """Tell whether to publish the path of an estimate: new, wanted, and not too soon."""
-        return (estimate is not self._path_shown
+        return (estimate is not self._path_shown and not self._holds(estimate)
                 and time.monotonic() - self._path_at >= self._path_period
                 and self._path.get_subscription_count() > 0)
 
@@ -190,7 +219,7 @@ class Publishers:
         """
         shown = thinned(path, n_frozen)
         with self._lock:
-            if graph != self.graph:
+            if graph != self.graph or self._holds(estimate):
                 return
             self._path_shown, self._path_at = estimate, time.monotonic()
             # a better path with the same newest odometry: 1 ns keeps the stamps increasing

@@ -12,6 +12,7 @@ from concurrent.futures import Future
 from copy import copy
 from functools import partial
 import logging
+import math
 import time
 from typing import Any
 
@@ -25,8 +26,8 @@ from rclpy.qos_overriding_options import QoSOverridingOptions
 from rclpy.subscription import Subscription
 from rclpy.timer import Timer
 
-from pose_graph_ros.adapters.conversions import frame, Message
-from pose_graph_ros.adapters.sources import backend_config, Kind, SET_POSE, Source
+from pose_graph_ros.adapters.conversions import Message
+from pose_graph_ros.adapters.sources import backend_config, Kind, NANOSECONDS, SET_POSE, Source
 from pose_graph_ros.adapters.verdict_messages import JUDGE, MOST_BELIEVED
 from pose_graph_ros.core.backend import PoseGraphBackend
 from pose_graph_ros.core.estimate import UpdateReport
@@ -36,11 +37,13 @@ from pose_graph_ros.ros import diagnostics, memory
 from pose_graph_ros.ros.decisions import decide
 from pose_graph_ros.ros.graph_file import initial_graph, InitialGraph
 from pose_graph_ros.ros.input import Input, PAUSED
+from pose_graph_ros.ros.log import ANSWER
 from pose_graph_ros.ros.messages import CLASSES, odometry_message
 from pose_graph_ros.ros.pose_continuity import PoseContinuity
 from pose_graph_ros.ros.publishers import Publishers
 from pose_graph_ros.ros.set_pose_input import SetPoseInput
 from pose_graph_ros.ros.spinning import guarded
+from pose_graph_ros.ros.surroundings import doubts
 from pose_graph_ros.ros.time_jump import ReceivedMessage
 from pose_graph_ros.ros.topics import (
     JUDGE_QOS,
@@ -81,6 +84,8 @@ class Session:
             self.out.map_frame, self.out.odom_frame, self.out.base_frame)
         self.active = self._closed = False
         self.n_resets, self.reset_reason = 0, ''
+        self.activated_at = math.inf  # by a monotonic clock [s]
+        self.doubts: list[str] = []  # what around the node is probably not as it was meant
         self.compiling = False  # whether kernels are compiled, which a start from the cache is not
         self._subscriptions: list[Subscription] = []
         self._timers: dict[str, Timer] = {}
@@ -103,6 +108,7 @@ class Session:
         self.final: Future[UpdateReport] | None = None  # optimisation at the end of the stream
         # of this graph, so that the answer of an earlier worker is nobody's
         self.energies = diagnostics.LargestEnergies()
+        self.contradiction = diagnostics.Contradiction()
 
     def _start_worker(
         self, backend: PoseGraphBackend, *, prepared: bool = False,
@@ -159,7 +165,7 @@ class Session:
                 self._on_odometry if raw else self._on_message, source), qos, raw=raw)
         self._watch_time()
         self.input.liveness.resume(time.monotonic())
-        self.active = True
+        self.active, self.activated_at = True, time.monotonic()
         topics = ', '.join(self.node.resolve_topic_name(source.topic) for source in sources)
         self.node.get_logger().info(f'ready, listening to {topics}')
 
@@ -210,11 +216,15 @@ class Session:
             qos_overriding_options=QoSOverridingOptions.with_default_policies(), raw=raw))
 
     def _set_timer(self, name: str, period: float, tick: Callable[[], None]) -> None:
-        if name in self._timers:
-            self.node.destroy_timer(self._timers.pop(name))
-        is_due = (lambda: not self._closed) if name == 'diagnostics' else (lambda: self.active)
-        self._timers[name] = self.node.create_timer(
-            period, guarded(tick, is_due), clock=self.steady)
+        timer, period_ns = self._timers.get(name), round(period * NANOSECONDS)
+        if timer is None:
+            is_due = (lambda: not self._closed) if name == 'diagnostics' else (lambda: self.active)
+            self._timers[name] = self.node.create_timer(
+                period, guarded(tick, is_due), clock=self.steady)
+        elif timer.timer_period_ns != period_ns:
+            # not a new one: the executor knows it before the one that it replaces is gone
+            timer.timer_period_ns = period_ns
+            timer.reset()
 
     # ---- messages
 
@@ -229,9 +239,7 @@ class Session:
 
     def _on_message(self, source: Source, message: Message) -> None:
         """Receive a message; never raises, whatever its content."""
-        estimate = self.worker.estimate
-        primary = '' if estimate is None else estimate.primary
-        decision = self.input.receive(source, message, primary)
+        decision = self.input.receive(source.name, message)
         if decision.jump_ns > 0:
             self._start_new_graph(f'the stamps of {source.name} jumped back by '
                                   f'{decision.jump_ns * 1e-9:.3f} s', decision.released)
@@ -240,13 +248,10 @@ class Session:
                 self._use(received)
 
     def _use(self, received: ReceivedMessage) -> None:
-        """Read a message and post the measurement; publish the pose at once for odometry."""
-        measurement = self.input.read(received)
-        if measurement is None:
-            return
-        self.input.post(received.source, measurement, self.worker.post)
-        if isinstance(measurement, OdometrySample):
-            self._publish_prediction(received.source, measurement, received.message)
+        """Post the measurement of a message; publish the pose at once for odometry."""
+        self.input.post(received, self.worker.post)
+        if received.refusal is None and isinstance(received.measurement, OdometrySample):
+            self._publish_prediction(received.source, received.measurement, received.message)
 
     def _publish_prediction(self, name: str, sample: OdometrySample, message: Message) -> None:
         """Publish the newest estimate, propagated to a message of the primary odometry."""
@@ -254,29 +259,19 @@ class Session:
         covers = self._continuity[name].covers(estimate, sample)
         if estimate is None or estimate.primary != name:
             return
-        if self.input.reader.sources[name].kind is Kind.ODOMETRY:
-            self._check_frames(message)
         if covers:
             self.out.publish_pose(estimate, message, sample, self.input.reader.datum)
         elif not self.input.paused:
             self.worker.request_update()  # with this sample
-
-    def _check_frames(self, odometry: Message) -> None:
-        """Warn once if the odometry's frames differ from those of the parameters."""
-        for name, parameter, expected in (
-                (odometry.header.frame_id, 'odom_frame', self.out.odom_frame),
-                (odometry.child_frame_id, 'base_link_frame', self.out.base_frame)):
-            if frame(name) not in ('', expected):
-                self.input.warn_once(parameter, name, (
-                    f'the odometry has the frame {frame(name)!r}, but the parameter {parameter} '
-                    f'is {expected!r}: set it, or the transform is not connected to the tree'))
 
     def _on_set_pose(self, message: Message) -> None:
         """Receive a pose that a user sets."""
         answer = PAUSED if self.input.paused else self._set_pose_input.receive(
             message, early=self.worker.estimate is None)
         if answer is not None:
-            self.input.reject(SET_POSE, answer)
+            self.input.count(SET_POSE, answer)
+            logger.warning(
+                'the pose is not set: %s: %s', answer.reason, answer.detail, extra=ANSWER)
         self._set_pose()
 
     def _set_pose(self) -> None:
@@ -293,7 +288,8 @@ class Session:
         x, y, yaw = pose.pose
         what = f'({x:.3f}, {y:.3f}, {yaw:.3f}) in {self.out.map_frame}'
         if answer.status is AnswerStatus.REJECTED:
-            logger.warning('the pose is not set to %s: %s: %s', what, answer.reason, answer.detail)
+            logger.warning('the pose is not set to %s: %s: %s', what, answer.reason, answer.detail,
+                           extra=ANSWER)
         else:
             logger.info('the pose is set to %s', what)
         # asked for here, as jobs are done after an update that was asked for before
@@ -333,9 +329,12 @@ class Session:
     def _start_new_graph(self, reason: str, messages: Sequence[ReceivedMessage] = ()) -> None:
         """Start a new graph with some messages; keep the datum by parameter and /tf_static."""
         self._replace(PoseGraphBackend(self._config), f'a new graph was started: {reason}')
-        for received in messages:
-            self.input.received[received.source] += 1
-            self._use(received)
+        for source, message, *_ in messages:
+            self.input.received[source] += 1
+            # read again, as the first fix of the new graph may be its datum
+            measurement = self.input.read(source, message)
+            if measurement is not None:
+                self._use(ReceivedMessage(source, message, measurement))
 
     def load(self, saved: SavedGraph, backend: PoseGraphBackend, name: str) -> None:
         """
@@ -433,7 +432,14 @@ class Session:
         self.input.watch(status.counts, status.refusals, active=self.active)
         if self.out.transforms is not None and self.active:
             self.out.transforms.check_for_others()
+        found = list(doubts(self)) if self.active else []
+        for about, what, sentence in found:
+            self.input.warn_once(about, what, sentence)
+        self.doubts = [sentence for *_, sentence in found]
         self.energies.update(self.worker)
+        self.contradiction.update(self.worker)
+        for key, text in diagnostics.disagreements(self):
+            self.input.warn_once(key, 'disagreement', text)
         # in this order: the sentence is then at least as new as the values beside it
         values = diagnostics.values(self)
         self.out.publish_diagnostics(*diagnostics.health(self), values)

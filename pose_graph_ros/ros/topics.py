@@ -7,7 +7,7 @@ Where a topic has two types, or a quality of service is wrong, rclpy and the mid
 little to find out which parameter to correct.
 """
 
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterator, Mapping
 from typing import Any
 
 from diagnostic_msgs.msg import KeyValue
@@ -20,7 +20,7 @@ from rclpy.qos import (
     QoSReliabilityPolicy,
 )
 
-from pose_graph_ros.adapters.sources import Source
+from pose_graph_ros.adapters.sources import OUTPUTS as OUTPUT_TOPICS, source_list
 from pose_graph_ros.core.exceptions import ConfigError
 from pose_graph_ros.ros.messages import CLASSES
 from pose_graph_ros.ros.publishers import OUTPUTS
@@ -38,6 +38,7 @@ JUDGE_QOS = QoSProfile(depth=100)
 
 SET_POSE_TOPICS = ('initialpose', 'set_pose')
 JUDGE_TOPIC = '~/judge'
+OUTPUT = 'the output'
 OVERRIDES = 'qos_overrides.'  # prefix of the parameters for the quality of service
 CHOICES = {
     policy.__name__.removeprefix('QoS').removesuffix('Policy').lower():
@@ -47,7 +48,7 @@ CHOICES = {
 LARGEST_DEPTH = 2**31 - 1
 
 
-def check_topics(node: Node, sources: Iterable[Source], overrides: Mapping[str, Any]) -> None:
+def check_topics(node: Node, values: Mapping[str, Any], overrides: Mapping[str, Any]) -> None:
     """
     Raise a `ConfigError` if the node cannot have its topics as they are set.
 
@@ -56,12 +57,13 @@ def check_topics(node: Node, sources: Iterable[Source], overrides: Mapping[str, 
 
     Parameters
     ----------
+    values : mapping, all checked parameters
     overrides : mapping, values of the parameters given to the node, by name
 
     """
     used: dict[str, tuple[str, str, bool]] = {}
     entities: set[tuple[str, str]] = set()
-    for user, name, message_type, published in _endpoints(sources):
+    for user, name, message_type, published in _endpoints(values):
         topic, kind = node.resolve_topic_name(name), _type_name(message_type)
         first, other, output = used.setdefault(topic, (user, kind, published))
         if other != kind:
@@ -69,24 +71,35 @@ def check_topics(node: Node, sources: Iterable[Source], overrides: Mapping[str, 
                               f'has with {other}')
         if output != published:
             raise ConfigError(
-                f'{user}: expected a topic that the node does not publish, got {topic}')
+                f'{user}: expected a topic that the node does not publish, got {topic}, which is '
+                f'{first}{_renamed(node, first)}')
         entities.add((topic, 'publisher' if published else 'subscription'))
     for name, value in sorted(overrides.items()):
         if name.startswith(OVERRIDES):
             _check_override(name, value, entities)
 
 
-def _endpoints(sources: Iterable[Source]) -> Iterator[tuple[str, str, type, bool]]:
+def _renamed(node: Node, output: str) -> str:
+    """Return what to type so that an output has a topic of its own."""
+    for name, (topic, *_) in OUTPUT_TOPICS.items():
+        if output == f'{OUTPUT} {topic}':
+            other = f'{node.get_fully_qualified_name()}/{name}'
+            return (f': move that by {name}:={other} with ros2 launch, or by -p outputs.{name}:='
+                    f'{other} with ros2 run, instead of a remap, which can move both')
+    return ''
+
+
+def _endpoints(values: Mapping[str, Any]) -> Iterator[tuple[str, str, type, bool]]:
     """Yield who uses a topic, the topic, the type of its messages, and whether it is an output."""
-    for topic, (message_type, _) in OUTPUTS.items():
-        yield f'the output {topic}', topic, message_type, True
+    for name, (topic, *_) in OUTPUT_TOPICS.items():
+        yield f'{OUTPUT} {topic}', values[f'outputs.{name}'], OUTPUTS[topic][0], True
     if TFMessage is not None:
-        yield f'the output {TOPIC}', TOPIC, TFMessage, True
+        yield f'{OUTPUT} {TOPIC}', TOPIC, TFMessage, True
         yield f'the input {STATIC_TOPIC}', STATIC_TOPIC, TFMessage, False
     for topic in SET_POSE_TOPICS:
         yield f'the input {topic}', topic, PoseWithCovarianceStamped, False
     yield f'the input {JUDGE_TOPIC}', JUDGE_TOPIC, KeyValue, False
-    for source in sources:
+    for source in source_list(values):
         yield f'parameter {source.name}.topic', source.topic, CLASSES[source.kind], False
 
 

@@ -17,6 +17,7 @@ from pose_graph_ros.adapters import output_cdr
 from pose_graph_ros.adapters.conversions import frame, stamp_ns
 from pose_graph_ros.core.geometry.se2 import FloatArray
 from pose_graph_ros.ros.spinning import guarded
+from pose_graph_ros.ros.surroundings import other_publishers
 
 try:
     from tf2_msgs.msg import TFMessage
@@ -112,12 +113,14 @@ class TransformPublisher:
             if frame(transform.child_frame_id) != self._odom_frame or (
                     stamp_ns(transform), t.translation.x, t.rotation.z) in self._own:
                 continue
+            names = ' or '.join(other_publishers(self._node, TOPIC))
+            names = names and f', by {names}'
             wrong = '' if parent == self._map_frame else ', so that it has two parents'
             self.other = (
                 f'another node publishes {parent} -> {self._odom_frame} on '
-                f'{self._node.resolve_topic_name(TOPIC)}{wrong}: set publish_tf of one of the two '
-                'to false; if it is that of another robot, give each a namespace and its own '
-                'tf, with remap_tf:=true of the launch file or -r /tf:=tf '
+                f'{self._node.resolve_topic_name(TOPIC)}{names}{wrong}: set publish_tf of one of '
+                'the two to false; if it is that of another robot, give each a namespace and its '
+                'own tf, with remap_tf:=true of the launch file or -r /tf:=tf '
                 '-r /tf_static:=tf_static')
             self._on_other(self.other)
             return

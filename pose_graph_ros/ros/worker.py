@@ -25,6 +25,7 @@ from pose_graph_ros.core.measurements import AnswerStatus, Measurement, Odometry
 from pose_graph_ros.core.odometry.agreement import Difference
 from pose_graph_ros.core.sources.source_report import SourceReport
 from pose_graph_ros.ros.announcements import Announcer
+from pose_graph_ros.ros.refusals import INTENDED
 
 logger = logging.getLogger(__name__)
 
@@ -94,6 +95,7 @@ class Worker:
         self._revision = backend.revision
         self._solves, self._solve_total, self._solve_max = 0, 0.0, 0.0
         self._warned: set[tuple[str, str]] = set()
+        self._jumps = _numbers_of_jumps(backend)
         self._announcer = Announcer()
         self.estimate: Estimate | None = None  # the newest, without its path; replaced as a whole
         self.status = WorkerStatus()  # the newest status; replaced as a whole
@@ -105,7 +107,7 @@ class Worker:
 
     def adopt(self, backend: PoseGraphBackend) -> None:
         """Run another backend; only for `prepare`, as nothing has been added yet."""
-        self._backend = backend
+        self._backend, self._jumps = backend, _numbers_of_jumps(backend)
 
     @property
     def alive(self) -> bool:
@@ -283,8 +285,8 @@ class Worker:
         """Log why a measurement is rejected, the first time for each source and reason."""
         if (source, reason) not in self._warned:
             self._warned.add((source, reason))
-            logger.warning(
-                '%s: %s: %s (logged once, counted in diagnostics)', source, reason, detail)
+            logger.log(logging.INFO if reason in INTENDED else logging.WARNING,
+                       '%s: %s: %s (logged once, counted in diagnostics)', source, reason, detail)
 
     def _update(self, update: Callable[[], UpdateReport]) -> UpdateReport:
         start = time.monotonic()
@@ -315,6 +317,10 @@ class Worker:
         status, backend = self.status, self._backend
         for (source, reason), detail in backend.refusals.items():
             self._warn_once(source, reason, detail)  # also those that had to wait for odometry
+        for source, stream in backend.odometry.items():
+            if stream.n_jumps > self._jumps.get(source, 0):
+                logger.warning('%s jumped %s: its motion there is not used', source, stream.jump)
+            self._jumps[source] = stream.n_jumps
         changes, verdicts = backend.verdict_changes(), backend.verdict_totals()
         for level, text in self._announcer.lines(
                 changes, verdicts, time.monotonic(), flush=ends):
@@ -331,3 +337,7 @@ class Worker:
             differences=backend.gyro_differences(),
             verdicts=verdicts, n_changes=status.n_changes + len(changes))
         return len(changes)
+
+
+def _numbers_of_jumps(backend: PoseGraphBackend) -> dict[str, int]:
+    return {source: stream.n_jumps for source, stream in backend.odometry.items()}

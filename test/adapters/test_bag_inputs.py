@@ -47,6 +47,10 @@ def bag(**topics: str) -> SimpleNamespace:
     (bag(o='odom', f='fix', p='global_pose'), {'fix': '/f'}, {'odom': '/o', 'fix': '/f'}),
     (bag(o='odom', f='fix', p='global_pose'), {'fix': '/f', 'global_pose': '/p'},
      {'odom': '/o', 'fix': '/f', 'global_pose': '/p'}),
+    (bag(o='odom', ground_truth='odom', gt='odom'), {}, {'odom': '/o'}),
+    (bag(o='odom', truth='global_pose', robot_gt='odom', gtx='fix'), {},
+     {'odom': '/o', 'fix': '/gtx'}),
+    (bag(truth='odom'), {'odom': '/truth'}, {'odom': '/truth'}),
     (bag(o='odom', p='odom', c='loop_closure'), {'odom': '/p', 'loop_closure': '/c'},
      {'odom': '/p', 'loop_closure': '/c'}),
 ])
@@ -109,12 +113,13 @@ def test_a_topic_that_the_parameters_name_is_taken_before_a_guess() -> None:
 
 
 def test_the_topic_of_the_truth_is_no_guess() -> None:
-    reader = bag(o='odom', truth='odom')
-    assert choose_inputs(reader, SOURCES, {}, truth='/truth').topics == {'odom': '/o'}
-    assert choose_inputs(reader, SOURCES, {'odom': '/truth'}, truth='/truth').topics == {
-        'odom': '/truth'}
-    with pytest.raises(BagError, match='but that of the truth, /truth; the bag has'):
-        choose_inputs(bag(truth='odom'), SOURCES, {}, truth='/truth')
+    reader = bag(o='odom', t='odom')
+    assert choose_inputs(reader, SOURCES, {}, truth='/t').topics == {'odom': '/o'}
+    assert choose_inputs(reader, SOURCES, {'odom': '/t'}, truth='/t').topics == {'odom': '/t'}
+    with pytest.raises(BagError, match='but that of the truth, /t; the bag has'):
+        choose_inputs(bag(t='odom'), SOURCES, {}, truth='/t')
+    with pytest.raises(BagError, match='for the odometry; the bag has /gt'):
+        choose_inputs(bag(gt='odom'), SOURCES, {})
 
 
 def test_an_option_for_a_source_that_is_not_there_says_so() -> None:

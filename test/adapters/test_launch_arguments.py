@@ -8,13 +8,15 @@ import pytest
 
 from pose_graph_ros.adapters.launch_arguments import (
     arguments,
+    display_remappings,
     parameter_file,
     parameters,
     remappings,
     switch,
+    unknown,
 )
 from pose_graph_ros.adapters.parameters import all_parameters
-from pose_graph_ros.adapters.sources import KNOWN_SOURCES
+from pose_graph_ros.adapters.sources import KNOWN_SOURCES, OUTPUTS
 from pose_graph_ros.core.exceptions import ConfigError
 
 TREE = Path(__file__).resolve().parents[2]
@@ -24,7 +26,7 @@ TF = [('/tf', 'tf'), ('/tf_static', 'tf_static')]
 
 def test_defaults_leave_everything_to_the_parameter_file() -> None:
     assert parameters(DEFAULTS) == {}
-    assert all(topic in (new, f'/{new}') for topic, new in remappings(DEFAULTS))
+    assert remappings(DEFAULTS) == display_remappings(DEFAULTS) == TF
     assert parameter_file(DEFAULTS) == str(TREE / 'config' / 'pose_graph.yaml')
     assert Path(DEFAULTS['rviz_config']).is_file()
     assert not switch(DEFAULTS, 'rviz')
@@ -55,9 +57,32 @@ def test_anything_else_is_refused(name: str, text: str) -> None:
 
 def test_tf_is_that_of_the_namespace_unless_refused() -> None:
     assert remappings(DEFAULTS)[-2:] == TF
-    without = remappings({**DEFAULTS, 'remap_tf': 'False', 'path': '/p'})
-    assert not set(TF) & set(without)
-    assert ('path', '/p') in without
+    assert remappings({**DEFAULTS, 'remap_tf': 'False'}) == []
+
+
+@pytest.mark.parametrize('output', OUTPUTS)
+def test_an_output_is_moved_without_moving_an_input_of_the_same_name(output: str) -> None:
+    given = {**DEFAULTS, output: '/new', 'odom': f'/{OUTPUTS[output][0]}'}
+    assert parameters(given) == {f'outputs.{output}': '/new', 'odom.topic': given['odom']}
+    assert remappings(given) == TF, 'a remap would move both'
+    assert (OUTPUTS[output][0], '/new') in display_remappings(given), 'RViz has no such parameter'
+    assert f'outputs.{output}' in {parameter.name for parameter in all_parameters({})}
+
+
+@pytest.mark.parametrize('text', ['[odom, fix]', 'odom,fix', "['odom', \"fix\"]", ' odom fix '])
+def test_sources_are_an_argument(text: str) -> None:
+    assert parameters({**DEFAULTS, 'sources': text}) == {'sources': ['odom', 'fix']}
+    with pytest.raises(ConfigError, match=r"argument sources: expected names, got '\[\]'"):
+        parameters({**DEFAULTS, 'sources': '[]'})
+
+
+def test_an_argument_that_launch_would_pass_over_is_told() -> None:
+    assert unknown(['odom:=/o', 'fix:=/f', 'file.launch.py'], DEFAULTS, included=False) == []
+    assert unknown(['odmo:=/o', 'speed:=3'], DEFAULTS, included=False) == [
+        'argument odmo is not known and has no effect: did you mean odom?',
+        'argument speed is not known and has no effect: --show-args lists all']
+    # another launch file may have a `speed` of its own
+    assert len(unknown(['odmo:=/o', 'speed:=3'], DEFAULTS, included=True)) == 1
 
 
 def test_a_parameter_file_that_is_not_there_is_refused(tmp_path: Path) -> None:

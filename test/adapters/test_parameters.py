@@ -29,7 +29,14 @@ from pose_graph_ros.adapters.parameters import (
     PARAMETERS,
     SOURCE_PARAMETERS,
 )
-from pose_graph_ros.adapters.sources import backend_config, Kind, SET_POSE, Source, source_list
+from pose_graph_ros.adapters.sources import (
+    backend_config,
+    Kind,
+    OUTPUTS,
+    SET_POSE,
+    Source,
+    source_list,
+)
 from pose_graph_ros.core.config import (
     BackendConfig,
     Correlation,
@@ -86,7 +93,9 @@ def test_every_parameter_says_when_it_changes() -> None:
     changes = {parameter.name: parameter.change for parameter in all_parameters(
         {'sources': ['odom', 'global_pose', 'fix', 'imu', 'gyro']})}
     taken = {name.rpartition('.')[2] if '.' in name else name
-             for name, change in changes.items() if change is Change.UNCONFIGURED}
+             for name, change in changes.items() if change is Change.UNCONFIGURED
+             and not name.startswith('outputs.')}
+    assert {changes[f'outputs.{name}'] for name in OUTPUTS} == {Change.UNCONFIGURED}
     assert taken == {'map_frame', 'odom_frame', 'base_link_frame', 'datum', 'wait_for_datum',
                      'topic', 'noise', 'correlation_time', 'correlation_model', 'white_share',
                      'load_graph_on_start', 'integrate', 'sigma_bias', 'sigma_bias_walk',
@@ -196,7 +205,7 @@ def test_a_name_that_is_not_known_has_to_have_a_type() -> None:
      r'fix\.sigma_ceiling: expected at least'),
     ({'fix.sigma_floor': [0.1, 3.0]}, r'fix\.sigma_floor: expected less'),
     ({'datum': [95.0, 10.0]}, r'datum: expected latitude'),
-    ({'map_frame': ''}, 'map_frame, .* expected three different names'),
+    ({'map_frame': ''}, "parameter map_frame: expected the name of a frame, got ''"),
     ({'map_frame': '/odom'}, 'map_frame, .* expected three different names')])
 def test_values_that_do_not_go_together_are_refused(values: dict[str, object], said: str) -> None:
     with pytest.raises(ConfigError, match=said):

@@ -20,6 +20,7 @@ from pose_graph_ros.cli.evaluation import (
     evaluate,
     format_table,
     place_odometry,
+    place_truth,
     summary,
 )
 from pose_graph_ros.cli.picture import BLUE, draw_drive, GREEN, VERMILION
@@ -107,6 +108,26 @@ def test_rows_of_a_hand_made_drive() -> None:
     assert rows['corrected path to fixes used'].median == pytest.approx(0.5)
     assert rows['corrected path to fixes held out'].median == pytest.approx(2.0)
     assert rows['corrected path to fixes held out'].maximum == pytest.approx(2.5)
+
+
+def test_a_truth_in_another_map_gives_path_and_odometry_the_same_errors() -> None:
+    """As where a part of a recording is replayed: the map begins at another fix."""
+    drive = hand_made_drive()
+    bent = drive.corrected.poses + np.column_stack((
+        np.zeros(11), 0.3 * np.sin(np.arange(11.0)), np.zeros(11)))
+    drive = replace(drive, corrected=Trajectory(drive.corrected.stamps_ns, bent))
+    truth = straight()
+    elsewhere = replace(drive, truth=Trajectory(
+        truth.stamps_ns, se2.compose(np.array((280.0, -35.0, 2.0)), truth.poses)))
+    placed = [place_truth(each) for each in (drive, elsewhere)]
+    rows = [evaluate(each) for each in placed]
+    for one, other in zip(*rows, strict=True):
+        assert one.rms == pytest.approx(other.rms, abs=1e-6)
+    assert max(row.rms for row in rows[1] if row.name == 'corrected path to truth') < 0.3
+    assert placed[1].truth_moved is not None
+    assert placed[1].truth_moved[0] == pytest.approx(282.0, abs=15.0)
+    assert placed[1].truth_moved[1] == pytest.approx(2.0, abs=0.1)
+    assert place_truth(without_truth(drive)).truth_moved is None
 
 
 def test_what_is_doubted_is_no_reference_and_counted_apart() -> None:

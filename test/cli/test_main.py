@@ -3,6 +3,7 @@
 """The command `pose-graph`: its tools, and those of them that need no module of their own."""
 
 from pathlib import Path
+import signal
 import subprocess
 import sys
 
@@ -12,7 +13,7 @@ import pytest
 from pose_graph_ros import __version__
 from pose_graph_ros.adapters.bags import open_bag
 from pose_graph_ros.adapters.parameter_texts import as_markdown, as_yaml, sources_as_markdown
-from pose_graph_ros.cli.main import main, SUMMARIES
+from pose_graph_ros.cli.main import guarded, main, SUMMARIES
 from pose_graph_ros.cli.simulate import simulate_drive
 
 TOOLS = tuple(SUMMARIES)
@@ -112,3 +113,39 @@ def test_a_drive_is_simulated_once(
     # what is there is not overwritten
     assert main(['simulate', str(folder)]) == 2
     assert capsys.readouterr().err == f'error: {folder}: exists already, not overwritten\n'
+
+
+INTERRUPTED_IN_THE_COMPILER = """
+import ctypes, os, signal, sys, time
+from pose_graph_ros.cli.main import guarded
+
+signal.signal(signal.SIGINT, signal.default_int_handler)    # a job in the background ignores it
+hook = {}
+exec(compile('def notify():\\n    kill(pid, number)\\n    for _ in range(1000): pass\\n',
+             '/site-packages/llvmlite/binding/executionengine.py', 'exec'),
+     {'kill': os.kill, 'pid': os.getpid(), 'number': signal.SIGINT, 'range': range}, hook)
+
+def run():
+    ctypes.CFUNCTYPE(None)(hook['notify'])()
+    time.sleep(20.0)
+    return 0
+
+sys.exit(guarded(run))
+"""
+
+
+def test_ctrl_c_while_the_compiler_calls_back_ends_a_tool_without_a_word() -> None:
+    done = subprocess.run([sys.executable, '-c', INTERRUPTED_IN_THE_COMPILER], check=False,
+                          capture_output=True, text=True, timeout=15)
+    assert (done.returncode, done.stdout, done.stderr) == (130, '', '')
+
+
+def test_ctrl_c_is_as_before_after_a_tool() -> None:
+    before = signal.getsignal(signal.SIGINT)
+    try:
+        for handler in (signal.default_int_handler, signal.SIG_IGN):
+            signal.signal(signal.SIGINT, handler)
+            assert guarded(lambda: 3) == 3
+            assert signal.getsignal(signal.SIGINT) is handler
+    finally:
+        signal.signal(signal.SIGINT, before)

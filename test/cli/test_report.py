@@ -87,6 +87,41 @@ def test_a_bag_is_replayed_first(
     assert sum(data['fixes'][0]['held_out']) == len(data['errors']['t'])
     assert 0.0 < max(data['errors']['position']) < 0.5
 
+def test_page_summary_and_messages_count_measurements_alike(tmp_path: Path) -> None:
+    """Duplicates, and what came before odometry, are refused: they are in no other count."""
+    bag, out = tmp_path / 'bag', tmp_path / 'out'
+    assert main(['simulate', str(bag), '--world', 'hall', '--duration', '120', '--fix',
+                 '--duplicate', '/gps/fix:0.2', '--jump', '/gps/fix:60:30,0:10']) == 0
+    assert run(bag, '--odom', '/odom', '--fix', '/gps/fix', '--run', out) == 0
+    summary = json.loads((out / 'summary.json').read_text('utf-8'))
+    data = json.loads((out / 'run.json').read_text('utf-8'))
+    accepted = summary['counts']['fix.accepted']
+    assert sum(count for name, count in summary['counts'].items()
+               if name.startswith('fix.')) > accepted
+    assert summary['fixes_used'] + summary['fixes_doubted'] == accepted
+    source = next(each for each in data['sources'] if each['name'] == 'fix')
+    assert (source['count'], source['used']) == (accepted, summary['fixes_used'])
+    states = data['fixes'][0]['state']
+    assert len(states) - states.count(data['states'].index('refused')) == accepted
+    assert states.count(data['states'].index('refused')) == summary['fixes_refused'] > 0
+    assert sum(summary['judged']['sources']['fix']['states'].values()) == accepted
+
+
+@pytest.mark.parametrize(('mounting', 'told'), [('down', True), ('up', False)])
+def test_a_gyroscope_that_is_mounted_wrongly_is_a_finding(
+    tmp_path: Path, mounting: str, told: bool,
+) -> None:
+    assert main(['simulate', str(tmp_path / 'drive'), '--duration', '100', '--gyro',
+                 '--closures', '0']) == 0
+    # with so wrong a gyroscope the final optimisation need not converge
+    main(['replay', str(tmp_path / 'drive'), '--odom', '/odom', '-o', str(tmp_path / 'out'),
+          '-p', 'sources:=[odom, fix, gyro]', '-p', f'gyro.mounting:={mounting}'])
+    findings = json.loads((tmp_path / 'out' / 'run.json').read_text('utf-8'))['findings']
+    blamed = [each for each in findings if each['anchor'] == 'source-gyro'
+              and each['level'] == 'warning']
+    assert len(blamed) == told
+    assert all('the other way' in each['text'] for each in blamed)
+
 
 @pytest.mark.skipif(not FALSE_LOOPS.is_dir(), reason=f'no {FALSE_LOOPS}')
 def test_wrong_closures_of_a_recording_are_told(

@@ -369,6 +369,49 @@ def test_the_scheme_is_that_of_the_reader_until_it_is_chosen(show, made) -> None
     assert page.locator('nav').is_hidden()
 
 
+def test_a_printed_page_has_its_charts_and_the_whole_map(show, made) -> None:
+    opened = show(made)
+    page, before = opened.page, opened.view()
+    # at once, as nothing is painted any more while the browser prints
+    painted = page.evaluate("""(() => {
+        window.dispatchEvent(new Event('beforeprint'));
+        return [...document.querySelectorAll('.plot canvas:first-child, #map-canvas')].map(
+          (canvas) => [canvas.getContext('2d').getImageData(0, 0, canvas.width, canvas.height)
+            .data.some((value) => value > 0), canvas.width - 2 * canvas.clientWidth,
+          canvas.clientWidth]);
+    })()""")
+    assert all(some and abs(apart) <= 2 and width < 700 for some, apart, width in painted)
+    page.emulate_media(media='print')
+    # no canvas of a chart hides another, and headings stay with what follows them
+    assert page.locator('.plot canvas:visible').count() == page.locator('.plot').count() > 0
+    assert page.evaluate('getComputedStyle(document.querySelector("h2")).breakAfter') == 'avoid'
+    page.emulate_media(media='screen')
+    page.evaluate('window.dispatchEvent(new Event("afterprint"))')
+    opened.settle()
+    opened.settle()
+    assert opened.view() == pytest.approx(before, rel=1e-6)
+
+
+def test_ellipses_that_lie_on_one_another_are_not_all_painted(show, made) -> None:
+    """Else they are a blot that hides the path, as of a drive without measurements in the map."""
+    opened = show(made)
+    strokes = opened.page.evaluate("""(() => {
+        let count = 0;
+        const context = {beginPath() {}, fill() {}, stroke() {}, ellipse() { count += 1; }};
+        const view = {scale: 1, toScreen: (x, y) => [x, y]};
+        const of = (sigma) => ({x: [...Array(50).keys()].map((k) => 4 * k), y: Array(50).fill(50),
+          xx: Array(50).fill(sigma ** 2), xy: Array(50).fill(0), yy: Array(50).fill(sigma ** 2)});
+        return [1, 40].map((sigma) => {
+          count = 0;
+          paintEllipses({ellipses: of(sigma), factor: 1}, context,
+            {view, width: 400, height: 100});
+          return count;
+        });
+    })()""")
+    assert strokes[0] == 50
+    assert 2 <= strokes[1] <= 4
+
+
 @pytest.mark.parametrize('width', [WIDE, NARROW])
 def test_hostile_texts_are_shown_as_texts(show, width) -> None:
     data = example(poses=60, fixes=40, closures=12, title=HOSTILE + '\ud800')

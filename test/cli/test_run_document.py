@@ -14,7 +14,7 @@ from run_schema import problems
 
 from pose_graph_ros.adapters.parameters import checked
 from pose_graph_ros.adapters.sources import Kind
-from pose_graph_ros.cli.evaluation import Drive, evaluate
+from pose_graph_ros.cli.evaluation import Drive, evaluate, place_truth
 from pose_graph_ros.cli.replay import run_measurements
 from pose_graph_ros.cli.run import places
 from pose_graph_ros.cli.run.content import Run
@@ -44,11 +44,11 @@ def run_of(*settings: tuple[str, Any], **of_drive: Any) -> dict[str, Any]:
     estimate, stamps = backend.estimate(), drive.truth.stamps_ns
     assert estimate is not None
     fixes = drive.fix_at[:len(drive.fix_at) * drive.fixes]
-    compared = Drive(
+    compared = place_truth(Drive(
         drive.odometry, stamps[fixes], drive.positions[:len(fixes)],
         np.zeros(len(fixes), dtype=bool), estimate.path, drive.truth, stamps[drive.closure_at],
         fix_sources=['global_pose'] * len(fixes),
-        loop_sources=['loop_closure'] * len(drive.closure_at))
+        loop_sources=['loop_closure'] * len(drive.closure_at)))
     kinds = {'odom': Kind.ODOMETRY, 'global_pose': Kind.GLOBAL_POSE,
              'loop_closure': Kind.LOOP_CLOSURE}
     # as it is read from the file
@@ -182,10 +182,18 @@ def test_false_closures_are_found() -> None:
 
 def test_without_anything_in_the_map_that_is_said() -> None:
     found = run_of(fixes=False)
-    first, second = texts(found, 'notice')
-    assert first.startswith('nothing was measured in the map')
-    assert 'may be in another frame' in second
-    assert not any('odometry alone' in text for text in texts(found, 'good', 'notice'))
+    notice, = texts(found, 'notice')
+    assert notice.startswith('nothing was measured in the map')
+    # path and odometry are compared alike, each where it fits the truth best
+    text, = (text for text in texts(found, 'good') if 'rms from the truth' in text)
+    assert 'odometry alone' in text
+    assert max(found['errors']['position']) < 10.0
+
+
+def test_a_path_that_is_worse_than_odometry_alone_is_not_called_good() -> None:
+    found = run_of(WHITE, ('odom.sigma_scale', 5.0), times=4.0, odometry_times=0.01, closures=0)
+    assert any('rms from the truth' in text for text in texts(found, 'warning'))
+    assert not any('rms from the truth' in text for text in texts(found, 'good', 'notice'))
 
 
 def test_a_line_keeps_within_the_tolerance_of_all_points() -> None:
@@ -271,3 +279,15 @@ def test_a_silence_of_one_of_two_odometries_does_not_hide_the_motion() -> None:
     del kinds['wheels'], recorder.arrivals['wheels']
     (_, text, _), _ = silences(recorder, kinds, 0)
     assert text.endswith('the motion there is not known')
+
+
+@pytest.mark.parametrize('source', ['odom', 'fix'])
+def test_a_silence_is_a_warning_from_20_s_on_as_the_docs_say(source: str) -> None:
+    for length, level in ((7, 'notice'), (25, 'warning')):
+        recorder = Recorder()
+        for tenth in (*range(10, 110), *range(109 + 10 * length, 210 + 10 * length)):
+            recorder.add_measurement(source, tenth * SECOND // 10)
+        (found, text, _), = silences(recorder, {
+            'odom': Kind.ODOMETRY, 'fix': Kind.FIX}, SECOND)
+        assert found == level
+        assert f'({length} s at most)' in text

@@ -24,7 +24,6 @@ WRONG = {
     'twice': ('VERTEX_SE2 0 1 0 0', ':3: vertex 0 is in the file twice'),
     'id': (f'EDGE_SE2 1 {LARGEST + 1} 1 0 0 {I}',
            ':3: EDGE_SE2: expected ids of at most 64 bits, got 9223372036854775808'),
-    'itself': (f'EDGE_SE2 1 1 1 0 0 {I}', ':3: .* from a node to itself'),
     'landmark': ('LANDMARK 0 0 1 1 5 0', ':3: LANDMARK is followed by 7 numbers, got 6'),
     'fix': ('FIX 4', ':3: FIX 4: there is no such vertex'),
 }
@@ -135,3 +134,36 @@ def test_landmarks_of_isam(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -
     assert values['chi2'] > 1e-3
     assert values['chi2'] == pytest.approx(solved(same, capsys)['chi2'], rel=1e-9)
     np.testing.assert_array_equal(read_g2o(path, 'isam').graph.is_pose, [True] * 3 + [False] * 2)
+
+
+def test_an_edge_from_a_node_to_itself_is_skipped_with_one_warning(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str],
+) -> None:
+    path = tmp_path / 'graph.g2o'
+    one = '1 0 0 1 0 1'
+    path.write_text(f'EDGE_SE2 0 1 1 0 0 {one}\nEDGE_SE2 1 1 0 0 0 {one}\n'
+                    f'EDGE_SE2 0 0 1 0 0 {one}\n', encoding='ascii')
+    assert main(['solve', str(path)]) == 0
+    out, err = capsys.readouterr()
+    assert '2 hidden nodes, 1 edges' in out
+    assert err == f'warning: {path}: 2 edges from a node to itself are skipped\n'
+
+
+def test_a_graph_in_space_is_said_to_be_one(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str],
+) -> None:
+    path = tmp_path / 'sphere.g2o'
+    path.write_text('VERTEX_SE3:QUAT 0 0 0 0 0 0 0 1\n', encoding='ascii')
+    assert main(['solve', str(path)]) == 2
+    assert '3D), which is not supported' in capsys.readouterr().err
+
+
+def test_a_toro_file_is_replayed_and_reported_as_it_is_solved(tmp_path: Path) -> None:
+    path = tmp_path / 'drive.graph'
+    path.write_text(''.join(f'EDGE2 {k} {k + 1} 1 0 0.1 100 0 100 400 0 0\n' for k in range(9)),
+                    encoding='ascii')
+    assert main(['replay', str(path), '-o', str(tmp_path / 'run')]) == 0
+    assert len((tmp_path / 'run' / 'path.tum').read_text().splitlines()) >= 10
+    assert main(['report', str(path), '--run', str(tmp_path / 'again'), '-o',
+                 str(tmp_path / 'page.html')]) == 0
+    assert (tmp_path / 'page.html').stat().st_size > 10_000

@@ -7,6 +7,7 @@ import io
 import json
 import os
 from pathlib import Path
+import re
 from typing import Any
 
 from helpers.noisy_drive import made, write
@@ -58,6 +59,39 @@ def test_the_node_takes_the_file(tuned: tuple[Path, dict[str, Any]], tmp_path: P
     assert main(['replay', bag, '--params-file', str(path), '-o', str(tmp_path / 'out')]) == 0
     given = {each['name'] for each in facts['parameters'] if each['changed']}
     assert given == {f'{source}.{name}' for source, of in content.items() for name in of}
+
+
+def test_no_file_is_written_where_nothing_becomes_better(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str],
+) -> None:
+    bag, out = write(tmp_path / 'bag', *made(4, 60), claimed=1.0), tmp_path / 'tuned.yaml'
+    out.write_text('from before')
+    assert main(['tune', str(bag), '-o', str(out), '--folds', '2']) == 1
+    assert out.read_text() == 'from before'
+    assert 'nothing is written' in capsys.readouterr().out
+    assert main(
+        ['tune', str(bag), '-o', str(tmp_path / 'new.yaml'), '--folds', '2', '--json']) == 1
+    assert not (tmp_path / 'new.yaml').exists()
+    assert json.loads(capsys.readouterr().out)['file'] is None
+
+
+def test_a_part_of_a_bag_can_be_tuned_with(
+    overconfident: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str],
+) -> None:
+    main(['tune', str(overconfident), '--from', '30', '--until', '90', '--folds', '2', '--json',
+          '-o', str(tmp_path / 'tuned.yaml')])
+    assert 50 <= json.loads(capsys.readouterr().out)['before']['n'] <= 60
+
+
+def test_progress_has_a_total(
+    overconfident: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str],
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr('sys.stderr.isatty', lambda: True)
+    main(['tune', str(overconfident), '--folds', '2', '-o', str(tmp_path / 'tuned.yaml')])
+    steps = re.findall(r'step (\d+) of (\d+): ', capsys.readouterr().err)
+    assert [int(step) for step, _ in dict.fromkeys(steps)] == list(range(1, len(set(steps)) + 1))
+    assert steps[-1][0] == steps[-1][1]
 
 
 @pytest.mark.parametrize(('args', 'message'), [

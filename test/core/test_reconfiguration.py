@@ -201,7 +201,7 @@ def test_edges_have_the_noise_that_is_set_when_they_are_made(wanted: BackendConf
     backend.configure(wanted)
     # so has what is not an edge yet: the way from the newest node to the robot
     assert backend.estimate().covariance[0, 0] >= anchor[0, 0]
-    assert backend.estimate().noise == wanted.odometry['odom'].noise
+    assert backend.estimate().odometry.noise == wanted.odometry['odom'].noise
     feed(backend, samples[150:])
     np.testing.assert_array_equal(edges(backend), np.concatenate((old[:made], new[made:])))
     assert not np.any(old[made:] == new[made:], axis=(1, 2)).all()

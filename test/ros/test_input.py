@@ -14,7 +14,7 @@ from pose_graph_ros.adapters.parameters import checked
 from pose_graph_ros.core.measurements import Fix, GlobalPose, OdometrySample
 from pose_graph_ros.ros import input as input_module
 from pose_graph_ros.ros.input import Input, LONGEST_DOUBT
-from pose_graph_ros.ros.time_jump import Decision, EVIDENCE
+from pose_graph_ros.ros.time_jump import Decision
 
 SECOND = 1_000_000_000
 
@@ -78,15 +78,13 @@ class Given:
         self.input = Input(checked(self.values), self.log.append)
         self.engine = Engine(limit)
 
-    def receive(self, source: str, message: object, primary: str = '') -> Decision:
-        return self.input.receive(self.input.reader.sources[source], message, primary)
+    def receive(self, source: str, message: object) -> Decision:
+        return self.input.receive(source, message)
 
     def use(self, source: str, message: object) -> None:
         """Do with a message what the node does, but for jumps of time."""
         for received in self.receive(source, message).released:
-            measurement = self.input.read(received)
-            if measurement is not None:
-                self.input.post(received.source, measurement, self.engine.post)
+            self.input.post(received, self.engine.post)
 
     def rejected(self) -> dict[str, int]:
         return {f'{source}.{reason}': count
@@ -203,15 +201,71 @@ def test_messages_are_held_back_while_a_jump_of_time_is_in_doubt() -> None:
     given = Given()
     for step in range(20):
         given.receive('odom', odometry(100.0 + 0.1 * step))
-    sent = [('odom', odometry(50.0 + 0.1 * step)) for step in range(EVIDENCE)]
+    sent = [('odom', odometry(50.0 + 0.1 * step)) for step in range(11)]
     sent.insert(2, ('fix', fix(50.15)))
     decisions = [given.receive(source, message) for source, message in sent]
-    assert [len(decision.released) for decision in decisions] == [0] * EVIDENCE + [EVIDENCE + 1]
-    assert [decision.jump_ns > 0 for decision in decisions] == [False] * EVIDENCE + [True]
+    assert [len(decision.released) for decision in decisions] == [0] * 11 + [12]
+    assert [decision.jump_ns > 0 for decision in decisions] == [False] * 11 + [True]
     assert decisions[-1].jump_ns == round(51.9 * SECOND)
     assert [(each.source, each.message) for each in decisions[-1].released] == sent
     # held back or not, all of them have come
-    assert given.input.received == {'odom': 25, 'fix': 1}
+    assert given.input.received == {'odom': 31, 'fix': 1}
+
+
+def test_messages_that_are_not_finite_are_no_evidence_of_another_time() -> None:
+    given = Given()
+    for step in range(20):
+        given.use('odom', odometry(100.0 + 0.1 * step))
+    for step in range(60):
+        assert given.receive('odom', not_finite(50.0 + 0.1 * step)) == Decision([])
+    given.use('odom', odometry(102.0))
+    assert given.input.posted == 21
+
+
+@pytest.mark.parametrize(('ahead', 'told'), [(100.0, True), (18.0, True), (3.0, False)])
+def test_fixes_ahead_of_odometry_are_told_once_with_what_to_do(ahead: float, told: bool) -> None:
+    given = Given()
+    for step in range(200):
+        given.use('odom', odometry(100.0 + 0.1 * step))
+        if step % 5 == 0:
+            given.use('fix', fix(100.0 + 0.1 * step + ahead))
+    assert given.input.delays.seconds == {'fix': pytest.approx(-ahead)}
+    assert len(given.log) == len(given.input.delays.wrong) == told
+    if told:
+        assert f'stamps of fix are {ahead:.1f} s ahead of those of odom' in given.log[0]
+        assert 'fix.time_offset' in given.log[0]
+    given.input.configure(checked({'fix.time_offset': -ahead}))
+    given.use('fix', fix(120.0 + ahead))
+    assert given.input.delays.wrong == {}
+
+
+def test_fixes_while_odometry_is_silent_are_not_called_ahead() -> None:
+    given = Given()
+    given.use('odom', odometry(100.0))
+    for step in range(60):
+        given.use('fix', fix(100.0 + step))
+    assert given.log == []
+
+
+def test_late_fixes_are_no_mistake_but_odometry_that_is_apart_is() -> None:
+    given = Given(sources=['odom', 'visual', 'fix'], visual__type='odometry')
+    for step in range(200):
+        given.use('odom', odometry(100.0 + 0.1 * step))
+        given.use('visual', odometry(70.0 + 0.1 * step))
+        given.use('fix', fix(60.0 + 0.1 * step))
+    assert list(given.input.delays.wrong) == ['visual']
+    assert '30.0 s behind those of odom' in given.log[0]
+
+
+def test_an_odometry_one_hour_ahead_does_not_get_in_and_is_named() -> None:
+    given = Given(sources=['odom', 'visual', 'fix'], visual__type='odometry')
+    for step in range(100):
+        given.use('odom', odometry(100.0 + 0.1 * step))
+        given.use('visual', odometry(3700.0 + 0.1 * step))
+    assert {source for source, _ in given.engine.posted} == {'odom'}
+    assert given.rejected() == {'visual.stamp_leap': 100}
+    assert '3600.0 s ahead of the stamps of odom' in given.log[0]
+    assert 'visual.time_offset' in given.log[0]
 
 
 def test_messages_that_are_held_back_are_released_after_a_while(clock: Clock) -> None:
@@ -224,26 +278,6 @@ def test_messages_that_are_held_back_are_released_after_a_while(clock: Clock) ->
     clock.now += 0.2 * LONGEST_DOUBT
     assert [received.source for received in given.input.release_overdue()] == ['odom', 'fix']
     assert given.input.release_overdue() == []
-
-
-def test_only_the_primary_odometry_is_evidence_of_a_jump() -> None:
-    given = Given(sources=['odom', 'visual'], visual__type='odometry')
-    for step in range(20):
-        given.receive('odom', odometry(100.0 + 0.1 * step), 'odom')
-    for step in range(2 * EVIDENCE):
-        decision = given.receive('visual', odometry(50.0 + 0.1 * step), 'odom')
-        assert (len(decision.released), decision.jump_ns) == (1, 0)
-    assert len(given.receive('odom', odometry(50.0), 'odom').released) == 0
-
-
-def test_before_an_odometry_is_primary_each_of_two_is_watched() -> None:
-    given = Given(sources=['odom', 'visual'], visual__type='odometry')
-    stamps = [100.0 + 0.1 * step for step in range(50)]
-    jumps = []
-    for seconds in stamps + stamps:
-        for source in ('odom', 'visual'):
-            jumps.append(given.receive(source, odometry(seconds)).jump_ns)
-    assert [k for k, jump_ns in enumerate(jumps) if jump_ns > 0] == [100 + 2 * (EVIDENCE - 1)]
 
 
 def test_after_a_jump_of_the_clock_messages_of_the_old_time_are_rejected() -> None:

@@ -39,14 +39,15 @@ def test_nodes_are_called_with_what_they_take() -> None:
     executable = ast.literal_eval(node['executable'])
     assert f"'{executable} = " in (TREE / 'setup.py').read_text(encoding='utf-8')
     # the displays have to find the topics wherever the node has them
-    for keyword in ('namespace', 'remappings', 'parameters'):
+    for keyword in ('namespace', 'parameters'):
         assert node[keyword] == rviz[keyword]
+    assert rviz['remappings'] == 'launch_arguments.display_remappings(given)'
 
 
 def test_every_argument_is_used() -> None:
     used = {node.value for node in ast.walk(TEXT) if isinstance(node, ast.Constant)}
     assert set(ARGUMENTS) - used == {
-        'params_file', 'remap_tf', 'use_sim_time', 'autostart', *KNOWN_SOURCES,
+        'params_file', 'remap_tf', 'use_sim_time', 'autostart', 'sources', *KNOWN_SOURCES,
         *launch_arguments.OUTPUTS}, 'and these by launch_arguments'
 
 

@@ -123,6 +123,7 @@ def test_what_does_not_go_together_is_mended_while_unconfigured(tmp_path: Path) 
         assert client.set_parameter('fix.topic', '/fix') == (True, '')
         assert client.set_parameter('load_graph_on_start', value=True) == (True, '')
         assert client.set_parameter('graph_file', str(tmp_path / 'no.g2o')) == (True, '')
+        (tmp_path / 'no.g2o').touch()   # without the .json beside it
         assert not manager.change(Transition.TRANSITION_CONFIGURE)
         assert client.set_parameter('load_graph_on_start', value=False) == (True, '')
         assert manager.change(Transition.TRANSITION_CONFIGURE)

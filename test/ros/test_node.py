@@ -309,7 +309,7 @@ BAD = (
     ('frequency:=1000.0', 'frequency'), ('datum:=[95.0, 10.0]', 'latitude'),
     ('map_frame:=3', 'map_frame'), ('odom_frame:=map', 'different'),
     ('fix.lever_arm:=[1.0]', 'fix.lever_arm'),
-    ('sources:=[odom, wheels]', 'wheels.type'), ('sources:=[fix]', 'odometry'),
+    ('sources:=[odom, wheels]', 'wheels.type'), ('sources:=[]', 'odometry or twist, got []'),
     ('odom.robust_loss:=l1', 'none, huber, cauchy'), ('fix.sigma_ceiling:=0.001', 'ceiling'),
     ('fix.topic:=/odom', 'fix.topic: expected a topic of sensor_msgs/msg/NavSatFix, got /odom'),
     ('qos_overrides./odom.subscription.reliability:=bestefort', 'best_effort'),

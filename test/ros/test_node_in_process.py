@@ -151,7 +151,7 @@ def test_parameters_are_checked_and_reach_the_session(managed: Managed) -> None:
     managed.start()
     assert managed.session.out.map_frame == 'world'
     assert managed.set('clock_jump_threshold', 3.0) == (True, '')
-    assert managed.session.input.time_jumps.threshold_ns == 3_000_000_000
+    assert managed.session.input.reader.keeper.threshold_ns == 3_000_000_000
     for name, value in (('map_frame', 'elsewhere'), ('frequency', -1.0), ('fix.topic', 'other')):
         successful, reason = managed.set(name, value)
         assert not successful
@@ -353,6 +353,7 @@ def test_a_node_starts_with_a_graph(
 
     assert node.trigger_deactivate() is node.trigger_cleanup() is SUCCESS
     assert managed.set('load_graph_on_start', True) == (True, '')
+    (tmp_path / 'no.g2o').touch()   # without the .json beside it
     # as Path.home does not know everyone
     for wrong in ('', str(tmp_path), str(tmp_path / 'no.g2o'), '~nobody_of_this_name/map.g2o'):
         managed.set('graph_file', wrong)

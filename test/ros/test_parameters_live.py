@@ -5,9 +5,10 @@
 from array import array
 from collections.abc import Mapping
 from pathlib import Path
+import signal
 
 from circle import drive, fix_at, odometry_at, path_error
-from harness import Client, NodeProcess, stamp_ns
+from harness import AS_A_USER, Client, NodeProcess, stamp_ns
 import pytest
 from rcl_interfaces.msg import Parameter
 from rcl_interfaces.srv import DescribeParameters, GetParameters, ListParameters, SetParameters
@@ -38,6 +39,24 @@ def test_every_parameter_is_described(client: Client) -> None:
             (interval,) = descriptor.floating_point_range
             assert (interval.from_value, interval.to_value) == (
                 parameter.smallest, parameter.largest)
+
+
+def test_periods_change_without_more_and_more_timers(
+    tmp_path: Path, capfd: pytest.CaptureFixture[str],
+) -> None:
+    with NodeProcess(tmp_path, program=AS_A_USER) as node:
+        with Client(int(node.env['ROS_DOMAIN_ID'])) as client:
+            for frequency in (5.0, 6.0, 7.0):
+                assert client.set_parameter('frequency', frequency) == (True, '')
+            assert client.set_parameter('diagnostics_period', 30.0) == (True, '')
+            client.diagnostics.clear()
+            client.spin_for(1.0)
+            assert len(client.diagnostics) <= 1, 'the last before'
+            assert client.set_parameter('diagnostics_period', 0.05) == (True, '')
+            client.spin_until(lambda: len(client.diagnostics) > 10, 'they come often')
+        assert node.signal_and_wait(signal.SIGINT) == 0
+    # the executor of rclpy prints that it has many timers
+    assert 'timers' not in capfd.readouterr().out
 
 
 def test_a_change_takes_effect_or_is_refused_with_the_reason(

@@ -45,6 +45,20 @@ def test_husky_ends_near_the_fixes_that_it_got_and_those_that_it_did_not(tmp_pat
     assert rows['corrected path to fixes held out']['count'] >= 190
 
 
+@pytest.mark.skipif(not HUSKY.exists(), reason=f'no recording at {HUSKY}')
+@pytest.mark.parametrize(('settings', 'source', 'words'), [
+    (('sources:=[odom, fix, gyro]', 'gyro.mounting:=up'), 'gyro', 'does not turn'),
+    (('sources:=[odom, fix, imu]',), 'imu', 'contradicts the other sources')])
+def test_husky_with_its_imu_that_is_not_level_is_told(
+    tmp_path: Path, settings: tuple[str, ...], source: str, words: str,
+) -> None:
+    assert main(['replay', str(HUSKY), '-o', str(tmp_path),
+                 *(word for each in settings for word in ('-p', each))]) == 0
+    findings = json.loads((tmp_path / 'run.json').read_text())['findings']
+    assert any(words in each['text'] and each['anchor'] == f'source-{source}'
+               and each['level'] == 'warning' for each in findings)
+
+
 @pytest.fixture(scope='module')
 def plaza(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Trajectory]:
     """Return a bag with odometry and fixes of 1 m at 1 Hz, and the truth at the odometry."""

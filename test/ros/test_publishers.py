@@ -25,7 +25,7 @@ from visualization_msgs.msg import Marker, MarkerArray
 from pose_graph_ros.adapters.fixes import Datum
 from pose_graph_ros.adapters.parameters import checked
 from pose_graph_ros.core.alignment.monitor import AlignmentState
-from pose_graph_ros.core.config import OdometryNoise
+from pose_graph_ros.core.config import OdometrySource
 from pose_graph_ros.core.estimate import Estimate
 from pose_graph_ros.core.geometry import se2
 from pose_graph_ros.core.geometry.trajectory import Trajectory
@@ -50,7 +50,7 @@ def estimate(
         stamp_ns=round(seconds * SECOND), T_odom_base=np.zeros(3), T_map_base=correction.copy(),
         T_map_odom=correction, covariance=0.01 * np.eye(3), alignment=alignment,
         alignment_sigma=0.01, chi2=0.0, n_hidden=1, n_edges=0, n_observed=1, n_biases=0,
-        primary='odom', noise=OdometryNoise())
+        primary='odom', odometry=OdometrySource())
 
 
 def trajectory(*seconds: float) -> Trajectory:
@@ -458,3 +458,49 @@ def test_listening_to_transforms_ends_and_starts_again(
     assert listens(transforms.PAUSE + 2.0 * transforms.LISTENING)
     given.configure(publish_tf=False)
     assert not any(subscription.topic_name == '/tf' for subscription in local.node.subscriptions)
+
+
+def test_until_the_map_is_known_the_covariance_says_so_if_a_source_is_to_tell(
+    local: LocalNode,
+) -> None:
+    given = Given(local)
+    poses = given.subscribe(PoseWithCovarianceStamped, 'pose')
+    filtered = given.subscribe(Odometry, 'odometry/filtered')
+    # with loop closures alone the map is the frame of odometry
+    given.publish(1.0, alignment=AlignmentState.LOCAL)
+    given.wait_for(poses, 1)
+    receiver = local.client.create_publisher(NavSatFix, 'gps/fix', RELIABLE)
+    local.spin_until(lambda: local.node.count_publishers('gps/fix') > 0, 'the receiver is seen')
+    given.publish(2.0, alignment=AlignmentState.LOCAL)
+    given.wait_for(poses, 2)
+    # also when it has gone
+    local.client.destroy_publisher(receiver)
+    local.spin_until(lambda: local.node.count_publishers('gps/fix') == 0, 'it is gone')
+    given.publish(3.0, alignment=AlignmentState.LOCAL)
+    given.publish(4.0)
+    given.wait_for(filtered, 4)
+    given.wait_for(poses, 4)
+    for messages in (poses, filtered):
+        found = [message.pose.covariance for message in messages]
+        x, y, yaw = (np.array([each[k] for each in found]) for k in (0, 7, 35))
+        np.testing.assert_array_equal(x > 1e5, [False, True, True, False])
+        np.testing.assert_array_equal(y > 1e5, [False, True, True, False])
+        np.testing.assert_array_equal(yaw > 3.0, [False, True, True, False])
+
+
+@pytest.mark.parametrize('sources', [['odom', 'fix'], ['odom']])
+def test_outputs_are_held_back_until_the_map_is_known_if_asked_for(
+    local: LocalNode, sources: list[str],
+) -> None:
+    given = Given(local, wait_for_map=True, sources=sources)
+    poses = given.subscribe(PoseWithCovarianceStamped, 'pose')
+    before = [AlignmentState.LOCAL, AlignmentState.UNALIGNED]
+    for seconds, state in enumerate((*before, AlignmentState.ALIGNED), 1):
+        given.publish(float(seconds), alignment=state)
+    held = 'fix' in sources
+    given.wait_for(poses, 1 if held else 3)
+    assert stamps(poses) == ([3.0] if held else [1.0, 2.0, 3.0])
+    # can be changed at run time
+    given.configure(wait_for_map=False)
+    given.publish(4.0, alignment=AlignmentState.UNALIGNED)
+    given.wait_for(poses, 2 if held else 4)

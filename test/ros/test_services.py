@@ -213,6 +213,22 @@ def test_a_node_is_started_with_a_graph(tmp_path: Path) -> None:
         assert 'map.g2o: is damaged' in line
 
 
+def test_the_first_start_of_a_robot_that_continues_its_graph(tmp_path: Path) -> None:
+    arguments = ('-p', f'graph_file:={tmp_path / "maps" / "yard"}', '-p',
+                 'load_graph_on_start:=true')
+    with NodeProcess(tmp_path, arguments) as node, \
+            Client(int(node.env['ROS_DOMAIN_ID'])) as client:
+        assert 'maps/yard yet: starting with an empty one' in node.stderr()
+        drive(client, 5.0)
+        assert client.trigger('save_graph').success
+        nodes = client.values['hidden_nodes']
+    (tmp_path / 'second').mkdir()
+    with NodeProcess(tmp_path / 'second', arguments) as node, \
+            Client(int(node.env['ROS_DOMAIN_ID'])) as client:
+        client.spin_until(lambda: client.values.get('hidden_nodes') == nodes, 'it is there')
+        assert 'yet' not in node.stderr()
+
+
 def test_a_graph_that_cannot_be_loaded_is_refused_and_the_present_one_stays(
     tmp_path: Path,
 ) -> None:

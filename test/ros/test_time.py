@@ -2,8 +2,12 @@
 # SPDX-License-Identifier: Apache-2.0
 """Clocks that jump, bags in a loop and at ten times their speed: the real node over DDS."""
 
+import math
+
 from circle import drive, fix_at, odometry_at, path_error, START
+from diagnostic_msgs.msg import DiagnosticStatus
 from harness import Client, NodeProcess, RELIABLE, stamp_ns
+from nav_msgs.msg import Odometry
 import numpy as np
 import pytest
 from rosgraph_msgs.msg import Clock
@@ -106,6 +110,74 @@ def test_a_single_stamp_of_the_past_or_the_future_changes_nothing(client: Client
     drive(client, 25.0, begin=4.0)
     assert client.values['resets'] == resets
     assert client.optimize().success
+
+
+def test_bad_stamps_and_messages_that_are_not_finite_neither_stop_the_node_nor_wipe_the_map(
+    client: Client,
+) -> None:
+    resets = client.values['resets']
+    drive(client, 4.0)
+    for away in (-1000.0, -2000.0, -3000.0, -4000.0, -5000.0, 5000.0, 5001.0, 5002.0):
+        client.odom.publish(odometry_at(4.0 + away))
+        client.spin_for(0.02)
+    client.wait_processed(48 + 8)
+    drive(client, 6.0, begin=4.0)
+    for step in range(40):
+        message = odometry_at(0.1 * step)
+        message.pose.pose.position.x = math.nan
+        client.odom.publish(message)
+        client.spin_for(0.01)
+    drive(client, 12.0, begin=6.0)
+    check_one_lap(client)
+    values = client.values
+    assert (values['odom.accepted'], values['resets']) == ('120', resets)
+    assert (values['odom.stamp_leap'], values['odom.not_finite']) == ('8', '40')
+    client.wait_answered(START + 11.9)
+
+
+@pytest.mark.parametrize('node', [(
+    *DATUM, '-p', 'sources:=[odom, visual, fix]', '-p', 'visual.type:=odometry')], indirect=True)
+@pytest.mark.parametrize('seconds', [30, 3600])
+def test_a_second_odometry_that_is_ahead_does_not_take_over(
+    node: NodeProcess, seconds: int,
+) -> None:
+    with Client(int(node.env['ROS_DOMAIN_ID']), listens=('odom', 'fix'),
+                more={'visual': Odometry}) as client:
+        for step in range(200):
+            ahead = odometry_at(0.1 * step)
+            ahead.header.stamp.sec += seconds
+            # the one that is wrong may be heard first
+            client.more['visual'].publish(ahead)
+            client.spin_for(0.005)
+            client.odom.publish(odometry_at(0.1 * step))
+            if step % 5 == 0:
+                client.fix.publish(fix_at(0.1 * step))
+            client.spin_for(0.005)
+        client.wait_answered(START + 19.9)
+        assert int(client.values['resets']) <= 1
+        assert client.values['odometry'] == 'odom'
+        assert float(client.values['visual.delay_s']) == pytest.approx(-seconds, abs=0.5)
+        assert client.optimize().success
+        assert path_error(client) < 1e-3
+        assert client.diagnostics[-1].status[0].level == DiagnosticStatus.WARN
+        assert 'of visual were refused' in client.diagnostics[-1].status[0].message
+        assert 'ahead of the stamps of odom' in client.diagnostics[-1].status[0].message
+
+
+def test_fixes_that_are_stamped_with_gps_time_are_told(client: Client) -> None:
+    for step in range(100):
+        client.odom.publish(odometry_at(0.1 * step))
+        if step % 5 == 0:
+            ahead = fix_at(0.1 * step)
+            ahead.header.stamp.sec += 18
+            client.fix.publish(ahead)
+        client.spin_for(0.005)
+    client.wait_level(DiagnosticStatus.WARN)
+    client.spin_until(
+        lambda: 'The stamps of fix are 18.0 s ahead' in client.diagnostics[-1].status[0].message,
+        'the stamps are named')
+    assert float(client.values['fix.delay_s']) == pytest.approx(-18.0, abs=0.5)
+    assert 'fix.time_offset' in client.diagnostics[-1].status[0].message
 
 
 def test_a_drive_at_many_times_its_speed_is_not_lost(client: Client) -> None:

@@ -14,7 +14,6 @@ from rclpy.context import Context
 from rclpy.node import Node
 
 from pose_graph_ros.adapters.parameters import checked
-from pose_graph_ros.adapters.sources import source_list
 from pose_graph_ros.core.exceptions import ConfigError
 from pose_graph_ros.ros.topics import check_topics
 
@@ -30,12 +29,14 @@ def node() -> Iterator[Node]:
 
 
 def check(node: Node, values: dict[str, Any], overrides: dict[str, Any] | None = None) -> None:
-    check_topics(node, source_list(checked(values)), overrides or {})
+    check_topics(node, checked(values), overrides or {})
 
 
 @pytest.mark.parametrize('values', [
     {}, {'sources': ['odom', 'fix', 'rear'], 'rear.type': 'fix', 'rear.topic': 'gps/fix'},
-    {'global_pose.topic': 'set_pose'}, {'odom.topic': '/path'}])
+    {'global_pose.topic': 'set_pose'}, {'odom.topic': '/path'},
+    {'odom.topic': 'odometry/filtered', 'outputs.filtered_odometry': 'pose_graph/odometry'},
+    {'odom.topic': 'path', 'outputs.path': 'odom'}])
 def test_topics_may_be_shared_by_inputs_of_one_type(node: Node, values: dict[str, Any]) -> None:
     check(node, values)
 
@@ -48,7 +49,11 @@ def test_topics_may_be_shared_by_inputs_of_one_type(node: Node, values: dict[str
      'nav_msgs/msg/Path'),
     ({'odom.topic': 'odometry/filtered'}, r'odom\.topic: expected a topic that the node does not '
      'publish, got /robot/odometry/filtered'),
-    ({'fix.topic': 'initialpose'}, 'the input initialpose has')])
+    ({'fix.topic': 'initialpose'}, 'the input initialpose has'),
+    ({'outputs.pose': 'x', 'global_pose.topic': 'x'}, r'global_pose\.topic: .* got /robot/x, '
+     'which is the output pose: move that by pose:=/robot/pose_graph/pose with ros2 launch, or '
+     'by -p '
+     'outputs.pose:=/robot/pose_graph/pose with ros2 run')])
 def test_a_topic_has_one_type_and_one_direction(
     node: Node, values: dict[str, Any], said: str,
 ) -> None:

@@ -73,4 +73,5 @@ def test_another_word_is_answered_with_those_that_are_expected() -> None:
     answer = read_decision(Space(key='loop/7', value='maybe'))
     assert isinstance(answer, Answer)
     assert answer.reason == 'unknown_decision'
-    assert answer.detail == "loop/7: expected one of in, out, auto, got 'maybe'"
+    assert answer.detail == (
+        "expected one of in, out, auto as the value for the key 'loop/7', got 'maybe'")

@@ -61,9 +61,8 @@ function canvasIn(host, properties, paint) {
   host.append(canvas);
   const context = canvas.getContext('2d');
   const surface = {canvas, context, width: 0, height: 0, due: false};
-  surface.paint = () => {
+  surface.paint = (ratio = window.devicePixelRatio || 1) => {
     surface.due = false;
-    const ratio = window.devicePixelRatio || 1;
     surface.width = canvas.clientWidth;
     surface.height = canvas.clientHeight;
     const [width, height] = [surface.width, surface.height].map((size) => Math.round(size * ratio));
@@ -74,7 +73,7 @@ function canvasIn(host, properties, paint) {
     paint(surface);
   };
   surface.later = () => {
-    if (!surface.due) requestAnimationFrame(surface.paint);
+    if (!surface.due) requestAnimationFrame(() => surface.paint());
     surface.due = true;
   };
   new ResizeObserver(surface.later).observe(canvas);

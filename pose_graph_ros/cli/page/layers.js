@@ -159,14 +159,18 @@ function ellipseAxes(xx, xy, yy, sigmas) {
     0.5 * Math.atan2(2 * xy, xx - yy)];
 }
 
+/** Paint ellipses, but none whose middle is in one that is painted: they would be one blot. */
 function paintEllipses({ellipses: e, factor}, context, {view, width, height}) {
   context.strokeStyle = context.fillStyle = colour('path');
   context.lineWidth = 1;
+  const painted = [];
   for (let k = 0; k < e.x.length; k += 1) {
     if (!known(e.xx[k])) continue;
     const [u, v] = view.toScreen(e.x[k], e.y[k]);
     const [long, short, angle] = ellipseAxes(e.xx[k], e.xy[k], e.yy[k], 2 * factor * view.scale);
     if (long < 1.5 || u < -long || v < -long || u > width + long || v > height + long) continue;
+    if (painted.some(([x, y, radius]) => Math.hypot(u - x, v - y) < Math.max(radius, long))) continue;
+    painted.push([u, v, long]);
     context.beginPath();
     context.ellipse(u, v, long, Math.max(short, 0.3), -angle, 0, 7);
     context.globalAlpha = 0.1;

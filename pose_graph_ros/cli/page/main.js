@@ -20,9 +20,13 @@ window.addEventListener('beforeprint', () => {
   onScreen = document.documentElement.dataset.scheme;
   folded = [...document.querySelectorAll('details.good:not([open])')];
   for (const each of folded) each.open = true;
+  document.documentElement.classList.add('paper');
   setScheme('light');
+  // nothing is painted any more while it is printed
+  for (const surface of surfaces) surface.paint(2);
 });
 window.addEventListener('afterprint', () => {
+  document.documentElement.classList.remove('paper');
   for (const each of folded) each.open = false;
   setScheme(onScreen || 'light');
 });

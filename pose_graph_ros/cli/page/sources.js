@@ -7,8 +7,8 @@
 function showSources() {
   const host = section('sources', 'Residuals by source',
     'A residual divided by the sigma that its source claims should be 1 on average, less what the '
-    + 'optimisation takes up. A ratio of 2 says that sigmas are half of what they should be; below '
-    + 'the interval, they are larger than need be.');
+    + 'optimisation takes up. A ratio of 2 says that sigmas are half of what they should be; an '
+    + 'interval with 1 in it, that nothing is wrong with them.');
   const sources = DATA.sources || [];
   if (sources.length === 0) host.append(nothing('No residuals: nothing was measured.'));
   for (const source of sources) host.append(showSource(source));
@@ -57,7 +57,7 @@ function ratioTable({name, rows}) {
       make('td', {}, known(row.low) ? `${number(row.low, 2)} – ${number(row.high, 2)}` : '–'))))));
 }
 
-/** The ratio on a logarithmic axis from 1/5 to 5: a dot, the band where it should be, and 1. */
+/** The ratio on a logarithmic axis from 1/5 to 5: a dot, its interval, and 1. */
 function ratioPicture({ratio, low, high}) {
   const at = (value) => 4 + 112 * Math.min(1, Math.max(0, 0.5 + Math.log(value) / Math.log(25)));
   const picture = draw('svg', {class: 'ratio-picture', viewBox: '0 0 120 18', 'aria-hidden': 'true'},
@@ -68,8 +68,8 @@ function ratioPicture({ratio, low, high}) {
       height: 10, rx: 2, fill: 'var(--believed)', 'fill-opacity': 0.4}));
   }
   if (known(ratio) && ratio > 0) {
-    const sign = !known(low) || (ratio >= low && ratio <= high) ? 'believed'
-      : (ratio > high ? 'doubted' : 'waiting');
+    const sign = !known(low) || (low <= 1 && high >= 1) ? 'believed'
+      : (low > 1 ? 'doubted' : 'waiting');
     picture.append(draw('circle', {cx: at(ratio), cy: 9, r: 5, stroke: 'var(--surface)',
       fill: `var(--${sign})`}));
   }

@@ -4,8 +4,8 @@
 What a person must know of a run, in sentences with numbers and the parameter to set.
 
 A *warning* is something to act on, a *notice* something to know, and *good* what was checked and
-is as it should be. Covariances count as wrong by a factor of 1.5 in sigma, beyond what chance
-explains; where the engine has found so by itself and allows for it, that is a notice.
+is as it should be. Covariances count as wrong if the interval of the factor on their sigmas is
+beyond 1.5; where the engine has found so by itself and allows for it, that is a notice.
 """
 
 from collections.abc import Iterator
@@ -20,6 +20,10 @@ from pose_graph_ros.cli.run.content import Run
 from pose_graph_ros.cli.run.sources import claim, SourceAnalysis, WRONG
 from pose_graph_ros.core.alignment.monitor import AlignmentState
 from pose_graph_ros.core.batch.optimizer import Status
+from pose_graph_ros.core.geometry.se2 import FloatArray
+from pose_graph_ros.core.judgement.texts import short
+from pose_graph_ros.core.odometry.agreement import CONTRADICTORY
+from pose_graph_ros.core.residuals.scale import ScaleFit
 
 # Ratio of true to claimed errors of the path from which its covariances count as too small: its
 # errors are few independent ones, as they go on for minutes.
@@ -42,7 +46,7 @@ def findings(run: Run, analyses: dict[str, SourceAnalysis]) -> list[dict[str, An
     """Return all findings for run.json, the worst first."""
     found = [*_whole(run), *(finding for each in analyses.values() for finding in _covariances(
         run, each)), *(Finding(*each) for each in measurement_findings.found(run)),
-        *_updates(run), *_path(run)]
+        *_disagreements(run), *_updates(run), *_path(run)]
     if all(each.level == 'good' for each in found):
         found.append(Finding('good', 'nothing was found that needs a person', 'map'))
     found.sort(key=lambda each: LEVELS.index(each.level))
@@ -81,30 +85,34 @@ def _covariances(run: Run, analysis: SourceAnalysis) -> Iterator[Finding]:
     if not analysis.is_wrong:
         if not analysis.correlated and len(analysis.suspects) == 0:
             yield Finding('good', f'{source}: its residuals agree with its covariances '
-                                  f'({fit.ratio:.2g} times the sigma, by {fit.independent:.0f} '
-                                  'independent residuals)', anchor)
+                                  f'({short(fit.ratio)} times the sigma, {_interval(fit)})',
+                          anchor)
         return
     advice = _advice(run, analysis)
     large = fit.ratio > 1.0
-    share = f'{fit.ratio:.2g} times' if large else f'{100.0 * fit.ratio:.2g} % of'
-    text = f'{source}: {claim(analysis)}, {share} the sigma'
+    share = f'{short(fit.ratio)} times' if large else f'{short(100.0 * fit.ratio)} % of'
+    text = f'{source}: {claim(analysis)}, {share} the sigma ({_interval(fit)})'
     if len(analysis.suspects) > 0:
         yield Finding('notice', f'{text}; this may only be because errors of '
                                 f'{" and ".join(analysis.suspects)} are treated as independent',
                       anchor)
     elif 1.0 / WRONG < fit.ratio / scale < WRONG:
-        yield Finding('notice', f'{text}; the estimate allows for it (sigmas times {scale:.2g}); '
-                                f'{advice} tells it from the beginning', anchor)
+        yield Finding('notice', f'{text}; the estimate allows for it (sigmas times '
+                                f'{short(scale)}); {advice} tells it from the beginning', anchor)
     elif large:
-        yield Finding('warning', f'{text}: its covariances are {fit.ratio**2:.2g} times too '
+        yield Finding('warning', f'{text}: its covariances are {short(fit.ratio**2)} times too '
                                  f'small; set {advice}', anchor)
     elif analysis.residuals.kind == 'odometry':
         yield Finding('good', f'{text}: on the safe side, as slow errors, such as of a wheel '
                               'radius, hardly show from node to node', anchor)
     else:
-        yield Finding('notice', f'{text}: its covariances are {fit.ratio**-2:.2g} times too '
+        yield Finding('notice', f'{text}: its covariances are {short(fit.ratio**-2)} times too '
                                 f'large, so it counts for less than it could; {advice} would be '
                                 'right', anchor)
+
+
+def _interval(fit: ScaleFit) -> str:
+    return f'{short(fit.low)} to {short(fit.high)}'
 
 
 def _advice(run: Run, analysis: SourceAnalysis) -> str:
@@ -112,9 +120,9 @@ def _advice(run: Run, analysis: SourceAnalysis) -> str:
     source, ratio = analysis.residuals.source, analysis.fit.ratio
     # other odometry than the primary one has no sigma_scale that is used
     if analysis.kind is Kind.LOOP_CLOSURE or source == run.estimate.primary:
-        return f'{source}.sigma_scale to {ratio:.2g}'
+        return f'{source}.sigma_scale to {short(ratio)}'
     factor = ratio**2 * float(run.values.get(f'{source}.covariance_scale', 1.0))
-    return f'{source}.covariance_scale to {factor:.2g}'
+    return f'{source}.covariance_scale to {short(factor)}'
 
 
 def _correlation(run: Run, analysis: SourceAnalysis) -> Iterator[Finding]:
@@ -126,14 +134,26 @@ def _correlation(run: Run, analysis: SourceAnalysis) -> Iterator[Finding]:
     anchor = f'source-{source}'
     if report.in_use is not None:
         by = 'found by itself and' if report.found else 'by its parameter,'
-        yield Finding('good', f'{source}: errors are correlated over {report.in_use.tau:.2g} s, '
-                              f'{by} allowed for', anchor)
+        yield Finding('good', f'{source}: errors are correlated over '
+                              f'{short(report.in_use.tau)} s, {by} allowed for', anchor)
     elif report.wrongly_white:
         yield Finding(
-            'warning', f'{source}: errors of {report.errors.sigma_correlated:.2g} m go on for '
-            f'{report.errors.tau:.2g} s but are treated as independent, so that the path is less '
-            f'certain than its covariances say; set {source}.correlation_time to -1, which finds '
-            f'the time, at least {report.errors.tau:.2g} s', anchor)
+            'warning', f'{source}: errors of {short(report.errors.sigma_correlated)} m go on for '
+            f'{short(report.errors.tau)} s but are treated as independent, so that the path is '
+            f'less certain than its covariances say; set {source}.correlation_time to -1, which '
+            f'finds the time, at least {short(report.errors.tau)} s', anchor)
+
+
+def _disagreements(run: Run) -> Iterator[Finding]:
+    """Yield which sources contradict the others."""
+    found = run.backend.disagreement()
+    if found is not None:
+        yield Finding('warning', found.text, f'source-{found.source}')
+    for source, each in run.backend.gyro_differences().items():
+        if each.sigmas > CONTRADICTORY and each.reason and (
+                found is None or found.source != source):
+            yield Finding('warning', f'of {source} and odometry one is wrong: {each.reason}',
+                          f'source-{source}')
 
 
 def _updates(run: Run) -> Iterator[Finding]:
@@ -159,22 +179,30 @@ def _path(run: Run) -> Iterator[Finding]:
     far = np.array(errors['position'], dtype=float)
     rms = math.sqrt(float(np.mean(far**2)))
     odometry = np.array([np.nan if each is None else each for each in errors['odometry']])
-    text = f'the path is {rms:.2g} m rms from the {errors["against"]}'
-    if errors['against'] == 'truth' and run.estimate.alignment is not AlignmentState.ALIGNED:
-        # odometry by itself is laid over the truth, so it would look better than the path
-        yield Finding('notice', f'{text}, which may be in another frame, as the path is not '
-                                'aligned with the map', 'errors')
-        return
-    if np.any(np.isfinite(odometry)):
-        text += f', odometry alone {math.sqrt(float(np.nanmean(odometry**2))):.2g} m'
-    yield Finding('good', text, 'errors')
-    if errors['sigma'] is None or errors['against'] != 'truth':
-        return
-    sigma = np.array([np.nan if each is None else each for each in errors['sigma']])
-    known = np.isfinite(sigma) & (sigma > 0.0)
-    if not np.any(known):
-        return
-    ratio = math.sqrt(float(np.mean((far[known] / sigma[known])**2)))
+    alone = math.sqrt(float(np.nanmean(odometry**2))) if np.any(np.isfinite(odometry)) else None
+    text = f'the path is {short(rms)} m rms from the {errors["against"]}'
+    if alone is not None:
+        text += f', odometry alone {short(alone)} m'
+    if run.drive.truth_moved is not None:
+        far_off, turn = run.drive.truth_moved
+        text += (', each where it fits best (the truth was moved by '
+                 f'{short(far_off)} m and {short(math.degrees(turn))} deg)')
+    # else the covariances are those to the first pose, which is no better known than the others
+    aligned = run.estimate.alignment is AlignmentState.ALIGNED
+    ratio = _to_claimed(errors, far) if aligned else 0.0
     if ratio > OVERCONFIDENT:
-        yield Finding('warning', f'errors of the path are {ratio:.2g} times what its covariances '
-                                 'say', 'errors')
+        yield Finding('warning', f'errors of the path are {short(ratio)} times what its '
+                                 'covariances say', 'errors')
+    worse = alone is not None and rms > alone and aligned
+    better = alone is None or float(short(rms)) < float(short(alone))
+    yield Finding('warning' if worse else 'good' if better and ratio <= OVERCONFIDENT
+                  else 'notice', text, 'errors')
+
+
+def _to_claimed(errors: dict[str, Any], far: FloatArray) -> float:
+    """Return the ratio of the errors of a path, shape (N,) [m], to what it claims; 0 unknown."""
+    sigma = np.array([np.nan if each is None else each for each in errors['sigma'] or ()])
+    known = np.isfinite(sigma) & (sigma > 0.0)
+    if errors['against'] != 'truth' or not np.any(known):
+        return 0.0
+    return math.sqrt(float(np.mean((far[known] / sigma[known])**2)))

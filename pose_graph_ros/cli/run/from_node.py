@@ -25,6 +25,7 @@ from pose_graph_ros.core.backend import PoseGraphBackend
 from pose_graph_ros.core.batch.optimizer import Status
 from pose_graph_ros.core.estimate import UpdateReport
 from pose_graph_ros.core.io.graph_files import read_graph
+from pose_graph_ros.core.io.saved_graph import SavedGraph
 
 GRAPH, RECORDED = 'graph.g2o', 'corrected'
 """Saved graph and rosbag2 of the node, in the folder of a run."""
@@ -34,9 +35,24 @@ NO_COUNTS = ('believed', 'believed_weakly', 'doubted', 'waiting', 'scale', 'forg
              'left_unused', 'without_lever_arm', 'rate_hz', 'silence_s', 'bias')
 
 
+def restored(folder: Path, values: Mapping[str, Any]) -> tuple[PoseGraphBackend, SavedGraph]:
+    """
+    Return an engine with the graph that the node has saved into a folder, and that graph.
+
+    Parameters
+    ----------
+    values : mapping, all parameters of the node
+
+    """
+    saved = read_graph(folder / GRAPH)
+    backend = PoseGraphBackend.restored(backend_config(values), saved)
+    backend.update()
+    return backend, saved
+
+
 def node_run(
-    title: str, drive: Drive, folder: Path, settings: tuple[Inputs, Mapping[str, Any]], *,
-    converged: bool, seconds: float,
+    title: str, drive: Drive, folder: Path, settings: tuple[Inputs, Mapping[str, Any]],
+    engine: tuple[PoseGraphBackend, SavedGraph], *, converged: bool, seconds: float,
 ) -> Run:
     """
     Return a run of the node.
@@ -45,16 +61,16 @@ def node_run(
     ----------
     folder : Path, with the graph that the node has saved, and the rosbag2 that it has published
     settings : tuple, what fed the node, and all its parameters
+    engine : tuple, see `restored`
     converged : bool, whether the final optimisation did
     seconds : float, how long it took [s]
 
     """
-    inputs, values = settings
-    saved = read_graph(folder / GRAPH)
-    backend = PoseGraphBackend.restored(backend_config(values), saved)
-    backend.update()
+    (inputs, values), (backend, saved) = settings, engine
     estimate = backend.estimate()
     assert estimate is not None, 'a saved graph has a hidden node'
+    # chi2 of the node has robust costs, that of an update does not
+    estimate = replace(estimate, chi2=saved.chi2)
     recorder = Recorder()
     for source in inputs.of(*ODOMETRY_KINDS)[:1]:
         for stamp in drive.odometry.stamps_ns.tolist():

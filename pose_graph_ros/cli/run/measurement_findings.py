@@ -9,7 +9,8 @@ import numpy as np
 from pose_graph_ros.adapters.sources import Kind
 from pose_graph_ros.cli.run.content import Run
 from pose_graph_ros.cli.run.recorder import Recorder
-from pose_graph_ros.core.judgement.texts import number_of, sentence
+from pose_graph_ros.core.judgement.closures import NEAR
+from pose_graph_ros.core.judgement.texts import number_of, sentence, short
 from pose_graph_ros.core.judgement.verdicts import Judged, State, Verdict
 
 Texts = tuple[str, str, str]
@@ -19,13 +20,11 @@ Texts = tuple[str, str, str]
 MOST_TOLD = 3
 # Doubted fixes belong to one stretch if at most so many others are between them.
 MOST_BETWEEN = 2
-# Loop closures belong to one group if both their ends are this near in time [s].
-GROUP_S = 20.0
 # Stretches and groups of at least so many measurements are more than bad luck.
 MANY = 3
 # A silence of odometry, or of fixes, is a gap if it is this long [s], and this many periods.
 GAPS = {True: (0.5, 8.0), False: (4.0, 8.0)}
-# A gap of fixes from which it is a warning [s].
+# A gap from which it is a warning [s].
 LONG_GAP = 20.0
 # Share of the messages of a source that are refused, from which it is a warning.
 MANY_REFUSED = 0.05
@@ -64,7 +63,7 @@ def _stretches(run: Run, source: str, verdicts: Sequence[Verdict]) -> Iterator[T
     for part in long[:MOST_TOLD]:
         begin, end = (_seconds(run, doubted[at].stamp_ns) for at in (part[0], part[-1]))
         far = [float(np.hypot(*doubted[at].residual[:2])) for at in part]
-        size = f', {np.nanmedian(far):.2g} m from the path' if np.any(np.isfinite(far)) else ''
+        size = f', {short(np.nanmedian(far))} m from the path' if np.any(np.isfinite(far)) else ''
         yield ('warning', f'{source}: {number_of(len(part), Judged.FIX)} from {begin:.1f} s to '
                f'{end:.1f} s contradict the path and are not used{size}: look for reflections, '
                f'or a jump of the receiver', 'map')
@@ -122,17 +121,19 @@ def _strongest(doubted: Sequence[Verdict]) -> str:
 
 def _closure_groups(run: Run, closures: Sequence[Verdict]) -> list[list[Verdict]]:
     """Return closures in groups with both ends near each other, the largest first."""
-    groups: list[list[Verdict]] = []
-    for each in closures:
-        ends = np.array((each.stamp_ns, each.reference_ns or 0)) * 1e-9
+    path = run.drive.corrected
+    stamps = np.array([(each.stamp_ns, each.reference_ns or 0) for each in closures])
+    ends = path.at(np.clip(stamps, *path.stamps_ns[[0, -1]]))[:, :, :2]
+    groups: list[list[int]] = []
+    for k, here in enumerate(ends):
         for group in groups:
-            last = np.array((group[-1].stamp_ns, group[-1].reference_ns or 0)) * 1e-9
-            if np.all(np.abs(ends - last) <= GROUP_S):
-                group.append(each)
+            # as near as those are that can agree with one another
+            if np.all(np.hypot(*(here - ends[group[-1]]).T) <= NEAR):
+                group.append(k)
                 break
         else:
-            groups.append([each])
-    return sorted(groups, key=len, reverse=True)
+            groups.append([k])
+    return [[closures[k] for k in group] for group in sorted(groups, key=len, reverse=True)]
 
 
 def _odometry(run: Run, source: str, verdicts: Sequence[Verdict]) -> Iterator[Texts]:
@@ -183,8 +184,9 @@ def silences(
                 'the heading there is that of other sources' if kind is Kind.GYRO else
                 'the motion there is that of other odometry, as far as it goes on' if others else
                 'the motion there is not known')
-        level = 'warning' if moves or np.max(lengths) > LONG_GAP else 'notice'
-        yield (level, f'{source}: no messages from {where}{more} ({np.max(lengths):.3g} s at '
+        longest = float(np.max(lengths))
+        level = 'warning' if longest > LONG_GAP else 'notice'
+        yield (level, f'{source}: no messages from {where}{more} ({short(longest, 3)} s at '
                f'most); {what}', f'source-{source}')
 
 

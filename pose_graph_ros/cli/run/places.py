@@ -129,8 +129,11 @@ def fixes(
         rows = rows[np.argsort(drive.fix_stamps_ns[rows], kind='stable')]
         stamps, held_out = drive.fix_stamps_ns[rows], drive.fix_held_out[rows]
         each = [known.get((source, stamp)) for stamp in stamps.tolist()]
-        states = [HELD_OUT if out else BELIEVED if verdict is None else _NUMBERS[verdict.state]
-                  for out, verdict in zip(held_out.tolist(), each, strict=True)]
+        refused = np.zeros_like(held_out) if drive.fix_refused is None else (
+            drive.fix_refused[rows])
+        states = [HELD_OUT if out else REFUSED if no else BELIEVED if verdict is None
+                  else _NUMBERS[verdict.state] for out, no, verdict in zip(
+                      held_out.tolist(), refused.tolist(), each, strict=True)]
         shown = _shown(states)
         left_out = len(rows) - len(shown)
         rows, stamps, held_out = rows[shown], stamps[shown], held_out[shown]

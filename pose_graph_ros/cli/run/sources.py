@@ -11,6 +11,7 @@ import numpy as np
 from pose_graph_ros.adapters.sources import Kind
 from pose_graph_ros.cli.run.lines import number, rounded
 from pose_graph_ros.cli.run.places import Frame
+from pose_graph_ros.core.judgement.texts import short
 from pose_graph_ros.core.residuals.components import Analysis
 from pose_graph_ros.core.residuals.scale import RowFit, ScaleFit
 from pose_graph_ros.core.residuals.source_residuals import SourceResiduals, spread
@@ -49,10 +50,9 @@ class SourceAnalysis(NamedTuple):
 
     @property
     def is_wrong(self) -> bool:
-        """Whether the claimed covariances are much too small or too large, beyond chance."""
-        ratio, low, high = self.fit.ratio, self.fit.low, self.fit.high
-        return bool(ratio > max(WRONG, high) or (
-            ratio < min(1.0 / WRONG, low) and not self.correlated and len(self.suspects) == 0))
+        """Whether the claimed covariances are surely much too small or too large."""
+        return bool(self.fit.low > WRONG or (self.fit.high < 1.0 / WRONG and not self.correlated
+                                             and len(self.suspects) == 0))
 
 
 def analyse(
@@ -139,19 +139,19 @@ def verdict(analysis: SourceAnalysis) -> str:
         return 'nothing of it is used'
     if found.says_nothing:
         return ('its covariances cannot be checked: the path follows it, so that its residuals '
-                f'are {100.0 * found.redundancy:.2g} % of what its errors are'
+                f'are {short(100.0 * found.redundancy)} % of what its errors are'
                 if found.redundancy < 0.1 else
                 f'its covariances cannot be checked: {found.n_used} measurements are as few as '
-                f'{found.independent:.2g} independent ones')
+                f'{short(found.independent)} independent ones')
     sizes = claim(analysis)
     if not analysis.is_wrong and analysis.correlated:
         return (f'its errors go on from one measurement to the next but are treated as '
                 f'independent, so that the path follows them; {sizes} or more')
     if not analysis.is_wrong:
-        return f'agrees with its covariances: {sizes}, {found.ratio:.2g} times'
+        return f'agrees with its covariances: {sizes}, {short(found.ratio)} times'
     variance = found.ratio**2
-    return (f'{sizes}: its covariances are {variance:.2g} times too small' if variance > 1.0
-            else f'{sizes}: its covariances are {1.0 / variance:.2g} times too large')
+    return (f'{sizes}: its covariances are {short(variance)} times too small' if variance > 1.0
+            else f'{sizes}: its covariances are {short(1.0 / variance)} times too large')
 
 
 def claim(analysis: SourceAnalysis) -> str:
@@ -161,6 +161,6 @@ def claim(analysis: SourceAnalysis) -> str:
     sigma = math.sqrt(sum(row.sigma**2 for row in rows) / len(rows))
     per = '' if analysis.residuals.kind in ('map', 'loop_closure') else ' from node to node'
     if len(positions) > 0:
-        return f'claims {sigma:.2g} m{per}, found {sigma * analysis.fit.ratio:.2g} m'
+        return f'claims {short(sigma)} m{per}, found {short(sigma * analysis.fit.ratio)} m'
     sigma = math.degrees(sigma)
-    return f'claims {sigma:.2g} deg{per}, found {sigma * analysis.fit.ratio:.2g} deg'
+    return f'claims {short(sigma)} deg{per}, found {short(sigma * analysis.fit.ratio)} deg'

@@ -12,6 +12,7 @@ from pose_graph_ros.cli.run.places import Frame
 from pose_graph_ros.core.backend import PoseGraphBackend
 from pose_graph_ros.core.geometry.se2 import FloatArray
 from pose_graph_ros.core.geometry.trajectory import Trajectory
+from pose_graph_ros.core.judgement.texts import short
 from pose_graph_ros.core.judgement.verdicts import Verdict
 from pose_graph_ros.core.residuals.source_residuals import SourceResiduals
 from pose_graph_ros.core.sources.constraint_names import ConstraintEnergy
@@ -99,7 +100,7 @@ def _text(
     if each.kind == 'bias':
         return f'error of {each.source}{at}: it changes faster than its correlation time says'
     off = '' if residual is None else (
-        f': {np.hypot(*residual[:2]):.2g} m' + ('' if residual[2] == 0.0 else
-                                                f' and {abs(residual[2]):.2g} rad') + ' off')
+        f': {short(np.hypot(*residual[:2]))} m' + ('' if residual[2] == 0.0 else
+                                                f' and {short(abs(residual[2]))} rad') + ' off')
     name = each.name.partition(' at ')[0] if len(ends) > 0 else each.name
     return f'{name}{at}{off}'

@@ -97,7 +97,8 @@ class AlignmentMonitor:
         self._config = config
 
     def find(
-        self, graph: Graph, waiting: list[AttachedMeasurement], primary: str,
+        self, graph: Graph, waiting: list[AttachedMeasurement], nodes: HiddenNodes,
+        odometry_scale: float = 1.0,
     ) -> FloatArray | None:
         """
         Return the motion of the graph into the map if it is found, and update the state.
@@ -108,7 +109,7 @@ class AlignmentMonitor:
         Parameters
         ----------
         waiting : list of AttachedMeasurement, on its hidden nodes, but not in it yet
-        primary : str, name of the primary odometry source
+        odometry_scale : float, factor on the sigmas of the primary odometry
 
         """
         if self.state is AlignmentState.ALIGNED or len(waiting) == 0:
@@ -116,13 +117,15 @@ class AlignmentMonitor:
         positions = placed(waiting)
         if len(positions) == 0:
             return None
+        poses = nodes.recent_poses(graph)
         found = estimator.find_alignment(
-            graph.poses, in_rows(graph, positions), self._config.alignment, self._noise(primary),
+            poses, _numbered(nodes, _table(positions)), self._config.alignment,
+            _noise(nodes, odometry_scale),
             self._correlation([_evidence_of(each) for each in positions]))
         headings = [each for each in waiting if each.observed.kind[0] == ObservedKind.HEADING]
         if len(headings) > 0:
-            by_heading = _by_heading(
-                graph.poses, in_rows(graph, headings), in_rows(graph, positions))
+            by_heading = _by_heading(poses, *(
+                _numbered(nodes, _table(some)) for some in (headings, positions)))
             if by_heading.sigma < min(found.sigma, ALIGNING_SIGMA):
                 found = by_heading
         self.state = (AlignmentState.UNALIGNED if found.T_map_graph is None
@@ -144,7 +147,9 @@ class AlignmentMonitor:
         """Drop the stored measurements on hidden nodes before one, by its id."""
         self._evidence = [each for each in self._evidence if each.observed.node[0] >= node]
 
-    def recheck(self, graph: Graph, nodes: HiddenNodes) -> FloatArray | None:
+    def recheck(
+        self, graph: Graph, nodes: HiddenNodes, odometry_scale: float = 1.0,
+    ) -> FloatArray | None:
         """
         Return new poses of all rows of the graph if the angle in use is wrong.
 
@@ -155,18 +160,17 @@ class AlignmentMonitor:
         Parameters
         ----------
         graph : Graph, in the map
+        odometry_scale : float, factor on the sigmas of the primary odometry
 
         """
         if self.state is not AlignmentState.ALIGNED or len(self._evidence) < self._next_recheck:
             return None
         self._next_recheck = 2 * len(self._evidence)
-        table, ids = _table(self._evidence), nodes.ids[nodes.n_frozen:]
-        table = ObservedNodes(np.searchsorted(ids, table.node), *table.columns[1:])
-        rows = graph.node_rows(ids)
+        rows = graph.node_rows(nodes.ids[nodes.n_frozen:])
         found = estimator.recheck(
-            nodes.recent_poses(graph), nodes.odometry, table, self._config.alignment,
-            self._noise(nodes.primary), correlation=self._correlation(self._evidence),
-            sigma=self.sigma)
+            nodes.recent_poses(graph), nodes.odometry, _numbered(nodes, _table(self._evidence)),
+            self._config.alignment, _noise(nodes, odometry_scale),
+            correlation=self._correlation(self._evidence), sigma=self.sigma)
         if self._next_recheck > LAST_RECHECK:
             self._evidence.clear()
         if found is None or found.T_map_graph is None:
@@ -180,9 +184,6 @@ class AlignmentMonitor:
         poses[graph.is_bias] = 0.0
         poses[rows] = moved
         return poses
-
-    def _noise(self, primary: str) -> OdometryNoise:
-        return self._config.odometry_source(primary).noise
 
     def _correlation(self, evidence: list[Evidence]) -> TimeCorrelation:
         # a time that is not known yet counts as white noise
@@ -246,6 +247,16 @@ def in_rows(graph: Graph, measurements: Sequence[AttachedMeasurement]) -> Observ
     """
     table = _table(measurements)
     return ObservedNodes(graph.node_rows(table.node), *table.columns[1:])
+
+
+def _numbered(nodes: HiddenNodes, table: ObservedNodes) -> ObservedNodes:
+    """Return observed nodes by the rows of `HiddenNodes.recent_poses`, which has no biases."""
+    ids = nodes.ids[nodes.n_frozen:]
+    return ObservedNodes(np.searchsorted(ids, table.node), *table.columns[1:])
+
+
+def _noise(nodes: HiddenNodes, scale: float) -> OdometryNoise:
+    return nodes.streams[nodes.primary].usual_noise().scaled(scale)
 
 
 def _evidence_of(attached: AttachedMeasurement) -> Evidence:

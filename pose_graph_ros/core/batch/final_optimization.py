@@ -9,6 +9,7 @@ the weights of constraints with a robust loss are computed from initial values.
 
 from collections.abc import Mapping
 from dataclasses import replace
+import math
 
 import numpy as np
 
@@ -28,6 +29,10 @@ REWEIGHTINGS = 200
 # Where contradictions are believed, each solution can take all iterations that it may: that many
 # of these in all.
 MOST_SOLUTIONS = 10
+# Number of iterations from one solution to the next, and of reweightings, that are many: more than
+# the last iterations without effect are, and than weights take that converge fast. Then it is
+# enough that the cost converges.
+MANY, MANY_REWEIGHTINGS = 11, 50
 # Largest change of a weight at which the reweighting has converged.
 SAME_WEIGHT = 1e-12
 # Successive factors on the thresholds of the losses, after plain least squares.
@@ -107,12 +112,14 @@ def _reweighted(
     """
     Reweight and solve until the weights converge; chi2 of the result is the robust cost.
 
+    Where each solution takes many iterations, although it begins at the last one, it is enough
+    that the cost converges.
     A loss may give weight 0 to all that determines a node. The last weights with a solution are
     kept then, and the status is MAX_ITERATIONS.
     """
-    iterations, largest = 0, 1.0
-    for _ in range(REWEIGHTINGS):
-        before = graph.weights
+    iterations, largest, cost = 0, 1.0, math.inf
+    for k in range(REWEIGHTINGS):
+        before, cost_before = graph.weights, cost
         found = _solved_with(graph, reweighting.all_changes(graph), config, solve)
         if found is None:
             largest = 1.0
@@ -121,6 +128,11 @@ def _reweighted(
                       for new, old in zip(graph.weights, before, strict=True))
         result = found
         iterations += result.iterations
+        cost = result.chi2 + reweighting.cost(graph)
+        is_slow = result.iterations >= MANY or k >= MANY_REWEIGHTINGS
+        if (is_slow and result.status is not Status.MAX_ITERATIONS
+                and not cost < cost_before * (1.0 - SAME_MINIMUM)):
+            largest = 0.0
         if largest < SAME_WEIGHT or iterations > MOST_SOLUTIONS * config.max_iterations:
             break
     if result.status is Status.FAILED:

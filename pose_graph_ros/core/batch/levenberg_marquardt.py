@@ -40,6 +40,10 @@ LEAST_DAMPING = 1e-9
 LARGEST_DAMPING = 1e12
 # Number of damped steps in a row after which one without damping is tried again.
 DAMPED_STEPS = 10
+# Number of damped steps, each of which lowers chi2 by less than this fraction, until the
+# optimisation ends: where residuals are so large that only short steps lower chi2, thousands of
+# them would change it no more than the rounding of the measurements does.
+SLOW_STEPS, SLOW = 10, 1e-9
 # Number of steps that change chi2 by rounding only and do not become shorter, until convergence.
 LEVEL_STEPS = 2
 # Where no step lowers chi2, the optimisation has stalled if the linear model predicts a decrease
@@ -94,7 +98,7 @@ def minimize(
     chord = False  # whether the next step is a chord step
     current = False  # whether the tree is that of the best poses, without damping
     damping = 0.0
-    n_damped = n_level = 0
+    n_damped = n_level = n_slow = 0
     rounding, shortest, previous, last_damping = 0.0, math.inf, math.inf, 0.0
     while iterations < config.max_iterations:
         yield
@@ -118,12 +122,14 @@ def minimize(
             elif length >= shortest:
                 n_level += 1
             shortest = min(shortest, length)
+            slow = damping > 0.0 and chi2 - trial < SLOW * max(chi2, 1.0)
+            n_slow = n_slow + 1 if slow else 0
             chi2 = trial
             gn.keep_poses(head, best)
             iterations += 1
             # an uphill step or stronger damping before this step changes its length
             comparable = uphill == 0 and damping <= last_damping
-            if n_level >= LEVEL_STEPS or (
+            if n_level >= LEVEL_STEPS or n_slow >= SLOW_STEPS or (
                     comparable and has_converged(length, previous, config.step_tolerance)):
                 end = Termination.CONVERGED
                 break

@@ -160,6 +160,18 @@ class TruncatedProblem:
         cost = known + float(np.sum(np.minimum(squares, self.limits)))
         return Choice(believed.copy(), squares, cost, self.graph.poses.copy(), known)
 
+    def near_start(self) -> Choice | None:
+        """Return a set with poses of no higher truncated cost than the start; None as `choice`."""
+        self.graph.set_poses(self.start)
+        choice = self.choice(self.allowed & (self.energies() <= self.limits))
+        return None if choice is None else self.improved(choice)
+
+    def cost_at(self, poses: FloatArray) -> float:
+        """Return the truncated cost of poses, shape (N, 3), whatever is believed."""
+        self._weigh(np.zeros(len(self)))
+        self.graph.set_poses(poses)
+        return chi2_of(self.graph) + float(np.sum(np.minimum(self.energies(), self.limits)))
+
     def improved(
         self, choice: Choice, retests: int = RETESTS, config: SolverConfig = CONFIG,
     ) -> Choice:

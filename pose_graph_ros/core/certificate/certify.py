@@ -62,7 +62,7 @@ class Certificate:
     """
     Smallest eigenvalue of the certificate matrix of the best minimum, but for the zero.
 
-    None if it is not known.
+    None if it is not known, or not needed as the objective is 0.
     """
     rank: int
     """Numbers for each heading with which the bound was found; 1 without the staircase."""
@@ -136,6 +136,10 @@ def certify(
     z = minimized(form, formulation.headings(poses)[:, None],
                   None if hessian is None else hessian.inverse(formulation))
     cost = near = form.cost(z)
+    if cost <= GAP * LEAST_COST:
+        # a sum of squares is nowhere below 0, whatever rounding leaves of the matrix
+        return Certificate(Verdict.CERTIFIED, cost, near, cost, None, 1,
+                           formulation.poses(form.positions(z)[:, 0], z[:, 0]))
     spectrum = examined(form, z, eigenvalue=eigenvalue)
     bound, rank = spectrum.bound, 1
     if not spectrum.positive:

@@ -97,10 +97,14 @@ def structure(rows: GraphRows, ids: IntArray | None = None) -> Structure:
     kinds = tuple(NodeKind(kind) for kind in rows.node_kind.tolist())
     edges, observed = rows.edges.renumbered(rows.rows_of), rows.observed.renumbered(rows.rows_of)
     terms, measured = [], set()
+    stepped = set(edges.i[edges.kind == EdgeKind.ODOMETRY].tolist())
     for i, j, k, kind, weight, mean in zip(
             edges.i.tolist(), edges.j.tolist(), edges.k.tolist(), edges.kind.tolist(),
             edges.weight.tolist(), edges.mean.tolist(), strict=True):
         sort = _SORTS[EdgeKind(kind)]
+        if sort is Sort.LOOP_CLOSURE and i == j + 1 and j not in stepped:
+            sort = Sort.ODOMETRY    # that leads back
+            stepped.add(j)
         if kind == EdgeKind.BIAS and kinds[i] is NodeKind.POSE:
             sort = Sort.OBSERVED
             measured.add((i, *mean[:2]))

@@ -153,6 +153,12 @@ class GraphContents:
         """Whether hidden nodes are poses, shape (N,)."""
         return self._is(NodeKind.POSE)
 
+    @property
+    def extent(self) -> FloatArray:
+        """Lengths of the sides of the box around all poses, shape (2,) [m]."""
+        x, y = self.poses[self.is_pose, :2].T   # much faster one by one
+        return np.array((np.ptp(x), np.ptp(y))) if len(x) > 0 else np.zeros(2)
+
     def _is(self, kind: NodeKind) -> BoolArray:
         # a byte for each node, as an estimate asks for it
         types = self.memory['node_i'][:self.n_nodes, tb.NODE_TYPE].astype(np.uint8)

@@ -218,6 +218,18 @@ class Reweighting:
         table = self._edges
         table.base_weights.values[np.isin(table.ids.values, ids)] *= factor
 
+    def knows(self, number: int, *, edge: bool) -> bool:
+        """
+        Tell whether a constraint has a loss.
+
+        Parameters
+        ----------
+        number : int, id
+        edge : bool, whether it is an edge, else an observed node
+
+        """
+        return (self._edges if edge else self._observed).index(number) >= 0
+
     def base_weight(self, number: int) -> float | None:
         """Return the base weight of an observed node, by its id; None without a loss."""
         table = self._observed

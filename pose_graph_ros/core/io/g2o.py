@@ -154,12 +154,13 @@ def graph_of(text: GraphText, edge2_order: str | None = None) -> GraphFile:
         raise FileFormatError(
             f'{text.where(line)}: {tag} means two formats with the information in different '
             f'order; say which this is: {" or ".join(EDGE2_ORDERS)}')
-    rows = dict(text.rows)
+    rows, loops = _without_loops(text.rows)
     vertices = Lines.joined(rows[tag] for tag in ('VERTEX_SE2', 'VERTEX2', 'VERTEX'))
     points = rows['VERTEX_XY']
     vertices = Lines.joined((vertices, Lines(points.ids, np.pad(
         points.numbers, ((0, 0), (0, 1))), points.lines)))
     rows[_POINT], notes = _with_landmarks(text, rows)
+    notes = (*loops, *notes)
     # with an index, as NumPy loads its masked arrays otherwise, which takes 7 ms
     ids, _ = np.unique(np.concatenate([table.ids.ravel() for tag, table in rows.items()
                                        if tag != 'LANDMARK']), return_index=True)
@@ -194,6 +195,18 @@ def graph_of(text: GraphText, edge2_order: str | None = None) -> GraphFile:
         se2.wrapped(poses), kind, fixed, edges, observed, np.arange(n), np.arange(len(edges)),
         np.arange(len(observed)), NextIds(n, len(edges), len(observed)))
     return GraphFile(graph, ids, bool(len(given) == n), text.skipped, notes)
+
+
+def _without_loops(rows: dict[str, Lines]) -> tuple[dict[str, Lines], tuple[str, ...]]:
+    """Return lines without edges from a node to itself, which tell nothing, and a note of them."""
+    kept, n = dict(rows), 0
+    for tag, table in rows.items():
+        if table.ids.shape[1] == 2 and tag != 'LANDMARK':
+            loop = table.ids[:, 0] == table.ids[:, 1]
+            if np.any(loop):
+                n += int(np.sum(loop))
+                kept[tag] = table.rows(np.flatnonzero(~loop))
+    return kept, () if n == 0 else (f'{n} edges from a node to itself are skipped',)
 
 
 def _with_landmarks(

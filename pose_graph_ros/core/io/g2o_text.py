@@ -190,6 +190,9 @@ def _forget_landmarks(
 
 def _raise_empty(path: Path, skipped: dict[str, list[list[str]]]) -> NoReturn:
     for tag, found in skipped.items():
+        if 'SE3' in tag or tag in {'VERTEX3', 'EDGE3'}:
+            raise FileFormatError(f'{path}:{found[0][0]}: {tag} is of a graph in space (3D), '
+                                  f'which is not supported: graphs are planar (SE2)')
         raise FileFormatError(
             f'{path}:{found[0][0]}: tag {tag!r} is not known, and there is no line with one of '
             f'{", ".join(LAYOUT)}')

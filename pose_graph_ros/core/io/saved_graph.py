@@ -289,8 +289,8 @@ class SavedGraph:
         _require(len(source.edges) in (0, n) and np.all(source.edges >= -1),
                  f'{where}.edges: expected no rows, or {n}')
         _require(source.next_estimate > 0, f'{where}.next_estimate: expected a positive number')
-        _require(source.odometry_scale >= 1.0,
-                 f'{where}.odometry_scale: expected at least 1')
+        _require(source.odometry_scale > 0.0,
+                 f'{where}.odometry_scale: expected a positive number')
         _require(source.errors is None or min(source.errors) > 0.0,
                  f'{where}.errors: expected positive numbers')
 

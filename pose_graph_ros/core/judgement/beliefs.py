@@ -177,8 +177,10 @@ class Beliefs:
         if not trial.is_finished:
             return []
         changes, later = trial.changes, trial.later
-        if (trial.is_outdated or trial.weights != self.weights_with(changes, self._doubts)
-                or not np.all(states.judged[[*changes]])):
+        is_of_closures = len(changes) > 0 or self._doubts is not None
+        if trial.is_outdated or (is_of_closures and (
+                trial.weights != self.weights_with(changes, self._doubts)
+                or not np.all(states.judged[[*changes]]))):
             later |= set(changes)
         else:
             bad = trial.misfits(self._table)

@@ -29,12 +29,13 @@ from pose_graph_ros.core.judgement.closure_states import (
     STATES,
     WAITING,
 )
+from pose_graph_ros.core.judgement.closure_trial import ClosureTrial
 from pose_graph_ros.core.judgement.closures import chances, claims, ClosureTable, GATE
 from pose_graph_ros.core.judgement.listing import MOST_OTHERS
 from pose_graph_ros.core.judgement.odometry_chain import OdometryChain
 from pose_graph_ros.core.judgement.odometry_states import OdometryStates
 from pose_graph_ros.core.judgement.residual_scale import ScaleLeft
-from pose_graph_ros.core.judgement.retests import Retests
+from pose_graph_ros.core.judgement.retests import MOST_TURNS, Retests
 from pose_graph_ros.core.judgement.scale_learner import ScaleLearner
 from pose_graph_ros.core.judgement.set_search import SetSearch
 from pose_graph_ros.core.judgement.verdicts import (
@@ -54,6 +55,9 @@ MOST_NEW, IN_UPDATE, IN_PART, NODES_IN_PART = 32, 16, 32, 160_000
 # Number of nodes above which an update adds closures with weight 0 and leaves all tests to the
 # work after it, so that it has nothing to solve for but what is new.
 LARGE = 500
+# A test, a change and a trial for each turn of a closure, and searches of other sets, each some
+# hundred iterations of a copy: no work that leads anywhere has more parts.
+PARTS_OF_EACH, PARTS = 3 * MOST_TURNS, 3000
 # Rounds of tests of closures that leave the graph.
 MOST_ROUNDS = 4
 
@@ -132,9 +136,10 @@ class ClosureJudge:
         self._retests.again(numbers.tolist())
         return self._beliefs.weights(numbers)
 
-    def solve_later(self) -> None:
-        """Solve the graph as it is as a copy, part by part, as a step of it diverges."""
-        self._beliefs.trial.begin({}, {})
+    @property
+    def trial(self) -> ClosureTrial:
+        """What is solved for between two updates, as these diverge with it."""
+        return self._beliefs.trial
 
     @property
     def _is_large(self) -> bool:
@@ -189,7 +194,7 @@ class ClosureJudge:
                     number, ~self._states.in_graph)
             if number < len(self._states) - self._n_staged:
                 self._states.announce(number, before, self._beliefs.now_ns)
-        return numbers[passes], chances(total[passes], self._smoother.poses)
+        return numbers[passes], chances(total[passes], self._smoother.graph.extent)
 
     def after(self) -> None:
         """Judge again, within bounds, after an update of a graph that is not large."""
@@ -205,6 +210,11 @@ class ClosureJudge:
     def test(self) -> bool:
         """Do a bounded part of the tests that are left; tell whether there was any."""
         return len(self._states) > 0 and self._test_again(self._most)
+
+    @property
+    def most_parts(self) -> int:
+        """Parts of the work that end it unless beliefs go round in a circle."""
+        return PARTS + PARTS_OF_EACH * len(self._states)
 
     @property
     def _most(self) -> int:

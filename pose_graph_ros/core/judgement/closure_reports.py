@@ -20,6 +20,7 @@ from pose_graph_ros.core.judgement.closure_states import (
 )
 from pose_graph_ros.core.judgement.closures import ClosureTable, GATE
 from pose_graph_ros.core.judgement.listing import listed
+from pose_graph_ros.core.judgement.texts import ODOMETRY
 from pose_graph_ros.core.judgement.verdicts import (
     Judged,
     MOST_NAMED,
@@ -74,10 +75,8 @@ class ClosureReports:
         states = self._states
         agree, against = self._neighbours(number)
         contradicted = [states.name(other) for other in against if USED[states.state[other]]]
-        # a person may force out what fits, and force in what does not
-        if (states.state[number] == DOUBTED if states.decision[number] == AUTO
-                else states.distance[number] > GATE):
-            contradicted.insert(0, 'odometry')
+        if states.distance[number] > GATE:
+            contradicted.insert(0, ODOMETRY)
         stamp, reference = states.stamps_ns[number].tolist()
         return Verdict(
             id=states.name(number), kind=Judged.LOOP_CLOSURE,

@@ -104,7 +104,7 @@ class ClosureStates:
 
     @property
     def since_ns(self) -> IntArray:
-        """Stamps of the newest odometry when the states changed last [ns]."""
+        """Stamps of the newest odometry when they came, or their use began or ended [ns]."""
         return self._since_ns.values
 
     @property
@@ -250,7 +250,9 @@ class ClosureStates:
         source, new = self.sources[self.source[number]], STATES[after]
         if before == after:
             return
-        self.since_ns[number] = now_ns
+        # one that has waited is as little used if it is doubted
+        if before < 0 or new.in_graph != STATES[before].in_graph:
+            self.since_ns[number] = now_ns
         if before >= 0 or not new.in_graph:
             self._changes.append(Change(
                 self.name(number), Judged.LOOP_CLOSURE, source, int(self.stamps_ns[number, 0]),

@@ -27,6 +27,8 @@ from pose_graph_ros.core.smoother.trial import Trial
 # this share of its size until the next trial, doubled so many times; so many updates that do not
 # diverge make up for one.
 WITHOUT_PAUSE, PAUSE, MOST_DOUBLINGS, MAKE_UP = 3, 0.01, 4, 3
+# Number of nodes up to which there are no pauses, as solving for all takes a few milliseconds.
+SMALL = 100
 
 
 class ClosureTrial:
@@ -50,7 +52,7 @@ class ClosureTrial:
 
     def begin(
         self, changes: Mapping[int, State], weights: Mapping[int, float],
-        poses: FloatArray | None = None,
+        poses: FloatArray | None = None, observed: Mapping[int, float] | None = None,
     ) -> None:
         """
         Begin a trial, but during a pause; that of a whole set does not wait for its end.
@@ -62,29 +64,41 @@ class ClosureTrial:
         changes : mapping, the states of closures that are tried, by number
         weights : mapping, the weights of their edges, by id
         poses : ndarray, shape (N, 3), optional, where it starts
+        observed : mapping, optional, the weights of observed nodes that are tried, by id
 
         """
         if self._trial is not None:
             self.later.update(changes)
             return
-        if poses is None:
-            self._n_diverged = min(
-                self._n_diverged + MAKE_UP, MAKE_UP * (WITHOUT_PAUSE + MOST_DOUBLINGS))
-            if self.is_pausing:
-                return
-            graph = self._smoother.graph
-            doublings = max(self._n_diverged // MAKE_UP - WITHOUT_PAUSE, 0)
-            self._next_at = graph.next_ids.node + math.ceil(
-                PAUSE * graph.n_nodes * 2**doublings)
+        if poses is None and not self.may_solve():
+            return
         self.changes, self.weights = dict(changes), dict(weights)
         self._is_set = poses is not None
-        self._trial = self._smoother.trial(GraphUpdate(weigh_edges=self.weights), poses)
+        self._trial = self._smoother.trial(
+            GraphUpdate(weigh_edges=self.weights, weigh_observed=observed or {}), poses)
+
+    def may_solve(self) -> bool:
+        """Tell whether all may be solved for now that an update has diverged, or in a pause."""
+        self._n_diverged = min(
+            self._n_diverged + MAKE_UP, MAKE_UP * (WITHOUT_PAUSE + MOST_DOUBLINGS))
+        if self.is_pausing:
+            return False
+        graph = self._smoother.graph
+        doublings = max(self._n_diverged // MAKE_UP - WITHOUT_PAUSE, 0)
+        self._next_at = graph.next_ids.node + math.ceil(PAUSE * graph.n_nodes * 2**doublings)
+        return True
+
+    @property
+    def is_due_or_pausing(self) -> bool:
+        """Whether a copy is solved, or has to wait until the graph has grown."""
+        return self._trial is not None or self.is_pausing
 
     @property
     def is_pausing(self) -> bool:
         """Whether the graph has to grow until the next trial, as too many updates diverge."""
-        return (self._n_diverged >= MAKE_UP * WITHOUT_PAUSE
-                and self._smoother.graph.next_ids.node < self._next_at)
+        graph = self._smoother.graph
+        return (self._n_diverged >= MAKE_UP * WITHOUT_PAUSE and graph.n_nodes > SMALL
+                and graph.next_ids.node < self._next_at)
 
     def was_not_needed(self) -> None:
         """Shorten the next pause, as an update has changed beliefs without a trial."""

@@ -50,18 +50,17 @@ def claims(edges: Edges, floors: FloatArray = FLOORS) -> Closures:
     return Closures(own.i.copy(), own.j.copy(), own.mean.copy(), covariance)
 
 
-def chances(covariance: FloatArray, poses: FloatArray) -> FloatArray:
+def chances(covariance: FloatArray, extent: FloatArray) -> FloatArray:
     """
     Return the chances of random closures to pass gates, shape (M,).
 
     Parameters
     ----------
     covariance : ndarray, shape (M, 3, 3), of the errors that the gates are for
-    poses : ndarray, shape (N, 3), nodes, which say how large the place is
+    extent : ndarray, shape (2,), how large the place is [m]
 
     """
-    x, y = poses[:, :2].T    # much faster one by one
-    area = max(float(np.ptp(x) * np.ptp(y)), 1.0)
+    area = max(float(np.prod(extent)), 1.0)
     ellipse = np.pi * GATE * np.sqrt(np.linalg.det(covariance[:, :2, :2]))
     arc = np.sqrt(GATE * covariance[:, 2, 2]) / np.pi
     return np.asarray(np.minimum(ellipse / area, 1.0) * np.minimum(arc, 1.0))

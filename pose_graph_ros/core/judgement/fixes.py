@@ -19,6 +19,7 @@ from pose_graph_ros.core.graph.constraints import Edges, ObservedNodes
 from pose_graph_ros.core.graph.graph import GraphUpdate
 from pose_graph_ros.core.graph.reweighting import Reweighting
 from pose_graph_ros.core.judgement import fix_states as fs, fix_verdicts
+from pose_graph_ros.core.judgement.decision_cost import decision_cost
 from pose_graph_ros.core.judgement.listing import MOST_OTHERS
 from pose_graph_ros.core.judgement.run_set import NOWHERE, RunSet, Turn
 from pose_graph_ros.core.judgement.runs import odometry_between
@@ -53,7 +54,7 @@ class _Before(NamedTuple):
 
 
 class _Decided(NamedTuple):
-    """What was decided on all measurements by `final_weights`, for `finish`."""
+    """A decision on all measurements."""
 
     run: IntArray
     believed: IntArray
@@ -242,11 +243,7 @@ class FixJudge:
         if decided is None:
             self._judge_all()
         else:
-            self._runs, self._loosened = decided.runs, decided.loosened
-            states.records[:, fs.RUN] = decided.run
-            for believed in (False, True):
-                states.believe(np.flatnonzero(decided.believed == believed), believed=believed,
-                               now_ns=self._now_ns)
+            self._use(decided)
         states.changed = {number: before for number, before in sorted(states.changed.items())
                           if before != bool(states.records[number, fs.BELIEVED])}
         change = self._with_weights(GraphUpdate(), len(states), loosened)
@@ -269,22 +266,33 @@ class FixJudge:
                                     (0, weights[1], graph.observed_rows)):
             some = records[records[:, fs.EDGE] == kind]
             table[row_of(some[:, fs.HELD])] = some[:, fs.BELIEVED]
-        decided = _Decided(records[:, fs.RUN].copy(), records[:, fs.BELIEVED].copy(),
-                           self._runs, self._loosened)
+        decided = self._decision()
         self.rollback()
         self._decided = decided
         return weights
+
+    def _decision(self) -> _Decided:
+        records = self._states.records
+        return _Decided(records[:, fs.RUN].copy(), records[:, fs.BELIEVED].copy(),
+                        self._runs, self._loosened)
+
+    def _use(self, decided: _Decided) -> None:
+        self._runs, self._loosened = decided.runs, decided.loosened
+        self._states.records[:, fs.RUN] = decided.run
+        for believed in (False, True):
+            self._states.believe(np.flatnonzero(decided.believed == believed), believed=believed,
+                                 now_ns=self._now_ns)
 
     def _can_judge_all(self) -> bool:
         return 0 < len(self._states) <= MOST_AGAIN and not self._smoother.graph.has_touched
 
     def _judge_all(self) -> None:
         """
-        Judge all measurements again.
+        Judge all measurements again, and keep the present decision if it is the cheaper one.
 
         Their errors are taken to be as stated, whatever was found since they came.
         """
-        graph, states = self._smoother.graph, self._states
+        graph, states, present = self._smoother.graph, self._states, self._decision()
         self._runs, self._loosened = self._runs.empty(), {}
         self._runs.chain.extend(graph)
         if self._cut is not None:
@@ -298,6 +306,16 @@ class FixJudge:
                 order.tolist(), stamps_ns.tolist(), seen, strict=True):
             self._judge(stamp_ns, one, None)
         self._again = -1
+        if np.array_equal(present.believed, states.records[:, fs.BELIEVED]):
+            return
+        begin = None if self._cut is None else self._cut[1]
+        now, before = (decision_cost(
+            ((stamp_ns, one, run, believed) for stamp_ns, one, run, believed in zip(
+                stamps_ns.tolist(), seen, decided.run[order].tolist(),
+                (decided.believed[order] != 0).tolist(), strict=True) if one is not None),
+            begin, self._runs.chain) for decided in (self._decision(), present))
+        if before < now:
+            self._use(present)
 
     def decide_leaving(
         self, edges: IntArray, observed: IntArray,

@@ -17,14 +17,14 @@ from typing import NamedTuple
 import numpy as np
 
 from pose_graph_ros.core.batch.optimizer import Status
-from pose_graph_ros.core.config import BackendConfig, Robust
+from pose_graph_ros.core.config import BackendConfig, Loss, Robust
 from pose_graph_ros.core.geometry.se2 import FloatArray, IntArray
 from pose_graph_ros.core.graph.constraints import EdgeKind
 from pose_graph_ros.core.graph.graph import GraphUpdate
 from pose_graph_ros.core.graph.graph_view import DrawnRows
 from pose_graph_ros.core.graph.reweighting import Reweighting
 from pose_graph_ros.core.judgement import fix_verdicts
-from pose_graph_ros.core.judgement.closure_judge import ClosureJudge
+from pose_graph_ros.core.judgement.closure_judge import ClosureJudge, LARGE
 from pose_graph_ros.core.judgement.closure_states import SavedClosures
 from pose_graph_ros.core.judgement.fix_states import SavedFixes
 from pose_graph_ros.core.judgement.fixes import FixJudge
@@ -80,6 +80,8 @@ class Judge:
         self._closures = ClosureJudge(smoother, reweighting, config, self._odometry)
         self._staged = np.empty(0, dtype=np.int64)
         """The judged closures of the last `before`, by their numbers among its edges."""
+        self._new: Sequence[NewConstraint] = ()
+        """All constraints of the last `before`."""
         self._left: deque[Verdict] = deque(maxlen=MOST_OTHERS)
         """On the newest constraints that have left the graph unused."""
 
@@ -102,6 +104,7 @@ class Judge:
         now_ns : int, stamp of the newest odometry
 
         """
+        self._new = new
         change = self._fixes.before(new, change, now_ns)
         change = change._replace(weigh_edges=self._odometry.kept(change.weigh_edges))
         first = self._smoother.graph.next_ids.edge
@@ -113,13 +116,16 @@ class Judge:
         return _weighed(change, self._staged, self._closures.before(
             closures, change.edges.rows(self._staged), now_ns))
 
-    def solve(self, change: GraphUpdate) -> UpdateResult:
+    def solve(self, change: GraphUpdate, *, at_once: bool = False) -> UpdateResult:
         """
         Return the result of the update of the last `before`.
 
         If its iterations diverge, the new closures are doubted for the moment, and tried between
         two updates. If they diverge without them and nothing else that is new has a weight, it is
         because of what earlier updates have left over: that is solved for between two updates.
+        So is what is new in a large graph, or where that goes on: solving all of it takes longer
+        than an update may, but `at_once`. If they diverge even so, the result is FAILED with the
+        reason `DIVERGED`, and the constraints may come again.
         """
         result = self._smoother.update(change, fall_back=False)
         weights = self._closures.withhold() if result.reason == DIVERGED else None
@@ -129,9 +135,69 @@ class Judge:
         if result.reason != DIVERGED:
             return result
         if self._smoother.append(change):
-            self._closures.solve_later()
+            self.solve_later({}, {})
             return UpdateResult(Status.MAX_ITERATIONS, '', 0, 0, 0, 0)
+        if not at_once and not self.may_solve():
+            without, *later = self._without_weights(change)
+            result = self._smoother.update(without, fall_back=False)
+            if result.reason == DIVERGED:
+                later = [{}, {}]
+            self.solve_later(*later)
+            return result
         return self._smoother.update(change)
+
+    def _without_weights(
+        self, change: GraphUpdate,
+    ) -> tuple[GraphUpdate, dict[int, float], dict[int, float]]:
+        """
+        Return an update with weight 0 for its new measurements in the map that have a loss.
+
+        With it come the weights of edges and observed nodes, by id, that it leaves out. As long as
+        the graph cannot be solved with them, reweighting tries to set them.
+        """
+        begin = self._smoother.graph.next_ids
+        weights = change.edges.weight.copy(), change.observed.weight.copy()
+        later: tuple[dict[int, float], dict[int, float]] = {}, {}
+        wanted = dict(change.weigh_edges), dict(change.weigh_observed)
+        for one in self._new:
+            if one.kind is LoopClosure or self._config.measurement_source(
+                    one.source, one.kind).applied_loss is Loss.NONE:
+                continue
+            kind, number = (0, one.held_by) if one.held_by >= 0 else (1, one.number)
+            row = number - (begin.edge, begin.observed)[kind]
+            later[kind][number] = wanted[kind].pop(number, float(weights[kind][row]))
+            weights[kind][row] = 0.0
+        for kind in (0, 1):
+            for number in list(wanted[kind]):
+                if self._reweighting.knows(number, edge=kind == 0):
+                    later[kind][number] = wanted[kind].pop(number)
+        edges, observed = weights
+        return change._replace(
+            edges=replace(change.edges, weight=edges), weigh_edges=wanted[0],
+            observed=replace(change.observed, weight=observed), weigh_observed=wanted[1],
+        ), *later
+
+    def may_solve(self) -> bool:
+        """Tell whether an update that has diverged may solve for all at once."""
+        trial = self._closures.trial
+        is_large = self._smoother.graph.n_nodes > LARGE
+        return not (is_large or trial.is_due_or_pausing) and trial.may_solve()
+
+    def solve_later(self, edges: Mapping[int, float], observed: Mapping[int, float]) -> None:
+        """
+        Solve the graph with some weights as a copy between the updates, as these diverge.
+
+        Parameters
+        ----------
+        edges, observed : mapping, new weights by id
+
+        """
+        self._closures.trial.begin({}, edges, observed=observed)
+
+    @property
+    def solves_later(self) -> bool:
+        """Whether that goes on, or has to wait until the graph has grown."""
+        return self._closures.trial.is_due_or_pausing
 
     def _is_judged_closure(self, one: NewConstraint, change: GraphUpdate, first: int) -> bool:
         number = one.number - first
@@ -174,6 +240,10 @@ class Judge:
         return [*self._closures.reports.verdicts(graph, most_believed),
                 *self._odometry.verdicts(graph, self._believed_after),
                 *fix_verdicts.verdicts(self._fixes.states, graph, most_believed), *self._left]
+
+    def closures(self) -> tuple[IntArray, IntArray]:
+        """Return the edges of judged loop closures, and stamps of their ends [ns], (L, 2)."""
+        return self._closures.states.edge, self._closures.states.stamps_ns
 
     def drawn_rows(self) -> DrawnRows:
         """Return the rows of constraints that are drawn in another way than believed ones."""
@@ -311,8 +381,9 @@ class Judge:
             self._reweighting.set_base_weights(base)
             graph.set_weights(weights)
             graph.set_poses(poses)
-        while self.work():
-            pass
+        for _ in range(self._closures.most_parts):  # the end of it is decided anew anyway
+            if not self.work():
+                break
         self._fixes.finish()
         self._keep_gaps()
         self._closures.decide_finally()

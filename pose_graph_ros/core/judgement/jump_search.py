@@ -65,7 +65,7 @@ def search(present: Swap, graph: Graph) -> Generator[None, None, Found | None]:
         fit = members[residual[members] <= GATE]
         if (present.truncated(copy, closures, residual) + strain.PRICE >= present.cost
                 or len(fit) < jumps.MOST_FIT * len(members)
-                or strain.n_places(copy.poses, edges.rows(fit)) < strain.PLACES):
+                or strain.n_places(copy.poses, edges.rows(fit), odometry) < strain.PLACES):
             continue
         total = se2.between(*copy.poses[odometry.nodes[[place.first, place.last]]])
         at, motion = odometry.smallest_jump(

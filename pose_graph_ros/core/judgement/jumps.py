@@ -188,7 +188,7 @@ def _with_jump(
     trial = other.improved(trial, RETESTS, ROUGH)
     fit = place.members[trial.believed[place.members]]
     if len(fit) < MOST_FIT * len(place.members) or n_places(
-            trial.poses, problem.edges.rows(fit)) < PLACES:
+            trial.poses, problem.edges.rows(fit), odometry) < PLACES:
         return None
     return trial if _is_better(problem, choice, other, trial, price) else None
 
@@ -296,7 +296,7 @@ def places(
         if place is None or place.gain <= found.get(
                 (place.first, place.last), place._replace(gain=0.0)).gain:
             continue
-        if n_places(poses, edges.rows(place.members)) >= PLACES:
+        if n_places(poses, edges.rows(place.members), odometry) >= PLACES:
             found[place.first, place.last] = place
     return sorted(found.values(), key=lambda place: (-place.gain, place.first))[:MOST_TRIALS]
 

@@ -213,11 +213,16 @@ def agreement_scale(
     if len(set(first)) < LEAST:
         return 1.0
     claimed, pairs = claims(edges, np.zeros(3)), (np.array(first), np.array(second))
-    scale = 1.0
-    while scale < LARGEST and np.median(squared_distances(
-            table.chain, claimed._replace(noise=scale**2 * claimed.noise), *pairs)) > MEDIAN:
+
+    def distance(factor: float) -> float:
+        return float(np.median(squared_distances(
+            table.chain, claimed._replace(noise=factor**2 * claimed.noise), *pairs)))
+
+    scale, share = 1.0, math.log(distance(1.0) / distance(RATIO)) / (2.0 * math.log(RATIO))
+    while scale < LARGEST and distance(scale) > MEDIAN:
         scale *= RATIO
-    return _believed(scale, len(set(first)))
+    # where odometry makes most of the distance, it tells little of closures
+    return _believed(scale, share * len(set(first)))
 
 
 def _believed(shown: float, n: float) -> float:

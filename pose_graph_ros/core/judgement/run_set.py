@@ -168,7 +168,7 @@ class RunSet:
         late = stamp_ns < main.end_ns
         cov, noise = predicted.cov, seen.noise
         wide = cov[0, 0] + cov[1, 1] >= WIDE * (noise[0, 0] + noise[1, 1])
-        run = None if late else self._join_other(stamp_ns, seen, mine if fits else None)
+        run = None if late else self._join_other(stamp_ns, seen, mine if fits else None, wide=wide)
         if run is None and fits and (not wide or late):
             self._noise.note(source, mine.d2, seen.size)
             main.n += 1
@@ -207,19 +207,20 @@ class RunSet:
         return track
 
     def _join_other(
-        self, stamp_ns: int, seen: Observation, mine: Innovation | None,
+        self, stamp_ns: int, seen: Observation, mine: Innovation | None, *, wide: bool,
     ) -> Run | None:
         """
         Add an observation to the doubted run that predicts it best.
 
-        Where the run that is believed predicts it as well, with `mine`, another one must be more
-        than a single measurement, go on at present, and predict it better.
+        Where the run that is believed predicts it as well, with `mine`, another one must go on at
+        present and predict it better, and be more than a single measurement: but where that
+        prediction is `wide`, each of a row of wrong ones would begin a run, and count for itself.
         """
         best = np.inf if mine is None else mine.d2 + mine.spread
         chosen: tuple[Run, Track, Track] | None = None
         for run in self._runs:
             if (run.believed or stamp_ns < run.end_ns or run.track.node > seen.node or (
-                    mine is not None and (run.n == 1 or run.contradicted))):
+                    mine is not None and ((run.n == 1 and not wide) or run.contradicted))):
                 continue
             begin, track, turned = run.predicted(seen, self.chain)
             innovation = track.innovation(seen)

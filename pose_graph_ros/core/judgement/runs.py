@@ -9,10 +9,8 @@ price in units of chi2:
 - a run of wrong measurements costs `EVENT`, and `RATE` for each second that it lasts: errors live
   for seconds to minutes, so a hundred fixes within one correlation time count as one;
 - two runs that are believed one after the other cost the squared Mahalanobis distance between
-  them, or, if odometry was worse than claimed in between, `EVENT` and a price that grows with the
-  square of the jump over the way travelled in between, later with its logarithm: where there is
-  little way, a jump is unlikely, however large. It is less where the measurements go on as a robot
-  moves: a receiver that goes wrong would hardly do so next to where it was right.
+  them, or, if odometry has slipped in between, `EVENT` and as much as a slip of this size is less
+  likely than a fault of the receiver: slips are rarer and go less far, mostly not beyond the way.
 
 `run_choice` finds the set of runs with the lowest price.
 """
@@ -38,15 +36,15 @@ EVENT = 13.8
 # Price of a second of wrong measurements [1/s], and the longest time that one of them counts [s].
 RATE = 0.25
 LONGEST = 10.0
-# Sigma of what odometry is worse than claimed, if it is: by the way [m/m], and in any case [m],
-# and that of the heading [rad].
-WORSE_BY_WAY = 0.1
-WORSE = 0.5
-WORSE_HEADING = 0.1
-# Squared sigmas of a jump at which its price becomes logarithmic.
-KNEE = 5.0
-# How far wrong measurements are off, about [m].
-FAR = 60.0
+# How far a receiver in a fault is off, about, and how far a slip of odometry goes [m]; the heading
+# that it leaves unknown [rad].
+FAULT, SLIP, SLIP_HEADING = 20.0, 1.0, 0.3
+# Time between two slips of odometry in units of that between two faults of a receiver, hours to
+# minutes.
+SLIPS_RARER = 30.0
+# Wheels that spin make the way too long: that the robot moved without them is less likely by so
+# much, once it would be by so far [m].
+UNMOVED, UNMOVED_WAY = 14.0, 5.0
 # Time between the states that a run notes [ns]; one is dropped when its neighbours' ages differ by
 # less than this factor; the newest so many are kept, which reach back about 7 minutes.
 NOTED_EVERY_NS, NOTED_RATIO, NOTED = 3_000_000_000, 1.4, 20
@@ -255,24 +253,9 @@ class Run:
         if self.n < LEAST_MEMBERS:
             return Transition(math.inf)
         way = _way(chain, track.node, self.first.node)
-        worse = (WORSE + WORSE_BY_WAY * way)**2
-        size2 = float(jump[0]**2 + jump[1]**2)
-        variance = float(jump[:2] @ cov[:2, :2] @ jump[:2]) / max(size2, 1e-12)
-        s2 = size2 / max(variance, worse) + jump[2]**2 / max(cov[2, 2], WORSE_HEADING**2)
-        price = max(KNEE * math.log1p(s2 / KNEE) - self._goes_on(track, way), 0.0)
-        return Transition(min(EVENT + price, d2), self._scale(track, jump, chain))
-
-    def _goes_on(self, track: Track, way: float) -> float:
-        """
-        Return the evidence for a jump of odometry in that the positions go on from a track.
-
-        It is twice the logarithm of how much likelier it is that the robot moved so far, about as
-        far as the way by odometry, than that a measurement which is off by about `FAR` is so near.
-        """
-        moved = self.first.pose[:2] - track.pose[:2]
-        cov = track.cov + self.first.cov
-        variance = 0.5 * float(cov[0, 0] + cov[1, 1]) + way**2
-        return max(2.0 * math.log(FAR**2 / variance) - float(moved @ moved) / variance, 0.0)
+        price = slip_price(math.hypot(jump[0], jump[1]), 0.5 * float(cov[0, 0] + cov[1, 1]), way)
+        turn2 = float(jump[2]**2 / (cov[2, 2] + SLIP_HEADING**2))
+        return Transition(min(EVENT + price + turn2, d2), self._scale(track, jump, chain))
 
     def carry(self, chain: OdometryChain, nodes: IntArray) -> dict[int, int]:
         """
@@ -373,6 +356,25 @@ def fitted(seen: Sequence[Observation], chain: OdometryChain) -> Track | None:
     lever = float(np.sum(here.mean(axis=0)**2)) / spread
     position = variance * (1.0 / len(seen) + lever)
     return Track(seen[0].node, pose, np.diag((position, position, variance / spread)))
+
+
+def slip_price(size: float, variance: float, way: float) -> float:
+    """
+    Return how much less likely a slip of odometry is than a fault of a receiver, as twice the log.
+
+    Both have sizes with a Cauchy density in the plane, broadened by what is not known.
+
+    Parameters
+    ----------
+    size : float, how far the positions are off [m]
+    variance : float, of a coordinate of what odometry predicts [m^2]
+    way : float, by odometry [m]
+
+    """
+    slip, fault = (0.5 * math.log(scale**2 + variance) - 1.5 * math.log(
+        scale**2 + variance + size**2) for scale in (SLIP, FAULT))
+    unmoved = min(max((size - way) / UNMOVED_WAY, 0.0), 1.0)
+    return max(2.0 * (math.log(SLIPS_RARER) + fault - slip) + UNMOVED * unmoved, 0.0)
 
 
 def _way(chain: OdometryChain, begin: int, end: int) -> float:

@@ -124,7 +124,7 @@ def _where(
     motion = se2.compose(odometry.motions[k], without[k])
     ends = problem.edges
     over = choice.believed & (odometry.places(ends.i) <= k) & (odometry.places(ends.j) > k)
-    if n_places(choice.poses, ends.rows(over)) < PLACES:
+    if n_places(choice.poses, ends.rows(over), odometry) < PLACES:
         return None
     total = se2.between(odometry.poses[first], odometry.poses[k])
     total = se2.compose(se2.compose(total, motion),
@@ -133,7 +133,7 @@ def _where(
                  np.empty(0, dtype=np.int64))
 
 
-def n_places(poses: FloatArray, edges: Edges) -> int:
+def n_places(poses: FloatArray, edges: Edges, odometry: Odometry) -> int:
     """
     Return the number of places that closures are apart from one another at both ends.
 
@@ -142,7 +142,8 @@ def n_places(poses: FloatArray, edges: Edges) -> int:
     poses : ndarray, shape (N, 3)
 
     """
-    size = min(PLACE, PLACE_SHARE * float(np.max(np.ptp(poses[:, :2], axis=0))))
+    path = poses[odometry.nodes, :2]
+    size = min(PLACE, PLACE_SHARE * float(np.max(np.ptp(path, axis=0))))
     ends = poses[np.column_stack((edges.i, edges.j)), :2]
     kept = np.empty((0, 2, 2))
     for each in ends:

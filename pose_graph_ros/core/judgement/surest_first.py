@@ -224,7 +224,7 @@ class _Gates:
     def _chances(self, numbers: IntArray) -> FloatArray:
         """Return the chances of wrong constraints to pass their gates, shape (K,)."""
         alone = np.asarray(ALONE)[self._agreeing[numbers]]
-        extent = np.maximum(np.ptp(self._problem.graph.poses[:, :2], axis=0), 1.0)
+        extent = np.maximum(self._problem.graph.extent, 1.0)
         ball = 4.0 / 3.0 * np.pi * self._problem.limits[numbers] ** 1.5
         return np.asarray(np.minimum(
             ball * self.volume[numbers] / alone / (np.prod(extent) * 2.0 * np.pi), 1.0))

@@ -4,6 +4,7 @@
 
 from collections.abc import Iterable, Mapping, Sequence
 import math
+import re
 
 from pose_graph_ros.core.judgement.verdicts import (
     Decision,
@@ -16,6 +17,10 @@ from pose_graph_ros.core.judgement.verdicts import (
 from pose_graph_ros.core.measurements import Answer, rejected
 
 NANOSECONDS = 1_000_000_000
+ODOMETRY = 'odometry'
+"""What stands for the path without a constraint among those that contradict it."""
+PLAUSIBLE = 3.37
+"""Distance up to which a pose may be right: 99 % of right ones are nearer [sigma]."""
 NOUNS = {Judged.LOOP_CLOSURE: 'closure', Judged.FIX: 'fix', Judged.ODOMETRY: 'odometry edge'}
 PLURALS = {Judged.LOOP_CLOSURE: 'closures', Judged.FIX: 'fixes',
            Judged.ODOMETRY: 'odometry edges'}
@@ -34,6 +39,23 @@ def seconds(stamp_ns: int, digits: int = 3) -> str:
     """
     whole, rest = divmod(stamp_ns, NANOSECONDS)
     return f'{whole}.{f"{rest:09d}"[:digits]}'
+
+
+def short(value: float, digits: int = 2) -> str:
+    """
+    Return a number for people: with so many significant digits, but all those before the point.
+
+    Parameters
+    ----------
+    value : float
+    digits : int
+
+    """
+    rounded = float(f'{value:.{digits}g}')
+    if not 1e-4 <= abs(rounded) < 1e9:
+        return f'{value:.{digits}g}'
+    text = f'{value:.{max(digits - 1 - math.floor(math.log10(abs(rounded))), 0)}f}'
+    return text.rstrip('0').rstrip('.') if '.' in text else text
 
 
 def nanoseconds(text: str) -> int:
@@ -68,15 +90,17 @@ def sentence(verdict: Verdict, start_ns: int | None = None) -> str:
     ----------
     verdict : Verdict
     start_ns : int, optional
-        Start of the drive [ns]: its times are since then, `12.3 s`; else they are stamps.
+        Start of a drive that is over [ns]: its times are since then, `12.3 s`; else they are
+        stamps.
 
     """
     since, far = _time(verdict.since_ns, start_ns), _far(verdict.distance)
-    reason = _jump(verdict, start_ns) or far
+    reason = _jump(verdict, start_ns) or _doubt(verdict.distance)
     supported = '' if len(verdict.supported_by) == 0 else (
         f'; {joined(verdict.supported_by)} {_agree(verdict.supported_by)} with it')
-    contradicted = '' if len(verdict.contradicted_by) == 0 else (
-        f'; it contradicts {joined(verdict.contradicted_by)}')
+    # that odometry contradicts it is what its distance tells
+    others = [name for name in verdict.contradicted_by if name != ODOMETRY]
+    contradicted = '' if len(others) == 0 else f'; it contradicts {joined(others)}'
     if verdict.left:
         how = 'doubted' if verdict.kind is Judged.ODOMETRY else 'unused'
         return f'Left the window {how} at {since}: {reason}{contradicted}{supported}.'
@@ -85,7 +109,9 @@ def sentence(verdict: Verdict, start_ns: int | None = None) -> str:
         return f'{used} since {since}, as a person has decided: {far}{contradicted}{supported}.'
     match verdict.state:
         case State.BELIEVED:
-            return f'Believed and used since {since}: {far}{supported}{contradicted}.'
+            # of a drive that is over, the path is that with it
+            when = f' since {since}' if start_ns is None else ''
+            return f'Believed and used{when}: {far}{supported}{contradicted}.'
         case State.WEAKLY_BELIEVED:
             return (f'Believed weakly, but used since {since}: {far}, and little else speaks for '
                     f'it{supported}{contradicted}.')
@@ -119,6 +145,15 @@ def _far(distance: float) -> str:
         f'it was {distance:.1f} sigma from the path without it')
 
 
+def _doubt(distance: float) -> str:
+    """Return why a constraint is doubted, by its distance from the path without it [sigma]."""
+    if distance > PLAUSIBLE:
+        return _far(distance)
+    alone = '' if math.isnan(distance) else (
+        f'by itself it could be right, {distance:.1f} sigma from the path without it, but ')
+    return f'{alone}all others together agree better without it'
+
+
 def unknown(name: str, *, has_left: bool) -> Answer:
     """
     Return the answer to a decision on a constraint that is not in the graph.
@@ -132,6 +167,8 @@ def unknown(name: str, *, has_left: bool) -> Answer:
     if has_left:
         return rejected('left_window', f'{name} has left the window of the graph, so nothing can '
                                        'be decided on it any more')
+    if re.fullmatch(r'\w+/\d+', name) is not None:
+        return rejected('unknown_id', f'there is no verdict {name!r}: it is none of those listed')
     return rejected('unknown_id', 'expected the id of a verdict, such as loop_closure/17, '
                                   f'got {name!r}')
 
@@ -174,7 +211,7 @@ def totals_text(totals: SourceVerdicts) -> str:
     if totals.n_left > 0:
         parts.append(f'{totals.n_left} left the window, {totals.n_left_unused} of them unused')
     if totals.scale != 1.0:
-        parts.append(f'sigmas times {totals.scale:.3g}')
+        parts.append(f'sigmas times {short(totals.scale, 3)}')
     return ', '.join(parts)
 
 

@@ -285,6 +285,14 @@ def _innovate(  # type: ignore[no-untyped-def]
                     total += jacobian[i, k] * cov[k, m] * jacobian[j, m]
             cov_out[i, j] = total
     l10, l20, l21, d0, d1, d2 = _factor(cov_out, n)
+    if not (d0 > 0.0 and d1 > 0.0 and d2 > 0.0):
+        # far from the origin of odometry the rounding of its sums may exceed what is left of them
+        for i in range(n):
+            least = LEAST_SIGMA[0] if i < 2 else LEAST_SIGMA[1]
+            total = max(cov_out[i, i], noise[i, i], least * least)
+            cov_out[i, :] = 0.0
+            cov_out[i, i] = total
+        l10, l20, l21, d0, d1, d2 = _factor(cov_out, n)
     y = error[1] - l10 * error[0]
     distance2 = error[0] * error[0] / d0 + y * y / d1
     if n == 3:

@@ -67,7 +67,7 @@ class Verdict:
     """Of the other end of a loop closure or an odometry edge [ns]."""
     state: State
     since_ns: int
-    """Stamp of the newest odometry when the state was last changed [ns]."""
+    """Stamp of the newest odometry when it came, or when its use began or ended last [ns]."""
     decision: Decision
     residual: FloatArray
     """Error at the present estimate, shape (3,) [m, m, rad]; nan where nothing is measured."""

@@ -30,6 +30,8 @@ SIGNIFICANT = 5.0
 # Rotations of independent sensors differ by more than the first of these; by more than the second
 # they contradict each other [sigma].
 INDEPENDENT, CONTRADICTORY = 0.1, 1.5
+# A gyroscope that turns by less than this share of the rotation by odometry has another axis.
+LEAST_SHARE = 0.3
 # Differences beyond do not count, as those of wheels that slip [sigma].
 MOST = 5.0
 
@@ -49,6 +51,8 @@ class Agreement:
     def __init__(self) -> None:
         self._normal, self._right = np.zeros((3, 3)), np.zeros(3)
         self._squares = self._n = self._turned = 0.0
+        self._shares = np.zeros((2, 2))
+        """Products of time and rotation by odometry with that rotation and the gyroscope's."""
 
     def add(
         self, difference: float, seconds: float, change: float, angle: float, variance: float,
@@ -74,13 +78,22 @@ class Agreement:
         self._right = fade * self._right + weight * difference * row
         self._squares = fade * self._squares + weight * difference * difference
         self._n = fade * self._n + 1.0
-        self._turned = fade * self._turned + abs(angle)
+        by_odometry = angle - difference
+        self._shares = fade * self._shares + weight * np.outer(
+            (seconds, by_odometry), (by_odometry, angle))
+        self._turned = fade * self._turned + max(abs(angle), abs(by_odometry))
 
     def _fit(self) -> tuple[FloatArray, FloatArray]:
         """Return bias, time and scale, and their covariance."""
         # weak priors: 0.1 rad/s, 10 s, 10
         covariance = np.linalg.inv(self._normal + np.diag((1e2, 1e-2, 1e-2)))
         return np.asarray(covariance @ self._right), np.asarray(covariance, dtype=np.float64)
+
+    def _share(self) -> float:
+        """Return how much the gyroscope turns per rotation by odometry, but for its bias."""
+        (time_by, time_angle), (by_by, by_angle) = self._shares.tolist()
+        per_time = time_by / float(self._normal[0, 0])
+        return (by_angle - per_time * time_angle) / max(by_by - per_time * time_by, 1e-300)
 
     def difference(self) -> Difference | None:
         """Return the difference by now; None as long as too little is known."""
@@ -97,6 +110,9 @@ class Agreement:
             reason = 'odometry seems to contain it already, so that it counts twice'
         elif sigmas < CONTRADICTORY:
             pass
+        elif self._share() < LEAST_SHARE and not (shown[2] and scale > 1.0):
+            reason = ('it does not turn with odometry: its z axis is not up (see mounting and '
+                      '/tf_static), or it is dead')
         elif shown[2] and scale > 1.0:
             reason = 'it turns the other way: check its mounting'
         elif shown[1] and abs(early) > LEAST_EARLY:

@@ -7,7 +7,8 @@ import numpy as np
 from pose_graph_ros.core.geometry import se2
 from pose_graph_ros.core.geometry.se2 import FloatArray
 from pose_graph_ros.core.odometry.jumps import MEMORY_TIME
-from pose_graph_ros.core.odometry.timeline import OdometryTimeline, Variances
+from pose_graph_ros.core.odometry.motion import Variances
+from pose_graph_ros.core.odometry.timeline import OdometryTimeline
 
 # Standard deviations of the motion across a jump or a gap for a robot at rest; the way at the
 # previous speed is added [m, rad].

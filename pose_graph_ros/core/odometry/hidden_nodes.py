@@ -131,11 +131,7 @@ class HiddenNodes:
         return self.streams[self.primary].newest_ns if self._primaries else -1
 
     def configure(self, config: BackendConfig) -> None:
-        """
-        Set the settings for nodes and edges that are made from now on.
-
-        The next edge has the new noise over all of the motion since the newest node.
-        """
+        """Set the settings for nodes and edges from now on; the next one has the new noise."""
         self._config = config
         for name, stream in self.streams.items():
             stream.configure(config.odometry_source(name))
@@ -357,6 +353,13 @@ class HiddenNodes:
             adjoint = se2.adjoint(mean)
             mean, noise = se2.inverse(mean), adjoint @ noise @ adjoint.T
         return self.table.attachment(node, mean, noise)
+
+    def attach_ahead(self, stamp_ns: int) -> Attachment | None:
+        """Return the newest node and the motion to a later stamp [ns], settled or not."""
+        stream = self.streams[self.primary]
+        motion = stream.motion_ahead(self._base_ns, stamp_ns)
+        return None if motion is None else Attachment(int(self.ids[-1]), *self._after_span(
+            motion.increment, stream.covariance(motion, floor=False)))
 
     def _between_nodes(self, node: int, stamp_ns: int) -> Motion:
         """

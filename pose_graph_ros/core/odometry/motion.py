@@ -7,10 +7,15 @@ from typing import NamedTuple
 
 import numpy as np
 
-from pose_graph_ros.core.config import OdometryNoise
+from pose_graph_ros.core.config import NoiseFrom, OdometryNoise, OdometrySource
 from pose_graph_ros.core.geometry.covariance import UNKNOWN_HEADING_VARIANCE
 from pose_graph_ros.core.geometry.se2 import FloatArray
 
+# Largest variance of a twist that is used; those beyond, and zero, stand for unknown
+# [m^2/s^2, rad^2/s^2].
+LARGEST_TWIST_VARIANCE = 1e4
+Variances = tuple[float, float, float]
+"""Of (x, y, theta) [m^2, m^2, rad^2], or of a twist."""
 NO_VARIANCE: FloatArray = np.zeros(3)
 NO_VARIANCE.flags.writeable = False
 
@@ -44,6 +49,30 @@ class Attachment:
     """`T_at`, pose at the instant in the frame of the node, shape (3,) [m, m, rad]."""
     noise: FloatArray
     """Covariance of the motion in the frame at the instant, shape (3, 3)."""
+
+
+def step_variance(
+    source: OdometrySource, twist: Variances | None, step: tuple[float, float], elapsed: float,
+) -> Variances:
+    """
+    Return the variance of (x, y, theta) of a short motion in the robot's frame, but its scale.
+
+    Parameters
+    ----------
+    twist : tuple, optional, variance of the twist in its message; None if it has none
+    step : tuple, length and absolute turn of the motion [m, rad]
+    elapsed : float, time of the motion [s]
+
+    """
+    noise = source.noise
+    by_model = (noise.sigma_distance**2 * step[0], noise.sigma_lateral**2 * step[0],
+                noise.sigma_heading_distance**2 * step[0] + noise.sigma_heading_turn**2 * step[1])
+    if source.noise_from is not NoiseFrom.TWIST or twist is None:
+        return by_model
+    x, y, theta = (
+        variance * elapsed if 0.0 < variance <= LARGEST_TWIST_VARIANCE else instead
+        for variance, instead in zip(twist, by_model, strict=True))
+    return x, y, theta
 
 
 def odometry_covariance(

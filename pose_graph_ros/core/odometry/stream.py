@@ -10,7 +10,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from pose_graph_ros.core.config import NoiseFrom, OdometrySource
+from pose_graph_ros.core.config import NoiseFrom, OdometryNoise, OdometrySource
+from pose_graph_ros.core.geometry import se2
 from pose_graph_ros.core.geometry.scalar_se2 import (
     between_one,
     compose_one,
@@ -36,19 +37,15 @@ from pose_graph_ros.core.odometry.gaps import (
     SPEED_TIME_NS,
 )
 from pose_graph_ros.core.odometry.jumps import is_jump, MEMORY_TIME, Speeds, SpeedWindow, UNKNOWN
-from pose_graph_ros.core.odometry.motion import Motion, odometry_covariance
-from pose_graph_ros.core.odometry.saved_stream import NO_TWIST, SavedInstant, SavedStream
-from pose_graph_ros.core.odometry.timeline import (
-    next_row,
-    NOTHING,
-    OdometryTimeline,
-    Row,
+from pose_graph_ros.core.odometry.motion import (
+    Motion,
+    odometry_covariance,
+    step_variance,
     Variances,
 )
+from pose_graph_ros.core.odometry.saved_stream import NO_TWIST, SavedInstant, SavedStream
+from pose_graph_ros.core.odometry.timeline import next_row, NOTHING, OdometryTimeline, Row
 
-# Largest variance of a twist that is used; those beyond, and zero, stand for unknown
-# [m^2/s^2, rad^2/s^2].
-LARGEST_TWIST_VARIANCE = 1e4
 # A sample is dropped if its stamp is farther ahead, by this and the reorder window [ns], than the
 # stamps of this number of consecutive samples that came after it.
 FAR_AHEAD_NS = 10_000_000_000
@@ -107,6 +104,8 @@ class OdometryStream:
         """Settled samples, in a frame without jumps."""
         self.n_jumps = 0
         """Number of jumps among the settled samples."""
+        self.jump = ''
+        """When and how far odometry jumped last, in words."""
         self.n_sorted = 0
         """Number of samples that were received after newer ones and sorted in before them."""
         self.n_dropped = 0
@@ -219,7 +218,9 @@ class OdometryStream:
             if not self._ahead:
                 self._ahead.append(self._next_instant(self._last, self._waiting[0]))
             del self._waiting[0]
-            self._last = self._ahead.pop(0)
+            before, self._last = self._last, self._ahead.pop(0)
+            if self._last.jumped and before is not None:
+                self.jump = _described(before, self._last)
             self.n_jumps += self._last.jumped
             if self._last.restarted:
                 self.restarted_ns = self._last.row.stamp_ns
@@ -286,6 +287,15 @@ class OdometryStream:
         self.restarted_ns = saved.restarted_ns
         self.saved_ns = self.newest_ns
 
+    def usual_noise(self) -> OdometryNoise:
+        """Return the noise by path and turns; of twists what they usually say of a metre."""
+        noise = self._source.noise
+        if self._source.noise_from is NoiseFrom.TWIST:
+            along, across, heading = np.sqrt(self.timeline.usual_variances()).tolist()
+            noise = replace(noise, sigma_distance=along, sigma_lateral=across,
+                            sigma_heading_distance=heading, sigma_heading_turn=0.0)
+        return noise.scaled(math.sqrt(self._source.covariance_scale))
+
     def covariance(self, motion: Motion, *, floor: bool = True) -> FloatArray:
         """
         Return the covariance, shape (3, 3), of a motion by this odometry in the frame at its end.
@@ -310,6 +320,27 @@ class OdometryStream:
         if last is None:
             raise ValueError('there is no odometry')
         return self.timeline.motion_to(since_ns, last.row), np.array(last.raw)
+
+    def motion_ahead(self, since_ns: int, stamp_ns: int) -> Motion | None:
+        """
+        Return the motion from a settled instant to one after it that may not be settled [ns].
+
+        None if samples do not cover that instant closely.
+        """
+        self._compute_ahead()
+        rows = [each.row for each in (*filter(None, [self._last]), *self._ahead)]
+        after = bisect.bisect_left(rows, stamp_ns, key=lambda row: row.stamp_ns)
+        if not 0 < after < len(rows):
+            return None
+        ends = OdometryTimeline()
+        for row in rows[after - 1:after + 1]:
+            ends.append(row)
+        if not ends.covers(stamp_ns, closely=True):
+            return None
+        first = self.timeline.motion_to(since_ns, rows[after - 1])
+        last = ends.motion(rows[after - 1].stamp_ns, stamp_ns)
+        return Motion(se2.compose(first.increment, last.increment), first.distance + last.distance,
+                      first.turn + last.turn, first.variance + last.variance)
 
     def _compute_ahead(self) -> None:
         """Compute the states at all samples that are not settled."""
@@ -348,16 +379,7 @@ class OdometryStream:
         """Return the variance of (x, y, theta) of a step by the twist; zero with other models."""
         if self._source.noise_from is not NoiseFrom.TWIST:
             return NOTHING
-        noise = self._source.noise
-        by_model = (
-            noise.sigma_distance**2 * step[0], noise.sigma_lateral**2 * step[0],
-            noise.sigma_heading_distance**2 * step[0] + noise.sigma_heading_turn**2 * step[1])
-        if sample.variance is None:
-            return by_model
-        x, y, theta = (
-            variance * elapsed if 0.0 < variance <= LARGEST_TWIST_VARIANCE else instead
-            for variance, instead in zip(sample.variance, by_model, strict=True))
-        return x, y, theta
+        return step_variance(self._source, sample.variance, step, elapsed)
 
 
 def _integrated(first: Pose, last: Pose, elapsed: float) -> Pose:
@@ -377,6 +399,14 @@ def _after_jump(before: _Instant, stamp_ns: int, raw: Pose, elapsed: float) -> _
     row = next_row(before.row, stamp_ns, pose, loose=(position, position, heading))
     offset = compose_one(pose, between_one(raw, (0.0, 0.0, 0.0)))
     return _Instant(raw, row, offset, SpeedWindow(speeds, stamp_ns, pose), jumped=True)
+
+
+def _described(before: _Instant, after: _Instant) -> str:
+    """Return when and how far odometry jumped between two samples."""
+    x, y, turn = between_one(before.raw, after.raw)
+    begin_ns, end_ns = before.row.stamp_ns, after.row.stamp_ns
+    return (f'by {math.hypot(x, y):.2f} m and {math.degrees(turn):.1f} degrees within '
+            f'{(end_ns - begin_ns) * 1e-9:.3f} s at {end_ns * 1e-9:.3f} s')
 
 
 def _after_restart(before: _Instant, stamp_ns: int, raw: Pose) -> _Instant:

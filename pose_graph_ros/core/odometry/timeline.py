@@ -11,7 +11,7 @@ from pose_graph_ros.core.compiled.growing_array import GrowingArray
 from pose_graph_ros.core.geometry import se2
 from pose_graph_ros.core.geometry.scalar_se2 import Pose, wrap_one
 from pose_graph_ros.core.geometry.se2 import BoolArray, FloatArray, IntArray
-from pose_graph_ros.core.odometry.motion import Motion, NO_MOTION
+from pose_graph_ros.core.odometry.motion import Motion, NO_MOTION, Variances
 
 # Motions below both of these are not added to path length and turns: odometry jitters at rest,
 # and the sum of its jitter at 50 Hz would be a long path [m, rad].
@@ -29,7 +29,6 @@ LARGEST_GAP_NS = 1_000_000_000
 # to the two samples.
 UNIFORM_WITHIN = (1.0, 0.5)
 
-Variances = tuple[float, float, float]
 NOTHING: Variances = (0.0, 0.0, 0.0)
 
 
@@ -224,6 +223,16 @@ class OdometryTimeline:
             self._variances.append(rows[:, 5:])
         self._dense.append(dense)
         self._last, self.resting = last, resting
+
+    def usual_variances(self) -> FloatArray:
+        """Return the variances of (x, y, theta) for a metre, shape (3,); the median over time."""
+        rows = self._rows(slice(None))
+        steps = np.diff(rows[:, 3:], axis=0)
+        steps[:, 1] = np.diff(self._stamps.values)
+        moving = steps[:, 0] > 0.0
+        # a jump has a variance of its own
+        rates = np.median(steps[moving, 2:] / steps[moving, 1:2], axis=0) if np.any(moving) else 0
+        return np.zeros(3) + rates * np.sum(steps[moving, 1]) / np.sum(steps[moving, 0])
 
     def motion(self, start_ns: int, end_ns: int) -> Motion:
         """

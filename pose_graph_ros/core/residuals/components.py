@@ -4,43 +4,35 @@
 The factors on the sigmas of all sources together that make their residuals as large as expected.
 
 Where the covariances of a source are wrong, the estimate follows it too much or too little, and
-the residuals of the others show it as well. So all sources are weighed anew by the factors that
-their residuals show, on a copy of the graph, and so on until the factors agree with the residuals.
-These are the variance components of restricted maximum likelihood (D. A. Harville, "Maximum
-likelihood approaches to variance component estimation and to related problems", JASA 1977,
-section 5.2: Anderson's iteration). Sources keep their weights where chance explains the factor or
-the residuals say nothing, as do those whose correlated errors the graph has as a bias. Odometry is
-not weighed more than it claims: where it drifts by a slow error, as of a wheel radius, its
-residuals from node to node are small, but what they add up to is not.
+the residuals of the others show it as well. So the factors of all sources are found in one
+estimate (`variance_components`), in which each may be above and below 1. Sources whose correlated
+errors the graph has as a bias keep their covariances, and what their residuals at the estimate
+show; where such errors are taken for independent, nothing is known of the others either.
 """
 
-from collections.abc import Mapping
-import math
+from collections.abc import Iterator, Mapping
 from typing import NamedTuple
 
 import numpy as np
 
-from pose_graph_ros.core.graph.graph import Graph, GraphUpdate
+from pose_graph_ros.core.geometry import se2
+from pose_graph_ros.core.geometry.se2 import FloatArray, IntArray
+from pose_graph_ros.core.graph.graph import Graph
 from pose_graph_ros.core.graph.reweighting import Reweighting
+from pose_graph_ros.core.measurements import Answer
 from pose_graph_ros.core.odometry.hidden_nodes import HiddenNodes
+from pose_graph_ros.core.residuals import variance_components as vc
 from pose_graph_ros.core.residuals.scale import fit, ScaleFit
 from pose_graph_ros.core.residuals.source_residuals import (
     collect,
-    Scales,
+    inverse,
     scales_in_use,
     SourceResiduals,
 )
 from pose_graph_ros.core.residuals.whiteness import whiteness
 from pose_graph_ros.core.smoother.incremental import IncrementalSmoother
-from pose_graph_ros.core.smoother.results import UpdateResult
 from pose_graph_ros.core.sources.factor_builder import FactorBuilder
-
-# Largest number of times that the copy is optimised.
-ROUNDS = 6
-# Factors that change by less than this have converged.
-CONVERGED = 0.03
-# Largest change of a factor in one round, and largest one in all, either way.
-STEP, LARGEST = 3.0, 30.0
+from pose_graph_ros.core.sources.measurement_constraints import attach, closure_covariance
 
 
 class Analysis(NamedTuple):
@@ -51,7 +43,7 @@ class Analysis(NamedTuple):
     at_estimate: Mapping[str, ScaleFit]
     """How large they are."""
     together: Mapping[str, ScaleFit]
-    """The same where all sources have been weighed by what their residuals show."""
+    """The same, with the factors of all sources in one estimate."""
     correlated: frozenset[str]
     """
     Sources with correlated errors that the graph takes for independent: the residuals do not show
@@ -59,9 +51,13 @@ class Analysis(NamedTuple):
     """
 
 
+Closures = tuple[IntArray, IntArray]
+"""Ids of the edges of loop closures, and stamps of each and of its other end [ns], (L, 2)."""
+
+
 def analyse(
     smoother: IncrementalSmoother, nodes: HiddenNodes, factors: FactorBuilder,
-    reweighting: Reweighting,
+    reweighting: Reweighting, closures: Closures,
 ) -> Analysis:
     """
     Return the residuals of each source, and the factors on sigmas that they show together.
@@ -70,66 +66,93 @@ def analyse(
     ----------
     smoother, nodes, factors, reweighting
         Of the engine, all of whose edits have been solved for.
+    closures : tuple of ndarray, see `Closures`
 
     """
-    scales = scales_in_use(smoother.graph, reweighting)
-    residuals = collect(smoother, nodes, factors, scales)
+    residuals = collect(smoother, nodes, factors, scales_in_use(smoother.graph, reweighting))
     at_estimate = {source: fit(each, factors.errors_in_use(source))
                    for source, each in residuals.items()}
-    white = {source: None if np.any(each.is_edge) else whiteness(each)
-             for source, each in residuals.items() if each.kind == 'map'}
+    white = {source: each for source, each in residuals.items()
+             if each.kind != 'map' or not np.any(each.is_edge)}
     correlated = frozenset(
-        source for source, found in white.items() if found is not None and found.tau > 0.0)
+        source for source, each in white.items() if each.kind == 'map'
+        and (found := whiteness(each)) is not None and found.tau > 0.0)
     together = dict(at_estimate)
-    if len(correlated) > 0 or not any(
-            _change(source, residuals, at_estimate) != 1.0 for source in residuals):
-        return Analysis(residuals, at_estimate, together, correlated)
-    copy = Graph()
-    copy.fill(smoother.graph.rows())
-    other, now = IncrementalSmoother(graph=copy), residuals
-    for _ in range(ROUNDS):
-        changes = {source: _change(source, now, together) for source in now}
-        if all(change == 1.0 for change in changes.values()) or not _weigh(
-                other, now, changes, scales):
-            break
-        now = collect(other, nodes, factors, scales)
-        together = {source: fit(each, factors.errors_in_use(source))
-                    for source, each in now.items()}
+    if len(correlated) == 0:
+        together |= _together(smoother, nodes, at_estimate, white, closures)
     return Analysis(residuals, at_estimate, together, correlated)
 
 
-def _change(
-    source: str, residuals: Mapping[str, SourceResiduals], fits: Mapping[str, ScaleFit],
-) -> float:
-    """Return the factor that the sigmas of a source need, 1 where chance may explain it."""
-    found, each = fits[source], residuals[source]
-    if found.says_nothing or (each.kind == 'map' and np.any(each.is_edge)):
-        return 1.0
-    present = float(np.median(each.scale[each.used]))
-    wanted = min(max(found.ratio, 1.0 / LARGEST), LARGEST)
-    if each.kind == 'odometry':
-        wanted = max(wanted, min(present, 1.0))
-    change = wanted / present
-    if found.low <= change <= found.high or abs(math.log(change)) <= CONVERGED:
-        return 1.0
-    return min(max(change, 1.0 / STEP), STEP)
-
-
-def _weigh(
-    smoother: IncrementalSmoother, residuals: Mapping[str, SourceResiduals],
-    changes: Mapping[str, float], scales: Scales,
-) -> bool:
-    """Multiply sigmas and scales by factors, and optimise; tell whether that was possible."""
+def _together(
+    smoother: IncrementalSmoother, nodes: HiddenNodes, at_estimate: Mapping[str, ScaleFit],
+    sources: Mapping[str, SourceResiduals], closures: Closures,
+) -> dict[str, ScaleFit]:
+    """Return the fits of some sources with the factors of all of them in one estimate."""
     graph = smoother.graph
-    weights = graph.weights
-    for source, change in changes.items():
-        each = residuals[source]
-        for weight, scale, rows_of, ids in (
-                (weights[0], scales.edges, graph.edge_rows, each.ids[each.is_edge]),
-                (weights[1], scales.observed, graph.observed_rows, each.ids[~each.is_edge])):
-            rows = rows_of(ids)
-            weight[rows] /= change**2
-            scale[rows] *= change
-    graph.set_weights(weights)
-    result: UpdateResult = smoother.update(GraphUpdate())
-    return result.reason == ''
+    data = vc.constraints(graph)
+    try:
+        claimed = inverse(data.information, data.measured)
+    except np.linalg.LinAlgError:   # what thinning leaves has no covariance
+        return {source: at_estimate[source].unknown for source in sources}
+    place = np.full(graph.n_edges + graph.n_observed, -1)
+    place[data.rows] = np.arange(len(data.rows))
+    own, parts = claimed.copy(), {source: np.zeros_like(claimed) for source in sources}
+    for source, row, motion in _motions(graph, nodes, closures):
+        # of a graph that was loaded, less is known of what odometry has added
+        if (k := place[row]) >= 0 and source in parts and (
+                np.linalg.eigvalsh(claimed[k] - motion)[0] > 0.0):
+            parts[source][k], own[k] = motion, claimed[k] - motion
+    fixed = claimed / data.weight[:, None, None]
+    rows = {source: place[graph.edge_rows(each.ids) if np.all(each.is_edge)
+                          else graph.n_edges + graph.observed_rows(each.ids)][each.used]
+            for source, each in sources.items()}
+    for source, at in rows.items():
+        parts[source][at] += own[at]
+        fixed[at] = 0.0
+    components = {(source, kind): part for source, whole in parts.items()
+                  for kind, part in enumerate(vc.split(whole)) if np.any(part)}
+    found = vc.restricted_likelihood(data, np.array(list(components.values())), fixed)
+    if found is None:
+        return {source: at_estimate[source].unknown for source in sources}
+    return {source: _with_factors(at_estimate[source], own[at], found, {
+        kind: k for k, (name, kind) in enumerate(components) if name == source})
+        for source, at in rows.items() if len(at) > 0}
+
+
+def _motions(
+    graph: Graph, nodes: HiddenNodes, closures: Closures,
+) -> Iterator[tuple[str, int, FloatArray]]:
+    """Yield source, row of the edge, and covariance of what odometry adds to loop closures."""
+    ids, stamps_ns = closures
+    for row, mean, (stamp, other) in zip(graph.edge_rows(ids).tolist(), graph.edges_at(
+            ids).mean, stamps_ns.tolist(), strict=True):
+        reference, attachment = attach(nodes, other), attach(nodes, stamp)
+        if isinstance(reference, Answer) or isinstance(attachment, Answer):
+            continue
+        pose = se2.compose(se2.compose(se2.inverse(reference.motion), mean), attachment.motion)
+        yield nodes.primary_at(stamp), row, closure_covariance(
+            np.zeros((3, 3)), pose, reference, attachment)
+
+
+def _with_factors(
+    present: ScaleFit, claimed: FloatArray, found: vc.Found, parts: Mapping[int, int],
+) -> ScaleFit:
+    """
+    Return a fit with other factors.
+
+    Parameters
+    ----------
+    claimed : ndarray, shape (M, 3, 3), covariances of the constraints
+    parts : mapping, numbers of the components of the source, by 0 for the way and 1 for the turn
+
+    """
+    sigmas = np.sqrt(np.mean(np.diagonal(claimed, axis1=1, axis2=2), axis=0)).tolist()
+    rows = []
+    for row in present.rows:
+        part = parts.get(row.coordinate // 2)
+        ratio, low, high, _ = found.of([] if part is None else [part])
+        rows.append(row._replace(
+            sigma=sigmas[row.coordinate], ratio=ratio, low=low, high=high))
+    ratio, low, high, independent = found.of(list(parts.values()))
+    return present._replace(
+        rows=tuple(rows), ratio=ratio, low=low, high=high, independent=independent)

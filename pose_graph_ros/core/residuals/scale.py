@@ -66,7 +66,7 @@ class RowFit(NamedTuple):
     ratio: float
     """Of true to claimed sigmas, by this coordinate; NaN if it says nothing."""
     low: float
-    """If the claims are right, the ratio is between this and `high` in 95 % of all runs."""
+    """The true ratio is between this and `high` in 95 % of all runs."""
     high: float
 
 
@@ -95,6 +95,14 @@ class ScaleFit(NamedTuple):
         """Whether the residuals tell nothing of the covariances."""
         return math.isnan(self.ratio)
 
+    @property
+    def unknown(self) -> 'ScaleFit':
+        """The same, without saying how large sigmas are."""
+        rows = tuple(row._replace(ratio=math.nan, low=math.nan, high=math.nan)
+                     for row in self.rows)
+        return self._replace(
+            rows=rows, ratio=math.nan, low=math.nan, high=math.nan, independent=0.0)
+
 
 def fit(residuals: SourceResiduals, errors: CorrelatedErrors | None = None) -> ScaleFit:
     """
@@ -119,12 +127,12 @@ def fit(residuals: SourceResiduals, errors: CorrelatedErrors | None = None) -> S
     rows = _rows(used, used.rows(known), errors)
     independent = sum(_independent(used, row, errors) for row in range(_COORDINATES))
     ratio, low, high = _ratio(
-        float(np.mean(_bounded(energies, redundancy * freedom, freedom))),
+        float(np.mean(bounded(energies, redundancy * freedom, freedom))),
         float(np.mean(expected)), independent, redundancy)
     return ScaleFit(
         n, rows, float(np.mean(expected)), float(np.mean(energies)),
         float(np.mean(energies <= _quantiles(freedom, INTERVAL))), redundancy, independent,
-        scale * ratio, low, high)
+        scale * ratio, scale * low, scale * high)
 
 
 def _rows(
@@ -142,7 +150,7 @@ def _rows(
         share = float(np.mean(left[known.measured[:, row], row]))
         one = np.ones(len(squares))
         ratio, low, high = _ratio(
-            float(np.mean(_bounded(squares, share * one, one))), share,
+            float(np.mean(bounded(squares, share * one, one))), share,
             _independent(used, row, errors), share)
         rows.append(RowFit(
             row, len(squares), float(np.sqrt(np.mean(sigma**2))), math.sqrt(share),
@@ -161,15 +169,16 @@ def _left(residuals: SourceResiduals) -> FloatArray:
 def _ratio(
     found: float, expected: float, independent: float, redundancy: float,
 ) -> tuple[float, float, float]:
-    """Return the ratio of sigmas with the interval in which it is if the claims are right."""
+    """Return the ratio of sigmas with its interval."""
     if (independent < LEAST_INDEPENDENT or redundancy < LEAST_REDUNDANCY or expected <= 0.0):
         return math.nan, math.nan, math.nan
-    low, high = (math.sqrt(float(chdtri(independent, 0.5 + side * 0.5 * INTERVAL)) / independent)
-                 for side in (1.0, -1.0))
-    return math.sqrt(found / expected), low, high
+    ratio = math.sqrt(found / expected)
+    low, high = (ratio * math.sqrt(independent / float(
+        chdtri(independent, 0.5 + side * 0.5 * INTERVAL))) for side in (-1.0, 1.0))
+    return ratio, low, high
 
 
-def _bounded(squares: FloatArray, expected: FloatArray, freedom: FloatArray) -> FloatArray:
+def bounded(squares: FloatArray, expected: FloatArray, freedom: FloatArray) -> FloatArray:
     """
     Return squares up to a quantile of their distribution, if the median of all shows its scale.
 

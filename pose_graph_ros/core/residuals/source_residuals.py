@@ -80,7 +80,7 @@ class SourceResiduals(NamedTuple):
     @property
     def information(self) -> FloatArray:
         """R^-1 in the coordinates that are measured, else 0, shape (M, 3, 3)."""
-        return _inverse(self.covariances, self.measured)
+        return inverse(self.covariances, self.measured)
 
     @property
     def redundancies(self) -> FloatArray:
@@ -91,7 +91,7 @@ class SourceResiduals(NamedTuple):
     @property
     def distances(self) -> FloatArray:
         """Of unused constraints, `sqrt(e^T (R + J P J^T)^-1 e)`, shape (M,) [sigma]."""
-        joint = _inverse(self.covariances + self.taken, self.measured)
+        joint = inverse(self.covariances + self.taken, self.measured)
         return np.asarray(np.sqrt(np.einsum('mi,mij,mj->m', self.errors, joint, self.errors)))
 
 
@@ -141,14 +141,14 @@ def collect(
         columns = map(np.concatenate, zip(*parts, strict=True))
         found[source] = _sorted(_made(
             source, 'map', stamps[order], *columns, held.ids[order], held.is_edge[order]))
-    for (source, kind), ids in _edges_by_source(graph, nodes, factors).items():
+    for (source, kind), ids in edges_by_source(graph, nodes, factors).items():
         if source not in found:
             found[source] = _sorted(_of_edges(
                 smoother, nodes, (source, kind), ids, scales.edges[graph.edge_rows(ids)]))
     return {source: each for source, each in found.items() if len(each.ids) > 0}
 
 
-def _edges_by_source(
+def edges_by_source(
     graph: Graph, nodes: HiddenNodes, factors: FactorBuilder,
 ) -> Mapping[tuple[str, str], IntArray]:
     """Return the ids of the edges between poses by source and kind."""
@@ -192,7 +192,7 @@ def _of_observed(
     information = turn @ observed.information @ np.swapaxes(turn, 1, 2)
     measured = np.diagonal(observed.information, axis1=1, axis2=2) > 0.0
     errors = np.einsum('kij,kj->ki', turn, errors) * measured
-    return (errors, measured, _inverse(information, measured) * scale[:, None, None]**2,
+    return (errors, measured, inverse(information, measured) * scale[:, None, None]**2,
             _taken(graph, observed.node, observed.offset[:, :2], covariances),
             observed.weight > 0.0, scale)
 
@@ -206,7 +206,7 @@ def _of_biased(
     measured = np.diagonal(edges.information, axis1=1, axis2=2) > 0.0
     errors = (graph.edge_errors(edges) - factor * states) * measured
     variance = (factor / (1.0, 1.0, STRETCH))**2 * measured
-    covariance = _inverse(edges.information, measured) + variance[:, :, None] * np.eye(3)
+    covariance = inverse(edges.information, measured) + variance[:, :, None] * np.eye(3)
     return (errors, measured, covariance * scale[:, None, None]**2,
             _taken(graph, edges.i, edges.bias[:, :2], covariances), edges.weight > 0.0,
             np.sqrt(total) * scale)
@@ -238,7 +238,7 @@ def _of_edges(
     return SourceResiduals(
         *name, nodes.stamps_ns[np.clip(later, 0, len(nodes) - 1)],
         graph.edge_errors(edges) * measured, measured,
-        _inverse(edges.information, measured) * scale[:, None, None]**2, taken,
+        inverse(edges.information, measured) * scale[:, None, None]**2, taken,
         edges.weight > 0.0, scale, ids, np.ones(len(ids), dtype=bool))
 
 
@@ -255,8 +255,16 @@ def spread(n: int, most: int) -> IntArray:
         np.round(np.linspace(0, n - 1, most)).astype(np.int64))
 
 
-def _inverse(matrices: FloatArray, measured: BoolArray) -> FloatArray:
-    """Return the inverses of (M, 3, 3) in the coordinates that are measured, else 0."""
+def inverse(matrices: FloatArray, measured: BoolArray) -> FloatArray:
+    """
+    Return the inverses of matrices in the coordinates that are measured, else 0.
+
+    Parameters
+    ----------
+    matrices : ndarray, shape (M, 3, 3)
+    measured : ndarray, shape (M, 3)
+
+    """
     both = measured[:, :, None] & measured[:, None, :]
     filled = np.where(both, matrices, 0.0) + np.eye(3) * ~measured[:, :, None]
     return np.asarray(np.where(both, np.linalg.inv(filled), 0.0))

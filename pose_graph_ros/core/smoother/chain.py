@@ -157,7 +157,7 @@ def extend(head, mean, information, weight):  # type: ignore[no-untyped-def]
     _root_equations(head, last, old[tb.VALUES], front, 7)
     normal_equations.add_edge(head, e, 0, 3, -1, front, 7)
     scale_t, scale_r = node_f[last, tb.SCALE_T], node_f[last, tb.SCALE_R]
-    scale_by_edge(head, e, 1.0)
+    scale_by_edge(head, e, weight)
     _set_least_pivots(head, last, least)
     if node_i[last, tb.FIXED] != 0:
         _insert_fixed(head, last, front)

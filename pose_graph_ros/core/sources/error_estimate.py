@@ -6,9 +6,10 @@ The statistics of the errors of a source that its measurements and odometry make
 Of all values on a lattice those with the largest likelihood (`error_likelihood`) are searched,
 once for errors that are white and once for errors with a correlated part. Senders know the size of
 their errors better than how these go on, so a total variance other than the claimed one counts
-against both. The noise of odometry, whose settings are mostly guesses, is searched along: its
-drift must not be taken for an error of the source. Correlated errors are believed if they are much
-more likely than white ones.
+against both. The noise of odometry is mostly a guess: it is searched along, that of the way and
+that of turns by themselves, and odometry may have a constant error of the scale and of the yaw
+rate. Otherwise its drift, or that it has less than its settings say, would be taken for errors of
+the source. Correlated errors are believed if they are much more likely than white ones.
 
 The result depends on the measurements and on odometry alone, not on the estimate of the graph,
 and so not on the order of arrival. Searches are generators: each step takes a bounded time.
@@ -36,14 +37,13 @@ from pose_graph_ros.core.sources.past_path import no_past, PastPath
 NEWEST = OLDER = 2000
 # Minimum number of measurements for an estimate.
 LEAST_POSITIONS = 10
-# Number of filtered measurements in one step of a search, of 0.4 us each.
+# Number of filtered measurements in one step of a search, of 0.3 us each.
 PER_STEP = 5000
 # Number of nodes that are joined in one step, of 0.1 us each.
 NODES_PER_STEP = 10_000
-# How much more likely correlated errors must be: twice the difference of the logarithms. White
-# ones exceed it in one search of a hundred, which costs a few per cent of accuracy until the next;
-# correlated ones that are missed make the claimed covariances up to ten times too small.
-SIGNIFICANT = 5.0
+# How much more likely correlated errors must be, in twice the difference of the logarithms; once
+# they are believed, they must only be more likely, so that it does not flip to and fro.
+SIGNIFICANT = 20.0
 # The same for each time that the filter was lost: then odometry was wrong, or many positions.
 PER_LOST = 100.0
 # The same of a scale of the noise of odometry other than 1.
@@ -55,17 +55,23 @@ LONGEST = 16.0
 LEAST_CORRELATION = 0.2
 # Sigma of the logarithm of the total variance in units of the claimed one, before it is seen.
 SPREAD = 0.7
-# The same of the noise of odometry.
-ODOMETRY_SPREAD = 1.5
+# The same of white errors that are smaller: where positions scatter much less than is claimed, the
+# rest of the claim is mostly an error that changes slowly.
+SMALLER_SPREAD = 0.5
+# The same of the noise of way and turn by odometry: settings of turns are hardly ever known.
+WAY_SPREAD, TURN_SPREAD = 2.0, 3.0
 # Exponents of 2 on the lattice: smallest step, and bounds of the variances.
-FINEST, LEAST, MOST = 0.25, -8.0, 8.0
-# Exponents with which the searches begin: correlated part, odometry, white part.
-BEGINNINGS = ((0.0, 0.0, -5.0), (0.0, 0.0, -3.0), (-0.5, 0.0, -2.0), (-1.0, 0.0, -1.0))
-WHITE_BEGINNINGS = tuple((0.0, at) for at in (-6.0, -4.0, -2.0, 0.0, 2.0, 4.0, 6.0))
-# Place of the noise of odometry in a point, from the end.
+FINEST, LEAST, MOST = 0.25, -10.0, 8.0
+# Exponents with which the searches begin: correlated and white part; way and turn, also less than
+# white errors need; way, turn and white part.
+BEGINNINGS = ((0.0, -5.0), (0.0, -3.0), (-0.5, -2.0), (-1.0, -1.0))
+ODOMETRY_BEGINNINGS = (0.0, 0.0), (-4.0, -4.0)
+WHITE_BEGINNINGS = tuple((at, at, 0.0) for at in (-6.0, -4.0, -2.0, 0.0, 2.0, 4.0, 6.0))
+# Place of the noise of odometry in a point, from the end; that of turns, if way has its own.
 ODOMETRY = -2
 # Headings at which the filter starts, of which the best one is used.
 HEADINGS = 16
+LOG_2 = math.log(2.0)
 
 Point = tuple[float, ...]
 
@@ -76,7 +82,7 @@ class Estimate(NamedTuple):
     errors: CorrelatedErrors | None
     """Statistics of the errors of the source; None for white errors."""
     odometry_scale: float
-    """Factor on the sigmas of odometry, at least 1."""
+    """Factor on the sigmas of odometry."""
 
 
 NOTHING = Estimate(None, 1.0)
@@ -114,7 +120,7 @@ def measured_path(
     until, edge_after = _odometry(graph, observed.node, begin_at)
     yield
     n = len(until)
-    joined, spread = np.zeros((n, 3)), np.zeros((n, 3, 3))
+    joined, spread, way = np.zeros((n, 3)), np.zeros((n, 3, 3)), np.zeros((n, 3))
     begin = 0
     while begin < n:
         most = until[max(begin - 1, 0)] + NODES_PER_STEP
@@ -122,12 +128,13 @@ def measured_path(
         # those of nodes that have left since count as unknown
         rows_after = graph.edge_rows(edge_after)
         chain_motions(
-            graph.memory['edge_f'], rows_after, until, begin, end, joined, spread)
+            graph.memory['edge_f'], rows_after, until, begin, end, joined, spread, way)
         begin = end
         yield
     if past is not None:
-        return past.continued(stamps_ns, _path(stamps_ns, observed, joined[1:], spread[1:]))
-    return _path(stamps_ns, observed, joined, spread)
+        return past.continued(
+            stamps_ns, _path(stamps_ns, observed, joined[1:], spread[1:], way[1:]))
+    return _path(stamps_ns, observed, joined, spread, way)
 
 
 def left_behind(
@@ -152,10 +159,11 @@ def left_behind(
         past = no_past(int(observed.node[0]) if len(observed) > 0 else node)
     until, edge_after = _odometry(graph, np.append(observed.node, node), past.node)
     n = len(until)
-    motion, noise = np.zeros((n, 3)), np.zeros((n, 3, 3))
+    motion, noise, way = np.zeros((n, 3)), np.zeros((n, 3, 3)), np.zeros((n, 3))
     chain_motions(
-        graph.memory['edge_f'], graph.edge_rows(edge_after), until, 0, n, motion, noise)
-    return past.extended(stamps_ns, _path(stamps_ns, observed, motion[1:], noise[1:]), node)
+        graph.memory['edge_f'], graph.edge_rows(edge_after), until, 0, n, motion, noise, way)
+    return past.extended(
+        stamps_ns, _path(stamps_ns, observed, motion[1:], noise[1:], way[1:]), node)
 
 
 def _sorted(
@@ -173,13 +181,14 @@ def _sorted(
 
 def _path(
     stamps_ns: IntArray, observed: ObservedNodes, motion: FloatArray, noise: FloatArray,
+    way: FloatArray,
 ) -> MeasuredPath:
     """Return the path of some positions."""
     covariance = np.linalg.inv(observed.information[:, :2, :2])
     seconds = np.asarray((stamps_ns - stamps_ns[:1]) * 1e-9, dtype=np.float64)
     return MeasuredPath(
         seconds, observed.mean[:, :2].copy(), 0.5 * np.trace(covariance, axis1=1, axis2=2),
-        observed.offset[:, :2].copy(), motion, noise)
+        observed.offset[:, :2].copy(), motion, noise, way)
 
 
 def _chosen(n: int) -> IntArray | slice:
@@ -215,8 +224,16 @@ def _odometry(
     return until, edge_after
 
 
-def search(positions: MeasuredPath) -> Search:
-    """Search for the statistics of the errors of the positions on a path."""
+def search(positions: MeasuredPath, *, correlated: bool = False) -> Search:
+    """
+    Return what the positions on a path show of their errors and of odometry, after some steps.
+
+    Parameters
+    ----------
+    positions : MeasuredPath
+    correlated : bool, whether the errors are taken for correlated ones until now
+
+    """
     if len(positions.seconds) < LEAST_POSITIONS:
         return NOTHING
     evaluate = _Evaluation(positions)
@@ -227,30 +244,44 @@ def search(positions: MeasuredPath) -> Search:
         math.ceil(math.log2(max(time, 1e-3)) / FINEST) * FINEST
         for time in (period, LONGEST * float(positions.seconds[-1])))
     evaluate.bounds = shortest, longest
-    found = yield from _descend(evaluate, [
-        (time, *parts) for time in np.arange(shortest, longest + 0.1, 1.0).tolist()
-        for parts in BEGINNINGS])
-    tau, correlated, _, white_part = (2.0 ** exponent for exponent in found.point)
-    errors = CorrelatedErrors(tau, correlated, white_part)
-    correlation = errors.correlated * math.exp(-period / errors.tau) / (
-        errors.correlated + errors.white)
-    needed = SIGNIFICANT + PER_LOST * max(
+    found = _Minimum(math.inf, white.point)
+    for odometry in {*ODOMETRY_BEGINNINGS, white.point[:2]}:
+        found = min(found, (yield from _descend(evaluate, [
+            (time, part, *odometry, white_part)
+            for time in np.arange(shortest, longest + 0.1, 1.0).tolist()
+            for part, white_part in BEGINNINGS])))
+    tau, part, *_, white_part = (2.0 ** exponent for exponent in found.point)
+    errors = CorrelatedErrors(tau, part, white_part)
+    correlation = part * math.exp(-period / tau) / (part + white_part)
+    needed = (0.0 if correlated else SIGNIFICANT) + PER_LOST * max(
         evaluate.lost[white.point], evaluate.lost[found.point])
     significant = white.value - found.value > needed and correlation > LEAST_CORRELATION
-    scale = yield from _odometry_scale(evaluate, found if significant else white)
+    scale = yield from _odometry_scale(evaluate, (found if significant else white).point)
     return Estimate(errors if significant else None, scale)
 
 
 def _odometry_scale(
-    evaluate: '_Evaluation', best: '_Minimum',
+    evaluate: '_Evaluation', best: Point,
 ) -> Generator[None, None, float]:
-    """Return the factor on the sigmas of odometry; 1 unless its claim is much less likely."""
-    exponent = best.point[ODOMETRY]
-    if exponent <= 0.0:
+    """
+    Return the factor on the sigmas of odometry; 1 unless its claim is much less likely.
+
+    The graph has one factor for way and turn, and no constant errors, so that its factor is
+    another one. A factor below 1 is the largest that is likely enough, and only beside white
+    errors: correlated ones show too little of what odometry does over longer times.
+    """
+    *errors, way, turn, white = best
+    found = yield from _descend(evaluate, [(*errors, at, white) for at in (way, turn, 0.0)])
+    *errors, exponent, white = found.point
+    claimed = yield from _descend(evaluate, [(*errors, 0.0, white)], fixed=ODOMETRY)
+    if claimed.value - found.value <= SIGNIFICANT_SCALE or (len(errors) > 0 and exponent < 0.0):
         return 1.0
-    claimed = yield from _descend(
-        evaluate, [(*best.point[:ODOMETRY], 0.0, best.point[-1])], fixed=ODOMETRY)
-    return 2.0 ** (0.5 * exponent) if claimed.value - best.value > SIGNIFICANT_SCALE else 1.0
+    while exponent < 0.0:
+        more = (*errors, exponent + FINEST, white)
+        if (yield from evaluate.value(more)) - found.value > SIGNIFICANT_SCALE:
+            break
+        exponent += FINEST
+    return 2.0 ** (0.5 * max(exponent, min(way, 0.0), min(turn, 0.0)))
 
 
 class _Evaluation:
@@ -271,7 +302,7 @@ class _Evaluation:
         """Find the heading at the first position that makes white errors the most likely."""
         best = math.inf
         for angle in (2.0 * math.pi / HEADINGS * np.arange(HEADINGS)).tolist():
-            value, _ = filtered(*self._path, 1.0, 0.0, 1.0, 1.0, angle)
+            value, _ = filtered(*self._path, 1.0, 0.0, 1.0, 1.0, 1.0, angle, True)
             if value < best:
                 best, self._heading = value, angle
             yield from self._pause()
@@ -280,18 +311,23 @@ class _Evaluation:
         """
         Return twice the negative logarithm of the posterior probability of a point.
 
-        A point has the exponents of tau, the correlated variance, the noise of odometry and the
-        white variance; for white errors only the last two.
+        A point has the exponents of tau and the correlated variance, if there is one, the noise of
+        way and turn by odometry, and the white variance. If it has one number for way and turn,
+        odometry has no constant errors.
         """
         if point not in self._values:
+            constant = len(point) % 2 == 1
+            way, turn = point[-3 if constant else ODOMETRY], point[ODOMETRY]
             tau, correlated = (
-                (1.0, 0.0) if len(point) == 2 else (2.0 ** point[0], 2.0 ** point[1]))
-            odometry, white = 2.0 ** point[-2], 2.0 ** point[-1]
+                (2.0 ** point[0], 2.0 ** point[1]) if len(point) > 3 else (1.0, 0.0))
+            white = 2.0 ** point[-1]
             value, self.lost[point] = filtered(
-                *self._path, tau, correlated, odometry, white, self._heading)
-            self._values[point] = (
-                value + (math.log(correlated + white) / SPREAD) ** 2
-                + (math.log(odometry) / ODOMETRY_SPREAD) ** 2)
+                *self._path, tau, correlated, 2.0 ** way, 2.0 ** turn, white, self._heading,
+                constant)
+            total = math.log2(correlated + white)
+            spread = SPREAD if len(point) > 3 or total > 0.0 else SMALLER_SPREAD
+            self._values[point] = value + LOG_2**2 * (
+                (total / spread) ** 2 + (way / WAY_SPREAD) ** 2 + (turn / TURN_SPREAD) ** 2)
             yield from self._pause()
         return self._values[point]
 
@@ -303,9 +339,10 @@ class _Evaluation:
 
     def clipped(self, point: Point) -> Point:
         """Return a point inside the bounds."""
+        times = 1 if len(point) > 3 else 0
         low, high = self.bounds
-        return (*(min(max(exponent, low), high) for exponent in point[:-3]),
-                *(min(max(exponent, LEAST), MOST) for exponent in point[-3:]))
+        return (*(min(max(exponent, low), high) for exponent in point[:times]),
+                *(min(max(exponent, LEAST), MOST) for exponent in point[times:]))
 
 
 def _descend(

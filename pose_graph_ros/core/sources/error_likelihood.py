@@ -8,13 +8,15 @@ errors. Here the positions are compared with odometry alone: a Kalman filter run
 with the states
 
     x, y, theta      pose of the robot in the map
+    w, k             constant errors of the yaw rate and of the scale of odometry
     m_x, m_y         correlated error of the source, of variance 1 and with time constant tau
 
 and sums up the negative logarithm of the likelihood of each position given those before it. The
 error of a position is `sqrt(correlated v) m` plus white noise of variance `white v`; v is the
-claimed variance. The noise of odometry is that of the edges of the graph times `odometry`. See
-e.g. Y. Bar-Shalom et al., "Estimation with applications to tracking and navigation", sections 8.2
-and 11.4.
+claimed variance. The noise of odometry is that of the edges of the graph, with one factor for what
+the way adds and one for what errors of the heading do, so that neither hides what the other one
+shows. See e.g. Y. Bar-Shalom et al., "Estimation with applications to tracking and navigation",
+sections 8.2 and 11.4.
 """
 
 import math
@@ -23,6 +25,7 @@ from typing import NamedTuple
 import numpy as np
 
 from pose_graph_ros.core.compiled.jit import (
+    FLAG,
     INTEGER,
     INTEGERS,
     kernel,
@@ -46,6 +49,10 @@ NO_ODOMETRY = 1e4, 1e4, 2.0 * UNKNOWN
 START_VARIANCE, RESTART_VARIANCE = 0.1, 1.0
 # Variance of a position at a start, in units of the claimed variance.
 START_SPREAD = 1e4
+# States of the filter after the pose.
+RATE, SCALE, MX, MY, N_STATES = 3, 4, 5, 6, 7
+# Variances of the constant errors of odometry, before they are seen [rad^2/s^2, 1].
+RATE_VARIANCE, SCALE_VARIANCE = 0.005**2, 0.01**2
 
 
 class MeasuredPath(NamedTuple):
@@ -63,11 +70,13 @@ class MeasuredPath(NamedTuple):
     """Pose of each one's hidden node in that of the one before, shape (K, 3); 0 for the first."""
     noise: FloatArray
     """Covariance of that motion in the frame at its end, shape (K, 3, 3)."""
+    way: FloatArray
+    """Part of it that no error of a heading makes: of xx, xy and yy, shape (K, 3)."""
 
 
-@kernel(signature=(ROWS, INTEGERS, INTEGERS, INTEGER, INTEGER, ROWS, MATRICES))
+@kernel(signature=(ROWS, INTEGERS, INTEGERS, INTEGER, INTEGER, ROWS, MATRICES, ROWS))
 def chain_motions(  # type: ignore[no-untyped-def]
-    edges, edge_after, until, begin, end, out_motion, out_noise,
+    edges, edge_after, until, begin, end, out_motion, out_noise, out_way,
 ):
     """
     Join the motions of a path: row k of the result is that from pose until[k - 1] to until[k].
@@ -78,19 +87,22 @@ def chain_motions(  # type: ignore[no-untyped-def]
     edge_after : ndarray of int, shape (N - 1,), row of the edge after each pose; -1 if none is
     until : ndarray of int, shape (K,), not decreasing, less than N
     begin, end : int, of the rows of the result that are written
-    out_motion, out_noise : ndarray, shapes (K, 3) and (K, 3, 3), noise in the frame at the end
+    out_motion, out_noise, out_way : ndarray, columns of a `MeasuredPath`
 
     """
     for k in range(begin, end):
         x = y = theta = 0.0
         cov = out_noise[k]
         cov[:] = 0.0
+        way_xx = way_xy = way_yy = 0.0
         for n in range(until[k - 1] if k > 0 else until[k], until[k]):
             row = edge_after[n]
             if row < 0:
                 cov[0, 0] += NO_ODOMETRY[0]
                 cov[1, 1] += NO_ODOMETRY[1]
                 cov[2, 2] += NO_ODOMETRY[2]
+                way_xx += NO_ODOMETRY[0]
+                way_yy += NO_ODOMETRY[1]
                 continue
             dx, dy, turn = edges[row, MEAN], edges[row, MEAN + 1], edges[row, MEAN + 2]
             c, s = math.cos(turn), math.sin(turn)
@@ -117,64 +129,84 @@ def chain_motions(  # type: ignore[no-untyped-def]
             cov[2, 0] += third / det
             cov[1, 2] += (xt * xy - xx * yt) / det
             cov[2, 1] += (xt * xy - xx * yt) / det
+            # what is left of the noise of the position where that of the heading is known
+            flat = xx * yy - xy * xy
+            way_xx, way_xy, way_yy = (
+                c * c * way_xx + 2.0 * c * s * way_xy + s * s * way_yy + yy / flat,
+                c * s * (way_yy - way_xx) + (c * c - s * s) * way_xy - xy / flat,
+                s * s * way_xx - 2.0 * c * s * way_xy + c * c * way_yy + xx / flat)
             c, s = math.cos(theta), math.sin(theta)
             x, y, theta = x + c * dx - s * dy, y + s * dx + c * dy, theta + turn
         out_motion[k, 0], out_motion[k, 1], out_motion[k, 2] = x, y, theta
+        out_way[k, 0], out_way[k, 1], out_way[k, 2] = way_xx, way_xy, way_yy
 
 
 @kernel
 def _start(pose, p, z, offset, variance, heading_variance):  # type: ignore[no-untyped-def]
-    """Start the filter at a position; the heading of `pose` stays."""
+    """Start the filter at a position; the heading of `pose` stays, and what is constant."""
     c, s = math.cos(pose[2]), math.sin(pose[2])
     pose[0] = z[0] - c * offset[0] + s * offset[1]
     pose[1] = z[1] - s * offset[0] - c * offset[1]
-    pose[3] = pose[4] = 0.0
-    for i in range(5):
-        for j in range(5):
-            p[i, j] = 0.0
+    pose[MX] = pose[MY] = 0.0
+    for i in range(N_STATES):
+        for j in range(N_STATES):
+            if not (RATE <= i <= SCALE and RATE <= j <= SCALE):
+                p[i, j] = 0.0
     p[0, 0] = p[1, 1] = START_SPREAD * variance
     p[2, 2] = heading_variance
-    p[3, 3] = p[4, 4] = 1.0
+    p[MX, MX] = p[MY, MY] = 1.0
 
 
 @kernel
-def _move(pose, p, motion, noise, scale):  # type: ignore[no-untyped-def]
-    """Predict the pose after a motion, with its noise times a scale."""
-    c, s = math.cos(pose[2]), math.sin(pose[2])
-    dx, dy = c * motion[0] - s * motion[1], s * motion[0] + c * motion[1]
+def _move(  # type: ignore[no-untyped-def]
+    pose, p, motion, seconds, noise, way, way_scale, turn_scale,
+):
+    """Predict the pose after a motion, with both parts of its noise times a scale."""
+    # a constant error of the yaw rate turns the chord by half of what it turns the end
+    middle = pose[2] + 0.5 * seconds * pose[RATE]
+    c, s = math.cos(middle), math.sin(middle)
+    wx, wy = c * motion[0] - s * motion[1], s * motion[0] + c * motion[1]
+    dx, dy = (1.0 + pose[SCALE]) * wx, (1.0 + pose[SCALE]) * wy
     pose[0] += dx
     pose[1] += dy
-    pose[2] += motion[2]
-    for i in range(5):
-        p[i, 0] -= dy * p[i, 2]
-        p[i, 1] += dx * p[i, 2]
-    for i in range(5):
-        p[0, i] -= dy * p[2, i]
-        p[1, i] += dx * p[2, i]
+    pose[2] += motion[2] + seconds * pose[RATE]
+    for i in range(N_STATES):
+        turned = p[i, 2] + 0.5 * seconds * p[i, RATE]
+        p[i, 0] += wx * p[i, SCALE] - dy * turned
+        p[i, 1] += wy * p[i, SCALE] + dx * turned
+        p[i, 2] += seconds * p[i, RATE]
+    for i in range(N_STATES):
+        turned = p[2, i] + 0.5 * seconds * p[RATE, i]
+        p[0, i] += wx * p[SCALE, i] - dy * turned
+        p[1, i] += wy * p[SCALE, i] + dx * turned
+        p[2, i] += seconds * p[RATE, i]
     c, s = math.cos(pose[2]), math.sin(pose[2])
-    xx, xy, yy = scale * noise[0, 0], scale * noise[0, 1], scale * noise[1, 1]
+    more = way_scale - turn_scale
+    xx = turn_scale * noise[0, 0] + more * way[0]
+    xy = turn_scale * noise[0, 1] + more * way[1]
+    yy = turn_scale * noise[1, 1] + more * way[2]
     p[0, 0] += c * c * xx - 2.0 * c * s * xy + s * s * yy
     p[1, 1] += s * s * xx + 2.0 * c * s * xy + c * c * yy
     cross = c * s * (xx - yy) + (c * c - s * s) * xy
-    xt = scale * (c * noise[0, 2] - s * noise[1, 2])
-    yt = scale * (s * noise[0, 2] + c * noise[1, 2])
+    xt = turn_scale * (c * noise[0, 2] - s * noise[1, 2])
+    yt = turn_scale * (s * noise[0, 2] + c * noise[1, 2])
     p[0, 1] += cross
     p[1, 0] += cross
     p[0, 2] += xt
     p[2, 0] += xt
     p[1, 2] += yt
     p[2, 1] += yt
-    p[2, 2] += scale * noise[2, 2]
+    p[2, 2] += turn_scale * noise[2, 2]
 
 
 @kernel
 def _fade(pose, p, phi):  # type: ignore[no-untyped-def]
     """Predict the correlated error, of which the part phi is left."""
-    for i in range(3, 5):
+    for i in range(MX, N_STATES):
         pose[i] *= phi
-        for j in range(5):
+        for j in range(N_STATES):
             p[i, j] *= phi
-        for j in range(5):
+        for j in range(N_STATES):
             p[j, i] *= phi
         p[i, i] += 1.0 - phi * phi
 
@@ -188,54 +220,60 @@ def _measure(pose, p, gain, z, offset, factor, white):  # type: ignore[no-untype
     """
     c, s = math.cos(pose[2]), math.sin(pose[2])
     ox, oy = c * offset[0] - s * offset[1], s * offset[0] + c * offset[1]
-    ex = z[0] - pose[0] - ox - factor * pose[3]
-    ey = z[1] - pose[1] - oy - factor * pose[4]
-    for i in range(5):
-        gain[i, 0] = p[i, 0] - oy * p[i, 2] + factor * p[i, 3]
-        gain[i, 1] = p[i, 1] + ox * p[i, 2] + factor * p[i, 4]
-    sxx = gain[0, 0] - oy * gain[2, 0] + factor * gain[3, 0] + white
-    sxy = gain[0, 1] - oy * gain[2, 1] + factor * gain[3, 1]
-    syy = gain[1, 1] + ox * gain[2, 1] + factor * gain[4, 1] + white
+    ex = z[0] - pose[0] - ox - factor * pose[MX]
+    ey = z[1] - pose[1] - oy - factor * pose[MY]
+    for i in range(N_STATES):
+        gain[i, 0] = p[i, 0] - oy * p[i, 2] + factor * p[i, MX]
+        gain[i, 1] = p[i, 1] + ox * p[i, 2] + factor * p[i, MY]
+    sxx = gain[0, 0] - oy * gain[2, 0] + factor * gain[MX, 0] + white
+    sxy = gain[0, 1] - oy * gain[2, 1] + factor * gain[MX, 1]
+    syy = gain[1, 1] + ox * gain[2, 1] + factor * gain[MY, 1] + white
     det = sxx * syy - sxy * sxy
     distance = (syy * ex * ex - 2.0 * sxy * ex * ey + sxx * ey * ey) / det
     if not distance <= GATE:
         return math.log(det) + GATE, True
     ax, ay = (syy * ex - sxy * ey) / det, (sxx * ey - sxy * ex) / det
-    for i in range(5):
+    for i in range(N_STATES):
         pose[i] += gain[i, 0] * ax + gain[i, 1] * ay
-    for i in range(5):
+    for i in range(N_STATES):
         kx = (syy * gain[i, 0] - sxy * gain[i, 1]) / det
         ky = (sxx * gain[i, 1] - sxy * gain[i, 0]) / det
-        for j in range(i, 5):
+        for j in range(i, N_STATES):
             p[i, j] -= kx * gain[j, 0] + ky * gain[j, 1]
             p[j, i] = p[i, j]
     return math.log(det) + distance, False
 
 
-@kernel(signature=(NUMBERS, ROWS, NUMBERS, ROWS, ROWS, MATRICES, NUMBER, NUMBER, NUMBER, NUMBER,
-                   NUMBER), allocates=True)
+@kernel(signature=(NUMBERS, ROWS, NUMBERS, ROWS, ROWS, MATRICES, ROWS, NUMBER, NUMBER, NUMBER,
+                   NUMBER, NUMBER, NUMBER, FLAG), allocates=True)
 def filtered(  # type: ignore[no-untyped-def]
-    seconds, position, variance, offset, motion, noise, tau, correlated, odometry, white, heading,
+    seconds, position, variance, offset, motion, noise, way, tau, correlated, by_way, by_turn,
+    white, heading, constant,
 ):
     """
     Return twice the negative logarithm of the likelihood of positions, and how often it was lost.
 
     Parameters
     ----------
-    seconds, position, variance, offset, motion, noise : ndarray, columns of a `MeasuredPath`
+    seconds, position, variance, offset, motion, noise, way : ndarray, columns of a `MeasuredPath`
     tau : float, time constant of the correlated error [s]
     correlated, white : float, variances of the two parts, in units of the claimed variance
-    odometry : float, factor on the noise of the motions
+    by_way, by_turn : float, factors on the two parts of the noise of the motions
     heading : float, of the robot at the first position [rad]
+    constant : bool, whether odometry may have constant errors
 
     """
-    pose, p, gain = np.zeros(5), np.zeros((5, 5)), np.zeros((5, 2))
+    pose, p = np.zeros(N_STATES), np.zeros((N_STATES, N_STATES))
+    gain = np.zeros((N_STATES, 2))
     pose[2] = heading
+    if constant:
+        p[RATE, RATE], p[SCALE, SCALE] = RATE_VARIANCE, SCALE_VARIANCE
     total, left_out, n_lost = 0.0, 0, 0
     for k in range(len(seconds)):
         if k > 0:
-            _move(pose, p, motion[k], noise[k], odometry)
-            _fade(pose, p, math.exp((seconds[k - 1] - seconds[k]) / tau))
+            gap = seconds[k] - seconds[k - 1]
+            _move(pose, p, motion[k], gap, noise[k], way[k], by_way, by_turn)
+            _fade(pose, p, math.exp(-gap / tau))
         n_lost += 1 if left_out >= LOST else 0
         if k == 0 or left_out >= LOST or noise[k, 2, 2] > UNKNOWN:
             _start(pose, p, position[k], offset[k], variance[k],

@@ -56,11 +56,6 @@ class FactorBuilder:
     correlated in time, it becomes an edge to a state of the source's bias (`GaussMarkovBias`), or
     an observed node with a lower weight (`InflatedWeights`). Once the graph has taken the update,
     the constraints are registered for reweighting, and the source of each is recorded.
-
-    Parameters
-    ----------
-    reweighting : Reweighting, where constraints with a robust loss are registered
-
     """
 
     def __init__(self, config: BackendConfig, reweighting: Reweighting) -> None:
@@ -140,6 +135,10 @@ class FactorBuilder:
         added = additions.add_observed(observed.weighted(0.0))
         return NewConstraint(False, added, source, stamp_ns, kind, noise=noise, held_by=edge)
 
+    def error_model(self, source: str) -> ErrorModel | None:
+        """Return the model of the errors of a source in use; None for white errors."""
+        return self._error_models.get(source)
+
     def _changed_weights(
         self, base_weights: Mapping[int, float], present: Mapping[int, float],
     ) -> dict[int, float]:
@@ -176,6 +175,10 @@ class FactorBuilder:
         """Return those of `finding` with enough new measurements for another estimate."""
         return [source for source in self.finding() if self._constraints[source].n_ever
                 >= self._constraints[source].next_estimate]
+
+    def has(self, source: str) -> bool:
+        """Tell whether a source has constraints in the map."""
+        return source in self._constraints
 
     def constraints(self, source: str) -> SourceConstraints:
         """Return the constraints of a source that has some."""
@@ -283,14 +286,7 @@ class FactorBuilder:
         return kept
 
     def inflate(self, source: str, errors: CorrelatedErrors | None) -> None:
-        """
-        Have later updates renew the weights of a source.
-
-        Parameters
-        ----------
-        errors : CorrelatedErrors, optional, None for white errors
-
-        """
+        """Have later updates renew the weights of a source; None for white errors."""
         # alone in a bin of a nanosecond, each measurement has the weight 1
         model = InflatedWeights(CorrelatedErrors(0.0, 0.0, 1.0) if errors is None else errors)
         model.restore(self._constraints[source].rows.values)
@@ -420,21 +416,21 @@ class FactorBuilder:
 
     def reports(self, graph: Graph) -> dict[str, SourceReport]:
         """Return how well the newest measurements of each source fit the estimate."""
-        reports = {}
         for source, constraints in self._constraints.items():
             n, before = constraints.n_ever, constraints.n_reported
             if n - before > MORE_RESIDUALS * min(len(constraints), before):
-                biased = self._has_given_bias(source)
-                used = constraints.used(graph, added_as_edges=biased)
-                constraints.n_reported = n if np.any(used) else 0
-                constraints.report = source_report.report(
-                    graph, constraints.rows.values[used], biased=biased,
-                    in_use=self.errors_in_use(source),
-                    found=self._settings(source).finds_correlation)
-            # a source of headings alone has no residuals of positions
-            if constraints.report is not None and constraints.report.energy > 0.0:
-                reports[source] = constraints.report
-        return reports
+                constraints.report = self.report(source, graph)
+                constraints.n_reported = n if constraints.report.n > 0 else 0
+        return {source: each.report for source, each in self._constraints.items()
+                if each.report is not None and each.report.energy > 0.0}
+
+    def report(self, source: str, graph: Graph) -> SourceReport:
+        """Return how well the newest measurements of a source fit a graph that has them."""
+        constraints, biased = self._constraints[source], self._has_given_bias(source)
+        used = constraints.used(graph, added_as_edges=biased)
+        return source_report.report(
+            graph, constraints.rows.values[used], biased=biased,
+            in_use=self.errors_in_use(source), found=self._settings(source).finds_correlation)
 
 
 def _weights_of(graph: Graph, observed: Collection[int]) -> dict[int, float]:

@@ -228,8 +228,25 @@ class GaussMarkovBias:
         if number not in self._bins:
             self._make_bin(number, additions)
         phi = self._phi(abs(rest_ns - self._width_ns / 2))
-        return additions.add_edge(_biased_constraint(
+        return additions.add_edge(biased_constraint(
             observed, noise, self._bins[number].node, phi, self.errors))
+
+    def preview(self, stamp_ns: int, observed: ObservedNodes, noise: FloatArray) -> Edges | None:
+        """
+        Return the edge of a measurement to the last state before it; None without one.
+
+        Parameters
+        ----------
+        observed, noise : as in `add`
+
+        """
+        at = bisect.bisect(self._numbers, stamp_ns // self._width_ns)
+        if at == 0:
+            return None
+        number = self._numbers[at - 1]
+        gap_ns = abs(stamp_ns - (number + 0.5) * self._width_ns)
+        return biased_constraint(
+            observed, noise, self._bins[number].node, self._phi(gap_ns), self.errors)
 
     def begin_ns(self, node: int) -> int | None:
         """Return when the bin of a state begins [ns], by its id; None for another source's."""
@@ -279,7 +296,7 @@ class GaussMarkovBias:
             bias=np.array([(0.0, 0.0, phi, phi)])))
 
 
-def _biased_constraint(
+def biased_constraint(
     observed: ObservedNodes, noise: FloatArray, bias: int, phi: float, errors: CorrelatedErrors,
 ) -> Edges:
     """
@@ -289,6 +306,13 @@ def _biased_constraint(
     lever arm; z is the measured pose; f is the standard deviation of the correlated part, from the
     mean of the variances of x and y. m is phi times the state plus a white rest of variance
     1 - phi^2.
+
+    Parameters
+    ----------
+    noise : array_like, shape (2,), as in `GaussMarkovBias.add`
+    bias : int, id of the state
+    phi : float, correlation of the error with the state
+
     """
     factors, information, mean = np.zeros(2), np.zeros((3, 3)), observed.mean[0].copy()
     given, kind, offset = observed.information[0], observed.kind[0], observed.offset[0]

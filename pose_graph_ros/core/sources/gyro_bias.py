@@ -100,7 +100,8 @@ class GyroBias:
         if gap <= SWITCHED_OFF:
             known = int(graph.node_rows(np.array([before]))[0])
             # one of this update has no estimate yet
-            value = float(graph.poses[known, 0] if known >= 0 else additions.biases[-1][0])
+            value = float(graph.poses[known, 0] if known >= 0
+                          else additions.biases[before - additions.first.node][0])
         state = additions.add_bias(value, dimension=1)
         self._begins_ns.append(begin_ns)
         self._ids.append(state)

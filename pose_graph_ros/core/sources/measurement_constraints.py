@@ -150,9 +150,25 @@ def loop_closure_constraint(
         information[2, 2] = 1.0 / float(
             measurement.covariance[2, 2] + attachment.noise[2, 2] + reference.noise[2, 2])
     else:
-        cov = covariance.turned(measurement.covariance, float(z[2])) + attachment.noise
-        back, out = se2.adjoint(se2.inverse(z)), se2.adjoint(attachment.motion)
-        cov = out @ (cov + back @ reference.noise @ back.T) @ out.T
-        information = covariance.information(cov)
+        information = covariance.information(closure_covariance(
+            covariance.turned(measurement.covariance, float(z[2])), z, reference, attachment))
     return Edges([reference.node], [attachment.node], [mean], [information],
                  [EdgeKind.LOOP_CLOSURE])
+
+
+def closure_covariance(
+    own: FloatArray, pose: FloatArray, reference: Attachment, attachment: Attachment,
+) -> FloatArray:
+    """
+    Return the covariance of a loop closure with what the motions since the nodes add, (3, 3).
+
+    Parameters
+    ----------
+    own : ndarray, shape (3, 3), of the closure, in the frame of the measured pose
+    pose : ndarray, shape (3,), as measured
+    reference, attachment : Attachment, as for `loop_closure_constraint`
+
+    """
+    back, out = se2.adjoint(se2.inverse(pose)), se2.adjoint(attachment.motion)
+    return np.asarray(
+        out @ (own + attachment.noise + back @ reference.noise @ back.T) @ out.T)

@@ -8,7 +8,7 @@ time in which errors change. Their number is bounded: every second one is droppe
 too many, and the motions on both sides of it are joined.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 
@@ -20,6 +20,8 @@ from pose_graph_ros.core.sources.error_likelihood import MeasuredPath
 
 # Number of positions that are left when some are dropped.
 KEPT = 1000
+
+_Motions = tuple[FloatArray, FloatArray, FloatArray]    # with `noise` and `way`
 
 
 @dataclass(frozen=True, slots=True)
@@ -36,6 +38,8 @@ class PastPath:
     """Upper triangles of the covariances of the motions, shape (K + 1, 6)."""
     node: int
     """Id of the first node that is left in the graph."""
+    way: Rows3 = field(default_factory=lambda: np.empty((0, 3)))
+    """Their parts by the way, shape (K + 1, 3); empty in files of older versions."""
 
     def continued(self, stamps_ns: IntArray, path: MeasuredPath) -> MeasuredPath:
         """
@@ -47,13 +51,13 @@ class PastPath:
         path : MeasuredPath, whose first motion leads from `node` to the first position
 
         """
-        motion, noise = _with_next(self, path.motion, path.noise)
+        motion, noise, way = _with_next(self, path)
         stamps_ns = np.maximum.accumulate(np.concatenate((self.stamps_ns, stamps_ns)))
         seconds = np.asarray((stamps_ns - stamps_ns[:1]) * 1e-9, dtype=np.float64)
         return MeasuredPath(
             seconds, np.concatenate((self.position, path.position)),
             np.concatenate((self.variance, path.variance)),
-            np.concatenate((self.offset, path.offset)), motion, np.ascontiguousarray(noise))
+            np.concatenate((self.offset, path.offset)), motion, np.ascontiguousarray(noise), way)
 
     def extended(
         self, stamps_ns: IntArray, path: MeasuredPath, node: int,
@@ -68,12 +72,12 @@ class PastPath:
         node : int, id of the first node that is left then
 
         """
-        motion, noise = _with_next(self, path.motion, path.noise)
+        motion, noise, way = _with_next(self, path)
         grown = PastPath(
             np.concatenate((self.stamps_ns, stamps_ns)),
             np.concatenate((self.position, path.position)),
             np.concatenate((self.variance, path.variance)),
-            np.concatenate((self.offset, path.offset)), motion, upper(noise), node)
+            np.concatenate((self.offset, path.offset)), motion, upper(noise), node, way)
         return grown.thinned() if len(grown.stamps_ns) > 2 * KEPT else grown
 
     def thinned(self) -> 'PastPath':
@@ -81,38 +85,41 @@ class PastPath:
         n = len(self.stamps_ns) // 2 * 2
         first, second = self.motion[:n:2], self.motion[1:n:2]
         noises = full(self.noise)
-        joined, noise = _joined(first, noises[:n:2], second, noises[1:n:2])
+        joined, noise, way = _joined((first, noises[:n:2], self.way[:n:2]),
+                                     (second, noises[1:n:2], self.way[1:n:2]))
         rest, kept = slice(n, None), slice(1, n, 2)
         every = np.arange(len(self.stamps_ns))
         which = np.append(every[kept], every[rest])
         return PastPath(
             self.stamps_ns[which], self.position[which], self.variance[which],
             self.offset[which], np.concatenate((joined, self.motion[rest])),
-            upper(np.concatenate((noise, noises[rest]))), self.node)
+            upper(np.concatenate((noise, noises[rest]))), self.node,
+            np.concatenate((way, self.way[rest])))
 
 
 def no_past(node: int) -> PastPath:
     """Return a path without positions before a node, given by its id."""
     return PastPath(np.empty(0, np.int64), np.empty((0, 2)), np.empty(0), np.empty((0, 2)),
-                    np.zeros((1, 3)), np.zeros((1, 6)), node)
+                    np.zeros((1, 3)), np.zeros((1, 6)), node, np.zeros((1, 3)))
 
 
-def _with_next(
-    past: PastPath, motion: FloatArray, noise: FloatArray,
-) -> tuple[FloatArray, FloatArray]:
+def _with_next(past: PastPath, path: MeasuredPath) -> _Motions:
     """Return the motions of a path, the last of which is joined with the first of others."""
-    noises = full(past.noise)
-    if len(motion) == 0:
-        return past.motion[:-1], noises[:-1]
-    joined, joint_noise = _joined(past.motion[-1:], noises[-1:], motion[:1], noise[:1])
-    return (np.concatenate((past.motion[:-1], joined, motion[1:])),
-            np.concatenate((noises[:-1], joint_noise, noise[1:])))
+    last = past.motion, full(past.noise), past.way
+    if len(path.motion) == 0:
+        return last[0][:-1], last[1][:-1], last[2][:-1]
+    new = path.motion, path.noise, path.way
+    joined = _joined((last[0][-1:], last[1][-1:], last[2][-1:]),
+                     (new[0][:1], new[1][:1], new[2][:1]))
+    motion, noise, way = (np.concatenate((one[:-1], both, other[1:]))
+                          for one, both, other in zip(last, joined, new, strict=True))
+    return motion, noise, way
 
 
-def _joined(
-    first: FloatArray, noise_first: FloatArray, second: FloatArray, noise_second: FloatArray,
-) -> tuple[FloatArray, FloatArray]:
+def _joined(first: _Motions, second: _Motions) -> _Motions:
     """Return motions one after the other, and their covariances in the frames at their ends."""
-    adjoint = se2.adjoint(se2.inverse(second))
-    return (np.asarray(se2.compose(first, second)),
-            adjoint @ noise_first @ np.swapaxes(adjoint, 1, 2) + noise_second)
+    adjoint = se2.adjoint(se2.inverse(second[0]))
+    turned = np.swapaxes(adjoint, 1, 2)
+    way = adjoint[:, :2, :2] @ first[2][:, [[0, 1], [1, 2]]] @ turned[:, :2, :2]
+    return (np.asarray(se2.compose(first[0], second[0])),
+            adjoint @ first[1] @ turned + second[1], way[:, [0, 0, 1], [0, 1, 1]] + second[2])

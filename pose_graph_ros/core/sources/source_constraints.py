@@ -182,5 +182,7 @@ class SourceConstraints:
         self.noise.append(saved.noise if len(saved.noise) == n else np.zeros((n, 2)))
         self.edges.append(saved.edges if len(saved.edges) == n else np.full(n, -1))
         self.n_gone, self.past = saved.n_gone, saved.past
+        if self.past is not None and len(self.past.way) == 0:
+            self.past = None    # of an older version, which did not tell way from turn
         self.next_estimate = saved.next_estimate
         self.odometry_scale = saved.odometry_scale

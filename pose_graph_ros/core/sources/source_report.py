@@ -8,7 +8,7 @@ import numpy as np
 
 from pose_graph_ros.core.geometry import se2
 from pose_graph_ros.core.geometry.se2 import FloatArray, IntArray
-from pose_graph_ros.core.graph.constraints import Edges, ObservedNodes
+from pose_graph_ros.core.graph.constraints import Edges
 from pose_graph_ros.core.graph.graph import Graph
 from pose_graph_ros.core.sources import autocorrelation
 from pose_graph_ros.core.sources.gauss_markov import CorrelatedErrors
@@ -17,6 +17,8 @@ from pose_graph_ros.core.sources.gauss_markov import CorrelatedErrors
 MOST_RESIDUALS = 5000
 # The whiteness test is skipped below this mean squared residual [sigma^2].
 LEAST_ENERGY = 0.1
+# Measurements fit badly from this mean squared residual on [sigma^2], if they are so many.
+FAR, MANY = 9.0, 30
 
 
 class SourceReport(NamedTuple):
@@ -32,6 +34,17 @@ class SourceReport(NamedTuple):
     """Statistics of its errors that the graph is built with; None for white errors."""
     found: bool
     """Whether these are estimated from the errors (`correlation_time` of -1)."""
+
+    @property
+    def strain(self) -> float:
+        """Mean squared residual, in units of what is known of the errors of the source."""
+        known = 1.0 if self.in_use is None else self.in_use.correlated + self.in_use.white
+        return self.energy / max(known, 1.0)
+
+    @property
+    def fits_badly(self) -> bool:
+        """Whether many measurements contradict the estimate, whoever is to blame."""
+        return self.n >= MANY and self.strain > FAR
 
     @property
     def wrongly_white(self) -> bool:
@@ -65,26 +78,24 @@ def report(
     newest = newest[np.diff(newest[:, 0], prepend=-1) > 0]
     stamps, numbers = newest[:, 0], newest[:, 1]
     if biased:
-        residuals, information = _biased_residuals(graph, graph.edges_at(numbers))
+        errors, information = _biased_residuals(graph, graph.edges_at(numbers))
+        residuals = errors
     else:
-        residuals, information = _residuals(graph, graph.observed_at(numbers))
-    energy = np.einsum('ki,kij,kj->k', residuals, information, residuals)
-    return SourceReport(len(rows), float(np.sum(energy)) / (2.0 * max(len(energy), 1)),
+        observed = graph.observed_at(numbers)
+        errors, information = graph.observed_errors(observed), observed.information
+        # of positions, in map axes
+        residuals = np.einsum('kij,kj->ki', se2.rotation(observed.mean[:, 2]), errors[:, :2])
+        placed = information[:, 0, 0] > 0.0
+        stamps, residuals = stamps[placed], residuals[placed]
+    energy = float(np.einsum('ki,kij,kj->', errors, information, errors))
+    n_measured = int(np.count_nonzero(np.diagonal(information, axis1=1, axis2=2) > 0.0))
+    return SourceReport(len(rows), energy / max(n_measured, 1),
                         autocorrelation.estimate(stamps, residuals), in_use, found)
-
-
-def _residuals(graph: Graph, observed: ObservedNodes) -> tuple[FloatArray, FloatArray]:
-    """Return residuals of positions in map axes, shape (K, 2), and their information."""
-    errors = graph.observed_errors(observed)
-    turn = se2.rotation(observed.mean[:, 2])
-    residuals = np.einsum('kij,kj->ki', turn, errors[:, :2])
-    information = turn @ observed.information[:, :2, :2] @ np.swapaxes(turn, 1, 2)
-    return residuals, information
 
 
 def _biased_residuals(graph: Graph, edges: Edges) -> tuple[FloatArray, FloatArray]:
     """
-    Return residuals and information as `_residuals` does, for edges to a bias.
+    Return residuals of positions in map axes, and their information, for edges to a bias.
 
     The residual is the whole error of the measurement: the part that the bias explains and the
     white rest.

@@ -54,6 +54,11 @@ class WaitingMeasurements:
         """All waiting measurements, with their sources."""
         return [(waiting.source, waiting.measurement) for waiting in self._waiting]
 
+    def until(self, stamp_ns: int) -> list[tuple[str, PoseMeasurement]]:
+        """Return the measurements due up to a stamp [ns], with their sources, earliest first."""
+        return [(waiting.source, waiting.measurement) for waiting in itertools.takewhile(
+            lambda waiting: waiting.due_ns <= stamp_ns, reversed(self._waiting))]
+
     def pop_due(self, covered_ns: int) -> list[WaitingMeasurement]:
         """Remove and return the measurements due up to a stamp [ns], the earliest first."""
         at = bisect.bisect_left(self._waiting, (-covered_ns, -next(self._arrival)),

@@ -27,6 +27,8 @@ LONGEST = 60.0
 LEAST_STRETCHES = 2
 # A measurement is wrong if it is so many times the median error away from all paths.
 WRONG = 6.0
+# What chance alone gives once in twenty times [standard deviations].
+LEAST_GAIN = 1.64
 
 
 class Errors(NamedTuple):
@@ -54,6 +56,9 @@ class Errors(NamedTuple):
 
         """
         return Errors(self.stamps_ns[which], self.errors[which], self.covariances[which])
+
+
+NO_ERRORS = Errors(np.empty(0, np.int64), np.empty((0, 2)), np.empty((0, 2, 2)))
 
 
 class Summary(NamedTuple):
@@ -146,6 +151,34 @@ def wrong(parts: Sequence[Errors]) -> BoolArray:
     return np.asarray(np.all(far, axis=0))
 
 
+def is_better(before: Errors, after: Errors, start_ns: int, stretch: float) -> bool:
+    """
+    Tell whether errors at the same positions have become smaller, by more than chance.
+
+    What differs between stretches, which are independent, is chance (F. Wilcoxon's signed ranks).
+    The squared errors are to be smaller, and the predicted density higher.
+
+    Parameters
+    ----------
+    start_ns, stretch : begin [ns] and length [s] of the first stretch
+
+    """
+    stretches = ((before.stamps_ns - start_ns) * 1e-9 / stretch).astype(np.int64)
+    squares = _gain(before.distances**2 - after.distances**2, stretches)
+    surprise = _gain(_surprises(before) - _surprises(after), stretches)
+    return squares > LEAST_GAIN and (surprise > LEAST_GAIN or not np.any(
+        np.isfinite(before.covariances)))  # of loop closures there is no density
+
+
+def _gain(gains: FloatArray, stretches: IntArray) -> float:
+    """Return the sum of signed ranks of the gains of stretches, in standard deviations."""
+    usable = np.isfinite(gains)
+    _, of = np.unique(stretches[usable], return_inverse=True)
+    sums = np.bincount(of, gains[usable])
+    ranks = np.argsort(np.argsort(np.abs(sums))) + 1.0
+    return float(np.sum(ranks * np.sign(sums)) / np.sqrt(np.sum(ranks**2))) if len(of) > 0 else 0.0
+
+
 def summary(of: Errors) -> Summary:
     """Return the statistics of errors."""
     if len(of.stamps_ns) == 0:
@@ -155,12 +188,24 @@ def summary(of: Errors) -> Summary:
     errors, covariances = of.errors[usable], of.covariances[usable]
     nees = nlpd = np.nan
     if len(errors) > 0:
-        sigmas = np.einsum('ki,ki->k', errors, np.linalg.solve(
-            covariances, errors[:, :, None])[:, :, 0])
-        nees = float(np.mean(sigmas)) / 2.0
-        nlpd = float(np.mean(0.5 * sigmas + 0.5 * np.linalg.slogdet(covariances)[1])
-                     + np.log(2.0 * np.pi))
+        nees = float(np.mean(_sigmas(errors, covariances))) / 2.0
+        nlpd = float(np.mean(_surprises(of)[usable]))
     distinct = np.diff(of.stamps_ns, prepend=-1) > 0
     return Summary(
         len(squared), float(np.sqrt(np.mean(squared))), float(np.median(of.distances)), nees,
         nlpd, estimate(of.stamps_ns[distinct], of.errors[distinct]).tau)
+
+
+def _sigmas(errors: FloatArray, covariances: FloatArray) -> FloatArray:
+    """Return squared errors in units of their covariances, shape (K,)."""
+    return np.asarray(np.einsum('ki,ki->k', errors, np.linalg.solve(
+        covariances, errors[:, :, None])[:, :, 0]))
+
+
+def _surprises(of: Errors) -> FloatArray:
+    """Return the negative logarithm of the density at each error, shape (K,); NaN without."""
+    found, usable = np.full(len(of.errors), np.nan), np.all(np.isfinite(of.covariances), (1, 2))
+    covariances = of.covariances[usable]
+    found[usable] = 0.5 * (_sigmas(of.errors[usable], covariances)
+                           + np.linalg.slogdet(covariances)[1]) + np.log(2.0 * np.pi)
+    return found

@@ -19,8 +19,8 @@ from pose_graph_ros.core.graph.graph import Graph
 
 # A stretch has at most this many poses; about so many stay in or around it.
 MOST_POSES, MOST_AROUND = 10, 12
-# It may have so many if a bias is in use that long.
-LONGEST = 20
+# It may have so many if a bias is in use that long: half a minute of a car in a town.
+LONGEST = 100
 
 
 class Segment(NamedTuple):

@@ -142,18 +142,19 @@ class Thinning:
     """Decides now and then which nodes leave; see the module."""
 
     def __init__(self) -> None:
-        self._newest, self._next = -EVERY, 0
+        self._n_made, self._next = -EVERY, 0
         self._n_stay = 0
         """Number of poses that stay, when it was last looked, or what stands for it."""
 
     def measurements_are_due(self, graph: Graph) -> bool:
         """Return whether there are so many measurements in the map that the oldest are to go."""
         n_measured = sum(int(np.count_nonzero(held >= 0)) for held in carriers(graph))
-        return n_measured > MOST_MEASUREMENTS * self._n_stay
+        # with about one for each node that comes before the next look
+        return n_measured + EVERY > MOST_MEASUREMENTS * self._n_stay
 
     def places(
-        self, smoother: IncrementalSmoother, config: ThinningConfig, keep: Collection[int] = (),
-        first: int = 0,
+        self, smoother: IncrementalSmoother, config: ThinningConfig, n_made: int,
+        keep: Collection[int] = (), first: int = 0,
     ) -> Places | None:
         """
         Return the nodes that leave now, maybe none; None most times.
@@ -162,14 +163,14 @@ class Thinning:
         ----------
         smoother : IncrementalSmoother, without edits that wait
         config : ThinningConfig
+        n_made : int, how many hidden nodes were made, with those that have left
         keep : collection of int, ids of nodes that do not leave
         first : int, id of the first node that is not frozen
 
         """
-        newest = smoother.graph.newest_pose
-        if config.cell == 0.0 or newest < self._newest + EVERY:
+        if config.cell == 0.0 or n_made < self._n_made + EVERY:
             return None
-        self._newest = newest
+        self._n_made = n_made
         graph = smoother.graph
         found = crowd(graph, config, first)
         n_stay = int(np.count_nonzero(graph.is_pose)) - len(found.leaving)

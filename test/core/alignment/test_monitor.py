@@ -2,13 +2,15 @@
 # SPDX-License-Identifier: Apache-2.0
 """The states of the alignment: found once, checked when the evidence has doubled, saved."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from saved_graphs import assert_same_value
 
 from pose_graph_ros.core.alignment import monitor
 from pose_graph_ros.core.alignment.monitor import AlignmentMonitor, AlignmentState
-from pose_graph_ros.core.config import BackendConfig
+from pose_graph_ros.core.config import BackendConfig, NoiseFrom, OdometryNoise, OdometrySource
 from pose_graph_ros.core.geometry import se2
 from pose_graph_ros.core.geometry.se2 import FloatArray
 from pose_graph_ros.core.graph.graph import Graph, GraphUpdate
@@ -25,19 +27,28 @@ from pose_graph_ros.core.sources.constraint_queue import AttachedMeasurement
 from pose_graph_ros.core.sources.measurement_constraints import absolute_constraint
 
 SECOND = 1_000_000_000
-CONFIG = BackendConfig()
+CONFIG, SOURCE = BackendConfig(), OdometrySource()
 T_MAP_ODOM = np.array([30.0, -7.0, 2.5])
 
 
-def driven(n: int) -> HiddenNodes:
+def driven(
+    n: int, source: OdometrySource = SOURCE, *, twist: tuple[float, ...] = (),
+    begin: tuple[float, ...] = (0.0, 0.0, 0.0),
+) -> HiddenNodes:
     """Return the nodes of exact odometry along a curve, a node per metre and second."""
     rows = iter(range(n))
-    nodes = HiddenNodes(CONFIG, lambda *_: next(rows))
-    pose = np.zeros(3)
-    for k in range(n + 1):      # the last one settles the one before
-        nodes.add_sample(OdometrySample((k + 1) * SECOND, pose, 1.0), 'odom')
-        pose = se2.compose(pose, np.array([1.01, 0.0, 0.05]))
+    nodes = HiddenNodes(replace(CONFIG, odometry={'odom': source}), lambda *_: next(rows))
+    drive(nodes, n, twist=twist, begin=begin)
     return nodes
+
+
+def drive(
+    nodes: HiddenNodes, n: int, *, begin: tuple[float, ...], twist: tuple[float, ...] = (),
+) -> None:
+    pose, variance = np.array(begin), np.array(twist) if twist else None
+    for k in range(n + 1):      # the last one settles the one before
+        nodes.add_sample(OdometrySample((k + 1) * SECOND, pose, 1.0, variance), 'odom')
+        pose = se2.compose(pose, np.array([1.01, 0.0, 0.05]))
 
 
 NODES = driven(70)
@@ -70,7 +81,7 @@ def fixes(
 
 def aligned_with(first: list[AttachedMeasurement]) -> AlignmentMonitor:
     monitor_ = AlignmentMonitor(CONFIG)
-    assert monitor_.find(GRAPH, first, 'odom') is not None
+    assert monitor_.find(GRAPH, first, NODES) is not None
     monitor_.add(first)
     return monitor_
 
@@ -78,24 +89,61 @@ def aligned_with(first: list[AttachedMeasurement]) -> AlignmentMonitor:
 def test_positions_lead_from_local_over_unaligned_to_aligned() -> None:
     some = AlignmentMonitor(CONFIG)
     assert (some.state, some.sigma) == (AlignmentState.LOCAL, np.inf)
-    assert some.find(GRAPH, [], 'odom') is None
+    assert some.find(GRAPH, [], NODES) is None
     assert some.state is AlignmentState.LOCAL
-    assert some.find(GRAPH, fixes(range(1)), 'odom') is None
+    assert some.find(GRAPH, fixes(range(1)), NODES) is None
     assert some.state is AlignmentState.UNALIGNED
     assert not some.is_aligned
-    T_map_graph = some.find(GRAPH, fixes(range(12)), 'odom')
+    T_map_graph = some.find(GRAPH, fixes(range(12)), NODES)
     assert T_map_graph is not None
     assert some.is_aligned
     assert 0.0 < some.sigma < CONFIG.alignment.sigma_heading
     np.testing.assert_allclose(T_map_graph, T_MAP_ODOM, atol=1e-9)
     # found once
-    assert some.find(GRAPH, fixes(range(12)), 'odom') is None
+    assert some.find(GRAPH, fixes(range(12)), NODES) is None
+
+
+def drifting(sigma: float, noise_from: NoiseFrom, scale: float) -> AlignmentMonitor:
+    """Return the alignment after 12 fixes and odometry with a heading that is uncertain."""
+    noise = OdometryNoise(sigma_heading_distance=sigma, sigma_heading_turn=0.0)
+    nodes = driven(70, OdometrySource(noise, noise_from, covariance_scale=scale), twist=(
+        noise.sigma_distance**2 / scale, noise.sigma_lateral**2 / scale, 4.0 * sigma**2))
+    some = AlignmentMonitor(CONFIG)
+    assert some.find(graph_at(nodes.odometry), fixes(range(12)), nodes) is not None
+    return some
+
+
+def test_the_angle_is_as_uncertain_as_the_odometry_in_the_graph() -> None:
+    twice = drifting(0.02, NoiseFrom.MODEL, 1.0)
+    assert twice.sigma > 1.1 * drifting(0.01, NoiseFrom.MODEL, 1.0).sigma
+    for other in (drifting(0.01, NoiseFrom.TWIST, 1.0), drifting(0.005, NoiseFrom.TWIST, 4.0)):
+        assert other.sigma == pytest.approx(twice.sigma, rel=0.05)
+
+
+def test_biases_in_the_graph_are_no_way_of_the_robot() -> None:
+    nodes = driven(12, begin=(900.0, 400.0, 0.0))
+    graph = Graph()
+    for k, pose in enumerate(nodes.odometry):
+        graph.apply(GraphUpdate(hidden=pose[None]))
+        if k % 3 == 0:
+            graph.apply(GraphUpdate(biases=np.zeros((1, 3)), dimensions=[1]))
+    some, alone = AlignmentMonitor(CONFIG), AlignmentMonitor(CONFIG)
+    ids = graph.node_ids[graph.is_pose].tolist()
+    where = [attached(Position((k + 1) * SECOND, pose[:2], 0.04 * np.eye(2), np.zeros(2)), k)
+             for k, pose in enumerate(nodes.odometry)]
+    among_biases = HiddenNodes(CONFIG, lambda *_: ids.pop(0))
+    drive(among_biases, 12, begin=(900.0, 400.0, 0.0))
+    numbers = among_biases.ids.tolist()
+    moved = [attached(each.measurement, numbers[k]) for k, each in enumerate(where)]
+    assert some.find(graph, moved, among_biases) is not None
+    assert alone.find(graph_at(nodes.odometry), where, nodes) is not None
+    assert some.sigma == pytest.approx(alone.sigma)
 
 
 def test_headings_alone_leave_the_map_local() -> None:
     some = AlignmentMonitor(CONFIG)
     compass = [attached(HeadingOnly(SECOND, T_MAP_ODOM[2], 1e-4), 0)]
-    assert some.find(GRAPH, compass, 'odom') is None
+    assert some.find(GRAPH, compass, NODES) is None
     assert some.state is AlignmentState.LOCAL
 
 
@@ -105,7 +153,7 @@ def test_a_certain_heading_and_one_position_are_enough(node: int) -> None:
     heading = float(se2.wrap(T_MAP_ODOM[2] + NODES.odometry[node, 2]))
     compass = [attached(HeadingOnly(SECOND, heading, variance), node, 'compass')
                for variance in (1e-4, 4e-4)]
-    T_map_graph = some.find(GRAPH, [*compass, *fixes(range(1))], 'odom')
+    T_map_graph = some.find(GRAPH, [*compass, *fixes(range(1))], NODES)
     assert T_map_graph is not None
     np.testing.assert_allclose(T_map_graph, T_MAP_ODOM, atol=1e-9)
     assert some.sigma == pytest.approx(0.01)    # of the better one
@@ -114,14 +162,14 @@ def test_a_certain_heading_and_one_position_are_enough(node: int) -> None:
 def test_an_uncertain_heading_does_not_align() -> None:
     some = AlignmentMonitor(CONFIG)
     compass = attached(HeadingOnly(SECOND, T_MAP_ODOM[2], 4.0), 0, 'compass')
-    assert some.find(GRAPH, [compass, *fixes(range(1))], 'odom') is None
+    assert some.find(GRAPH, [compass, *fixes(range(1))], NODES) is None
     assert some.state is AlignmentState.UNALIGNED
 
 
 def test_a_global_pose_aligns_alone() -> None:
     some = AlignmentMonitor(CONFIG)
     pose = GlobalPose(SECOND, T_MAP_ODOM, np.diag([0.01, 0.01, 1e-4]))
-    T_map_graph = some.find(GRAPH, [attached(pose, 0)], 'odom')
+    T_map_graph = some.find(GRAPH, [attached(pose, 0)], NODES)
     assert T_map_graph is not None
     np.testing.assert_allclose(T_map_graph, T_MAP_ODOM, atol=1e-9)
 
@@ -181,7 +229,7 @@ def test_after_the_last_check_no_evidence_is_kept(monkeypatch: pytest.MonkeyPatc
 
 def test_before_the_alignment_nothing_is_checked() -> None:
     some = AlignmentMonitor(CONFIG)
-    some.find(GRAPH, fixes(range(1)), 'odom')
+    some.find(GRAPH, fixes(range(1)), NODES)
     some.add(fixes(range(60)))
     assert some.recheck(GRAPH, NODES) is None
     assert some.saved().next_verdict == monitor.FIRST_RECHECK
@@ -189,15 +237,15 @@ def test_before_the_alignment_nothing_is_checked() -> None:
 
 def test_what_find_has_done_is_undone_by_the_copy_from_before() -> None:
     some = AlignmentMonitor(CONFIG)
-    some.find(GRAPH, fixes(range(1)), 'odom')
+    some.find(GRAPH, fixes(range(1)), NODES)
     before = some.copy()
-    first = some.find(GRAPH, fixes(range(12)), 'odom')
+    first = some.find(GRAPH, fixes(range(12)), NODES)
     assert some.is_aligned
     some.restore(before)
     assert some.copy() == before
     assert some.state is AlignmentState.UNALIGNED
     # the next attempt finds the same
-    np.testing.assert_array_equal(some.find(GRAPH, fixes(range(12)), 'odom'), first)
+    np.testing.assert_array_equal(some.find(GRAPH, fixes(range(12)), NODES), first)
 
 
 @pytest.mark.parametrize('n', [0, 1, 20])
@@ -206,7 +254,7 @@ def test_a_saved_monitor_decides_as_the_first_one_would_have(n: int) -> None:
     one = AlignmentMonitor(CONFIG)
     if n > 0:
         first = [*fixes(range(min(n, 5)), wrong, 'gps'), *fixes(range(5, n), source='beacon')]
-        one.find(GRAPH, first[:5], 'odom')
+        one.find(GRAPH, first[:5], NODES)
         one.add(first)
     other = AlignmentMonitor(CONFIG)
     other.load(one.saved())

@@ -288,7 +288,6 @@ MISTAKES = {
     'twice': ('VERTEX_SE2 1 0 0 0', 'vertex 1 is in the file twice'),
     'fix': ('FIX 2', 'FIX 2: there is no such vertex'),
     'fix_word': ('FIX x', "FIX: .*'x'"),
-    'itself': (f'EDGE_SE2 1 1 0 0 0 {IDENTITY}', 'an edge leads from a node to itself'),
     'negative': ('EDGE_SE2 0 1 1 0 0 -1 0 0 1 0 1', 'not positive semidefinite'),
     'zero': ('EDGE_SE2 0 1 1 0 0 0 0 0 0 0 0', 'not positive semidefinite, or zero'),
     'prior': ('EDGE_PRIOR_SE2 0 0 0 0 1 2 0 1 0 1', 'not positive semidefinite'),

@@ -44,6 +44,7 @@ from pose_graph_ros.core.measurements import (
     OdometrySample,
     Position,
 )
+from pose_graph_ros.core.sources.waiting import WaitingMeasurements
 
 CONFIGS = {'plain': PLAIN, 'robust': ROBUST, 'correlated': CORRELATED}
 
@@ -63,6 +64,14 @@ def left_out(backend: PoseGraphBackend) -> list[tuple[str, Measurement]]:
     bound = backend._pipeline.queue.observed + backend._quarantine.observed
     return (backend._pipeline.waiting.measurements
             + [(each.source, each.measurement) for each in bound])
+
+
+def of_the_graph(backend: PoseGraphBackend) -> Estimate:
+    """Return the estimate without what waits, which is not saved but sent again."""
+    waiting, backend._pipeline.waiting = backend._pipeline.waiting, WaitingMeasurements()
+    estimate, backend._pipeline.waiting = backend.estimate(), waiting
+    assert estimate is not None
+    return estimate
 
 
 def closed(backend: PoseGraphBackend) -> Estimate:
@@ -90,7 +99,8 @@ def assert_same_estimate(actual: Estimate, expected: Estimate, tolerance: float 
             se2.wrap(one[..., 2] - other[..., 2]), 0.0, rtol=0.0, atol=tolerance)
     np.testing.assert_allclose(
         actual.covariance, expected.covariance, rtol=0.0, atol=tolerance)
-    for name in ('n_hidden', 'n_edges', 'n_observed', 'n_biases', 'primary', 'alignment', 'noise'):
+    for name in (
+            'n_hidden', 'n_edges', 'n_observed', 'n_biases', 'primary', 'alignment', 'odometry'):
         assert getattr(actual, name) == getattr(expected, name), name
 
 
@@ -109,8 +119,7 @@ def test_a_graph_comes_back_to_the_bit_and_grows_on_as_without_saving(kind: str,
     assert_same_value(loaded, saved)
     after = PoseGraphBackend.restored(CONFIGS[kind], loaded)
     # the state is the same
-    estimate = before.estimate()
-    assert estimate is not None
+    estimate = of_the_graph(before)
     assert_same_estimate(after.estimate(), estimate)
     assert (after.estimate().chi2, after.estimate().alignment_sigma) == (
         estimate.chi2, estimate.alignment_sigma)
@@ -136,7 +145,7 @@ def test_the_first_update_after_a_load_eliminates_everything() -> None:
     report = restored.update()
     assert (report.status, report.eliminated) == (Status.CONVERGED, restored.graph.n_nodes)
     np.testing.assert_allclose(report.chi2, backend.estimate().chi2, rtol=1e-5)
-    assert_same_estimate(restored.estimate(), backend.estimate(), 3e-3)
+    assert_same_estimate(restored.estimate(), of_the_graph(backend), 3e-3)
     assert restored.update().eliminated == 0
 
 
@@ -154,7 +163,7 @@ def test_a_robot_that_was_put_elsewhere_stays_there() -> None:
     resent = left_out(parted)
     saved = parted.saved()
     parted = PoseGraphBackend.restored(PLAIN, through_files(saved))
-    assert_same_estimate(parted.estimate(), whole.estimate())
+    assert_same_estimate(parted.estimate(), of_the_graph(whole))
     for source, measurement in resent:
         parted.add_measurement(measurement, source)
     odometry = [event for event in stream[500:] if isinstance(event.what, OdometrySample)]
@@ -231,7 +240,7 @@ def test_a_source_with_other_settings_adds_to_its_saved_constraints(
     stream, config = events(kind), CONFIGS[kind]
     backend = PoseGraphBackend(config)
     feed_all(backend, stream[:500])
-    before, resent = backend.estimate(), left_out(backend)
+    before, resent = of_the_graph(backend), left_out(backend)
     settings_ = {**config.measurements, 'gps': now}
     restored = PoseGraphBackend.restored(
         replace(config, measurements=settings_), through_files(backend.saved()))

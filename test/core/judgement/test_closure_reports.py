@@ -16,6 +16,7 @@ from pose_graph_ros.core.judgement import closure_judge, closure_states
 from pose_graph_ros.core.judgement.closures import GATE
 from pose_graph_ros.core.judgement.verdicts import Change, Decision, State
 from pose_graph_ros.core.measurements import AnswerStatus, LoopClosure, OdometrySample
+from pose_graph_ros.core.sources.constraint_queue import NewConstraint
 
 SECOND = 10**9
 LAP = 60  # duration of a round [s]
@@ -54,6 +55,19 @@ def settle(backend: PoseGraphBackend) -> None:
     backend.update()
     while not backend.refine().finished:
         pass
+
+
+def test_one_that_was_never_used_is_doubted_since_it_came_not_since_the_end() -> None:
+    """As in a replay, where what waits in a large graph is judged at the end."""
+    state = closure_states.ClosureStates()
+    state.append([NewConstraint(True, 0, 'loop', 5 * SECOND, LoopClosure, SECOND)], 6 * SECOND)
+    for before, after, now, since in (
+            (State.WAITING, State.DOUBTED, 90, 6), (State.DOUBTED, State.BELIEVED, 91, 91),
+            (State.BELIEVED, State.WEAKLY_BELIEVED, 92, 91),
+            (State.WEAKLY_BELIEVED, State.WAITING, 93, 93)):
+        state.state[0] = closure_states.STATES.index(after)
+        state.announce(0, closure_states.STATES.index(before), now * SECOND)
+        assert state.since_ns[0] == since * SECOND
 
 
 def test_verdicts_tell_origin_reason_and_error() -> None:

@@ -2,6 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Which loop closures are believed: small worlds with false ones, and the pieces by oracles."""
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -13,14 +14,21 @@ from pose_graph_ros.core.config import BackendConfig, MeasurementSource, NodePol
 from pose_graph_ros.core.geometry import se2
 from pose_graph_ros.core.geometry.se2 import FloatArray
 from pose_graph_ros.core.graph.constraints import EdgeKind, Edges
-from pose_graph_ros.core.graph.graph import GraphUpdate
+from pose_graph_ros.core.graph.graph import Graph, GraphUpdate
 from pose_graph_ros.core.io.graph_files import read_graph, write_graph
-from pose_graph_ros.core.judgement import relative
+from pose_graph_ros.core.judgement import relative, strain
 from pose_graph_ros.core.judgement.closures import claims, GATE
 from pose_graph_ros.core.judgement.floors import forward
+from pose_graph_ros.core.judgement.odometry_motions import Odometry
+from pose_graph_ros.core.judgement.scale_learner import ScaleLearner
 from pose_graph_ros.core.judgement.set_search import SetSearch
 from pose_graph_ros.core.judgement.verdicts import Decision, State, Verdict
-from pose_graph_ros.core.measurements import AnswerStatus, LoopClosure, OdometrySample
+from pose_graph_ros.core.measurements import (
+    AnswerStatus,
+    GlobalPose,
+    LoopClosure,
+    OdometrySample,
+)
 from pose_graph_ros.core.solver_config import CLOSURE_FLOORS
 
 SECOND = 10**9
@@ -340,3 +348,43 @@ def test_the_scale_of_the_sigmas_is_found_in_the_agreement_of_neighbours(factor:
                 + rng.normal(0.0, factor * SIGMAS)) for j in range(LAP + 2, LAP * LAPS)])
     backend.optimize()
     assert backend.verdict_totals()['scan'].scale == pytest.approx(max(factor, 1.0), rel=0.1)
+
+
+@pytest.mark.parametrize('correlation_time', [0.0, 10.0])
+def test_a_bias_does_not_make_a_distant_place_large(correlation_time: float) -> None:
+    backend = PoseGraphBackend(replace(CONFIG, measurements={
+        'fix': MeasurementSource(robust=Robust.NONE, correlation_time=correlation_time)}))
+    for k in range(5):
+        backend.add_measurement(GlobalPose(
+            (k + 1) * SECOND, TRUTH[k] + np.array([10_000.0, 2_000.0, 0.0]),
+            np.diag([0.1, 0.1, 0.01])), 'fix')
+    # nothing but its gate, which is as large as a tenth of the place, speaks for this one
+    run([closure(3, 2 * LAP + 3, np.array([1.0, 1.0, 0.1]))], begin=backend)
+    assert np.any(backend.graph.is_bias) == (correlation_time > 0.0)
+    only, = (each for each in backend.verdicts() if each.source == 'scan')
+    assert only.state is State.WAITING
+
+
+def test_few_places_of_a_distant_map_are_not_many() -> None:
+    graph, near = Graph(), np.column_stack((10_000.0 + np.arange(60.0), np.zeros((60, 2))))
+    i = np.arange(59)
+    graph.apply(GraphUpdate(hidden=near, edges=Edges(
+        i, i + 1, np.tile([1.0, 0.0, 0.0], (59, 1)), np.tile(np.eye(3), (59, 1, 1)),
+        np.full(59, EdgeKind.ODOMETRY))))
+    over = Edges(np.arange(20), np.arange(20) + 30, np.zeros((20, 3)),
+                 np.tile(np.eye(3), (20, 1, 1)), np.full(20, EdgeKind.LOOP_CLOSURE))
+    before = strain.n_places(graph.poses, over, Odometry(graph))
+    graph.apply(GraphUpdate(biases=np.zeros((1, 3))))
+    assert strain.n_places(graph.poses, over, Odometry(graph)) == before > 1
+
+
+def test_the_end_of_a_stream_comes_also_where_beliefs_go_round_in_a_circle(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    backend = run(true_ones(np.random.default_rng(2))[:6], last=120)
+    calls = []
+    # whatever is left to be done is to be done once more
+    monkeypatch.setattr(ScaleLearner, 'learn', lambda _: len(calls.append(1) or calls) > 0)
+    assert backend.optimize().status is Status.CONVERGED
+    assert len(calls) < 10_000
+    assert all(each.state.in_graph for each in backend.verdicts() if each.source == 'scan')

@@ -10,6 +10,8 @@ from pose_graph_ros.core.backend import PoseGraphBackend
 from pose_graph_ros.core.config import BackendConfig, Correlation, MeasurementSource, POSITIONS
 from pose_graph_ros.core.geometry import se2
 from pose_graph_ros.core.geometry.se2 import BoolArray, FloatArray
+from pose_graph_ros.core.judgement import run_set
+from pose_graph_ros.core.judgement.run_choice import best_runs
 from pose_graph_ros.core.judgement.verdicts import Decision, State, Verdict
 from pose_graph_ros.core.measurements import GlobalPose, Measurement, OdometrySample, Position
 
@@ -33,6 +35,7 @@ class Drive:
         self.fix_time = np.arange(seconds) + 0.0
         self.fixes = self.truth[::5, :2] + 0.5 * rng.standard_normal((seconds, 2))
         self.sent = np.ones(seconds, dtype=bool)
+        self.claimed = 0.5
 
     def between(self, begin: float, end: float) -> BoolArray:
         """Return which fixes have a stamp in an interval [s]."""
@@ -56,7 +59,7 @@ class Drive:
 
     def measurements(self) -> list[tuple[str, Measurement]]:
         return [('fix', Position(
-            SECOND + round(time * SECOND), where, 0.25 * np.eye(2), np.zeros(2)))
+            SECOND + round(time * SECOND), where, self.claimed**2 * np.eye(2), np.zeros(2)))
             for time, where in zip(self.fix_time[self.sent], self.fixes[self.sent], strict=True)]
 
 
@@ -100,6 +103,22 @@ class Driven:
             verdict.id for verdict in backend.verdicts() if verdict.state is State.DOUBTED}
 
 
+class Aside(Drive):
+    """Fixes of 1 m at 3 m/s, the yaw rate is off: a minute without any, then 30 s all aside."""
+
+    def __init__(self, seed: int, period: float) -> None:
+        super().__init__(230, seed)
+        rng, self.claimed = np.random.default_rng(seed + 1000), 1.0
+        self.motion[:, 0], self.motion[:, 2] = 0.6, 0.12 * np.sin(self.time / period)
+        self.noise[:, 2] = 0.004 * rng.standard_normal(len(self.time)) + 0.005 / 5.0
+        for k in range(1, len(self.truth)):
+            self.truth[k] = se2.compose(self.truth[k - 1], self.motion[k])
+        self.fixes = self.truth[::5, :2] + rng.standard_normal((230, 2))
+        self.sent[self.between(100.0, 160.0)] = False
+        angle = np.random.default_rng(seed).uniform(-np.pi, np.pi)
+        self.move(160.0, 190.0, (40.0 * np.cos(angle), 40.0 * np.sin(angle)))
+
+
 def ids(drive: Drive, begin: float, end: float, source: str = 'fix') -> set[str]:
     """Return the ids of the fixes of an interval."""
     numbers = np.cumsum(drive.sent) - 1
@@ -135,6 +154,33 @@ def test_consistent_offset_after_an_outage_is_doubted_throughout() -> None:
     assert all(driven.doubting[at] for at in range(84, 111))
     assert max(driven.newest[at] for at in range(80, 111)) < 5.0
     assert driven.rms < 1.5
+
+
+@pytest.mark.parametrize('seed', [3, 4, 5])
+def test_fixes_after_an_outage_do_not_throw_out_the_right_ones_before(seed: int) -> None:
+    drive = Aside(seed, 5.0)
+    assert Driven(drive).doubted == ids(drive, 160.0, 190.0)
+
+
+@pytest.mark.parametrize('seed', range(3))
+def test_an_offset_after_an_outage_is_no_slip_of_odometry(seed: int) -> None:
+    driven = Driven(Aside(seed, 9.0), final=False)
+    assert max(driven.newest[at] for at in range(160, 190)) < 20.0
+
+
+def test_the_end_keeps_what_is_believed_if_a_search_finds_nothing_better(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    drive = Drive(150)
+    drive.sent[drive.between(40.0, 80.0)] = False
+    drive.move(80.0, 110.0, (25.0, -31.0))
+    driven = Driven(drive, final=False)
+    assert driven.doubted == ids(drive, 80.0, 110.0)
+    # the present decision begins before the wrong ones; this search only finds what comes last
+    monkeypatch.setattr(run_set, 'best_runs', lambda runs, chain: best_runs(runs, chain)[-1:])
+    driven.backend.optimize()
+    assert {each.id for each in driven.backend.verdicts()
+            if each.state is State.DOUBTED} == driven.doubted
 
 
 def test_slip_in_an_outage_right_fixes_win() -> None:

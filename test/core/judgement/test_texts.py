@@ -19,6 +19,7 @@ from pose_graph_ros.core.judgement.texts import (
     number_of,
     seconds,
     sentence,
+    short,
     states_by_stamps,
     total_values,
     totals_text,
@@ -40,7 +41,11 @@ CLOSURE = Verdict(
 def test_a_sentence_says_state_and_reason() -> None:
     assert sentence(CLOSURE) == (
         'Doubted and not used since 1700.500: it was 14.2 sigma from the path without it; it '
-        'contradicts loop_closure/3, odometry.')
+        'contradicts loop_closure/3.')
+    # odometry is the path without it, which is not far
+    assert sentence(replace(CLOSURE, distance=0.04, contradicted_by=())) == (
+        'Doubted and not used since 1700.500: by itself it could be right, 0.0 sigma from the '
+        'path without it, but all others together agree better without it.')
     assert sentence(replace(
         CLOSURE, state=State.BELIEVED, distance=1.0, supported_by=('loop_closure/3',),
         contradicted_by=())) == (
@@ -108,6 +113,14 @@ def test_lists_are_bounded_and_nouns_are_counted() -> None:
     assert joined([str(k) for k in range(7)]) == '0, 1, 2, 3, 4 and 2 more'
     assert number_of(1, Judged.FIX) == '1 fix'
     assert number_of(2, Judged.FIX) == '2 fixes'
+
+
+@pytest.mark.parametrize(('value', 'digits', 'text'), [
+    (98.7, 2, '99'), (283.4, 2, '283'), (0.0456, 2, '0.046'), (0.5, 2, '0.5'), (9.96, 2, '10'),
+    (1.25e-7, 2, '1.2e-07'), (0.0, 2, '0'), (-1234.5, 3, '-1234'), (14.96, 3, '15'),
+    (math.nan, 2, 'nan')])
+def test_numbers_for_people_have_no_exponents(value: float, digits: int, text: str) -> None:
+    assert short(value, digits) == text
 
 
 def test_states_are_found_by_source_and_stamps() -> None:

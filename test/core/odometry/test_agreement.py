@@ -55,3 +55,27 @@ def test_nothing_is_said_without_turns() -> None:
     for _ in range(100):
         agreement.add(0.0, 1.0, 0.0, 0.01, 1e-6)
     assert agreement.difference() is None
+
+
+@pytest.mark.parametrize('rate', [0.0, 0.004, 0.02])
+@pytest.mark.parametrize('noise', [0.0, 0.01])
+def test_a_gyroscope_that_does_not_turn_while_odometry_does_is_recognised(
+    rate: float, noise: float,
+) -> None:
+    rng, agreement = np.random.default_rng(1), Agreement()
+    for start, end in pairwise(np.arange(0.0, 200.0).tolist()):
+        by_wheels = float(1.5 * np.sin(0.3 * end) - 1.5 * np.sin(0.3 * start))
+        angle = rate + noise * float(rng.standard_normal())
+        agreement.add(angle - by_wheels, 1.0, 0.0, angle, 1e-4)
+    found = agreement.difference()
+    assert found is not None
+    assert found.sigmas > 1.5
+    assert 'does not turn' in found.reason
+
+
+def test_odometry_that_hardly_turns_says_nothing_of_a_gyroscope() -> None:
+    rng, agreement = np.random.default_rng(1), Agreement()
+    for _ in range(200):
+        agreement.add(0.01 * float(rng.standard_normal()), 1.0, 0.0, 0.0, 1e-4)
+    found = agreement.difference()
+    assert found is None or found.reason == ''

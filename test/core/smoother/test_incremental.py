@@ -546,6 +546,25 @@ def test_extending_equals_updating(config: SmootherConfig) -> None:
     assert np.max(np.abs(off)) < 0.05
 
 
+@pytest.mark.parametrize('weight', [0.01, 100.0])
+def test_a_chain_made_with_another_weight_follows_what_pulls_at_it(weight: float) -> None:
+    extended, updated = IncrementalSmoother(), IncrementalSmoother()
+    mean = np.array([1.0, 0.0, 0.05])
+    for smoother in (extended, updated):
+        smoother.update(GraphUpdate(hidden=np.zeros((1, 3)), observed=seen(0, np.zeros(3))))
+    for k in range(1, 60):
+        extended.extend(mean, POSE_INFORMATION, weight)
+        updated.update(GraphUpdate(
+            hidden=se2.compose(updated.poses[-1], mean)[None],
+            edges=replace(link(k - 1, k, mean), weight=np.array([weight]))))
+    for smoother in (extended, updated):
+        # odometry counts as claimed again, and a fix moves the end
+        smoother.update(GraphUpdate(weigh_edges=dict.fromkeys(range(59), 1.0)))
+        smoother.update(GraphUpdate(observed=seen(
+            59, smoother.poses[59] + np.array([3.0, 3.0, 0.0]))))
+    np.testing.assert_allclose(extended.poses, updated.poses, rtol=0.0, atol=1e-3)
+
+
 def test_extending_takes_any_numbers() -> None:
     smoother = IncrementalSmoother(EXACT)
     smoother.update(GraphUpdate(hidden=np.zeros((1, 3)), fix=[0]))

@@ -2,6 +2,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """The statistics of errors: the likelihood by an oracle, what is found, and what is not."""
 
+import itertools
+
 import numpy as np
 import pytest
 
@@ -16,6 +18,8 @@ from pose_graph_ros.core.sources.error_likelihood import (
     filtered,
     MeasuredPath,
     NO_ODOMETRY,
+    RATE_VARIANCE,
+    SCALE_VARIANCE,
 )
 
 SECOND = 1_000_000_000
@@ -36,13 +40,20 @@ def errors(
 
 def a_drive(
     seed: int, *, n: int = 200, period: float = 1.0, tau: float = 0.0, white: float = 0.05,
-    sigma: float = 1.0, drift: float = 1.0, wrong: float = 0.0,
+    sigma: float = 1.0, drift: float = 1.0, wrong: float = 0.0, turns: float = 1.0,
+    speed: float = 1.0, longer: float = 0.0, rate: float = 0.0,
 ) -> MeasuredPath:
-    """Return a drive at 1 m/s with positions of a claimed sigma of 1 m."""
+    """
+    Return a drive with positions of a claimed sigma of 1 m.
+
+    The noise of odometry is `drift` times what it says, that of turns `turns` times that; it takes
+    the way for `longer`, and turns by `rate` [rad/s] more.
+    """
     rng = np.random.default_rng(seed)
-    steps = np.column_stack((np.full(n, period), np.zeros(n), 0.1 * np.sin(np.arange(n))))
-    cov = period * np.diag((0.0025, 0.0009, 1e-4))
-    slips = drift * rng.standard_normal((n, 3)) * np.sqrt(np.diagonal(cov))
+    steps = np.column_stack((
+        np.full(n, speed * period), np.zeros(n), 0.1 * np.sin(np.arange(n))))
+    cov = speed * period * np.diag((0.0025, 0.0009, 1e-4))
+    slips = drift * rng.standard_normal((n, 3)) * np.sqrt(np.diagonal(cov)) * (1.0, 1.0, turns)
     true = np.zeros((n, 3))
     true[0, 2] = rng.uniform(-3.0, 3.0)
     for k in range(1, n):
@@ -50,11 +61,13 @@ def a_drive(
     seen = true[:, :2] + sigma * errors(rng, n, period, tau, white)
     jumps = rng.random(n) < wrong
     seen[jumps] += rng.uniform(-50.0, 50.0, (np.sum(jumps), 2))
-    return MeasuredPath(period * np.arange(n), seen, np.ones(n), np.zeros((n, 2)), steps,
-                        np.tile(cov, (n, 1, 1)))
+    told = steps * (1.0 + longer, 1.0, 1.0) + (0.0, 0.0, rate * period)
+    return MeasuredPath(period * np.arange(n), seen, np.ones(n), np.zeros((n, 2)), told,
+                        np.tile(cov, (n, 1, 1)), np.tile((cov[0, 0], 0.0, cov[1, 1]), (n, 1)))
 
 
-def test_the_likelihood_is_that_of_the_full_covariance() -> None:
+@pytest.mark.parametrize('constant', [False, True])
+def test_the_likelihood_is_that_of_the_full_covariance(*, constant: bool) -> None:
     """On a straight line with a known heading the positions are jointly Gaussian."""
     n, tau, correlated, odometry, white = 12, 7.0, 0.8, 1.5, 0.3
     rng = np.random.default_rng(0)
@@ -63,20 +76,27 @@ def test_the_likelihood_is_that_of_the_full_covariance() -> None:
     variance = rng.uniform(0.5, 2.0, n)
     position = np.column_stack((np.arange(n), np.zeros(n))) + 0.3 * rng.standard_normal((n, 2))
     given = MeasuredPath(seconds, position, variance, np.zeros((n, 2)),
-                         np.tile((1.0, 0.0, 0.0), (n, 1)), np.tile(cov, (n, 1, 1)))
+                         np.tile((1.0, 0.0, 0.0), (n, 1)), np.tile(cov, (n, 1, 1)),
+                         np.tile((0.04, 0.0, 0.09), (n, 1)))
     sigma = np.sqrt(variance)
     bias = correlated * np.outer(sigma, sigma) * np.exp(
         -np.abs(np.subtract.outer(seconds, seconds)) / tau)
     steps = np.minimum.outer(np.arange(n), np.arange(n))
 
+    # what a heading that grows in time makes of the way so far
+    swept = np.append(0.0, np.cumsum(0.5 * (seconds[1:] + seconds[:-1]) - seconds[0]))
+
     expected = 0.0
-    for axis, first in ((0, 0.0), (1, 0.1)):
+    for axis, first, slow, shape in ((0, 0.0, SCALE_VARIANCE, np.arange(n)),
+                                     (1, 0.1, RATE_VARIANCE, swept)):
         # the position at the start is unknown; a wrong heading there turns the whole line
         full = (bias + white * np.diag(variance) + odometry * cov[axis, axis] * steps
-                + 1e4 * variance[0] + first * np.outer(np.arange(n), np.arange(n)))
+                + 1e4 * variance[0] + first * np.outer(np.arange(n), np.arange(n))
+                + constant * slow * np.outer(shape, shape))
         off = position[:, axis] - np.arange(n) * (axis == 0) - position[0, axis]
         expected += np.linalg.slogdet(full)[1] + off @ np.linalg.solve(full, off)
-    found, n_lost = filtered(*given, tau, correlated, odometry, white, 0.0)
+    found, n_lost = filtered(
+        *given, tau, correlated, odometry, 3.0, white, 0.0, constant)   # no noise of turns
     assert n_lost == 0
     assert found == pytest.approx(expected, abs=0.05)
 
@@ -102,10 +122,40 @@ def test_white_errors_are_not_taken_for_correlated_ones(settings: dict[str, floa
     assert sum(errors is not None for errors in taken) <= 1     # by chance in one of a hundred
 
 
+@pytest.mark.parametrize('settings', [
+    {'drift': 0.1}, {'turns': 0.1}, {'turns': 0.1, 'drift': 3.0}, {'turns': 0.05, 'drift': 5.0},
+    {'turns': 0.3, 'drift': 0.3, 'longer': 0.02}, {'drift': 0.1, 'longer': 0.01},
+    {'drift': 0.1, 'rate': 0.005}, {'drift': 0.1, 'longer': 0.01, 'rate': 0.002}], ids=str)
+def test_white_errors_beside_odometry_that_hardly_turns_by_itself_are_not_taken_for_correlated(
+    settings: dict[str, float],
+) -> None:
+    """As visual odometry: its headings are far better than the settings say, its scale is off."""
+    taken = [to_the_end(search(a_drive(seed, n=400, speed=8.0, **settings))).errors
+             for seed in range(8)]
+    assert taken == [None] * 8
+
+
+def test_errors_are_not_taken_for_white_or_correlated_to_and_fro() -> None:
+    """It takes much to believe that they are correlated, and then much less to go on so."""
+    changes = []
+    for seed in range(6):
+        # odometry whose headings say little, so that not much speaks for either
+        whole, taken = a_drive(seed, n=400, tau=30.0, white=0.3, speed=5.0), [False]
+        for n in (40, 52, 68, 88, 115, 150, 195, 253, 329, 400):
+            drive = MeasuredPath(*(each[:n] for each in whole))
+            taken.append(to_the_end(search(drive, correlated=taken[-1])).errors is not None)
+        changes.append(sum(one != other for one, other in itertools.pairwise(taken)))
+    assert max(changes) <= 1
+
+
 @pytest.mark.parametrize(('n', 'period', 'tau'), [
-    (12, 1.0, 60.0), (30, 1.0, 10.0), (30, 1.0, 60.0), (30, 1.0, 300.0), (30, 5.0, 30.0)])
+    (30, 1.0, 60.0), (30, 1.0, 300.0), (60, 1.0, 10.0), (120, 5.0, 30.0)])
 def test_correlated_errors_show_in_few_positions(n: int, period: float, tau: float) -> None:
-    """Even where all of them are within one time constant: they scatter less than is claimed."""
+    """
+    Even where all of them are within one time constant: they scatter less than is claimed.
+
+    Fewer do not tell them from white errors beside odometry that is worse than it says.
+    """
     found = [to_the_end(search(a_drive(seed, n=n, period=period, tau=tau))).errors
              for seed in range(12)]
     assert sum(errors is not None for errors in found) >= 10
@@ -143,16 +193,30 @@ def test_a_step_of_a_search_is_bounded(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 @pytest.mark.parametrize(('drift', 'tau', 'n'), [
-    (1.0, 0.0, 200), (1.0, 60.0, 400), (0.3, 0.0, 400), (2.0, 0.0, 600), (3.0, 0.0, 400),
+    (1.0, 0.0, 200), (1.0, 60.0, 400), (0.3, 60.0, 400), (2.0, 0.0, 600), (3.0, 0.0, 400),
     (3.0, 60.0, 600)])
 def test_the_noise_of_odometry_is_found_where_it_is_more_than_claimed(
     drift: float, tau: float, n: int,
 ) -> None:
-    """Odometry that is as it says, or better, keeps its noise."""
+    """Odometry that is as it says keeps its noise; a better one as well, beside slow errors."""
     scales = [to_the_end(search(a_drive(seed, n=n, tau=tau, drift=drift))).odometry_scale
               for seed in range(5)]
     assert max(drift, 1.0) / 1.35 < np.median(scales) < 1.35 * max(drift, 1.0)
     assert drift > 1.0 or sum(scale > 1.0 for scale in scales) <= 1
+
+
+@pytest.mark.parametrize('settings', [
+    {'drift': 0.1}, {'drift': 0.3}, {'drift': 0.1, 'longer': 0.01}, {'drift': 0.1, 'rate': 0.002},
+    {'drift': 0.3, 'turns': 3.0}, {'drift': 1.0, 'turns': 0.1}], ids=str)
+def test_better_odometry_gets_no_less_noise_than_what_is_likely(
+    settings: dict[str, float],
+) -> None:
+    """The factor of the graph is that of way and turn, and it has to cover constant errors."""
+    scales = [to_the_end(search(a_drive(seed, n=400, speed=8.0, **settings))).odometry_scale
+              for seed in range(6)]
+    worse = settings['drift'] * max(1.0, settings.get('turns', 1.0))
+    assert all(0.7 * worse < scale < 1.5 for scale in scales)
+    assert len(settings) > 1 or np.median(scales) < 4.0 * worse
 
 
 def line(n: int) -> Graph:
@@ -194,18 +258,21 @@ def test_chained_motions_are_those_of_an_oracle() -> None:
     graph.apply(GraphUpdate(hidden=np.zeros((n + 1, 3)), fix=(0,), edges=Edges(
         poses, poses + 1, motion, np.linalg.inv(noise), [EdgeKind.ODOMETRY] * n)))
     edge_after = np.where(poses == 10, -1, poses)
-    got, spread = np.zeros((4, 3)), np.zeros((4, 3, 3))
+    got, spread, ways = np.zeros((4, 3)), np.zeros((4, 3, 3)), np.zeros((4, 3))
     for part in ((0, 3), (3, 4)):
-        chain_motions(graph.memory['edge_f'], edge_after, until, *part, got, spread)
+        chain_motions(graph.memory['edge_f'], edge_after, until, *part, got, spread, ways)
     motion[10], noise[10] = 0.0, np.diag(NO_ODOMETRY)
     for k in range(1, 4):
-        pose, cov = np.zeros(3), np.zeros((3, 3))
+        pose, cov, way = np.zeros(3), np.zeros((3, 3)), np.zeros((2, 2))
         for row in range(until[k - 1], until[k]):
             back = se2.adjoint(se2.inverse(motion[row]))
             pose, cov = se2.compose(pose, motion[row]), back @ cov @ back.T + noise[row]
+            way = (back[:2, :2] @ way @ back[:2, :2].T + noise[row][:2, :2]
+                   - np.outer(noise[row][:2, 2], noise[row][:2, 2]) / noise[row][2, 2])
         np.testing.assert_allclose(got[k, :2], pose[:2], atol=1e-12)
         assert se2.wrap(got[k, 2] - pose[2]) == pytest.approx(0.0, abs=1e-12)
         np.testing.assert_allclose(spread[k], cov, rtol=1e-10, atol=1e-10)
+        np.testing.assert_allclose(ways[k], way[[0, 0, 1], [0, 1, 1]], rtol=1e-10, atol=1e-10)
 
 
 def test_a_long_path_is_joined_in_steps(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -10,9 +10,15 @@ import numpy as np
 import pytest
 
 from pose_graph_ros.core.backend import PoseGraphBackend
-from pose_graph_ros.core.config import OdometryNoise, OdometrySource, WindowConfig
+from pose_graph_ros.core.config import (
+    BackendConfig,
+    OdometryNoise,
+    OdometrySource,
+    WindowConfig,
+)
 from pose_graph_ros.core.geometry import se2
 from pose_graph_ros.core.graph.constraints import EdgeKind
+from pose_graph_ros.core.graph.graph import Graph, GraphUpdate
 from pose_graph_ros.core.io.graph_files import read_graph, write_graph
 from pose_graph_ros.core.measurements import (
     AnswerStatus,
@@ -21,6 +27,9 @@ from pose_graph_ros.core.measurements import (
     OdometrySample,
     YawRate,
 )
+from pose_graph_ros.core.odometry.turns import Turn
+from pose_graph_ros.core.sources.gauss_markov import Additions
+from pose_graph_ros.core.sources.gyro_bias import GyroBiases
 
 Events = list[tuple[str, OdometrySample | Measurement]]
 
@@ -232,3 +241,14 @@ def test_the_newest_pose_has_the_rotation_by_the_gyroscope() -> None:
                  [each for each in events if each[0] != 'gyro']).estimate()
     assert alone.T_map_base[2] == pytest.approx(0.0, abs=1e-9)
     assert estimate.covariance[2, 2] < alone.covariance[2, 2]
+
+
+def test_each_of_two_gyroscopes_goes_on_from_its_own_bias_within_an_update() -> None:
+    gyros, graph = GyroBiases(BackendConfig()), Graph()
+    graph.apply(GraphUpdate(hidden=np.zeros((4, 3))))
+    additions = Additions(graph.next_ids)
+    gyros.add([Turn(source, k, k + 1, round((1.0 + 20.0 * k) * SECOND), 0.0, 1e-4, 1.0,
+                    rest_rate=rate, rest_variance=1e-6)
+               for k in range(3) for source, rate in (('left', 0.02), ('right', -0.01))],
+              graph, additions)
+    assert additions.update().biases[:, 0].tolist() == [0.02, -0.01] * 3

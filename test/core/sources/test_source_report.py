@@ -54,10 +54,32 @@ def test_the_energy_is_the_mean_square_of_a_coordinate_in_sigmas(turn: float) ->
 
 
 def test_residuals_are_in_map_axes_however_the_measured_pose_is_turned() -> None:
-    residuals, information = source_report._residuals(
-        graph := observed(gauss_markov(50, 5.0), 0.5, turn=1.0), graph.observed)
-    np.testing.assert_allclose(residuals, gauss_markov(50, 5.0), atol=1e-12)
-    np.testing.assert_allclose(information, np.tile(4.0 * np.eye(2), (50, 1, 1)), atol=1e-12)
+    found = [report(observed(gauss_markov(600, 20.0) * (1.0, 3.0), 0.5, turn=turn), in_time(600),
+                    biased=False, in_use=None) for turn in (0.0, 1.0)]
+    assert found[1].errors == pytest.approx(found[0].errors)
+    assert found[1].energy == pytest.approx(found[0].energy)
+
+
+def test_headings_have_a_squared_residual_and_no_correlation_of_positions() -> None:
+    errors = 0.1 * np.random.default_rng(1).standard_normal(200)
+    graph, information = Graph(), np.zeros((200, 3, 3))
+    information[:, 2, 2] = 0.05**-2
+    graph.apply(GraphUpdate(
+        hidden=np.column_stack((gauss_markov(200, 20.0), errors)), observed=ObservedNodes(
+            np.arange(200), None, np.zeros((200, 3)), information, [ObservedKind.HEADING] * 200)))
+    found = report(graph, in_time(200), biased=False, in_use=None)
+    assert found.energy == pytest.approx(np.mean(errors**2) / 0.05**2)
+    assert not found.errors.significant
+
+
+def test_what_is_known_of_the_errors_counts_for_whether_they_fit_badly() -> None:
+    graph = observed(4.0 * gauss_markov(100, 1.0), 1.0)
+    unknown, known = (report(graph, in_time(100), biased=False, in_use=in_use) for in_use in (
+        None, CorrelatedErrors(1.0, 15.0, 1.0)))
+    assert unknown.fits_badly
+    assert not known.fits_badly
+    assert known.strain == pytest.approx(unknown.energy / 16.0)
+    assert not report(graph, in_time(20), biased=False, in_use=None).fits_badly
 
 
 @pytest.mark.parametrize(('white', 'sigma', 'tau', 'wrong'), [

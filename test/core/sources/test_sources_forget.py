@@ -160,7 +160,8 @@ def test_the_past_is_bounded() -> None:
     graph, stamps_ns, ids = drive(1, 12)
     part = to_the_end(measured_path(graph, stamps_ns, ids))
     grown = part._replace(motion=np.zeros((len(ids) + 1, 3)),
-                          noise=np.tile(np.eye(3), (len(ids) + 1, 1, 1)))
+                          noise=np.tile(np.eye(3), (len(ids) + 1, 1, 1)),
+                          way=np.tile((1.0, 0.0, 1.0), (len(ids) + 1, 1)))
     for k in range(600):
         path = path.extended(stamps_ns + k * 100 * SECOND, grown, 0)
         assert len(path.stamps_ns) <= 2 * past_path.KEPT

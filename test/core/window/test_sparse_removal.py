@@ -149,7 +149,7 @@ def test_the_graph_of_a_place_that_is_driven_often_does_not_grow() -> None:
                 other, mean = place.anchor, se2.compose(place.mean, mean)
             smoother.update(GraphUpdate(edges=Edges(
                 [other], [k], [mean], [np.linalg.inv(noise)], [EdgeKind.LOOP_CLOSURE])))
-        places = thinning.places(smoother, config)
+        places = thinning.places(smoother, config, k + 1)
         if places is not None:
             for group in groups(smoother.graph, places):
                 assert removed(

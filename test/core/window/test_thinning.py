@@ -11,8 +11,9 @@ from random_graphs import random_poses
 
 from pose_graph_ros.core.config import ThinningConfig
 from pose_graph_ros.core.exceptions import ConfigError
-from pose_graph_ros.core.graph.constraints import EdgeKind, Edges, ObservedNodes
+from pose_graph_ros.core.graph.constraints import EdgeKind, Edges, ObservedKind, ObservedNodes
 from pose_graph_ros.core.graph.graph import Graph, GraphUpdate
+from pose_graph_ros.core.smoother.incremental import IncrementalSmoother
 from pose_graph_ros.core.window import thinning
 
 
@@ -97,3 +98,16 @@ def test_wrong_settings_are_refused() -> None:
     for settings_ in ({'cell': -1.0}, {'angle': 0.0}, {'poses': 0}, {'newest': 0}):
         with pytest.raises(ConfigError):
             ThinningConfig(**settings_)
+
+
+def test_ten_new_nodes_are_waited_for_and_biases_are_none() -> None:
+    smoother, some, looked = IncrementalSmoother(), thinning.Thinning(), []
+    smoother.update(GraphUpdate(hidden=np.zeros((1, 3)), fix=[0]))
+    for k in range(2, 42):
+        smoother.update(GraphUpdate(biases=np.zeros((2, 3)), observed=ObservedNodes(
+            smoother.graph.next_ids.node + np.arange(2), None, np.zeros((2, 3)),
+            np.tile(np.eye(3), (2, 1, 1)), np.full(2, ObservedKind.GLOBAL_POSE))))
+        smoother.extend(np.array([1.0, 0.0, 0.0]), np.eye(3))
+        if some.places(smoother, ThinningConfig(cell=2.0, newest=15), k) is not None:
+            looked.append(k)
+    assert np.diff(looked).tolist() == [10, 10, 10]

@@ -1,0 +1,192 @@
+# Copyright 2026 The pose_graph_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""
+The one judge of stamps: the time of the robot is that of its odometry.
+
+A stamp is of the present if it is near the newest one, and stamps of another time are believed
+only if several consecutive ones agree with one another for a second, while no other odometry goes
+on. Time has moved on then (a silence has ended), or begins again (a bag that is played in a loop,
+a simulation that is reset). Only messages that are usable otherwise are shown to it.
+"""
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+from pose_graph_ros.core.measurements import (
+    Answer,
+    Measurement,
+    OdometrySample,
+    rejected,
+    YawRate,
+)
+
+# Stamps that are farther apart are not of one time [ns]. The poses of odometry are accumulated, so
+# the motion of the few messages that are refused is not lost.
+APART_NS = 60_000_000_000
+# No odometry is so late that another one, of the same time, is ahead of it by more than this [ns].
+LATEST_NS = 5_000_000_000
+# Number of consecutive stamps, and the time that they span [ns], that show another time.
+EVIDENCE, EVIDENCE_NS = 5, 1_000_000_000
+# For so long after the first odometry the preferred one may still say that time is another [ns].
+AT_FIRST_NS = 10_000_000_000
+
+
+class Judgement(NamedTuple):
+    """What a stamp says."""
+
+    refusal: Answer | None = None
+    """Why its message is not used, unless time begins again."""
+    jump_ns: int = 0
+    """Length of the jump back with which time begins again with this stamp [ns], else 0."""
+
+
+PRESENT = Judgement()
+
+
+class _Watch:
+    """The stamps of one source; 0 stands for none [ns]."""
+
+    def __init__(self) -> None:
+        self.newest_ns = 0  # newest one of the present; 0 as well if they are of another time
+        self.passed_ns = 0  # newest one that was not refused
+        self.was_present = False
+        self.n_apart = 0  # number of the last stamps that are of another time and agree
+        self.first_ns = self.last_ns = 0  # first and last of these
+        self.others_ns = 0  # newest stamp of the other odometry at the first
+        self.in_doubt = False  # whether time begins again with them if they go on
+        self.clock_ns = 0  # newest stamp of the odometry that is preferred to it
+        self.since_ns = 0  # its own stamp when that one came
+
+    def extend(self, stamp_ns: int, others_ns: int) -> None:
+        if self.n_apart == 0 or not 0 < stamp_ns - self.last_ns <= APART_NS:
+            self.n_apart, self.first_ns, self.others_ns = 0, stamp_ns, others_ns
+        self.n_apart, self.last_ns = self.n_apart + 1, stamp_ns
+
+    @property
+    def is_evidence(self) -> bool:
+        return self.n_apart >= EVIDENCE and self.last_ns - self.first_ns >= EVIDENCE_NS
+
+    def set_present(self, newest_ns: int) -> None:
+        self.newest_ns = self.passed_ns = newest_ns
+        self.n_apart, self.in_doubt, self.was_present = 0, False, True
+
+
+class TimeKeeper:
+    """
+    Keeps the time of the robot.
+
+    Parameters
+    ----------
+    odometry : sequence of str, its sources, the preferred one first; other sources tell no time
+    threshold_ns : int, a stamp behind the newest one by less is late, and no jump [ns]
+
+    """
+
+    def __init__(self, odometry: Sequence[str], threshold_ns: int) -> None:
+        self.threshold_ns = threshold_ns
+        self._odometry = list(odometry)
+        self._watches: dict[str, _Watch] = {}
+        self._since_ns = 0
+
+    @property
+    def now_ns(self) -> int:
+        """Newest stamp of odometry [ns]; 0 before the first."""
+        return self._newest_but('')
+
+    @property
+    def clock(self) -> tuple[str, int]:
+        """The odometry that others are compared with, and its newest stamp [ns]; 0 for none."""
+        return next(((name, self._watches[name].newest_ns) for name in self._odometry
+                     if name in self._watches and self._watches[name].newest_ns > 0), ('', 0))
+
+    @property
+    def in_doubt(self) -> bool:
+        """Whether time may have begun again, so that messages are to be held back."""
+        return any(watch.in_doubt and self._newest_but(name) - watch.others_ns < EVIDENCE_NS
+                   for name, watch in self._watches.items())
+
+    def forget(self) -> None:
+        """Forget all stamps: the next one may be any."""
+        self._watches.clear()
+
+    def shift(self, source: str, by_ns: int) -> None:
+        """Add an offset [ns] to the stamps of a source, as all from now on have it."""
+        watch = self._watches.get(source)
+        if watch is not None and watch.newest_ns > 0:
+            watch.set_present(max(watch.newest_ns + by_ns, 1))
+
+    def judge(self, source: str, measurement: OdometrySample | Measurement) -> Judgement:
+        """Return what a usable measurement says of the time, and whether it is of that time."""
+        stamp_ns = measurement.stamp_ns
+        if stamp_ns <= 0 or not isinstance(measurement, OdometrySample | YawRate):
+            return PRESENT  # the engine refuses stamps of zero, and waits for odometry
+        watch, now_ns = self._watches.setdefault(source, _Watch()), self.now_ns
+        if source not in self._odometry:
+            return self._follow(source, watch, stamp_ns)
+        if self._is_ahead(source, watch, stamp_ns):
+            return Judgement(self._refusal(source, stamp_ns))
+        own_ns = watch.newest_ns
+        earliest_ns = own_ns - self.threshold_ns if own_ns > 0 else now_ns - LATEST_NS
+        latest_ns = now_ns + min(self.threshold_ns, APART_NS)
+        if now_ns == 0 or earliest_ns <= stamp_ns <= latest_ns:
+            self._since_ns = stamp_ns if now_ns == 0 else self._since_ns
+            watch.set_present(max(own_ns, stamp_ns))
+            return PRESENT
+        return self._judge_other_time(source, watch, stamp_ns, earliest_ns, now_ns)
+
+    def _judge_other_time(
+        self, source: str, watch: _Watch, stamp_ns: int, earliest_ns: int, now_ns: int,
+    ) -> Judgement:
+        """Judge a stamp of odometry that is before the earliest one of the present, or ahead."""
+        others_ns = self._newest_but(source)
+        watch.extend(stamp_ns, others_ns)
+        # at first, the preferred odometry need not have the time of the one that came before it
+        decides = (not watch.was_present and source == self._odometry[0]
+                   and now_ns - self._since_ns < AT_FIRST_NS)
+        if watch.is_evidence and (decides or self._moves(watch, others_ns)):
+            begins_again = stamp_ns < earliest_ns
+            if decides or begins_again:
+                self._watches, self._since_ns = {source: watch}, watch.first_ns
+            watch.set_present(stamp_ns)
+            return Judgement(jump_ns=now_ns - watch.first_ns) if begins_again else PRESENT
+        watch.in_doubt = stamp_ns < earliest_ns and (decides or watch.newest_ns > 0)
+        if abs(stamp_ns - max(now_ns, watch.passed_ns)) > APART_NS:
+            return Judgement(self._refusal(source, stamp_ns))
+        watch.passed_ns = max(watch.passed_ns, stamp_ns)
+        return PRESENT
+
+    def _is_ahead(self, source: str, watch: _Watch, stamp_ns: int) -> bool:
+        """Tell whether a stamp is ahead of preferred odometry while that is not silent."""
+        clock, clock_ns = self.clock
+        if clock == '' or self._odometry.index(clock) >= self._odometry.index(source):
+            return False
+        if clock_ns != watch.clock_ns:
+            watch.clock_ns, watch.since_ns = clock_ns, stamp_ns
+        return stamp_ns - clock_ns > LATEST_NS >= stamp_ns - watch.since_ns
+
+    def _moves(self, watch: _Watch, others_ns: int) -> bool:
+        """Tell whether time moves with a source; not if it went on elsewhere meanwhile."""
+        if 2 * (others_ns - watch.others_ns) > watch.last_ns - watch.first_ns:
+            watch.newest_ns = 0
+        return watch.newest_ns > 0
+
+    def _follow(self, source: str, watch: _Watch, stamp_ns: int) -> Judgement:
+        """Judge a source that tells no time: by odometry, and by what it sent before."""
+        known = [each for each in (self.now_ns, watch.newest_ns) if each > 0]
+        if known and all(abs(stamp_ns - each) > APART_NS for each in known):
+            return Judgement(self._refusal(source, stamp_ns))
+        watch.newest_ns = stamp_ns
+        return PRESENT
+
+    def _newest_but(self, source: str) -> int:
+        return max((self._watches[name].newest_ns for name in self._odometry
+                    if name in self._watches and name != source), default=0)
+
+    def _refusal(self, source: str, stamp_ns: int) -> Answer:
+        other, clock_ns = self.clock
+        apart = 1e-9 * (stamp_ns - (clock_ns or self._watches[source].newest_ns))
+        return rejected('stamp_leap', (
+            f'{1e-9 * stamp_ns:.3f} s is {abs(apart):.1f} s '
+            f'{"ahead of" if apart > 0 else "behind"} '
+            f'{"those before" if other in ("", source) else f"the stamps of {other}"}: mend the '
+            f'clock of its driver, or set {source}.time_offset'))
