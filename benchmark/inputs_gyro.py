@@ -24,6 +24,7 @@ from pose_graph_ros.core.backend import PoseGraphBackend
 from pose_graph_ros.core.config import BackendConfig, MeasurementSource, OdometryNoise
 from pose_graph_ros.core.geometry import se2
 from pose_graph_ros.core.geometry.se2 import FloatArray
+from pose_graph_ros.core.geometry.similarity import fit_similarity
 from pose_graph_ros.core.geometry.trajectory import Trajectory
 from pose_graph_ros.core.gyro_config import GyroSource
 from pose_graph_ros.core.measurements import (
@@ -34,7 +35,6 @@ from pose_graph_ros.core.measurements import (
     Position,
     YawRate,
 )
-from pose_graph_ros.core.trajectories.similarity import fit_similarity
 
 GYRO = GyroSource(sigma_rate=5e-4, sigma_bias=0.02, sigma_bias_walk=2e-5, sigma_turn=1e-3)
 BEGIN, END = 100.0, 160.0

@@ -13,8 +13,8 @@ import numpy as np
 from benchmark.robust_closures import Recording, Run, TRUE
 from pose_graph_ros.cli.picture import BLUE, GREEN, GREY, INK, PURPLE, VERMILION
 from pose_graph_ros.core.geometry import se2
+from pose_graph_ros.core.geometry.similarity import fit_similarity
 from pose_graph_ros.core.geometry.trajectory import Trajectory
-from pose_graph_ros.core.trajectories.similarity import fit_similarity
 
 SIZE, DPI = (13.0, 6.5), 100
 """Of the picture [inch], and dots per inch."""

@@ -21,7 +21,7 @@ from pose_graph_ros.core.geometry import se2
 from pose_graph_ros.core.geometry.se2 import FloatArray, IntArray
 from pose_graph_ros.core.geometry.trajectory import Trajectory
 from pose_graph_ros.core.graph.constraints import EdgeKind
-from pose_graph_ros.core.simulation.streets import street_path
+from pose_graph_ros.offline.simulation.streets import street_path
 
 LEAST_WRONG = 3.5
 """Smallest error of a closure that is meant to be wrong [m]."""

@@ -24,8 +24,8 @@ from benchmark.robust_closures import read_recording, Recording, TRUE
 from benchmark.robust_worlds import with_false
 from pose_graph_ros.cli.solve_starts import METHODS
 from pose_graph_ros.core.geometry import se2
+from pose_graph_ros.core.geometry.similarity import fit_similarity
 from pose_graph_ros.core.io.g2o import read_g2o
-from pose_graph_ros.core.trajectories.similarity import fit_similarity
 
 SHARES = (0.1, 0.3, 0.5)
 GROUP = 10

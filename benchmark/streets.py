@@ -25,7 +25,7 @@ from scipy.spatial import cKDTree
 from benchmark.worlds import arranged, closures, odometry, SEED, seen, World
 from pose_graph_ros.core.geometry.se2 import FloatArray, IntArray
 from pose_graph_ros.core.graph.constraints import Edges
-from pose_graph_ros.core.simulation.streets import street_path
+from pose_graph_ros.offline.simulation.streets import street_path
 
 
 def grid(n: int = 3500, seed: int = SEED) -> World:

@@ -28,10 +28,8 @@ CORE = {
     'core.sparse': {'core.geometry'},
     'core.batch': {
         'core.compiled', 'core.geometry', 'core.graph', 'core.elimination', 'core.sparse'},
-    'core.certificate': {'core.geometry', 'core.graph', 'core.sparse'},
     'core.marginalization': {
         'core.compiled', 'core.geometry', 'core.graph', 'core.elimination'},
-    'core.drawing': {'core.geometry', 'core.graph', 'core.elimination'},
     'core.smoother': {
         'core.compiled', 'core.geometry', 'core.graph', 'core.elimination', 'core.batch'},
     'core.odometry': {'core.compiled', 'core.geometry', 'core.graph'},
@@ -43,15 +41,19 @@ CORE = {
     'core.window': {
         'core.compiled', 'core.geometry', 'core.graph', 'core.elimination',
         'core.marginalization', 'core.batch', 'core.smoother', 'core.odometry'},
-    'core.trajectories': {'core.geometry'},
     'core.residuals': {
         'core.geometry', 'core.graph', 'core.batch', 'core.smoother', 'core.odometry',
         'core.sources'},
-    'core.simulation': {'core.geometry', 'core.graph'},
-    'core.tuning': {
-        'core.compiled', 'core.geometry', 'core.graph', 'core.odometry', 'core.sources'},
 }
 CORE['core.io'] = set(CORE)
+# What only tools use, and the packages of `core` that each may import.
+OFFLINE = {
+    'offline.certificate': {'core.geometry', 'core.graph', 'core.sparse'},
+    'offline.drawing': {'core.geometry', 'core.graph', 'core.elimination'},
+    'offline.simulation': {'core.geometry', 'core.graph'},
+    'offline.tuning': {
+        'core.compiled', 'core.geometry', 'core.graph', 'core.odometry', 'core.sources'},
+}
 # The modules on top of the packages: the facade, what it hands out, and who drives it.
 TOP = {'core.estimate', 'core.newest_estimate', 'core.prediction', 'core.transaction',
        'core.isolation', 'core.forgetting', 'core.refiner', 'core.relocation',
@@ -84,7 +86,7 @@ def imports(path: Path) -> list[str]:
 def package_of(module: str) -> str:
     """Return `core.graph` for `core.graph.graph.Graph`, `core.config` for `core.config.X`."""
     parts = module.split('.')
-    return '.'.join(parts[:2]) if parts[0] == 'core' else parts[0]
+    return '.'.join(parts[:2]) if parts[0] in {'core', 'offline'} else parts[0]
 
 
 def own_imports(path: Path) -> set[str]:
@@ -111,15 +113,18 @@ def modules(*parts: str) -> list[Path]:
 
 
 def test_every_package_is_looked_at() -> None:
-    assert {path.parts[0] for path in MODULES} == {'core', 'adapters', 'ros', 'cli', '__init__.py'}
+    assert {path.parts[0] for path in MODULES} == {
+        'core', 'offline', 'adapters', 'ros', 'cli', '__init__.py'}
     inside = {package_of('.'.join(path.with_suffix('').parts)) for path in modules('core')}
     assert inside == {*CORE, *BASE, *TOP, 'core.__init__'}
+    tools = {package_of('.'.join(path.with_suffix('').parts)) for path in modules('offline')}
+    assert tools == {*OFFLINE, 'offline.__init__'}
 
 
 @pytest.mark.parametrize('path', modules('core'), ids=str)
 def test_core_imports_only_numbers(path: Path) -> None:
     assert libraries(path) <= LIBRARIES
-    assert not own_imports(path) & {'adapters', 'ros', 'cli'}
+    assert not own_imports(path) & {'adapters', 'ros', 'cli', *OFFLINE}
 
 
 @pytest.mark.parametrize('path', MODULES, ids=str)
@@ -130,12 +135,12 @@ def test_only_one_module_imports_what_is_not_public_in_numba(path: Path) -> None
     assert not found or path.name == 'numba_internals.py'
 
 
-@pytest.mark.parametrize('package', CORE)
-def test_a_package_of_core_imports_only_those_below_it(package: str) -> None:
+@pytest.mark.parametrize('package', [*CORE, *OFFLINE])
+def test_a_package_imports_only_those_below_it(package: str) -> None:
     paths = modules(*package.split('.'))
     assert len(paths) > 1
     for path in paths:
-        assert own_imports(path) <= CORE[package] | BASE, path
+        assert own_imports(path) <= (CORE | OFFLINE)[package] | BASE, path
 
 
 def test_the_arrows_between_packages_form_no_circle() -> None:
@@ -166,12 +171,12 @@ def test_the_base_of_core_imports_no_engine(name: str) -> None:
 @pytest.mark.parametrize('path', modules('adapters'), ids=str)
 def test_adapters_import_no_rclpy_and_nothing_above_them(path: Path) -> None:
     assert not {name for name in imports(path) if is_ros(name)}
-    assert not own_imports(path) & {'ros', 'cli'}
+    assert not own_imports(path) & {'ros', 'cli', *OFFLINE}
 
 
 @pytest.mark.parametrize('path', modules('ros'), ids=str)
 def test_ros_never_imports_cli(path: Path) -> None:
-    assert 'cli' not in own_imports(path)
+    assert not own_imports(path) & {'cli', *OFFLINE}
 
 
 @pytest.mark.parametrize('name', LOGIC)

@@ -12,7 +12,7 @@ from pose_graph_ros.adapters.bag_writer import BagWriter, message_types
 from pose_graph_ros.adapters.conversions import PLANAR
 from pose_graph_ros.core.geometry.se2 import FloatArray, IntArray
 from pose_graph_ros.core.geometry.trajectory import Trajectory
-from pose_graph_ros.core.simulation.sensors import velocities
+from pose_graph_ros.offline.simulation.sensors import velocities
 
 Message = tuple[str, str, int, Any]
 """Topic, type, time of recording [ns] and message; recorded at its stamp, if made here."""

@@ -19,9 +19,9 @@ from pose_graph_ros.cli.diagram_style import (
     SORT_COLOURS,
     TEXT,
 )
-from pose_graph_ros.core.drawing.diagram import Diagram, Role, View
-from pose_graph_ros.core.drawing.pattern import Pattern
 from pose_graph_ros.core.geometry.se2 import FloatArray
+from pose_graph_ros.offline.drawing.diagram import Diagram, Role, View
+from pose_graph_ros.offline.drawing.pattern import Pattern
 
 SMALL = 8.0     # size of text [pt]
 CHARACTER = 0.07  # mean width of one of its letters [inch]

@@ -2,8 +2,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """Colours and shapes of diagrams; lines and texts show on light and on dark backgrounds."""
 
-from pose_graph_ros.core.drawing.diagram import Role
-from pose_graph_ros.core.drawing.structure import Sort
+from pose_graph_ros.offline.drawing.diagram import Role
+from pose_graph_ros.offline.drawing.structure import Sort
 
 INK, BORDER, TEXT, LINE = '#111111', '#000000', '#7a828c', '#7a828c'
 # After Okabe and Ito, but for grey.

@@ -17,13 +17,13 @@ from typing import Any
 import numpy as np
 
 from pose_graph_ros.cli.graph_input import add_graph, NamedRows, read, rows_of
-from pose_graph_ros.core.drawing.diagram import Diagram, diagram, View
-from pose_graph_ros.core.drawing.example import five_states
-from pose_graph_ros.core.drawing.layout import Layout, place
-from pose_graph_ros.core.drawing.pattern import elimination_order, Pattern, pattern
-from pose_graph_ros.core.drawing.structure import part, Structure, structure, within
 from pose_graph_ros.core.exceptions import ConfigError
 from pose_graph_ros.core.geometry.se2 import IntArray
+from pose_graph_ros.offline.drawing.diagram import Diagram, diagram, View
+from pose_graph_ros.offline.drawing.example import five_states
+from pose_graph_ros.offline.drawing.layout import Layout, place
+from pose_graph_ros.offline.drawing.pattern import elimination_order, Pattern, pattern
+from pose_graph_ros.offline.drawing.structure import part, Structure, structure, within
 
 N_MOST = 200  # hidden nodes in a picture; with more of them names can't be read
 SUFFIXES = ('.svg', '.png', '.dot')

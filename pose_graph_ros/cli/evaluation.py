@@ -18,9 +18,9 @@ import numpy.typing as npt
 
 from pose_graph_ros.core.geometry import se2
 from pose_graph_ros.core.geometry.se2 import FloatArray, IntArray
+from pose_graph_ros.core.geometry.similarity import fit_similarity
 from pose_graph_ros.core.geometry.trajectory import Trajectory
 from pose_graph_ros.core.judgement.verdicts import State
-from pose_graph_ros.core.trajectories.similarity import fit_similarity
 
 
 @dataclass(frozen=True, slots=True)

@@ -5,9 +5,9 @@
 from collections.abc import Sequence
 
 from pose_graph_ros.cli import diagram_style as style
-from pose_graph_ros.core.drawing.diagram import Arc, Diagram, Vertex
-from pose_graph_ros.core.drawing.layout import Layout
 from pose_graph_ros.core.geometry.se2 import FloatArray
+from pose_graph_ros.offline.drawing.diagram import Arc, Diagram, Vertex
+from pose_graph_ros.offline.drawing.layout import Layout
 
 UNIT = 0.2      # radius of a node [inch]
 _SHAPES = {'circle': ('circle', 2.0), 'square': ('square', 1.0), 'dot': ('point', 0.5)}

@@ -34,11 +34,11 @@ from pose_graph_ros.cli.diagram_style import (
     SORT_COLOURS,
     TEXT,
 )
-from pose_graph_ros.core.drawing.diagram import Diagram, Role, Vertex
-from pose_graph_ros.core.drawing.layout import Layout
-from pose_graph_ros.core.drawing.pattern import Pattern
-from pose_graph_ros.core.drawing.structure import Sort
 from pose_graph_ros.core.geometry.se2 import FloatArray
+from pose_graph_ros.offline.drawing.diagram import Diagram, Role, Vertex
+from pose_graph_ros.offline.drawing.layout import Layout
+from pose_graph_ros.offline.drawing.pattern import Pattern
+from pose_graph_ros.offline.drawing.structure import Sort
 
 DPI = 200
 UNIT = 0.15     # radius of a node [inch]; less in a large diagram

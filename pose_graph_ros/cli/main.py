@@ -24,7 +24,6 @@ SUMMARIES = {
     'demo': 'play a bag to the node over DDS',
     'replay': 'run a bag or a g2o file through the engine of the node, without ROS',
     'solve': 'optimise a g2o file',
-    'compare': 'compare trajectories: ATE, RPE, NEES',
     'report': 'make one HTML page of a run: map, errors, residuals, what is doubted',
     'draw': 'draw a small graph: SVG, PNG or DOT',
     'marginalize': 'take nodes out of a graph, and keep what they told',

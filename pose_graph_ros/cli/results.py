@@ -208,7 +208,7 @@ def read_truth(bag: Bag, topic: str, span: Span = WHOLE) -> Trajectory:
         raise BagError(f'{bag.path}: {what} {topic} (--truth); expected one of '
                        f'{", ".join(POSE_TYPES)}; the bag has {bag.describe()}')
     poses = PathCollector()
-    for stamp, pose, _ in poses_on(bag, topic, span):
+    for stamp, pose in poses_on(bag, topic, span):
         poses.add(stamp, pose)
     return poses.path()
 

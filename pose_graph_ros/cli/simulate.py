@@ -29,10 +29,10 @@ from pose_graph_ros.cli.simulation_options import (
 from pose_graph_ros.core.exceptions import ConfigError, FileWriteError
 from pose_graph_ros.core.io.atomic_files import write_files
 from pose_graph_ros.core.io.tum import tum_text
-from pose_graph_ros.core.simulation.graph import graph_of, SimulatedGraph
-from pose_graph_ros.core.simulation.recording import course, record, Recording
-from pose_graph_ros.core.simulation.settings import Gyro, Setup
-from pose_graph_ros.core.simulation.worlds import WORLDS
+from pose_graph_ros.offline.simulation.graph import graph_of, SimulatedGraph
+from pose_graph_ros.offline.simulation.recording import course, record, Recording
+from pose_graph_ros.offline.simulation.settings import Gyro, Setup
+from pose_graph_ros.offline.simulation.worlds import WORLDS
 
 GRAPH_SUFFIX = '.g2o'
 LONGEST_S = 100_000.0  # of a simulation, which takes 100 MB an hour

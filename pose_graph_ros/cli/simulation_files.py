@@ -22,10 +22,10 @@ from pose_graph_ros.cli.bag_messages import (
 from pose_graph_ros.cli.progress import watched
 from pose_graph_ros.core.geometry.se2 import IntArray
 from pose_graph_ros.core.io.g2o_writing import g2o_text
-from pose_graph_ros.core.simulation.graph import SimulatedGraph
-from pose_graph_ros.core.simulation.motion import PERIOD_S
-from pose_graph_ros.core.simulation.recording import Course, Recording
-from pose_graph_ros.core.simulation.settings import (
+from pose_graph_ros.offline.simulation.graph import SimulatedGraph
+from pose_graph_ros.offline.simulation.motion import PERIOD_S
+from pose_graph_ros.offline.simulation.recording import Course, Recording
+from pose_graph_ros.offline.simulation.settings import (
     CLOSURES,
     FIXES,
     GYRO,

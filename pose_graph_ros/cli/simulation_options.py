@@ -9,7 +9,7 @@ import math
 from typing import Any
 
 from pose_graph_ros.core.exceptions import ConfigError
-from pose_graph_ros.core.simulation.settings import (
+from pose_graph_ros.offline.simulation.settings import (
     ClaimedSigma,
     ClockOffset,
     CLOSURES,

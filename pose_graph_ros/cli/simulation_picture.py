@@ -16,8 +16,8 @@ from pose_graph_ros.cli.picture import BLUE, GREEN, GREY, GRID, INK, ORANGE, thi
 from pose_graph_ros.core.geometry import se2
 from pose_graph_ros.core.geometry.geodesy import TangentPlane
 from pose_graph_ros.core.geometry.se2 import BoolArray, FloatArray, IntArray
-from pose_graph_ros.core.simulation.graph import SimulatedGraph
-from pose_graph_ros.core.simulation.recording import Recording
+from pose_graph_ros.offline.simulation.graph import SimulatedGraph
+from pose_graph_ros.offline.simulation.recording import Recording
 
 LONG_SIDE, OTHER_SIDE = 8.0, (4.0, 8.0)  # of the map [inch]
 LEGEND, DPI = 0.9, 100  # height of title and legend [inch]; resolution [dots per inch]

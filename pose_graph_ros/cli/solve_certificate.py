@@ -8,9 +8,9 @@ from typing import Any
 
 from pose_graph_ros.cli.solve_starts import Problem, resumed, Solution, solve
 from pose_graph_ros.core.batch.outcome import SAME_MINIMUM, Status
-from pose_graph_ros.core.certificate.certify import Certificate, certify, NearHessian, Verdict
-from pose_graph_ros.core.certificate.formulation import formulate, NotCoveredError
 from pose_graph_ros.core.exceptions import LinearSolveError
+from pose_graph_ros.offline.certificate.certify import Certificate, certify, NearHessian, Verdict
+from pose_graph_ros.offline.certificate.formulation import formulate, NotCoveredError
 
 
 @dataclass(frozen=True, slots=True)

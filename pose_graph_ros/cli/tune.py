@@ -31,8 +31,8 @@ from pose_graph_ros.cli.results import read_truth
 from pose_graph_ros.cli.tuned_parameters import interval, yaml_text
 from pose_graph_ros.cli.tuning import Outcome, Tuning, Verdict
 from pose_graph_ros.cli.tuning_drive import TuningDrive
-from pose_graph_ros.core.tuning.fit import CONTRADICTION
-from pose_graph_ros.core.tuning.held_out import Summary
+from pose_graph_ros.offline.tuning.fit import CONTRADICTION
+from pose_graph_ros.offline.tuning.held_out import Summary
 
 EXAMPLES = """examples:
   pose-graph tune my_bag --odom /wheel/odometry --fix /gnss/fix -o tuned.yaml

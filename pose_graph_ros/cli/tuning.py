@@ -32,12 +32,12 @@ from pose_graph_ros.cli.tuned_parameters import (
 from pose_graph_ros.cli.tuning_drive import Key, LEAST, Run, SourceOfPoses, TuningDrive
 from pose_graph_ros.core.geometry.trajectory import Trajectory
 from pose_graph_ros.core.measurements import LoopClosure
-from pose_graph_ros.core.tuning.closure_fit import ClosureProblem, fit_closures, MOST_NODES
-from pose_graph_ros.core.tuning.drive_rows import drive_rows, timeline
-from pose_graph_ros.core.tuning.estimation import estimate
-from pose_graph_ros.core.tuning.evidence import proven, shown_variances
-from pose_graph_ros.core.tuning.fit import Fit
-from pose_graph_ros.core.tuning.held_out import (
+from pose_graph_ros.offline.tuning.closure_fit import ClosureProblem, fit_closures, MOST_NODES
+from pose_graph_ros.offline.tuning.drive_rows import drive_rows, timeline
+from pose_graph_ros.offline.tuning.estimation import estimate
+from pose_graph_ros.offline.tuning.evidence import proven, shown_variances
+from pose_graph_ros.offline.tuning.fit import Fit
+from pose_graph_ros.offline.tuning.held_out import (
     Errors,
     fold_of,
     is_better,
@@ -48,7 +48,7 @@ from pose_graph_ros.core.tuning.held_out import (
     summary,
     wrong,
 )
-from pose_graph_ros.core.tuning.problem import Role
+from pose_graph_ros.offline.tuning.problem import Role
 
 
 class Verdict(Enum):

@@ -31,9 +31,9 @@ from pose_graph_ros.core.measurements import (
     Position,
 )
 from pose_graph_ros.core.sources.validation import validate, Validated
-from pose_graph_ros.core.tuning import likelihood as lk
-from pose_graph_ros.core.tuning.drive_rows import Measured, measured
-from pose_graph_ros.core.tuning.held_out import Errors, errors_at
+from pose_graph_ros.offline.tuning import likelihood as lk
+from pose_graph_ros.offline.tuning.drive_rows import Measured, measured
+from pose_graph_ros.offline.tuning.held_out import Errors, errors_at
 
 # Measurements that are kept in memory, of about 700 bytes each.
 MOST_MEASUREMENTS = 1_000_000

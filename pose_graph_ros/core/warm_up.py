@@ -3,8 +3,8 @@
 """
 Compile all kernels before the first measurement, or load them from the cache.
 
-Importing this module imports all modules with kernels. What has to be compiled are the kernels
-that Python calls, each of which declares its signature (`compiled.jit`).
+Importing this module imports all modules of the engine with kernels. What has to be compiled are
+the kernels that Python calls, each of which declares its signature (`compiled.jit`).
 
 Compiling takes half a minute or more, and Numba's compiler holds the GIL for most of it. So other
 processes compile, and this one only loads the result: meanwhile it receives messages and can be
@@ -20,7 +20,6 @@ import time
 from pose_graph_ros.core import backend  # noqa: F401  imports all modules with kernels
 from pose_graph_ros.core.compiled import jit
 from pose_graph_ros.core.helper_process import end_with_parent, HelperProcess
-from pose_graph_ros.core.tuning import likelihood  # noqa: F401  the tool has kernels of its own
 
 # Functions that the helper processes call: one begins with the first kernel, one with the last.
 HELPERS = ((__name__, 'compile_forwards'), (__name__, 'compile_backwards'))

@@ -13,8 +13,8 @@ import pytest
 
 from pose_graph_ros.cli.draw import N_MOST
 from pose_graph_ros.cli.main import main
-from pose_graph_ros.core.drawing.diagram import View
 from pose_graph_ros.core.io.graph_files import read_graph
+from pose_graph_ros.offline.drawing.diagram import View
 
 IDENTITY = '1 0 0 1 0 1'
 SAVED = Path(__file__).parents[1] / 'data' / 'version_1.g2o'

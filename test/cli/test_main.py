@@ -81,7 +81,7 @@ def test_solve_loads_what_it_needs(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize('words', [
-    [], ['no_such_tool'], ['compare'], ['solve', 'a', '--edge2', 'b'],
+    [], ['no_such_tool'], ['solve', 'a', '--edge2', 'b'],
     ['replay', 'bag', '--hold-out', 'some']])
 def test_wrong_words_are_refused(words: list[str], capsys: pytest.CaptureFixture[str]) -> None:
     with pytest.raises(SystemExit) as ended:

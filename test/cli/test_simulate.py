@@ -11,9 +11,9 @@ from pose_graph_ros.adapters.bags import open_bag
 from pose_graph_ros.cli.simulate import simulate_drive, write_drive
 from pose_graph_ros.core.geometry import se2
 from pose_graph_ros.core.geometry.geodesy import TangentPlane
-from pose_graph_ros.core.simulation.recording import Recording
-from pose_graph_ros.core.simulation.settings import Closures, FalseClosures, Fixes
-from pose_graph_ros.core.simulation.worlds import REFLECTED
+from pose_graph_ros.offline.simulation.recording import Recording
+from pose_graph_ros.offline.simulation.settings import Closures, FalseClosures, Fixes
+from pose_graph_ros.offline.simulation.worlds import REFLECTED
 
 OLD = Path(__file__).parents[1] / 'data' / 'drive_2.npz'
 FIX_PERIOD_S, FIX_SIGMA = Fixes().period_s, Fixes().sigma

@@ -13,7 +13,6 @@ from pose_graph_ros.adapters.bags import open_bag
 from pose_graph_ros.cli.main import main
 from pose_graph_ros.core.geometry import se2
 from pose_graph_ros.core.io.g2o import read_g2o
-from pose_graph_ros.core.io.trajectory_files import read_trajectory
 
 ALL = ('--gyro', '--fix', '--global-pose', '2', '--closures', '1')
 TOPICS = {'odom': '/odom', 'gyro': '/imu/data', 'fix': '/gps/fix', 'global_pose': '/global_pose',
@@ -121,13 +120,18 @@ def test_replay_reads_all_of_it(disturbed: Path, tmp_path: Path) -> None:
         assert read == truth['topics'][topic], name
 
 
+def read_tum(path: Path) -> np.ndarray:
+    rows = np.loadtxt(path)
+    return np.column_stack((rows[:, 1:3], 2.0 * np.arctan2(rows[:, 6], rows[:, 7])))
+
+
 def test_the_truth_beside_a_bag_is_that_in_it(disturbed: Path) -> None:
-    written = read_trajectory(disturbed.with_name('bag_truth.tum'))
+    written = read_tum(disturbed.with_name('bag_truth.tum'))
     with open_bag(disturbed) as bag:
         poses = [(pose.position.x, pose.position.y, 2.0 * np.arctan2(
             pose.orientation.z, pose.orientation.w)) for pose in (
                 record.decode().pose.pose for record in bag.messages(['/ground_truth']))]
-    difference = written.poses - np.array(poses)
+    difference = written - np.array(poses)
     difference[:, 2] = se2.wrap(difference[:, 2])
     np.testing.assert_allclose(difference, 0.0, atol=1e-12)
 
@@ -149,8 +153,8 @@ def test_a_graph_and_its_truth_have_the_same_ids_and_constraints(tmp_path: Path)
     assert set(false) <= pairs
     assert len(set(false)) == len(false)
     assert len(false) >= 10
-    tum = read_trajectory(tmp_path / 'graph_truth.tum')
-    np.testing.assert_allclose(tum.poses, truth.graph.poses, atol=1e-12)
+    tum = read_tum(tmp_path / 'graph_truth.tum')
+    np.testing.assert_allclose(tum, truth.graph.poses, atol=1e-12)
 
 
 @pytest.mark.parametrize('out', ['bag', 'graph.g2o'])

@@ -18,9 +18,9 @@ from pose_graph_ros.cli.run.lines import number, rounded
 from pose_graph_ros.cli.run.reading import FILE, VERSION
 from pose_graph_ros.cli.run.sources import analyse, source_entry
 from pose_graph_ros.cli.run.springs import springs
-from pose_graph_ros.core.drawing import binned_pattern
-from pose_graph_ros.core.drawing.binned_pattern import BinnedPattern
 from pose_graph_ros.core.graph.graph import Graph
+from pose_graph_ros.offline.drawing import binned_pattern
+from pose_graph_ros.offline.drawing.binned_pattern import BinnedPattern
 
 # Stamps from the year 2000 on are times of this epoch [ns]; others count from any beginning.
 _EPOCH = 946_684_800_000_000_000

@@ -1,0 +1,185 @@
+# Copyright 2026 The pose_graph_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""
+A simulated graph: nodes along a course, with odometry, closures, fixes and global poses.
+
+Its information is honest: every error is drawn from the covariance that comes with it, but for
+what is false or moved, and for a claimed sigma that is not 1. So chi2 at the truth, without these,
+is distributed as chi-square with as many degrees of freedom as there are measured numbers.
+"""
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from pose_graph_ros.core.exceptions import ConfigError
+from pose_graph_ros.core.geometry import se2
+from pose_graph_ros.core.geometry.se2 import FloatArray, IntArray
+from pose_graph_ros.core.geometry.trajectory import Trajectory
+from pose_graph_ros.core.graph.constraints import EdgeKind, Edges, ObservedKind, ObservedNodes
+from pose_graph_ros.core.graph.graph import Graph, GraphUpdate
+from pose_graph_ros.offline.simulation import disturbances, sensors
+from pose_graph_ros.offline.simulation.closures import (
+    false_pairs,
+    false_poses,
+    measured,
+    Path,
+    revisits,
+)
+from pose_graph_ros.offline.simulation.recording import Course
+from pose_graph_ros.offline.simulation.settings import CLOSURES, FIXES, Jump, ODOMETRY, POSES
+
+
+@dataclass(frozen=True, slots=True)
+class SimulatedGraph:
+    """A graph of N nodes, whose numbers are 0 to N - 1, and the truth."""
+
+    truth: Trajectory
+    """True poses of the nodes at their stamps."""
+    start: FloatArray
+    """Poses by odometry, from the true first one, shape (N, 3)."""
+    edges: Edges
+    """Odometry, then loop closures."""
+    group: IntArray
+    """Number of the group of each false closure, -1: true, shape (L,)."""
+    observed: ObservedNodes
+    wrong: IntArray
+    """Which of the observed nodes are moved by a jump, shape (W,)."""
+    missing_groups: int
+    """Of false closures, for which there were no places."""
+
+    @property
+    def loops(self) -> Edges:
+        """Loop closures."""
+        return self.edges.rows(self.edges.kind == EdgeKind.LOOP_CLOSURE)
+
+    def graph(self, poses: FloatArray) -> Graph:
+        """Return the graph with some poses, shape (N, 3); its first node is fixed if need be."""
+        graph = Graph()
+        graph.apply(GraphUpdate(hidden=poses, edges=self.edges, observed=self.observed,
+                                fix=[0] if len(self.observed) == 0 else []))
+        return graph
+
+
+def graph_of(way: Course, node_distance: float) -> SimulatedGraph:
+    """
+    Return a graph along a course, in the frame in which it begins, or in that of the world.
+
+    The latter if there are fixes or global poses.
+
+    Parameters
+    ----------
+    way : Course
+    node_distance : float, of neighbouring nodes along the path [m]
+
+    """
+    setup, streams = way.setup, way.streams
+    at = np.unique(np.searchsorted(
+        way.motion.distance, np.arange(0.0, way.motion.distance[-1], node_distance)))
+    if len(at) < 2:
+        raise ConfigError(f'distance of nodes: expected less than what is driven, '
+                          f'{way.motion.distance[-1]:.3g} m, got {node_distance:g} m')
+    poses = se2.wrapped(way.truth.poses[at])
+    if setup.fixes is None and setup.poses is None:
+        poses = se2.between(poses[0], poses)
+    truth = Trajectory(way.truth.stamps_ns[at], poses)
+    start_ns = int(way.truth.stamps_ns[0])
+
+    odometry = _odometry(streams['odometry'], truth, [
+        jump for jump in setup.jumps if jump.topic == ODOMETRY], start_ns)
+    loops, group, missing = _closures(
+        way, Path(truth.stamps_ns, poses, way.motion.distance[at]), node_distance)
+    fixes, wrong_fixes = _observed(way, truth, FIXES)
+    absolute, wrong_poses = _observed(way, truth, POSES)
+    return SimulatedGraph(
+        truth, _composed(poses[0], odometry.mean), Edges.joined((odometry, loops)), group,
+        ObservedNodes.joined((fixes, absolute)),
+        np.append(wrong_fixes, len(fixes) + wrong_poses), missing)
+
+
+def _odometry(
+    generator: np.random.Generator, truth: Trajectory, jumps: list[Jump], start_ns: int,
+) -> Edges:
+    """Return the edges from each node to the next, with the noise of the model."""
+    steps, n = se2.between(truth.poses[:-1], truth.poses[1:]), len(truth) - 1
+    variances = sensors.model_variances(steps)
+    mean = se2.compose(steps, np.sqrt(variances) * generator.standard_normal(steps.shape))
+    for jump in jumps:
+        if jump.step is None:
+            raise ConfigError(f'jump of {ODOMETRY}: in a graph it cannot begin again, expected '
+                              'DX,DY')
+        k = int(np.searchsorted(truth.stamps_ns, start_ns + round(jump.at_s * 1e9))) - 1
+        if 0 <= k < n:
+            mean[k] = se2.compose(mean[k], np.array(jump.step))
+    information = np.zeros((n, 3, 3))
+    information[:, range(3), range(3)] = 1.0 / variances
+    return Edges(np.arange(n), np.arange(1, n + 1), mean, information,
+                 np.full(n, EdgeKind.ODOMETRY))
+
+
+def _composed(first: FloatArray, steps: FloatArray) -> FloatArray:
+    """Return the poses that steps (N, 3) lead to, shape (N + 1, 3)."""
+    heading = first[2] + np.concatenate(([0.0], np.cumsum(steps[:, 2])))
+    moves = np.einsum('nij,nj->ni', se2.rotation(heading[:-1]), steps[:, :2])
+    positions = first[:2] + np.concatenate((np.zeros((1, 2)), np.cumsum(moves, axis=0)))
+    return se2.wrapped(np.column_stack((positions, heading)))
+
+
+def _closures(way: Course, path: Path, node_distance: float) -> tuple[Edges, IntArray, int]:
+    """Return loop closures, the group of each, and how many groups are missing."""
+    settings, streams = way.setup.closures, way.streams
+    if settings is None:
+        return Edges(), np.empty(0, dtype=np.int64), 0
+    settings = replace(settings, first_s=0.0)
+    # so that no two closures of a group have the same ends
+    spacing = max(settings.false.spacing, 1.5 * node_distance)
+    settings = replace(settings, false=replace(settings.false, spacing=spacing))
+    old, new = revisits(streams['closures'], path, np.arange(len(path.poses)), settings)
+    found = streams['rate'].random(len(old)) < settings.rate
+    old, new = old[found], new[found]
+    poses = measured(streams['closures'], path.poses[old], path.poses[new], settings)
+    sizes = settings.false.sizes(len(old))
+    pairs, groups = false_pairs(streams['false'], path, sizes, settings)
+    false = false_poses(streams['false'], path, pairs, groups, settings)
+    ends = np.concatenate((np.column_stack((old, new)), pairs))
+    order = np.argsort(ends[:, 1], kind='stable')
+    order = order[disturbances.heard(
+        path.stamps_ns[ends[order, 1]],
+        [each for each in way.setup.outages if each.topic == CLOSURES], int(path.stamps_ns[0]))]
+    sigmas = way.setup.claimed(CLOSURES) * np.array(settings.sigmas)
+    edges = Edges(ends[order, 0], ends[order, 1], np.concatenate((poses, false))[order],
+                  np.tile(np.diag(sigmas**-2), (len(order), 1, 1)),
+                  np.full(len(order), EdgeKind.LOOP_CLOSURE))
+    group = np.append(np.full(len(old), -1), groups)[order]
+    return edges, group, len(sizes) - len(np.unique(groups))
+
+
+def _observed(way: Course, truth: Trajectory, topic: str) -> tuple[ObservedNodes, IntArray]:
+    """Return fixes or global poses, each with its error moved to the nearest node; the wrong."""
+    setup, start_ns = way.setup, int(way.truth.stamps_ns[0])
+    if topic == FIXES and setup.fixes is not None:
+        stamps, values = sensors.positions(way.streams['fixes'], way.truth, setup.fixes)
+        sigmas, kind = np.array([setup.fixes.sigma] * 2), ObservedKind.POSITION
+        stream = way.streams['jumps']
+    elif topic == POSES and setup.poses is not None:
+        stamps, values = sensors.global_poses(way.streams['poses'], way.truth, setup.poses)
+        sigmas, kind = np.array(setup.poses.sigmas)[[0, 0, 1]], ObservedKind.GLOBAL_POSE
+        stream = way.streams['pose jumps']
+    else:
+        return ObservedNodes(), np.empty(0, dtype=np.int64)
+    moved, wrong = disturbances.moved(
+        stream, stamps, values, [each for each in setup.jumps if each.topic == topic], start_ns)
+    kept = disturbances.heard(
+        stamps, [each for each in setup.outages if each.topic == topic], start_ns)
+    stamps, wrong = stamps[kept], wrong[kept]
+    width = len(sigmas)
+    errors = (moved[kept] - way.truth.at(stamps)[:, :width])
+    # the nearest node in time, and the first of those that are nearest to it
+    after = np.clip(np.searchsorted(truth.stamps_ns, stamps), 1, len(truth) - 1)
+    nearer = stamps - truth.stamps_ns[after - 1] < truth.stamps_ns[after] - stamps
+    nodes, first = np.unique(np.where(nearer, after - 1, after), return_index=True)
+    mean, information = np.zeros((len(nodes), 3)), np.zeros((len(nodes), 3, 3))
+    mean[:, :width] = truth.poses[nodes, :width] + errors[first]
+    information[:, range(width), range(width)] = (setup.claimed(topic) * sigmas)**-2
+    return (ObservedNodes(nodes, None, se2.wrapped(mean), information, np.full(len(nodes), kind)),
+            np.flatnonzero(wrong[first]))

@@ -1,0 +1,162 @@
+# Copyright 2026 The pose_graph_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""What sensors measure along a true motion. Truth is given densely, in the frame of the world."""
+
+import numpy as np
+from scipy.ndimage import gaussian_filter1d
+
+from pose_graph_ros.core.config import OdometryNoise
+from pose_graph_ros.core.geometry import se2
+from pose_graph_ros.core.geometry.se2 import FloatArray, IntArray
+from pose_graph_ros.core.geometry.trajectory import Trajectory
+from pose_graph_ros.offline.simulation.motion import gauss_markov, PERIOD_S
+from pose_graph_ros.offline.simulation.settings import (
+    Fixes,
+    GlobalPoses,
+    Gyro,
+    OdometryErrors,
+    Wheels,
+)
+
+ODOMETRY_PERIOD_S = 0.05
+MOVING = 1e-4  # motion in a period of the truth above which wheels turn [m]
+CELL_S = 1.0
+"""
+How often errors of odometry by the model are drawn [s].
+
+The engine sums up the turns that odometry shows; errors of each sample would lengthen that sum.
+"""
+
+
+def jittered_stamps(
+    generator: np.random.Generator, truth: Trajectory, period_s: float,
+) -> IntArray:
+    """
+    Return stamps of a sensor during the truth, with random phase and jitter, shape (M,) [ns].
+
+    Parameters
+    ----------
+    generator : numpy.random.Generator
+    truth : Trajectory
+    period_s : float
+
+    """
+    span = truth.stamps_ns[-1] - truth.stamps_ns[0]
+    ticks = np.arange(generator.uniform(0.2, 0.8), span * 1e-9 / period_s - 0.2)
+    ticks += np.clip(generator.normal(0.0, 0.01, len(ticks)), -0.1, 0.1)
+    stamps: IntArray = truth.stamps_ns[0] + np.round(ticks * period_s * 1e9).astype(np.int64)
+    return stamps
+
+
+def odometry(generator: np.random.Generator, truth: Trajectory, wheels: Wheels) -> Trajectory:
+    """Return `T_odom_base` by odometry."""
+    steps = se2.between(truth.poses[:-1], truth.poses[1:])
+    measured = (_by_wheels if wheels.errors is OdometryErrors.WHEELS else _by_model)(
+        generator, steps, wheels)
+    x, y, turned = (0.0, 0.0, -truth.poses[0, 2]) if wheels.start is None else wheels.start
+    heading = se2.wrap(truth.poses[0, 2] + turned) + np.concatenate((
+        [0.0], np.cumsum(measured[:, 2])))
+    middle = 0.5 * (heading[1:] + heading[:-1])
+    moves = measured[:, :1] * np.column_stack((np.cos(middle), np.sin(middle)))
+    if np.any(measured[:, 1] != 0.0):
+        moves += measured[:, 1:2] * np.column_stack((-np.sin(middle), np.cos(middle)))
+    positions = np.array([x, y]) + np.concatenate(([[0.0, 0.0]], np.cumsum(moves, axis=0)))
+    dense = Trajectory(truth.stamps_ns, np.column_stack((positions, se2.wrap(heading))))
+    stamps = jittered_stamps(generator, truth, ODOMETRY_PERIOD_S)
+    return Trajectory(stamps, dense.at(stamps))
+
+
+def _by_wheels(generator: np.random.Generator, steps: FloatArray, wheels: Wheels) -> FloatArray:
+    """Return the motions that the wheels measure, ahead, sideways and turned, shape (N, 3)."""
+    forward, turn = np.hypot(steps[:, 0], steps[:, 1]), steps[:, 2]
+    left = wheels.scale[0] * (forward - 0.5 * wheels.track_width * turn)
+    right = wheels.scale[1] * (forward + 0.5 * wheels.track_width * turn)
+
+    # the inner wheel skids slightly in turns, and sometimes a wheel spins for half a second
+    turning = np.abs(turn) / PERIOD_S
+    left *= 1.0 + np.where(turn > 0.0, 0.02, 0.005) * turning
+    right *= 1.0 + np.where(turn < 0.0, 0.02, 0.005) * turning
+    impulses = generator.random((2, len(steps))) < wheels.slip_events_per_s * PERIOD_S
+    spin = gaussian_filter1d(impulses / PERIOD_S, 0.2 / PERIOD_S)
+    left *= 1.0 + wheels.slip_s * spin[0]
+    right *= 1.0 + wheels.slip_s * spin[1]
+
+    wander = gauss_markov(generator, len(steps), wheels.wander, PERIOD_S / wheels.wander_time_s)
+    forward = 0.5 * (left + right) + generator.normal(0.0, 3e-4, len(steps)) * (forward > MOVING)
+    turn = (right - left) / (wheels.track_scale * wheels.track_width) + np.where(
+        forward > MOVING, wander * PERIOD_S, 0.0) + wheels.heading_drift * forward
+    return np.column_stack((forward, np.zeros(len(steps)), turn))
+
+
+def _by_model(generator: np.random.Generator, steps: FloatArray, wheels: Wheels) -> FloatArray:
+    """Return the motions with the noise that the node assumes, shape (N, 3)."""
+    variances = model_variances(steps)
+    cells = (PERIOD_S / CELL_S * np.arange(len(steps))).astype(np.int64)
+    n_cells = int(cells[-1]) + 1
+    noise = np.empty_like(steps)
+    for axis in range(3):
+        whole = np.bincount(cells, variances[:, axis], n_cells)
+        drawn = generator.standard_normal(n_cells) * np.sqrt(whole)
+        noise[:, axis] = variances[:, axis] * (drawn / np.where(whole > 0.0, whole, 1.0))[cells]
+    noise[:, 2] += wheels.heading_drift * np.hypot(steps[:, 0], steps[:, 1])
+    return steps + noise
+
+
+def model_variances(steps: FloatArray) -> FloatArray:
+    """
+    Return the variances of motions by the noise model of the node, but for its floors.
+
+    In: motions of the robot, shape (N, 3). Out: variances in its frame, shape (N, 3).
+    """
+    model = OdometryNoise()
+    distance, turn = np.hypot(steps[:, 0], steps[:, 1]), np.abs(steps[:, 2])
+    return np.column_stack((
+        model.sigma_distance**2 * distance, model.sigma_lateral**2 * distance,
+        model.sigma_heading_distance**2 * distance + model.sigma_heading_turn**2 * turn))
+
+
+def velocities(path: Trajectory) -> FloatArray:
+    """Return the mean velocity before each pose, in its frame, shape (N, 3) [m/s, m/s, rad/s]."""
+    steps = se2.between(path.poses[:-1], path.poses[1:])
+    rates = steps / (np.diff(path.stamps_ns) * 1e-9)[:, None]
+    return np.concatenate((rates[:1], rates))
+
+
+def yaw_rates(generator: np.random.Generator, heading: FloatArray, gyro: Gyro) -> FloatArray:
+    """
+    Return the yaw rates of a gyroscope, shape (R,) [rad/s].
+
+    Parameters
+    ----------
+    generator : numpy.random.Generator
+    heading : ndarray, shape (R,), true headings every `PERIOD_S`, not wrapped [rad]
+    gyro : Gyro
+
+    """
+    n = len(heading)
+    walk = np.cumsum(generator.normal(0.0, gyro.bias_walk * np.sqrt(PERIOD_S), n))
+    bias = generator.normal(0.0, gyro.bias) + walk
+    noise = generator.normal(0.0, gyro.sigma / np.sqrt(PERIOD_S), n)
+    return np.asarray(np.gradient(heading, PERIOD_S) + bias + noise)
+
+
+def positions(
+    generator: np.random.Generator, truth: Trajectory, fixes: Fixes,
+) -> tuple[IntArray, FloatArray]:
+    """Return the stamps of fixes, shape (M,), and their positions, shape (M, 2) [m]."""
+    stamps = jittered_stamps(generator, truth, fixes.period_s)
+    errors = np.column_stack([
+        gauss_markov(generator, len(stamps), fixes.correlated,
+                     fixes.period_s / fixes.correlation_s)
+        + generator.normal(0.0, fixes.white, len(stamps)) for _ in range(2)])
+    return stamps, truth.at(stamps)[:, :2] + errors
+
+
+def global_poses(
+    generator: np.random.Generator, truth: Trajectory, poses: GlobalPoses,
+) -> tuple[IntArray, FloatArray]:
+    """Return the stamps of global poses, shape (M,), and the poses, shape (M, 3) [m, m, rad]."""
+    stamps = jittered_stamps(generator, truth, poses.period_s)
+    sigmas = np.array((poses.sigmas[0], poses.sigmas[0], poses.sigmas[1]))
+    return stamps, se2.wrapped(
+        truth.at(stamps) + sigmas * generator.standard_normal((len(stamps), 3)))

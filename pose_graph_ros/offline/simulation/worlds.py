@@ -1,0 +1,125 @@
+# Copyright 2026 The pose_graph_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""
+Worlds: where a vehicle moves, how, and what sensors it usually has there.
+
+- `drive`: a car laps some city blocks twice (`circuit`), with fixes that fail at the beginning of
+  the second lap and are reflected for a while, loop closures, and false ones.
+- `hall`: a robot drives through the aisles of a hall in any order, for as long as asked, and
+  stops where it picks something up; parallel aisles look alike.
+- `grid`: a walk at random through the streets of a small Manhattan, as in the data set M3500 of
+  E. Olson; it crosses its path all the time.
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+
+from pose_graph_ros.core.geometry import se2
+from pose_graph_ros.offline.simulation.circuit import drive_circuit, STREET_BEARING
+from pose_graph_ros.offline.simulation.motion import (
+    follow,
+    Limits,
+    MARGIN_S,
+    Motion,
+    wandering,
+)
+from pose_graph_ros.offline.simulation.settings import (
+    Closures,
+    FalseClosures,
+    FIXES,
+    Fixes,
+    Jump,
+    Outage,
+    Setup,
+    Wheels,
+)
+from pose_graph_ros.offline.simulation.streets import aisle_corners, rounded, street_corners
+
+PATH_STEP = 0.05  # distance of the points of paths [m]
+AISLES, AISLE_SPACING, AISLE_DEPTH = 8, 4.0, 30.0  # of the hall; distances [m]
+PICKS, PICK_S = 0.7, (4.0, 12.0)  # share of the lines with a stop, and how long it takes [s]
+FORKLIFT, ROBOT_TURN = Limits(1.4, 0.7, 0.8), 2.4  # what moves in the hall; length of turns [m]
+BLOCKS, BLOCK = 10, 10.0  # of the grid, along each axis, and their size [m]
+CART, CART_TURN = Limits(2.0, 0.8, 1.0), 4.0  # what moves in the grid
+ASIDE = 0.1  # standard deviation of the distance from the middle of a lane [m]
+REST_S = 3.0  # before the start [s]
+
+# Of the drive: the outage of fixes, from the second lap on [s], and reflected signals (multipath).
+OUTAGE_S = (-40.0, 30.0)
+REFLECTED = Jump(FIXES, 150.0, (14.0, -9.0, 0.0), 25.0, 1.5)
+
+
+@dataclass(frozen=True, slots=True)
+class World:
+    """A place, and what moves there."""
+
+    duration_s: float
+    """Usual length of a simulation [s]."""
+    drive: Callable[[np.random.Generator, float], Motion]
+    """Return the motion of some length [s]."""
+    setup: Callable[[Motion], Setup]
+    """Return the usual sensors and disturbances."""
+    node_distance: float
+    """Usual distance of the nodes of a graph [m]."""
+    one_stream: bool = False
+    """Whether its usual sensors draw from one stream of random numbers, one after the other."""
+
+
+def _drive_setup(motion: Motion) -> Setup:
+    outage = (motion.lap_time + OUTAGE_S[0], motion.lap_time + OUTAGE_S[1])
+    return Setup(
+        wheels=Wheels(start=(3.2, -1.4, -2.0)), fixes=Fixes(),
+        closures=Closures(false=FalseClosures(groups=1, size=4, singles=4, loose=True)),
+        outages=(Outage(FIXES, *outage),) if np.isfinite(motion.lap_time) else (),
+        jumps=(REFLECTED,))
+
+
+def _hall(generator: np.random.Generator, duration_s: float) -> Motion:
+    length = (duration_s + MARGIN_S) * FORKLIFT.speed
+    corners = aisle_corners(generator, length + 2.0 * AISLE_DEPTH, AISLES, AISLE_SPACING,
+                            AISLE_DEPTH)
+    points, middles = rounded(corners, ROBOT_TURN, PATH_STEP)
+    path = wandering(generator, points, PATH_STEP, ASIDE)
+    picks = middles[1:-1][generator.random(len(middles) - 2) < PICKS]
+    stops = np.unique(np.round(picks / PATH_STEP).astype(np.int64))
+    waits = np.append(REST_S, generator.uniform(*PICK_S, len(stops)))
+    return follow(path, stops, waits, FORKLIFT, duration_s)[0]
+
+
+def _hall_setup(_motion: Motion) -> Setup:
+    return Setup(
+        wheels=Wheels(track_width=0.6, slip_events_per_s=1.0 / 120.0),
+        closures=Closures(
+            sigmas=(0.05, 0.05, 0.01), spacing=5.0, radius=1.0, min_distance=20.0,
+            place_distance=1.0, first_s=REST_S,
+            false=FalseClosures(min_distance=3.0, spacing=1.0, from_s=60.0)))
+
+
+def _grid(generator: np.random.Generator, duration_s: float) -> Motion:
+    length = (duration_s + MARGIN_S) * CART.speed
+    corners = street_corners(
+        generator, length + 2.0 * BLOCK * BLOCKS, np.full(BLOCKS, BLOCK), fresh=1.0)
+    points, _ = rounded(corners, CART_TURN, PATH_STEP)
+    path = wandering(generator, points, PATH_STEP, ASIDE)
+    path[:, :2] = path[:, :2] @ se2.rotation(STREET_BEARING).T
+    path[:, 2] += STREET_BEARING
+    stops = np.empty(0, dtype=np.int64)
+    return follow(path, stops, np.array([REST_S]), CART, duration_s)[0]
+
+
+def _grid_setup(_motion: Motion) -> Setup:
+    return Setup(
+        wheels=Wheels(track_width=0.8),
+        closures=Closures(
+            rate=0.5, sigmas=(0.1, 0.1, 0.02), spacing=1.0, radius=1.5, min_distance=10.0,
+            first_s=REST_S,
+            false=FalseClosures(min_distance=8.0, spacing=1.0, from_s=60.0)))
+
+
+WORLDS = {
+    'drive': World(440.0, drive_circuit, _drive_setup, 2.0, one_stream=True),
+    'hall': World(900.0, _hall, _hall_setup, 1.0),
+    'grid': World(1800.0, _grid, _grid_setup, 1.0),
+}

@@ -1,0 +1,256 @@
+# Copyright 2026 The pose_graph_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""The four views of a small graph, against lists by hand and against H itself."""
+
+from graphlib import TopologicalSorter
+
+from hypothesis import given, settings, strategies as st
+import numpy as np
+import pytest
+from random_graphs import random_graph
+
+from pose_graph_ros.core.exceptions import GraphUpdateError
+from pose_graph_ros.core.graph.constraints import EdgeKind, Edges, ObservedKind, ObservedNodes
+from pose_graph_ros.core.graph.graph import Graph, GraphUpdate
+from pose_graph_ros.core.graph.priors import Prior
+from pose_graph_ros.core.marginalization.marginalize import equations
+from pose_graph_ros.offline.drawing.diagram import Diagram, diagram, Role, View
+from pose_graph_ros.offline.drawing.example import five_states
+from pose_graph_ros.offline.drawing.layout import APART, place
+from pose_graph_ros.offline.drawing.pattern import elimination_order, filled, pattern
+from pose_graph_ros.offline.drawing.structure import part, Sort, Structure, structure, within
+
+seeds = st.integers(0, 2**31)
+
+
+def small_graph() -> Graph:
+    """Return x0 to x3 with a closure, a gyro with its bias 5, a landmark 6, and observed nodes."""
+    graph, eye = Graph(), np.eye(3)
+    kinds = [EdgeKind.ODOMETRY] * 3 + [EdgeKind.LOOP_CLOSURE, EdgeKind.TURN] + [EdgeKind.POINT] * 2
+    information = np.stack([eye] * 4 + [np.diag((0.0, 0.0, 1.0))] + [np.diag((1.0, 1.0, 0.0))] * 2)
+    mean = np.zeros((7, 3))
+    mean[:4, 0] = 1.0
+    graph.apply(GraphUpdate(
+        hidden=np.column_stack((np.arange(4.0), np.zeros((4, 2)))), biases=np.zeros((1, 3)),
+        dimensions=[1], landmarks=np.array([[1.0, 2.0]]), fix=(0,)))
+    graph.apply(GraphUpdate(
+        edges=Edges([0, 1, 2, 3, 1, 0, 2], [1, 2, 3, 0, 2, 5, 5], mean, information, kinds,
+                    weight=np.ones(7), k=[-1, -1, -1, -1, 4, -1, -1],
+                    bias=[[0.0] * 4] * 4 + [[0.0, 0.0, 0.0, 1.0]] + [[0.0] * 4] * 2),
+        observed=ObservedNodes([1, 2], mean=np.zeros((2, 3)), information=np.stack((eye, eye)),
+                               kind=[ObservedKind.GLOBAL_POSE] * 2, weight=[1.0, 0.0])))
+    return graph
+
+
+def named(drawing: Diagram) -> list[tuple[str, str]]:
+    """Return the names of the ends of all arcs; those without a direction are sorted."""
+    names = [vertex.name for vertex in drawing.vertices]
+    pairs = [(names[arc.start], names[arc.end]) for arc in drawing.arcs]
+    return [pair if arc.directed else tuple(sorted(pair))
+            for pair, arc in zip(pairs, drawing.arcs, strict=True)]
+
+
+def roles(drawing: Diagram, role: Role) -> list[str]:
+    return [vertex.name for vertex in drawing.vertices if vertex.role is role]
+
+
+SMALL = structure(small_graph().rows())
+
+
+def test_a_pose_graph_has_hidden_and_observed_nodes_and_directed_edges() -> None:
+    drawing = diagram(SMALL, View.POSE_GRAPH)
+    assert roles(drawing, Role.POSE) == ['x0', 'x1', 'x2', 'x3']
+    assert roles(drawing, Role.BIAS) == ['b4']
+    assert roles(drawing, Role.LANDMARK) == ['l5']
+    assert roles(drawing, Role.OBSERVED) == ['z0', 'z1']
+    assert named(drawing) == [
+        ('x0', 'x1'), ('x1', 'x2'), ('x2', 'x3'), ('x3', 'x0'), ('0', 'x1'), ('0', 'x2'),
+        ('0', 'b4'), ('x0', 'l5'), ('x2', 'l5'), ('z0', 'x1'), ('z1', 'x2')]
+    assert [vertex.name for vertex in drawing.vertices if vertex.fixed] == ['x0']
+    assert [vertex.name for vertex in drawing.vertices if not vertex.used] == ['z1']
+    assert drawing.notes == ('Dashed: 1 constraint with weight 0.',)
+
+
+def test_a_factor_graph_has_a_factor_for_each_term() -> None:
+    drawing = diagram(SMALL, View.FACTOR_GRAPH)
+    factors = [vertex for vertex in drawing.vertices if vertex.role is Role.FACTOR]
+    assert [vertex.sort for vertex in factors] == [
+        *[Sort.ODOMETRY] * 3, Sort.LOOP_CLOSURE, Sort.TURN, *[Sort.LANDMARK] * 2, Sort.OBSERVED]
+    assert [len(vertex.nodes) for vertex in factors] == [2, 2, 2, 2, 3, 2, 2, 1]
+    assert not any(arc.directed for arc in drawing.arcs)
+    assert len(drawing.arcs) == 16
+    assert drawing.notes == ('1 constraint with weight 0 left out.',)
+
+
+def test_a_markov_random_field_has_a_line_for_each_pair() -> None:
+    drawing = diagram(SMALL, View.MRF)
+    assert {vertex.role for vertex in drawing.vertices} == {Role.POSE, Role.BIAS, Role.LANDMARK}
+    assert named(drawing) == [
+        ('x0', 'x1'), ('x0', 'x3'), ('l5', 'x0'), ('x1', 'x2'), ('b4', 'x1'), ('x2', 'x3'),
+        ('b4', 'x2'), ('l5', 'x2')]
+    assert drawing.notes[0].startswith('1 term of a single node is not in the picture')
+
+
+def test_a_dynamic_bayesian_network_has_controls_and_measurements() -> None:
+    drawing = diagram(SMALL, View.DBN)
+    assert roles(drawing, Role.CONTROL) == ['u0', 'u1', 'u2']
+    assert roles(drawing, Role.MEASUREMENT) == ['z0', 'z1', 'z2', 'z3', 'z4']
+    assert named(drawing) == [
+        ('x0', 'x1'), ('u0', 'x1'), ('x1', 'x2'), ('u1', 'x2'), ('x2', 'x3'), ('u2', 'x3'),
+        ('x3', 'z0'), ('x0', 'z0'), ('x1', 'z1'), ('x2', 'z1'), ('b4', 'z1'),
+        ('x0', 'z2'), ('l5', 'z2'), ('x2', 'z3'), ('l5', 'z3'), ('x1', 'z4')]
+
+
+def test_a_dense_prior_is_one_term_of_all_its_nodes() -> None:
+    graph = small_graph()
+    graph.apply(GraphUpdate(priors=[Prior(
+        np.array([1, 2, 3]), graph.poses[1:4].copy(), np.eye(9), np.zeros(9), 0.0,
+        anchored=True)]))
+    whole = structure(graph.rows())
+    assert whole.terms[-1] == (Sort.PRIOR, (1, 2, 3), True)
+    assert ('x1', 'x3') in named(diagram(whole, View.MRF))
+    assert len(roles(diagram(whole, View.POSE_GRAPH), Role.JOINT)) == 2
+
+
+def numeric_pattern(graph: Graph) -> np.ndarray:
+    """Return which blocks of H of the free nodes are not zero."""
+    H = equations(graph)[0]
+    free = np.flatnonzero(~graph.fixed)
+    blocks = H.reshape(graph.n_nodes, 3, graph.n_nodes, 3)
+    return np.any(blocks != 0.0, axis=(1, 3))[np.ix_(free, free)]
+
+
+@given(seeds)
+def test_the_pattern_is_that_of_the_matrix_and_the_random_field_that_off_its_diagonal(
+    seed: int,
+) -> None:
+    graph = random_graph(seed, fix=(0,), n_biases=2)
+    whole = structure(graph.rows())
+    expected = numeric_pattern(graph)
+    np.testing.assert_array_equal(pattern(whole).blocks, expected)
+    pairs = np.zeros((whole.n_nodes, whole.n_nodes), dtype=bool)
+    for arc in diagram(whole, View.MRF).arcs:
+        pairs[arc.start, arc.end] = True
+    np.testing.assert_array_equal(pairs[1:, 1:], np.triu(expected, 1))
+
+
+def test_the_pattern_of_a_small_graph_is_that_of_the_matrix() -> None:
+    found = pattern(SMALL)
+    np.testing.assert_array_equal(found.blocks, numeric_pattern(small_graph()))
+    assert found.names == ('x1', 'x2', 'x3', 'b4', 'l5')
+    assert found.sizes == (3, 3, 3, 1, 2)
+
+
+@given(seeds)
+def test_the_fill_is_that_of_a_numeric_factor(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    n = int(rng.integers(1, 12))
+    blocks = rng.random((n, n)) < 0.25
+    blocks |= blocks.T | np.eye(n, dtype=bool)
+    values = np.where(blocks, rng.uniform(0.5, 1.0, (n, n)), 0.0)
+    factor = np.linalg.cholesky(values + values.T + 4.0 * n * np.eye(n)).T
+    np.testing.assert_array_equal(filled(blocks), np.abs(factor) > 1e-12)
+
+
+@given(seeds)
+def test_the_elimination_takes_each_node_once(seed: int) -> None:
+    graph = random_graph(seed, n_nodes=12, n_edges=20, fix=(3,))
+    whole = structure(graph.rows())
+    order = elimination_order(whole)
+    assert sorted(order.tolist()) == list(range(12))
+    found = pattern(whole, order)
+    assert found.names == tuple(whole.names[row] for row in order.tolist() if row != 3)
+    assert not np.any(found.fill & found.blocks)
+    assert not np.any(np.tril(found.fill))
+
+
+def test_a_tree_is_eliminated_without_fill() -> None:
+    graph = Graph()
+    graph.apply(GraphUpdate(hidden=np.zeros((7, 3)), edges=Edges(
+        [0, 0, 0, 3, 3, 5], [1, 2, 3, 4, 5, 6], np.zeros((6, 3)), np.tile(np.eye(3), (6, 1, 1)),
+        [EdgeKind.LOOP_CLOSURE] * 6)))
+    whole = structure(graph.rows())
+    assert np.any(pattern(whole, np.arange(7)).fill)
+    assert not np.any(pattern(whole, elimination_order(whole)).fill)
+
+
+@given(seeds)
+def test_a_dynamic_bayesian_network_has_no_circle(seed: int) -> None:
+    graph = random_graph(seed, n_biases=2)
+    graph = with_random_kinds(graph, seed)
+    drawing = diagram(structure(graph.rows()), View.DBN)
+    before: dict[int, set[int]] = {}
+    for arc in drawing.arcs:
+        before.setdefault(arc.end, set()).add(arc.start)
+    TopologicalSorter(before).prepare()
+
+
+def with_random_kinds(graph: Graph, seed: int) -> Graph:
+    """Return a graph some of whose loop closures are odometry, in either direction."""
+    rows, rng = graph.rows(), np.random.default_rng(seed)
+    kinds = rows.edges.kind
+    swap = (kinds == EdgeKind.LOOP_CLOSURE) & (rng.random(len(kinds)) < 0.5)
+    kinds[swap] = EdgeKind.ODOMETRY
+    other = Graph()
+    other.fill(rows)
+    return other
+
+
+def test_the_five_states_have_the_patterns_of_the_thesis() -> None:
+    shown = [structure(rows) for _, rows in five_states()]
+    band = np.abs(np.subtract.outer(np.arange(5), np.arange(5))) <= 1
+    expected = [np.ones((1, 1)), np.ones((1, 1)), np.ones((2, 2)), np.ones((2, 2)), band]
+    for each, blocks in zip(shown, expected, strict=True):
+        np.testing.assert_array_equal(pattern(each).blocks, blocks)
+    assert [len(roles(diagram(each, View.POSE_GRAPH), Role.OBSERVED)) for each in shown] == [
+        1, 2, 2, 3, 4]
+
+
+def test_a_part_has_the_nodes_within_some_hops_and_the_terms_among_them() -> None:
+    chain = structure(five_states()[-1][1])
+    near = within(chain, 1, 1)
+    np.testing.assert_array_equal(near, [True, True, True, False, False])
+    np.testing.assert_array_equal(within(chain, 4, 0), [False] * 4 + [True])
+    shown, n_cut = part(chain, near)
+    assert shown.names == ('x0', 'x1', 'x2')
+    assert n_cut == 1
+    assert named(diagram(shown, View.MRF)) == [('x0', 'x1'), ('x1', 'x2')]
+    with pytest.raises(GraphUpdateError, match='none of the hidden nodes'):
+        part(chain, np.zeros(5, dtype=bool))
+
+
+@settings(max_examples=25)
+@given(seeds, st.sampled_from(list(View)))
+def test_what_is_round_does_not_overlap(seed: int, view: View) -> None:
+    rng = np.random.default_rng(seed)
+    graph = random_graph(seed, int(rng.integers(2, 8)), n_biases=int(rng.integers(0, 2)))
+    whole = structure(graph.rows())
+    drawing = diagram(whole, view)
+    layout = place(drawing, whole)
+    assert layout.at.shape == (len(drawing.vertices), 2)
+    assert len(layout.corners) == len(drawing.arcs)
+    assert np.all(np.isfinite(layout.at))
+    rounds = whole.n_nodes if view is not View.DBN else len(drawing.vertices)
+    assert least_distance(layout.at[:rounds]) > (2.2 if view is View.DBN else APART - 0.3)
+
+
+def least_distance(at: np.ndarray) -> float:
+    apart = at[:, None] - at[None]
+    return float(np.min(np.hypot(apart[..., 0], apart[..., 1]) + 1e9 * np.eye(len(at))))
+
+
+def test_nodes_at_one_place_are_moved_apart_and_counted() -> None:
+    graph = Graph()
+    graph.apply(GraphUpdate(hidden=np.zeros((6, 3))))
+    whole: Structure = structure(graph.rows())
+    layout = place(diagram(whole, View.MRF), whole)
+    assert least_distance(layout.at) > APART - 0.1
+    assert layout.n_moved >= 5
+
+
+def test_a_graph_with_room_is_to_scale() -> None:
+    chain = structure(five_states()[-1][1])
+    layout = place(diagram(chain, View.FACTOR_GRAPH), chain)
+    steps = np.diff(layout.at[:5], axis=0)
+    np.testing.assert_allclose(steps, np.tile(steps[0], (4, 1)), atol=1e-9)
+    assert layout.n_moved == 0
