@@ -14,6 +14,7 @@ import argparse
 from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import ExitStack
+import math
 from pathlib import Path
 import time
 from types import MappingProxyType
@@ -67,6 +68,7 @@ from pose_graph_ros.core.io.g2o_writing import write_g2o
 from pose_graph_ros.core.judgement.texts import Key, short, states_by_stamps
 from pose_graph_ros.core.judgement.verdicts import State, Verdict
 from pose_graph_ros.core.measurements import Answer, LoopClosure, Measurement, OdometrySample
+from pose_graph_ros.core.odometry.odometry_errors import AS_CLAIMED
 
 EXAMPLES = """examples:
   pose-graph replay my_bag --odom /wheel/odometry --fix /gnss/fix -o tuesday
@@ -344,7 +346,7 @@ def _report(
         'hidden_nodes': estimate.n_hidden, 'frozen_nodes': estimate.n_frozen,
         'thinned_nodes': estimate.n_thinned, 'edges': estimate.n_edges,
         'observed_nodes': estimate.n_observed, 'biases': estimate.n_biases,
-        'chi2': estimate.chi2, 'odometry_scale': estimate.odometry_scale,
+        'chi2': estimate.chi2, 'odometry_errors': estimate.odometry_errors._asdict(),
         'status': report.status.value, 'counts': counts,
         'judged': judgement(totals, verdicts)})
     write_g2o(backend.graph, options.out / 'graph.g2o')
@@ -378,9 +380,11 @@ def _lines(
     yield (f'{estimate.n_hidden} hidden nodes, {estimate.n_edges} edges, {estimate.n_observed} '
            f'observed nodes in {facts["seconds"]:.2f} s; {report.status.value}, chi2 '
            f'{report.chi2:.6g}; {estimate.alignment.value}')
-    if estimate.odometry_scale != 1.0:
-        yield (f'{estimate.primary}: weighed with {short(estimate.odometry_scale, 3)} times the '
-               'sigmas that it claims')
+    errors = estimate.odometry_errors
+    if errors != AS_CLAIMED:
+        yield (f'{estimate.primary}: noise of the way {short(math.sqrt(errors.way), 3)} times, of '
+               f'turns {short(math.sqrt(errors.turn), 3)} times what it claims; corrected by '
+               f'{short(errors.rate, 3)} rad/s and {short(100.0 * errors.scale, 3)} % of the way')
     for source, fit in sorted(backend.reports().items()):
         text = f'{source}: squared residual {short(fit.energy, 3)} sigma^2'
         if fit.errors.significant:

@@ -84,7 +84,8 @@ class PoseGraphBackend:
         self._factors = FactorBuilder(self._config, self._reweighting)
         self.gyro_biases = self._factors.gyros.values
         self.disagreement = lambda: disagreement.find(self._smoother, self._nodes, self._factors)
-        self._tuner = ErrorTuner(self._smoother, self._factors, self._reweighting, self._judge)
+        self._tuner = ErrorTuner(
+            self._smoother, self._nodes, self._factors, self._reweighting, self._judge)
         self._refiner = Refiner(self._smoother, self._reweighting, self._judge, self._tuner)
         self._pipeline = MeasurementPipeline(self._nodes, self._config)
         self.gyro_differences = self._pipeline.gyros.differences
@@ -208,7 +209,7 @@ class PoseGraphBackend:
             first = self.graph.next_ids.node
             self._smoother.update(GraphUpdate(hidden=mean[None], fix=(first,)))
             return first
-        result = self._smoother.extend(mean, information, self._tuner.odometry_weight)
+        result = self._smoother.extend(mean, information)
         if result.status is Status.FAILED:
             # the next sample tries again, with a longer motion
             self.counts['solver', 'failed'] += 1
@@ -218,7 +219,6 @@ class PoseGraphBackend:
         settings = self._config.odometry_source(source)
         edge = self.graph.next_ids.edge - 1
         self._reweighting.add(edge, settings.loss, settings.rejection_threshold, edge=True)
-        self._reweighting.set_base_weight(edge, self._tuner.odometry_weight, edge=True)
         return self.graph.newest_pose
 
     def add_measurement(self, measurement: Measurement, source: str) -> Answer:
@@ -301,7 +301,7 @@ class PoseGraphBackend:
             return UpdateReport(Status.MAX_ITERATIONS, '', 0, 0, self._chi2), Queue()
         with self._transaction() as transaction:
             T_map_graph = self._alignment.find(
-                self.graph, self._pipeline.queue.observed, self._nodes, self._tuner.odometry_scale)
+                self.graph, self._pipeline.queue.observed, self._nodes)
             queue = transaction.add(self._pipeline.take_ready(aligned=self._alignment.is_aligned))
             if len(queue) == 0 and self._settled:
                 return UpdateReport(Status.CONVERGED, '', 0, 0, self._chi2), Queue()
@@ -358,7 +358,7 @@ class PoseGraphBackend:
 
     def _recheck_alignment(self) -> None:
         """Rotate and optimise the graph anew if the angle between odometry and map is wrong."""
-        poses = self._alignment.recheck(self.graph, self._nodes, self._tuner.odometry_scale)
+        poses = self._alignment.recheck(self.graph, self._nodes)
         if poses is None:
             return
         graph, before = self.graph, self.graph.poses.copy()
@@ -420,8 +420,7 @@ class PoseGraphBackend:
             return None
         return newest_estimate.estimate(
             self._parts(), self._smoother, self._config.odometry_source(self._nodes.primary),
-            self._newest_node_covariance, self._chi2,
-            scale=self._tuner.odometry_scale, with_path=with_path)
+            self._newest_node_covariance, self._chi2, with_path=with_path)
 
     def path_covariances(self, estimate: Estimate) -> FloatArray:
         """Return those at the path of the present estimate; see `newest_estimate`."""
@@ -438,7 +437,7 @@ class PoseGraphBackend:
         """Return a back end that continues a saved graph; see `io.capture.restore`."""
         backend = cls(config)
         restore(backend._parts(), saved)
-        backend._tuner.restored()
+        backend._tuner.restored(knows_errors=len(saved.nodes.errors) > 0)
         backend._forgetting.restored()
         backend._newest_node_covariance = np.array(saved.newest_covariance)
         # the next update eliminates all nodes

@@ -22,9 +22,16 @@ from pose_graph_ros.core.geometry.se2 import FloatArray, IntArray
 from pose_graph_ros.core.graph import tables as tb
 from pose_graph_ros.core.graph.constraints import EdgeKind
 from pose_graph_ros.core.graph.graph import GraphUpdate
+from pose_graph_ros.core.graph.graph_update import Measured
 from pose_graph_ros.core.graph.incidence import constraints_on
 from pose_graph_ros.core.graph.reweighting import Reweighting
 from pose_graph_ros.core.judgement.judge import Judge
+from pose_graph_ros.core.odometry.hidden_nodes import HiddenNodes
+from pose_graph_ros.core.odometry.odometry_errors import (
+    AS_CLAIMED,
+    changed,
+    OdometryErrors,
+)
 from pose_graph_ros.core.smoother.incremental import IncrementalSmoother
 from pose_graph_ros.core.sources import error_estimate
 from pose_graph_ros.core.sources.factor_builder import FactorBuilder
@@ -42,8 +49,8 @@ MORE = 1.3
 PART, WHOLE = 100, 5000
 # Estimates that differ by less than this factor from what is in use change nothing online.
 SIMILAR = 1.9
-# The same of the scale of odometry.
-SCALE_STEP = 1.2
+# The same of the factors on the noise of odometry.
+FACTOR_STEP = 1.5
 
 
 @dataclass(slots=True)
@@ -79,6 +86,7 @@ class ErrorTuner:
     Parameters
     ----------
     smoother : IncrementalSmoother
+    nodes : HiddenNodes
     factors : FactorBuilder
     reweighting : Reweighting
     judge : Judge
@@ -86,27 +94,20 @@ class ErrorTuner:
     """
 
     def __init__(
-        self, smoother: IncrementalSmoother, factors: FactorBuilder, reweighting: Reweighting,
-        judge: Judge,
+        self, smoother: IncrementalSmoother, nodes: HiddenNodes, factors: FactorBuilder,
+        reweighting: Reweighting, judge: Judge,
     ) -> None:
         self._smoother, self._factors, self._reweighting = smoother, factors, reweighting
-        self._judge = judge
+        self._nodes, self._judge = nodes, judge
         self._search: _Search | None = None
         self._change: _Change | None = None
         self.n_failures = 0
         """Number of changes that were undone because the solver failed."""
-        self.odometry_scale = 1.0
-        """Factor on the sigmas of the primary odometry in the graph."""
-        self._failed_scale = 0.0    # with which the solver failed
+        self._failed: OdometryErrors | None = None  # of odometry, with which the solver failed
         self._past: dict[str, PastPath] = {}
         """Of each source, its positions that will have left the graph."""
         self._n_bias_edges = 0
         """Number of edges to biases that are about to leave."""
-
-    @property
-    def odometry_weight(self) -> float:
-        """Weight of the primary odometry in the graph."""
-        return self.odometry_scale**-2
 
     def step(self, most_edges: float = math.inf) -> float:
         """
@@ -114,18 +115,18 @@ class ErrorTuner:
 
         Parameters
         ----------
-        most_edges : float, of a graph in which all odometry may get another weight
+        most_edges : float, of a graph in which all odometry may be changed
 
         """
         graph = self._smoother.graph
         if graph.has_touched:
             return 0.0  # an update has failed
-        if self._change is not None or (self._scale_is_due() and graph.n_edges <= most_edges):
+        if self._change is not None or (self._odometry_is_due() and graph.n_edges <= most_edges):
             before = graph.poses.copy()
             if self._change is not None:
                 self._move(PART)
             else:
-                self._weigh_odometry()
+                self._correct_odometry(self._wanted())
             moved = np.abs(graph.poses[:len(before)] - before)[graph.is_pose[:len(before)], :2]
             return float(np.max(moved, initial=0.0))
         if self._search is None:
@@ -138,8 +139,8 @@ class ErrorTuner:
                 constraints = self._factors.constraints(search.source)
                 constraints.next_estimate = search.next_estimate
                 found: error_estimate.Estimate = end.value
-                if _far(constraints.odometry_scale, found.odometry_scale):
-                    constraints.odometry_scale = found.odometry_scale
+                if _far(constraints.odometry, found):
+                    constraints.odometry = found.odometry
                 if _differ(self._factors.errors_in_use(search.source), found.errors):
                     self._begin(search.source, found.errors)
         return 0.0
@@ -147,15 +148,15 @@ class ErrorTuner:
     @property
     def is_idle(self) -> bool:
         """Whether `step` has nothing to do."""
-        return (self._change is None and self._search is None and not self._scale_is_due()
+        return (self._change is None and self._search is None and not self._odometry_is_due()
                 and len(self._factors.due_for_estimate()) == 0)
 
     def finish_change(self) -> None:
         """Do all that is left of a change that is under way."""
         while self._change is not None and self._move(WHOLE):
             pass
-        if self._scale_is_due() and not self._smoother.graph.has_touched:
-            self._weigh_odometry()
+        if self._odometry_is_due() and not self._smoother.graph.has_touched:
+            self._correct_odometry(self._wanted())
 
     def decide(self) -> None:
         """Give all sources the errors that their measurements show; for the end of a stream."""
@@ -164,14 +165,18 @@ class ErrorTuner:
         sources = self._factors.finding()
         if len(sources) == 0:
             return
+        # what was in use depends on the order of arrival
+        self._correct_odometry(self._given or AS_CLAIMED)
         # moving the measurements of one source changes none of another one
         weights = self._judge.final_weights()
         for source in sources:
             constraints = self._factors.constraints(source)
             found = to_the_end(self._steps(constraints, weights))
+            if found.odometry.rate != 0.0:
+                found = to_the_end(self._steps(constraints, weights, reference=found.odometry))
             constraints.next_estimate = max(
                 constraints.next_estimate, _next_estimate(constraints))
-            constraints.odometry_scale = found.odometry_scale
+            constraints.odometry = found.odometry
             if found.errors != self._factors.errors_in_use(source):
                 self._begin(source, found.errors)
                 self.finish_change()
@@ -198,7 +203,8 @@ class ErrorTuner:
             used = gone[self._weights(constraints.held(gone), graph.weights) > 0.0]
             stamps_ns, ids = constraints.rows.values[used].T
             self._past[source] = error_estimate.left_behind(
-                graph, stamps_ns, ids, constraints.past, first)
+                graph, self._odometry(AS_CLAIMED), stamps_ns, ids, past=constraints.past,
+                node=first)
         change = self._change
         model = None if change is None else change.model or change.failed
         others = {} if change is None or model is None else {change.source: model}
@@ -242,43 +248,74 @@ class ErrorTuner:
         change.left = np.flatnonzero(np.isin(numbers, change.left))
         change.before = change.before[numbers]
 
-    def restored(self) -> None:
-        """Follow the graph, which was loaded."""
-        graph = self._smoother.graph
+    def restored(self, *, knows_errors: bool) -> None:
+        """
+        Follow the graph, which was loaded.
+
+        Parameters
+        ----------
+        knows_errors : bool
+            False for files of older versions, in which weights stand for the noise of odometry.
+
+        """
+        graph, rows = self._smoother.graph, self._primary_rows()
         # what a loss or the judge has changed has less weight
-        weight = np.max(graph.weights[0][self._primary_rows()], initial=0.0)
-        if weight > 0.0:
-            self._use_scale(float(weight)**-0.5)
+        weight = float(np.max(graph.weights[0][rows], initial=0.0))
+        if knows_errors or weight in (0.0, 1.0):
+            return
+        ids, edges = graph.edge_ids[rows], graph.edges_at(graph.edge_ids[rows])
+        graph.apply(GraphUpdate(
+            measure_edges=[Measured(ids, edges.mean, weight * edges.information)],
+            weigh_edges=dict(zip(ids.tolist(), (edges.weight / weight).tolist(), strict=True))))
+        self._reweighting.scale_base_weights(ids, 1.0 / weight)
+        self._nodes.errors = OdometryErrors.scaled(weight**-0.5)
 
-    def _wanted_scale(self) -> float:
-        """Return the factor on the sigmas of odometry that is given, or that sources show."""
-        return self._factors.config.odometry_scale or max((
-            self._factors.constraints(source).odometry_scale
-            for source in self._factors.finding()), default=1.0)
+    @property
+    def _given(self) -> OdometryErrors | None:
+        """Errors of odometry that are set by a person; None if they are to be found."""
+        scale = self._factors.config.odometry_scale
+        return OdometryErrors.scaled(scale) if scale > 0.0 else None
 
-    def _scale_is_due(self) -> bool:
-        """Tell whether the odometry in the graph is to have another weight."""
-        wanted = self._wanted_scale()
-        return not math.isclose(wanted, self.odometry_scale) and wanted != self._failed_scale
+    def _wanted(self) -> OdometryErrors:
+        """Return the errors of odometry that are given, or that most measurements show."""
+        if self._given is not None:
+            return self._given
+        sources = [self._factors.constraints(source) for source in self._factors.finding()]
+        found = max(sources, key=lambda one: one.n_ever, default=None)
+        if found is None:
+            return AS_CLAIMED
+        if self._nodes.n_primaries > 1:     # constant errors are those of one odometry
+            return found.odometry._replace(rate=0.0, scale=0.0)
+        return found.odometry
 
-    def _weigh_odometry(self) -> None:
-        """Give all primary odometry in the graph the weight that is wanted; all or nothing."""
-        graph, wanted = self._smoother.graph, self._wanted_scale()
-        ratio = (self.odometry_scale / wanted)**2
-        rows = self._primary_rows()
-        ids = graph.edge_ids[rows]
-        update = GraphUpdate(weigh_edges=dict(zip(
-            ids.tolist(), (ratio * graph.weights[0][rows]).tolist(), strict=True)))
+    def _odometry_is_due(self) -> bool:
+        """Tell whether the odometry in the graph is to have other errors."""
+        wanted = self._wanted()
+        return not wanted.is_close(self._nodes.errors) and wanted != self._failed
+
+    def _correct_odometry(self, wanted: OdometryErrors) -> None:
+        """Have all primary odometry in the graph know of the errors; all or nothing."""
+        graph, before = self._smoother.graph, self._nodes.errors
+        if wanted.is_close(before):
+            return
+        edges = graph.edges_at(ids := graph.edge_ids[self._primary_rows()])
+        stamps_ns = (self._nodes.stamps_ns[np.searchsorted(self._nodes.ids, ends)]
+                     for ends in (edges.i, edges.j))
+        begin_ns, end_ns = stamps_ns
+        measured = Measured(ids, *changed(
+            edges.mean, edges.information,
+            np.asarray((end_ns - begin_ns) * 1e-9, dtype=np.float64), before, wanted))
         try:
-            failed = self._smoother.update(update).status is Status.FAILED
+            failed = self._smoother.update(
+                GraphUpdate(measure_edges=[measured])).status is Status.FAILED
         except Exception:
             failed = True   # the smoother has rolled it back
         if failed:
             self.n_failures += 1
-            self._failed_scale = wanted
+            self._failed = wanted
             return
-        self._reweighting.scale_base_weights(ids, ratio)
-        self._use_scale(wanted)
+        self._nodes.errors = wanted
+        self._judge.correct_odometry(before, wanted)
 
     def _primary_rows(self) -> IntArray:
         """Return the rows of the edges that the hidden nodes were made with."""
@@ -288,29 +325,31 @@ class ErrorTuner:
         primary[graph.edge_rows(others)] = False
         return np.flatnonzero(primary)
 
-    def _use_scale(self, scale: float) -> None:
-        self.odometry_scale = scale
-        self._judge.weigh_odometry(self.odometry_weight)
-
     def _next_search(self) -> _Search | None:
         for source in self._factors.due_for_estimate():
             constraints = self._factors.constraints(source)
             steps = self._steps(
                 constraints, self._smoother.graph.weights,
-                correlated=self._factors.errors_in_use(source) is not None)
+                correlated=self._factors.errors_in_use(source) is not None,
+                reference=self._nodes.errors)
             return _Search(source, steps, _next_estimate(constraints))
         return None
 
     def _steps(
         self, constraints: SourceConstraints, by_row: tuple[FloatArray, FloatArray], *,
-        correlated: bool = False,
+        correlated: bool = False, reference: OdometryErrors = AS_CLAIMED,
     ) -> error_estimate.Search:
         """Search with the measurements of a source whose edges or observed nodes have a weight."""
         weights = self._weights(constraints.held(np.arange(len(constraints))), by_row)
         used = constraints.rows.values[weights > 0.0]
         path = yield from error_estimate.measured_path(
-            self._smoother.graph, used[:, 0], used[:, 1], constraints.past)
+            self._smoother.graph, self._odometry(reference), used[:, 0], used[:, 1],
+            constraints.past)
         return (yield from error_estimate.search(path, correlated=correlated))
+
+    def _odometry(self, reference: OdometryErrors) -> error_estimate.PathOdometry:
+        return error_estimate.PathOdometry(
+            self._nodes.ids, self._nodes.stamps_ns, self._nodes.errors, reference)
 
     def _weights(
         self, held: Held, by_row: tuple[FloatArray, FloatArray],
@@ -408,9 +447,13 @@ def _next_estimate(constraints: SourceConstraints) -> int:
     return constraints.n_gone + math.ceil(MORE * len(constraints))
 
 
-def _far(one: float, other: float) -> bool:
-    """Tell whether two scales of odometry differ by more than the factor `SCALE_STEP`."""
-    return max(one, other) > SCALE_STEP * min(one, other)
+def _far(known: OdometryErrors, found: error_estimate.Estimate) -> bool:
+    """Tell whether errors of odometry differ by more than what is known of them."""
+    new = found.odometry
+    return (any(max(one, other) > FACTOR_STEP * min(one, other)
+                for one, other in zip(known[:2], new[:2], strict=True))
+            or abs(new.rate - known.rate) > found.rate_sigma
+            or abs(new.scale - known.scale) > found.scale_sigma)
 
 
 def _differ(one: CorrelatedErrors | None, other: CorrelatedErrors | None) -> bool:

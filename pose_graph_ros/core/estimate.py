@@ -9,6 +9,7 @@ from pose_graph_ros.core.batch.optimizer import Status
 from pose_graph_ros.core.config import OdometrySource
 from pose_graph_ros.core.geometry.se2 import FloatArray
 from pose_graph_ros.core.geometry.trajectory import Trajectory
+from pose_graph_ros.core.odometry.odometry_errors import AS_CLAIMED, OdometryErrors
 
 
 @dataclass(frozen=True, slots=True)
@@ -71,8 +72,8 @@ class Estimate:
     """Source of the odometry in `T_odom_base`."""
     odometry: OdometrySource
     """Settings of that source."""
-    odometry_scale: float = 1.0
-    """Factor on the sigmas of the primary odometry."""
+    odometry_errors: OdometryErrors = AS_CLAIMED
+    """Errors of the primary odometry that the graph knows of."""
     n_frozen: int = 0
     """How many of the hidden nodes have left the graph; their poses do not change any more."""
     n_thinned: int = 0

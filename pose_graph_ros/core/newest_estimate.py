@@ -20,7 +20,7 @@ from pose_graph_ros.core.smoother.incremental import IncrementalSmoother
 
 def estimate(
     parts: Parts, smoother: IncrementalSmoother, source: OdometrySource,
-    newest_covariance: FloatArray, chi2: float, *, scale: float = 1.0, with_path: bool,
+    newest_covariance: FloatArray, chi2: float, *, with_path: bool,
 ) -> Estimate:
     """
     Return the present estimate.
@@ -32,7 +32,6 @@ def estimate(
     source : OdometrySource, of the primary odometry
     newest_covariance : ndarray, shape (3, 3), of the newest hidden node, in map axes
     chi2 : float
-    scale : float, factor on the sigmas of odometry
     with_path : bool, whether with the path, which takes time and memory linear in the graph
 
     """
@@ -42,7 +41,7 @@ def estimate(
     if state is AlignmentState.ALIGNED:
         node = corrected(parts, smoother, node)
     motion, motion_noise, odometry = nodes.newest()
-    motion, motion_noise = _turned(parts, motion, scale**2 * motion_noise)
+    motion, motion_noise = _turned(parts, motion, motion_noise)
     newest = se2.compose(node.pose, motion)
     cov = covariance.propagated(*node, motion, motion_noise)
     shift = np.zeros(3)
@@ -65,7 +64,7 @@ def estimate(
         n_priors=graph.n_priors,
         n_edges=graph.n_edges - factors.n_bias_edges,
         n_observed=factors.n_measurements, n_biases=int(np.count_nonzero(graph.is_bias)),
-        primary=nodes.primary, odometry=source, odometry_scale=scale,
+        primary=nodes.primary, odometry=source, odometry_errors=nodes.errors,
         trajectory=None if not with_path else Trajectory(
             nodes.stamps_ns, nodes.poses(graph) + shift).continued(stamp_ns, newest))
 

@@ -39,21 +39,28 @@ def predict(estimate: Estimate, sample: OdometrySample) -> Prediction:
     """
     x, y, theta = between_one(estimate.T_odom_base.tolist(), sample.pose.tolist())
     begin = estimate.T_map_base.tolist()
-    end = compose_one(begin, (x, y, theta))
     # noise of the odometry in between, along (a) and across (b) the robot's final heading
-    odometry, twist = estimate.odometry, sample.twist_variance
-    step, elapsed = (math.hypot(x, y), abs(theta)), abs(sample.stamp_ns - estimate.stamp_ns) * 1e-9
+    odometry, twist, errors = estimate.odometry, sample.twist_variance, estimate.odometry_errors
+    since = (sample.stamp_ns - estimate.stamp_ns) * 1e-9
+    step, elapsed = (math.hypot(x, y), abs(theta)), abs(since)
     if step[0] < JITTER_DISTANCE and step[1] < JITTER_HEADING:
         elapsed = 0.0   # at rest the twist adds nothing
     along, across, heading = step_variance(
         odometry, None if twist is None else tuple(twist.tolist()), step, elapsed)
-    factor = odometry.covariance_scale * estimate.odometry_scale**2
-    q = factor * min(heading, UNKNOWN_HEADING_VARIANCE)
+    factor = odometry.covariance_scale
+    claimed = factor * min(heading, UNKNOWN_HEADING_VARIANCE)
     c, s = math.cos(theta), math.sin(theta)
     sweep_a, sweep_b = s * x - c * y, c * x + s * y
-    aa = q / 3.0 * sweep_a * sweep_a + factor * along
-    ab = q / 3.0 * sweep_a * sweep_b
-    bb = q / 3.0 * sweep_b * sweep_b + factor * across
+    # of q / 3 the part q / 4 is what the heading at the end tells
+    q, by_sweep = errors.turn * claimed, (errors.turn / 4.0 + errors.way / 12.0) * claimed
+    aa = by_sweep * sweep_a * sweep_a + errors.way * factor * along
+    ab = by_sweep * sweep_a * sweep_b
+    bb = by_sweep * sweep_b * sweep_b + errors.way * factor * across
+    if errors.rate != 0.0 or errors.scale != 0.0:
+        c, s = math.cos(0.5 * errors.rate * since), math.sin(0.5 * errors.rate * since)
+        x, y, theta = ((1.0 + errors.scale) * (c * x - s * y),
+                       (1.0 + errors.scale) * (s * x + c * y), theta + errors.rate * since)
+    end = compose_one(begin, (x, y, theta))
     # the same in map axes
     c, s = math.cos(end[2]), math.sin(end[2])
     sweep_x, sweep_y = c * sweep_a - s * sweep_b, s * sweep_a + c * sweep_b

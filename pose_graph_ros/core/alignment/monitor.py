@@ -5,6 +5,7 @@
 from collections.abc import Sequence
 from dataclasses import dataclass
 from enum import Enum
+import math
 from typing import NamedTuple
 
 import numpy as np
@@ -98,7 +99,6 @@ class AlignmentMonitor:
 
     def find(
         self, graph: Graph, waiting: list[AttachedMeasurement], nodes: HiddenNodes,
-        odometry_scale: float = 1.0,
     ) -> FloatArray | None:
         """
         Return the motion of the graph into the map if it is found, and update the state.
@@ -109,7 +109,6 @@ class AlignmentMonitor:
         Parameters
         ----------
         waiting : list of AttachedMeasurement, on its hidden nodes, but not in it yet
-        odometry_scale : float, factor on the sigmas of the primary odometry
 
         """
         if self.state is AlignmentState.ALIGNED or len(waiting) == 0:
@@ -120,7 +119,7 @@ class AlignmentMonitor:
         poses = nodes.recent_poses(graph)
         found = estimator.find_alignment(
             poses, _numbered(nodes, _table(positions)), self._config.alignment,
-            _noise(nodes, odometry_scale),
+            _noise(nodes),
             self._correlation([_evidence_of(each) for each in positions]))
         headings = [each for each in waiting if each.observed.kind[0] == ObservedKind.HEADING]
         if len(headings) > 0:
@@ -147,9 +146,7 @@ class AlignmentMonitor:
         """Drop the stored measurements on hidden nodes before one, by its id."""
         self._evidence = [each for each in self._evidence if each.observed.node[0] >= node]
 
-    def recheck(
-        self, graph: Graph, nodes: HiddenNodes, odometry_scale: float = 1.0,
-    ) -> FloatArray | None:
+    def recheck(self, graph: Graph, nodes: HiddenNodes) -> FloatArray | None:
         """
         Return new poses of all rows of the graph if the angle in use is wrong.
 
@@ -160,7 +157,6 @@ class AlignmentMonitor:
         Parameters
         ----------
         graph : Graph, in the map
-        odometry_scale : float, factor on the sigmas of the primary odometry
 
         """
         if self.state is not AlignmentState.ALIGNED or len(self._evidence) < self._next_recheck:
@@ -169,7 +165,7 @@ class AlignmentMonitor:
         rows = graph.node_rows(nodes.ids[nodes.n_frozen:])
         found = estimator.recheck(
             nodes.recent_poses(graph), nodes.odometry, _numbered(nodes, _table(self._evidence)),
-            self._config.alignment, _noise(nodes, odometry_scale),
+            self._config.alignment, _noise(nodes),
             correlation=self._correlation(self._evidence), sigma=self.sigma)
         if self._next_recheck > LAST_RECHECK:
             self._evidence.clear()
@@ -255,7 +251,9 @@ def _numbered(nodes: HiddenNodes, table: ObservedNodes) -> ObservedNodes:
     return ObservedNodes(np.searchsorted(ids, table.node), *table.columns[1:])
 
 
-def _noise(nodes: HiddenNodes, scale: float) -> OdometryNoise:
+def _noise(nodes: HiddenNodes) -> OdometryNoise:
+    """Return the noise that odometry has at least, constant errors included."""
+    scale = math.sqrt(max(nodes.errors.way, nodes.errors.turn, 1.0))
     return nodes.streams[nodes.primary].usual_noise().scaled(scale)
 
 

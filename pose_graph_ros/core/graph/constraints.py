@@ -315,7 +315,7 @@ def check(
     diagonal = np.diagonal(table.information, axis1=1, axis2=2)
     _refuse_rows(missing & (diagonal != 0.0), f'{name}.information: expected 0 in rows that the '
                  'error or the node has not', diagonal)
-    _check_information(f'{name}.information', table.information)
+    check_information(f'{name}.information', table.information)
 
 
 def _check_ends(edges: Edges, kind: npt.NDArray[Any], ids: Ids) -> None:
@@ -330,7 +330,7 @@ def _check_ends(edges: Edges, kind: npt.NDArray[Any], ids: Ids) -> None:
                          f'{expected} for this end', node)
 
 
-def _check_information(name: str, matrix: FloatArray) -> None:
+def check_information(name: str, matrix: FloatArray) -> None:
     """Raise unless matrices are symmetric and positive semidefinite, whatever units they have."""
     diagonal, scaled = np.diagonal(matrix, axis1=1, axis2=2), _scaled(matrix)
     skew = np.max(np.abs(scaled - np.swapaxes(scaled, 1, 2)), axis=(1, 2), initial=0.0)

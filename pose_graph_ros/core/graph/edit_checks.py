@@ -10,6 +10,7 @@ import numpy.typing as npt
 
 from pose_graph_ros.core.exceptions import GraphUpdateError
 from pose_graph_ros.core.geometry.se2 import FloatArray, IntArray
+from pose_graph_ros.core.graph.constraints import check_information
 from pose_graph_ros.core.graph.factor_types import type_of
 from pose_graph_ros.core.graph.ids import Ids
 from pose_graph_ros.core.graph.kinds import NodeKind
@@ -99,6 +100,17 @@ def check_ids(name: str, ids: Collection[int], what: str, known: Ids) -> None:
         gone = known.rows(array) < 0
         if np.any(gone):
             raise GraphUpdateError(f'{name}: {what} {array[gone][0]} has left the graph')
+
+
+def check_measured(means: FloatArray, informations: FloatArray, n: int) -> None:
+    """Raise GraphUpdateError unless these are means and informations of n edges."""
+    shapes = means.shape, informations.shape
+    if shapes != ((n, 3), (n, 3, 3)):
+        raise GraphUpdateError(f'measure_edges: expected the shapes {(n, 3)} and {(n, 3, 3)}, '
+                               f'got {shapes[0]} and {shapes[1]}')
+    if not np.all(np.isfinite(means)):
+        raise GraphUpdateError('measure_edges: expected finite means')
+    check_information('measure_edges', informations)
 
 
 def check_weights(name: str, weights: Mapping[int, float], what: str, known: Ids) -> None:

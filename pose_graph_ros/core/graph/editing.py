@@ -276,6 +276,36 @@ def weigh_edges(head, edges, weights):  # type: ignore[no-untyped-def]
             head[tb.N_LEAVING] += 1
 
 
+@kernel(signature=(tb.HEAD, INTEGERS, ROWS, MATRICES))
+def measure_edges(head, edges, means, informations):  # type: ignore[no-untyped-def]
+    """
+    Give edges other measurements.
+
+    Parameters
+    ----------
+    edges : ndarray of int, shape (M,), ids
+    means, informations : ndarray, shapes (M, 3) and (M, 3, 3)
+
+    """
+    edge_f, edge_i, scalars = tb.edge_f(head), tb.edge_i(head), tb.scalars(head)
+    for m in range(len(edges)):
+        e = identities.edge_row(head, edges[m])
+        f = edge_f[e]
+        weight = f[tb.WEIGHT]
+        transaction_log.log_edge(head, e)
+        if weight > 0.0:
+            _touch_edge(head, e)
+            scale_by_edge(head, e, -weight)
+            scalars[tb.CHI2] -= f[tb.ENERGY]
+        rows.write_measurement(f, means[m], informations[m])
+        factor_types.prepare(f, edge_i[e, tb.EDGE_KIND])
+        if weight > 0.0:
+            scale_by_edge(head, e, weight)
+            factors.linearize_edge(head, e)
+            factors.check_edge(head, e, factors.NO_TURN)
+            scalars[tb.CHI2] += f[tb.ENERGY]
+
+
 @kernel(signature=(tb.HEAD, INTEGERS, NUMBERS))
 def weigh_observed(head, observed, weights):  # type: ignore[no-untyped-def]
     """

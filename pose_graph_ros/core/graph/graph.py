@@ -16,6 +16,7 @@ from pose_graph_ros.core.graph.constraints import check, NodeKind
 from pose_graph_ros.core.graph.contents import GraphContents
 from pose_graph_ros.core.graph.edit_checks import (
     check_ids,
+    check_measured,
     check_weights,
     checked_poses,
     integers,
@@ -139,6 +140,9 @@ class Graph(GraphContents):
                 check_ids(part, getattr(update, part), what, known_ids)
         check_weights('weigh_edges', update.weigh_edges, 'edge', edges)
         check_weights('weigh_observed', update.weigh_observed, 'observed node', observed)
+        for measured in update.measure_edges:
+            check_ids('measure_edges', measured.ids.tolist(), 'edge', edges)
+            check_measured(measured.mean, measured.information, len(measured.ids))
         check_priors(update.priors, update.remove_nodes)
         for n, prior in enumerate(update.priors):
             check_ids(f'priors[{n}].nodes', prior.nodes, 'hidden node', nodes)
@@ -156,6 +160,10 @@ class Graph(GraphContents):
                 weigh(head, integers(weights), values(weights))
             if len(dropped) > 0:
                 weigh(head, integers(dropped), np.full(len(dropped), editing.DROPPED))
+        for measured in update.measure_edges:
+            editing.measure_edges(head, integers(measured.ids), *map(
+                np.ascontiguousarray, (measured.mean, measured.information)))
+            self.n_moves += 1
         for nodes, fixed in ((update.fix, True), (update.free, False)):
             if len(nodes) > 0:
                 editing.set_fixed(head, integers(nodes), fixed)

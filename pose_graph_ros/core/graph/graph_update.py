@@ -21,6 +21,17 @@ NOTHING_OBSERVED: Final = ObservedNodes()
 NO_WEIGHTS: Final[Mapping[int, float]] = MappingProxyType({})
 
 
+class Measured(NamedTuple):
+    """Other measurements of edges that there are; raises GraphUpdateError where invalid."""
+
+    ids: IntArray
+    """Shape (M,)."""
+    mean: FloatArray
+    """Shape (M, 3)."""
+    information: FloatArray
+    """Shape (M, 3, 3)."""
+
+
 class GraphUpdate(NamedTuple):
     """
     An edit of a graph; all nodes and constraints in it are given by their ids.
@@ -69,6 +80,8 @@ class GraphUpdate(NamedTuple):
     """Observed nodes that leave the graph for good."""
     priors: Sequence[Prior] = ()
     """New dense priors, possibly on the new nodes."""
+    measure_edges: Sequence[Measured] = ()
+    """Edges that get another mean and information; they keep their weights."""
 
 
 class Left(NamedTuple):

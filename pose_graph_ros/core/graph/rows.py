@@ -72,6 +72,13 @@ def _copy_pose(to, at, pose):  # type: ignore[no-untyped-def]
 
 
 @kernel
+def write_measurement(f, mean, information):  # type: ignore[no-untyped-def]
+    """Write mean and information to a row; return whether both are valid."""
+    valid = _copy_pose(f, tb.MEAN, mean)
+    return _pack_information(f, information) and valid
+
+
+@kernel
 def write_edge(head, e, i, j, mean, information, kind, weight):  # type: ignore[no-untyped-def]
     """
     Return whether an edge is valid after writing it; its nodes, kind and bias are not checked.
@@ -86,8 +93,8 @@ def write_edge(head, e, i, j, mean, information, kind, weight):  # type: ignore[
     f, row = edge_f[e], edge_i[e]
     row[tb.END_I], row[tb.END_J], row[tb.END_K], row[tb.EDGE_KIND] = i, j, -1, kind
     f[tb.WEIGHT] = weight
-    valid = _copy_pose(f, tb.MEAN, mean) and _is_finite(weight) and weight >= 0.0 and i != j
-    return _pack_information(f, information) and valid
+    valid = _is_finite(weight) and weight >= 0.0 and i != j
+    return write_measurement(f, mean, information) and valid
 
 
 @kernel

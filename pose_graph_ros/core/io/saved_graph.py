@@ -137,6 +137,8 @@ class SavedGraph:
         _require(n_frozen + len(nodes.odometry) == n and n_frozen < n,
                  'nodes: expected a frozen pose or an odometry pose of each, got '
                  f'{n_frozen} and {len(nodes.odometry)} for {n} nodes')
+        _require(_are_odometry_errors(nodes.errors),
+                 'nodes.errors: expected two positive numbers and two others')
         _increasing('nodes.stamps_ns', nodes.stamps_ns)
         _increasing('nodes.ids', nodes.ids)
         _same_length('nodes.thinned', thinned, 'numbers', 'anchors', 'relative', 'noise')
@@ -291,8 +293,16 @@ class SavedGraph:
         _require(source.next_estimate > 0, f'{where}.next_estimate: expected a positive number')
         _require(source.odometry_scale > 0.0,
                  f'{where}.odometry_scale: expected a positive number')
+        _require(_are_odometry_errors(source.odometry),
+                 f'{where}.odometry: expected two positive numbers and two others')
         _require(source.errors is None or min(source.errors) > 0.0,
                  f'{where}.errors: expected positive numbers')
+
+
+def _are_odometry_errors(numbers: FloatArray) -> bool:
+    return len(numbers) == 0 or (
+        len(numbers) == 4 and bool(np.all(np.isfinite(numbers))) and min(numbers[:2]) > 0.0
+        and numbers[3] > -1.0)
 
 
 def site_refusal(

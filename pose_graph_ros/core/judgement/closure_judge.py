@@ -79,7 +79,7 @@ class ClosureJudge:
     ) -> None:
         self._smoother, self._reweighting = smoother, reweighting
         self._odometry = odometry
-        self._chain = OdometryChain()
+        self.chain = self._chain = OdometryChain()
         self._table = ClosureTable(self._chain)
         self.states = self._states = ClosureStates()
         self.reports = ClosureReports(self._states, self._table)

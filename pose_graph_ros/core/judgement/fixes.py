@@ -21,6 +21,7 @@ from pose_graph_ros.core.graph.reweighting import Reweighting
 from pose_graph_ros.core.judgement import fix_states as fs, fix_verdicts
 from pose_graph_ros.core.judgement.decision_cost import decision_cost
 from pose_graph_ros.core.judgement.listing import MOST_OTHERS
+from pose_graph_ros.core.judgement.odometry_chain import OdometryChain
 from pose_graph_ros.core.judgement.run_set import NOWHERE, RunSet, Turn
 from pose_graph_ros.core.judgement.runs import odometry_between
 from pose_graph_ros.core.judgement.texts import sentence, unknown
@@ -81,7 +82,6 @@ class FixJudge:
         self._runs = RunSet()
         self._loosened: dict[int, float] = {}
         """Weights of odometry edges by id; replaced, never changed, so that it is not copied."""
-        self.odometry_weight = 1.0  # in the graph, where it is not loosened
         self._restore: _Before | None = None
         self._decided: _Decided | None = None
         self._cut: tuple[int, Track] | None = None
@@ -144,9 +144,14 @@ class FixJudge:
         return change._replace(weigh_edges={**change.weigh_edges, **edges},
                                weigh_observed={**change.weigh_observed, **observed})
 
+    @property
+    def chain(self) -> OdometryChain:
+        """The odometry between hidden nodes, as the judge knows it."""
+        return self._runs.chain
+
     def weight_of_odometry(self, edge: int) -> float:
         """Return the weight that an odometry edge has, by its id, as far as fixes know."""
-        return self.odometry_weight * self._loosened.get(edge, 1.0)
+        return self._loosened.get(edge, 1.0)
 
     def _begin(self) -> None:
         self._restore, self._decided = self._copy(), None

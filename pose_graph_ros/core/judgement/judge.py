@@ -34,6 +34,7 @@ from pose_graph_ros.core.judgement.tracks import Track
 from pose_graph_ros.core.judgement.verdicts import Change, Decision, SourceVerdicts, Verdict
 from pose_graph_ros.core.measurements import Answer, LoopClosure
 from pose_graph_ros.core.odometry.hidden_nodes import HiddenNodes
+from pose_graph_ros.core.odometry.odometry_errors import OdometryErrors
 from pose_graph_ros.core.smoother.incremental import IncrementalSmoother
 from pose_graph_ros.core.smoother.results import DIVERGED, UpdateResult
 from pose_graph_ros.core.sources.constraint_queue import NewConstraint
@@ -340,9 +341,11 @@ class Judge:
         self._odometry.keep_gaps(self._fixes.loosened, self._smoother.graph, now_ns)
         self._odometry.take_changes()   # which were told before
 
-    def weigh_odometry(self, weight: float) -> None:
-        """Tell the weight that the odometry has in the graph where it is not loosened."""
-        self._fixes.odometry_weight = weight
+    def correct_odometry(self, before: OdometryErrors, after: OdometryErrors) -> None:
+        """Follow the edges of odometry, which know of other errors of it now."""
+        for chain in (self._fixes.chain, self._closures.chain):
+            chain.correct(before, after, self._nodes.stamps_ns[
+                np.searchsorted(self._nodes.ids, chain.nodes)])
 
     def moved(self, before: Held, after: Held) -> None:
         """

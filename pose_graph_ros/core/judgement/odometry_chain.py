@@ -21,6 +21,7 @@ from pose_graph_ros.core.graph import factors, tables as tb
 from pose_graph_ros.core.graph.constraints import EdgeKind, full, upper
 from pose_graph_ros.core.graph.graph import Graph
 from pose_graph_ros.core.graph.kinds import NodeKind
+from pose_graph_ros.core.odometry.odometry_errors import OdometryErrors
 
 # Weight that one of 0 counts as.
 _LEAST_WEIGHT = 1e-9
@@ -29,6 +30,16 @@ _NOISE = OdometryNoise()
 GAP_ALONG, GAP_ACROSS, GAP_BY_WAY, GAP_BY_TURN, GAP_FLOOR = (
     _NOISE.sigma_distance**2, _NOISE.sigma_lateral**2, _NOISE.sigma_heading_distance**2,
     _NOISE.sigma_heading_turn**2, _NOISE.sigma_floor_position**2)
+
+
+def integrated(motions: FloatArray) -> FloatArray:
+    """Return poses from the motions between them, shape (N + 1, 3), the first at the origin."""
+    heading = np.concatenate(([0.0], np.cumsum(motions[:, 2])))
+    c, s = np.cos(heading[:-1]), np.sin(heading[:-1])
+    x, y = motions[:, 0], motions[:, 1]
+    steps = np.column_stack((c * x - s * y, s * x + c * y))
+    return np.column_stack((np.vstack((np.zeros(2), np.cumsum(steps, axis=0))),
+                            se2.wrap(heading)))
 
 
 class OdometryChain:
@@ -115,6 +126,35 @@ class OdometryChain:
         self._poses.append(poses[:n])
         self._sums.append(sums[:n])
         self._travel.append(self._travel.values[last] + travel[:n])
+
+    def correct(
+        self, before: OdometryErrors, after: OdometryErrors, stamps_ns: IntArray,
+    ) -> None:
+        """
+        Follow the edges, which know of other errors of odometry now.
+
+        Parameters
+        ----------
+        before, after : OdometryErrors
+        stamps_ns : ndarray of int, shape (M,), of the nodes of the chain
+
+        """
+        if len(self) < 2:
+            return
+        poses, sums = self._poses.values, full(self._sums.values)
+        seconds = np.asarray(np.diff(stamps_ns) * 1e-9, dtype=np.float64)
+        motions = after.motions(before.as_odometry_says(
+            se2.between(poses[:-1], poses[1:]), seconds), seconds)
+        back = se2.adjoint(se2.inverse(poses[1:]))
+        noises = after.covariances(before.inverse_noise.covariances(
+            back @ np.diff(sums, axis=0) @ np.swapaxes(back, 1, 2)))
+        moved = se2.compose(poses[:1], integrated(motions))
+        forth = se2.adjoint(moved[1:])
+        steps = forth @ noises @ np.swapaxes(forth, 1, 2)
+        length = np.hypot(motions[:, 0], motions[:, 1])
+        self._poses.values[:] = moved
+        self._sums.values[1:] = upper(sums[:1] + np.cumsum(steps, axis=0))
+        self._travel.values[1:] = self._travel.values[0] + np.cumsum(length)
 
     def forget(self, nodes: IntArray) -> None:
         """Forget nodes that have left the graph; the motion between all others stays known."""

@@ -9,7 +9,7 @@ from pose_graph_ros.core.geometry.se2 import FloatArray, IntArray
 from pose_graph_ros.core.graph import tables as tb
 from pose_graph_ros.core.graph.constraints import EdgeKind
 from pose_graph_ros.core.graph.graph import Graph
-from pose_graph_ros.core.judgement.odometry_chain import OdometryChain
+from pose_graph_ros.core.judgement.odometry_chain import integrated, OdometryChain
 from pose_graph_ros.core.solver_config import CLOSURE_FLOORS
 
 # Sigmas of the motion over a jump, which the closures over it determine [m, m, rad].
@@ -71,13 +71,3 @@ class Odometry:
         sizes = np.sum((se2.between(self.motions[at], motions) / SIGMAS)**2, axis=1)
         k = int(np.argmin(np.round(sizes, 6)))
         return begin + k, motions[k]
-
-
-def integrated(motions: FloatArray) -> FloatArray:
-    """Return poses from the motions between them, shape (N + 1, 3), the first at the origin."""
-    heading = np.concatenate(([0.0], np.cumsum(motions[:, 2])))
-    c, s = np.cos(heading[:-1]), np.sin(heading[:-1])
-    x, y = motions[:, 0], motions[:, 1]
-    steps = np.column_stack((c * x - s * y, s * x + c * y))
-    return np.column_stack((np.vstack((np.zeros(2), np.cumsum(steps, axis=0))),
-                            se2.wrap(heading)))

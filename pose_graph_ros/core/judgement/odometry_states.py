@@ -19,7 +19,7 @@ from pose_graph_ros.core.graph.constraints import Edges
 from pose_graph_ros.core.graph.error_functions import energies
 from pose_graph_ros.core.graph.graph import Graph
 from pose_graph_ros.core.judgement.jumps import Jump
-from pose_graph_ros.core.judgement.odometry_motions import integrated
+from pose_graph_ros.core.judgement.odometry_chain import integrated
 from pose_graph_ros.core.judgement.verdicts import (
     Change,
     Decision,

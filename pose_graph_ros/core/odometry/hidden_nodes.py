@@ -17,6 +17,7 @@ from pose_graph_ros.core.measurements import Answer, OdometrySample
 from pose_graph_ros.core.odometry.gaps import gap_motion
 from pose_graph_ros.core.odometry.motion import Attachment, Motion
 from pose_graph_ros.core.odometry.node_table import NodeTable
+from pose_graph_ros.core.odometry.odometry_errors import AS_CLAIMED, OdometryErrors
 from pose_graph_ros.core.odometry.primary_source import (
     choose_first,
     find_silence,
@@ -76,6 +77,8 @@ class HiddenNodes:
         self._secondary = SecondaryEdges()
         self._samples_since_ns = -1
         """Stamp before which samples may have been dropped as nodes were thinned out [ns]."""
+        self.errors = AS_CLAIMED
+        """Of the primary odometry, which the edges to new nodes know of."""
         self.relocated: set[int] = set()
         """Numbers of the nodes at which the robot was put by hand."""
 
@@ -295,9 +298,20 @@ class HiddenNodes:
                 abs(wrap_one(pose[2] - base[2])), (stamp_ns - self._base_ns) * 1e-9):
             return
         mean, noise = self._motion_since_node(self.streams[self.primary], stamp_ns)
-        node = self._make_node(mean, covariance.information(noise), self.primary)
+        known, noise = self._corrected(mean, noise, stamp_ns)
+        node = self._make_node(known, covariance.information(noise), self.primary)
         if node >= 0:
             self._append(stamp_ns, node, pose, se2.compose(self.odometry[-1], mean))
+
+    def _corrected(
+        self, mean: FloatArray, noise: FloatArray, stamp_ns: int,
+    ) -> tuple[FloatArray, FloatArray]:
+        """Return a motion from the newest node to a stamp [ns] that knows of its errors."""
+        if self.errors == AS_CLAIMED:
+            return mean, noise
+        seconds = np.array([(stamp_ns - int(self.stamps_ns[-1])) * 1e-9])
+        return (self.errors.motions(mean[None], seconds)[0],
+                self.errors.covariances(noise[None])[0])
 
     def _motion_since_node(
         self, stream: OdometryStream, stamp_ns: int,
@@ -419,7 +433,9 @@ class HiddenNodes:
         """
         stream = self.streams[self.primary]
         motion, raw = stream.newest(self._base_ns)
-        return *self._after_span(motion.increment, stream.covariance(motion, floor=False)), raw
+        mean, noise = self._after_span(
+            motion.increment, stream.covariance(motion, floor=False))
+        return *self._corrected(mean, noise, max(self.newest_ns, int(self.stamps_ns[-1]))), raw
 
     def saved(self) -> SavedNodes:
         """Return the state, with the odometry samples that are needed; there must be a node."""
@@ -432,7 +448,8 @@ class HiddenNodes:
             primaries, np.array(after_ns), self.covered_ns, self._base_ns, self._base, span,
             {name: stream.saved(needed_ns, self._secondary.progress[name])
              for name, stream in self.streams.items()},
-            self.table.frozen.copy(), float(self.table.travelled[0]), self.table.thinned.saved())
+            self.table.frozen.copy(), float(self.table.travelled[0]), self.table.thinned.saved(),
+            np.array(self.errors))
 
     def restore(self, saved: SavedNodes) -> None:
         """Set the state of this empty object to a saved one."""
@@ -444,5 +461,7 @@ class HiddenNodes:
         for name, stream in saved.streams.items():
             self._make_stream(name).restore(stream)
             self._secondary.progress[name] = stream.tied, stream.next_to_tie
+        if len(saved.errors) > 0:
+            self.errors = OdometryErrors(*saved.errors.tolist())
         if len(self.table.thinned) > 0:
             self._samples_since_ns = int(self.streams[self.primary].timeline.stamps_ns[0])

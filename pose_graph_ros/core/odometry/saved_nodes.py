@@ -12,7 +12,7 @@ from pose_graph_ros.core.geometry.se2 import FloatArray, IntArray
 from pose_graph_ros.core.odometry.node_table import NodeTable
 from pose_graph_ros.core.odometry.saved_stream import SavedStream
 from pose_graph_ros.core.odometry.thinned_nodes import SavedThinned
-from pose_graph_ros.core.saved_columns import Integers, Matrix, Rows3
+from pose_graph_ros.core.saved_columns import Integers, Matrix, Numbers, Rows3
 
 
 @dataclass(frozen=True, slots=True)
@@ -54,6 +54,12 @@ class SavedNodes:
     """Path length up to the first node in the graph [m]."""
     thinned: SavedThinned = field(default_factory=SavedThinned)
     """Nodes that have left although older ones stay."""
+
+    errors: Numbers = field(default_factory=lambda: np.empty(0))
+    """
+    `OdometryErrors` that the edges know of. Empty in files of older versions, in which weights of
+    the edges stand for them.
+    """
 
     def poses(self, node_ids: IntArray, poses: FloatArray) -> FloatArray:
         """

@@ -23,8 +23,15 @@ import numpy as np
 
 from pose_graph_ros.core.geometry.se2 import BoolArray, FloatArray, IntArray
 from pose_graph_ros.core.graph import tables as tb
-from pose_graph_ros.core.graph.constraints import EdgeKind, ObservedKind, ObservedNodes
+from pose_graph_ros.core.graph.constraints import (
+    EdgeKind,
+    full,
+    ObservedKind,
+    ObservedNodes,
+    upper,
+)
 from pose_graph_ros.core.graph.graph import Graph
+from pose_graph_ros.core.odometry.odometry_errors import AS_CLAIMED, OdometryErrors
 from pose_graph_ros.core.sources.error_likelihood import (
     chain_motions,
     filtered,
@@ -46,7 +53,7 @@ NODES_PER_STEP = 10_000
 SIGNIFICANT = 20.0
 # The same for each time that the filter was lost: then odometry was wrong, or many positions.
 PER_LOST = 100.0
-# The same of a scale of the noise of odometry other than 1.
+# The same of one factor on the noise of odometry; and how much less likely larger ones may be.
 SIGNIFICANT_SCALE = 4.0
 # Longest time constant, in units of the time from the first measurement to the last. Shorter ones
 # would make the variance of an error that hardly changes in this time too small.
@@ -81,15 +88,39 @@ class Estimate(NamedTuple):
 
     errors: CorrelatedErrors | None
     """Statistics of the errors of the source; None for white errors."""
-    odometry_scale: float
-    """Factor on the sigmas of odometry."""
+    odometry: OdometryErrors
+    rate_sigma: float = math.inf
+    """Sigma of the constant error of the yaw rate [rad/s]."""
+    scale_sigma: float = math.inf
+    """Sigma of that of the scale."""
 
 
-NOTHING = Estimate(None, 1.0)
+NOTHING = Estimate(None, AS_CLAIMED)
 Search = Generator[None, None, Estimate]
 """Yields after each step."""
 PathSteps = Generator[None, None, MeasuredPath]
 """The same of a path."""
+
+
+class PathOdometry(NamedTuple):
+    """What is known of the odometry between the hidden nodes."""
+
+    ids: IntArray
+    """Ids of the nodes, ascending, shape (N,)."""
+    stamps_ns: IntArray
+    """Shape (N,) [ns]."""
+    errors: OdometryErrors
+    """Those that the edges in the graph know of."""
+    reference: OdometryErrors
+    """Constant errors that the motions of a path are to be without, near the true ones."""
+
+
+class _Edges(NamedTuple):
+    """The odometry after each pose of a path, as `chain_motions` takes it."""
+
+    means: FloatArray
+    informations: FloatArray
+    seconds: FloatArray
 
 
 class _Minimum(NamedTuple):
@@ -100,7 +131,8 @@ class _Minimum(NamedTuple):
 
 
 def measured_path(
-    graph: Graph, stamps_ns: IntArray, ids: IntArray, past: PastPath | None = None,
+    graph: Graph, odometry: PathOdometry, stamps_ns: IntArray, ids: IntArray,
+    past: PastPath | None = None,
 ) -> PathSteps:
     """
     Return the positions of a source along the path by odometry, sorted by stamp, after some steps.
@@ -108,6 +140,7 @@ def measured_path(
     Parameters
     ----------
     graph : Graph, whose nodes may leave between two steps
+    odometry : PathOdometry
     stamps_ns : ndarray of int64, shape (K,)
     ids : ndarray of int64, shape (K,), of the observed nodes; headings among them are left out
     past : PastPath, optional, positions that have left the graph
@@ -117,28 +150,26 @@ def measured_path(
     chosen = _chosen(len(observed))
     stamps_ns, observed = stamps_ns[chosen], observed.rows(chosen)
     begin_at = None if past is None else past.node
-    until, edge_after = _odometry(graph, observed.node, begin_at)
+    until, edges = _odometry(graph, odometry, observed.node, begin_at)
     yield
-    n = len(until)
-    joined, spread, way = np.zeros((n, 3)), np.zeros((n, 3, 3)), np.zeros((n, 3))
-    begin = 0
+    n, begin = len(until), 0
+    motions = _no_motions(n)
     while begin < n:
         most = until[max(begin - 1, 0)] + NODES_PER_STEP
         end = max(int(np.searchsorted(until, most)), begin + 1)
-        # those of nodes that have left since count as unknown
-        rows_after = graph.edge_rows(edge_after)
-        chain_motions(
-            graph.memory['edge_f'], rows_after, until, begin, end, joined, spread, way)
+        chain_motions(*edges, until, begin, end, *motions)
         begin = end
         yield
-    if past is not None:
-        return past.continued(
-            stamps_ns, _path(stamps_ns, observed, joined[1:], spread[1:], way[1:]))
-    return _path(stamps_ns, observed, joined, spread, way)
+    taken_out = np.tile((odometry.reference.rate, odometry.reference.scale), (n, 1))
+    if past is None:
+        return _path(stamps_ns, observed, *motions, taken_out)
+    return past.continued(stamps_ns, _path(
+        stamps_ns, observed, *(column[1:] for column in (*motions, taken_out))))
 
 
 def left_behind(
-    graph: Graph, stamps_ns: IntArray, ids: IntArray, past: PastPath | None, node: int,
+    graph: Graph, odometry: PathOdometry, stamps_ns: IntArray, ids: IntArray, *,
+    past: PastPath | None, node: int,
 ) -> PastPath:
     """
     Return the positions of a source before a node, when those before it leave the graph.
@@ -146,6 +177,7 @@ def left_behind(
     Parameters
     ----------
     graph : Graph, with the nodes that leave
+    odometry : PathOdometry, with a reference without constant errors
     stamps_ns : ndarray of int64, shape (K,)
     ids : ndarray of int64, shape (K,), of the observed nodes that leave
     past : PastPath, optional, those that have left before
@@ -157,13 +189,17 @@ def left_behind(
     stamps_ns, observed = stamps_ns[before], observed.rows(before)
     if past is None:
         past = no_past(int(observed.node[0]) if len(observed) > 0 else node)
-    until, edge_after = _odometry(graph, np.append(observed.node, node), past.node)
+    until, edges = _odometry(graph, odometry, np.append(observed.node, node), past.node)
     n = len(until)
-    motion, noise, way = np.zeros((n, 3)), np.zeros((n, 3, 3)), np.zeros((n, 3))
-    chain_motions(
-        graph.memory['edge_f'], graph.edge_rows(edge_after), until, 0, n, motion, noise, way)
-    return past.extended(
-        stamps_ns, _path(stamps_ns, observed, motion[1:], noise[1:], way[1:]), node)
+    motions = _no_motions(n)
+    chain_motions(*edges, until, 0, n, *motions)
+    return past.extended(stamps_ns, _path(
+        stamps_ns, observed, *(column[1:] for column in (*motions, np.zeros((n, 2))))), node)
+
+
+def _no_motions(n: int) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
+    """Return room for motions, their noises, those of the way, and levers."""
+    return np.zeros((n, 3)), np.zeros((n, 3, 3)), np.zeros((n, 3)), np.zeros((n, 3))
 
 
 def _sorted(
@@ -180,15 +216,14 @@ def _sorted(
 
 
 def _path(
-    stamps_ns: IntArray, observed: ObservedNodes, motion: FloatArray, noise: FloatArray,
-    way: FloatArray,
+    stamps_ns: IntArray, observed: ObservedNodes, *motions: FloatArray,
 ) -> MeasuredPath:
-    """Return the path of some positions."""
+    """Return the path of some positions, with the columns that say how the robot moved."""
     covariance = np.linalg.inv(observed.information[:, :2, :2])
     seconds = np.asarray((stamps_ns - stamps_ns[:1]) * 1e-9, dtype=np.float64)
     return MeasuredPath(
         seconds, observed.mean[:, :2].copy(), 0.5 * np.trace(covariance, axis1=1, axis2=2),
-        observed.offset[:, :2].copy(), motion, noise, way)
+        observed.offset[:, :2].copy(), *motions)
 
 
 def _chosen(n: int) -> IntArray | slice:
@@ -200,10 +235,10 @@ def _chosen(n: int) -> IntArray | slice:
 
 
 def _odometry(
-    graph: Graph, nodes: IntArray, begin: int | None = None,
-) -> tuple[IntArray, IntArray]:
+    graph: Graph, odometry: PathOdometry, nodes: IntArray, begin: int | None = None,
+) -> tuple[IntArray, _Edges]:
     """
-    Return where nodes are among the poses of a path, and the id of the edge after each.
+    Return where nodes are among the poses of a path, and the odometry after each pose.
 
     With `begin`, the id of a node that is still there, that is the first of them.
     """
@@ -213,15 +248,27 @@ def _odometry(
         rows = np.maximum(rows, rows[0])
     first = int(at[np.min(rows)]) if len(rows) > 0 else 0
     until = np.maximum.accumulate(at[rows] - first)
-    edge_after = np.full(int(until[-1]) if len(until) > 0 else 0, -1)
+    n = int(until[-1]) if len(until) > 0 else 0
+    edge_after = np.full(n, -1)
     table = graph.memory['edge_i'][:graph.n_edges]
     edges = np.flatnonzero(table[:, tb.EDGE_KIND] == EdgeKind.ODOMETRY)
     start = at[table[edges, tb.END_I]] - first
-    inside: BoolArray = ((start >= 0) & (start < len(edge_after))
+    inside: BoolArray = ((start >= 0) & (start < n)
                          & (at[table[edges, tb.END_J]] - first == start + 1))
     # of several edges the first is that of the primary odometry
-    edge_after[start[inside][::-1]] = graph.edge_ids[edges[inside]][::-1]
-    return until, edge_after
+    edge_after[start[inside][::-1]] = edges[inside][::-1]
+    stamps_ns = odometry.stamps_ns[np.searchsorted(
+        odometry.ids, graph.node_ids[graph.is_pose][first:first + n + 1])]
+    seconds = np.asarray(np.diff(stamps_ns) * 1e-9, dtype=np.float64)
+    known = edge_after >= 0
+    numbers = graph.memory['edge_f'][edge_after[known]]
+    claimed = odometry.errors.inverse_noise.informations(
+        full(numbers[:, tb.INFO:tb.INFO + 6]))
+    means, informations = np.zeros((n, 3)), np.zeros((n, 6))
+    means[known] = odometry.reference.motions(odometry.errors.as_odometry_says(
+        numbers[:, tb.MEAN:tb.MEAN + 3], seconds[known]), seconds[known])
+    informations[known] = upper(claimed)
+    return until, _Edges(means, informations, seconds)
 
 
 def search(positions: MeasuredPath, *, correlated: bool = False) -> Search:
@@ -256,32 +303,40 @@ def search(positions: MeasuredPath, *, correlated: bool = False) -> Search:
     needed = (0.0 if correlated else SIGNIFICANT) + PER_LOST * max(
         evaluate.lost[white.point], evaluate.lost[found.point])
     significant = white.value - found.value > needed and correlation > LEAST_CORRELATION
-    scale = yield from _odometry_scale(evaluate, (found if significant else white).point)
-    return Estimate(errors if significant else None, scale)
+    odometry, *sigmas = yield from _odometry_errors(
+        evaluate, (found if significant else white).point)
+    return Estimate(errors if significant else None, odometry, *sigmas)
 
 
-def _odometry_scale(
+def _odometry_errors(
     evaluate: '_Evaluation', best: Point,
-) -> Generator[None, None, float]:
+) -> Generator[None, None, tuple[OdometryErrors, float, float]]:
     """
-    Return the factor on the sigmas of odometry; 1 unless its claim is much less likely.
+    Return the errors of odometry, as claimed unless others are much more likely.
 
-    The graph has one factor for way and turn, and no constant errors, so that its factor is
-    another one. A factor below 1 is the largest that is likely enough, and only beside white
-    errors: correlated ones show too little of what odometry does over longer times.
+    Factors below 1 are the largest ones that are likely enough, and only beside white errors:
+    correlated ones show too little of what odometry does over longer times.
     """
     *errors, way, turn, white = best
-    found = yield from _descend(evaluate, [(*errors, at, white) for at in (way, turn, 0.0)])
-    *errors, exponent, white = found.point
     claimed = yield from _descend(evaluate, [(*errors, 0.0, white)], fixed=ODOMETRY)
-    if claimed.value - found.value <= SIGNIFICANT_SCALE or (len(errors) > 0 and exponent < 0.0):
-        return 1.0
-    while exponent < 0.0:
-        more = (*errors, exponent + FINEST, white)
-        if (yield from evaluate.value(more)) - found.value > SIGNIFICANT_SCALE:
-            break
-        exponent += FINEST
-    return 2.0 ** (0.5 * max(exponent, min(way, 0.0), min(turn, 0.0)))
+    least = yield from evaluate.value(best)
+    if claimed.value - least > SIGNIFICANT:
+        for axis in (-3, ODOMETRY):
+            while best[axis] < 0.0:
+                more = (*best[:axis], best[axis] + FINEST, *best[axis + 1:])
+                if len(errors) == 0 and (
+                        yield from evaluate.value(more)) - least > SIGNIFICANT_SCALE:
+                    break
+                best = more
+        yield from evaluate.value(best)
+        rate, scale, rate_variance, scale_variance = evaluate.constants[best]
+        return (OdometryErrors(2.0 ** best[-3], 2.0 ** best[ODOMETRY], rate, scale),
+                math.sqrt(rate_variance), math.sqrt(scale_variance))
+    found = yield from _descend(evaluate, [(*errors, at, white) for at in (way, turn, 0.0)])
+    exponent = found.point[ODOMETRY]
+    if claimed.value - found.value <= SIGNIFICANT_SCALE or exponent < 0.0:
+        return AS_CLAIMED, math.inf, math.inf
+    return OdometryErrors.scaled(2.0 ** (0.5 * exponent)), math.inf, math.inf
 
 
 class _Evaluation:
@@ -294,6 +349,8 @@ class _Evaluation:
         self._values: dict[Point, float] = {}
         self.lost: dict[Point, int] = {}
         """How often the filter was lost."""
+        self.constants: dict[Point, list[float]] = {}
+        """Constant errors of odometry, of yaw rate and scale, and their variances."""
         self._left = PER_STEP
         self.bounds = LEAST, MOST
         """Of the exponent of the time constant."""
@@ -302,7 +359,7 @@ class _Evaluation:
         """Find the heading at the first position that makes white errors the most likely."""
         best = math.inf
         for angle in (2.0 * math.pi / HEADINGS * np.arange(HEADINGS)).tolist():
-            value, _ = filtered(*self._path, 1.0, 0.0, 1.0, 1.0, 1.0, angle, True)
+            value, *_ = filtered(*self._path, 1.0, 0.0, 1.0, 1.0, 1.0, angle, True)
             if value < best:
                 best, self._heading = value, angle
             yield from self._pause()
@@ -321,7 +378,7 @@ class _Evaluation:
             tau, correlated = (
                 (2.0 ** point[0], 2.0 ** point[1]) if len(point) > 3 else (1.0, 0.0))
             white = 2.0 ** point[-1]
-            value, self.lost[point] = filtered(
+            value, self.lost[point], *self.constants[point] = filtered(
                 *self._path, tau, correlated, 2.0 ** way, 2.0 ** turn, white, self._heading,
                 constant)
             total = math.log2(correlated + white)

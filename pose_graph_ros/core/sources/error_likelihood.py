@@ -35,7 +35,6 @@ from pose_graph_ros.core.compiled.jit import (
     ROWS,
 )
 from pose_graph_ros.core.geometry.se2 import FloatArray
-from pose_graph_ros.core.graph.tables import INFO, MEAN
 
 # Squared Mahalanobis distance beyond which a position is taken for wrong, and left out.
 GATE = 16.0
@@ -72,39 +71,46 @@ class MeasuredPath(NamedTuple):
     """Covariance of that motion in the frame at its end, shape (K, 3, 3)."""
     way: FloatArray
     """Part of it that no error of a heading makes: of xx, xy and yy, shape (K, 3)."""
+    lever: FloatArray
+    """How a higher yaw rate changes the motion, shape (K, 3) [m s, m s, s]."""
+    taken_out: FloatArray
+    """Yaw rate and scale that are no longer in the motion, shape (K, 2) [rad/s, 1]."""
 
 
-@kernel(signature=(ROWS, INTEGERS, INTEGERS, INTEGER, INTEGER, ROWS, MATRICES, ROWS))
+@kernel(signature=(ROWS, ROWS, NUMBERS, INTEGERS, INTEGER, INTEGER, ROWS, MATRICES, ROWS, ROWS))
 def chain_motions(  # type: ignore[no-untyped-def]
-    edges, edge_after, until, begin, end, out_motion, out_noise, out_way,
+    means, informations, seconds, until, begin, end, out_motion, out_noise, out_way, out_lever,
 ):
     """
     Join the motions of a path: row k of the result is that from pose until[k - 1] to until[k].
 
     Parameters
     ----------
-    edges : ndarray, the table of edges of a graph (`graph.tables`)
-    edge_after : ndarray of int, shape (N - 1,), row of the edge after each pose; -1 if none is
+    means, informations : ndarray, shapes (N - 1, 3) and (N - 1, 6), of the edge after each pose;
+        an information of 0 stands for none
+    seconds : ndarray, shape (N - 1,), from each pose to the next one [s]
     until : ndarray of int, shape (K,), not decreasing, less than N
     begin, end : int, of the rows of the result that are written
-    out_motion, out_noise, out_way : ndarray, columns of a `MeasuredPath`
+    out_motion, out_noise, out_way, out_lever : ndarray, columns of a `MeasuredPath`
 
     """
     for k in range(begin, end):
         x = y = theta = 0.0
+        lever_x = lever_y = time = 0.0
         cov = out_noise[k]
         cov[:] = 0.0
         way_xx = way_xy = way_yy = 0.0
         for n in range(until[k - 1] if k > 0 else until[k], until[k]):
-            row = edge_after[n]
-            if row < 0:
+            xx, xy, xt, yy, yt, tt = informations[n]
+            if xx <= 0.0:
                 cov[0, 0] += NO_ODOMETRY[0]
                 cov[1, 1] += NO_ODOMETRY[1]
                 cov[2, 2] += NO_ODOMETRY[2]
                 way_xx += NO_ODOMETRY[0]
                 way_yy += NO_ODOMETRY[1]
+                time += seconds[n]
                 continue
-            dx, dy, turn = edges[row, MEAN], edges[row, MEAN + 1], edges[row, MEAN + 2]
+            dx, dy, turn = means[n]
             c, s = math.cos(turn), math.sin(turn)
             # adjoint of the inverse of the motion maps the covariance to the frame at its end
             a, b = -c * dy + s * dx, s * dy + c * dx
@@ -116,8 +122,6 @@ def chain_motions(  # type: ignore[no-untyped-def]
                 p, q, r = cov[0, i], cov[1, i], cov[2, i]
                 cov[0, i] = c * p + s * q + a * r
                 cov[1, i] = -s * p + c * q + b * r
-            xx, xy, xt = edges[row, INFO], edges[row, INFO + 1], edges[row, INFO + 2]
-            yy, yt, tt = edges[row, INFO + 3], edges[row, INFO + 4], edges[row, INFO + 5]
             first, second, third = yy * tt - yt * yt, xt * yt - xy * tt, xy * yt - xt * yy
             det = xx * first + xy * second + xt * third
             cov[0, 0] += first / det
@@ -136,9 +140,15 @@ def chain_motions(  # type: ignore[no-untyped-def]
                 c * s * (way_yy - way_xx) + (c * c - s * s) * way_xy - xy / flat,
                 s * s * way_xx - 2.0 * c * s * way_xy + c * c * way_yy + xx / flat)
             c, s = math.cos(theta), math.sin(theta)
-            x, y, theta = x + c * dx - s * dy, y + s * dx + c * dy, theta + turn
+            wx, wy = c * dx - s * dy, s * dx + c * dy
+            # a rate turns this motion by all of what it has turned before, and by half of its own
+            turned = time + 0.5 * seconds[n]
+            lever_x, lever_y = lever_x - wy * turned, lever_y + wx * turned
+            time += seconds[n]
+            x, y, theta = x + wx, y + wy, theta + turn
         out_motion[k, 0], out_motion[k, 1], out_motion[k, 2] = x, y, theta
         out_way[k, 0], out_way[k, 1], out_way[k, 2] = way_xx, way_xy, way_yy
+        out_lever[k, 0], out_lever[k, 1], out_lever[k, 2] = lever_x, lever_y, time
 
 
 @kernel
@@ -159,27 +169,30 @@ def _start(pose, p, z, offset, variance, heading_variance):  # type: ignore[no-u
 
 @kernel
 def _move(  # type: ignore[no-untyped-def]
-    pose, p, motion, seconds, noise, way, way_scale, turn_scale,
+    pose, p, motion, lever, taken_out, noise, way, way_scale, turn_scale,
 ):
     """Predict the pose after a motion, with both parts of its noise times a scale."""
-    # a constant error of the yaw rate turns the chord by half of what it turns the end
-    middle = pose[2] + 0.5 * seconds * pose[RATE]
-    c, s = math.cos(middle), math.sin(middle)
-    wx, wy = c * motion[0] - s * motion[1], s * motion[0] + c * motion[1]
-    dx, dy = (1.0 + pose[SCALE]) * wx, (1.0 + pose[SCALE]) * wy
+    rate, length = pose[RATE] - taken_out[0], 1.0 / (1.0 + taken_out[1])
+    by_scale = (1.0 + pose[SCALE]) * length
+    x = by_scale * motion[0] + rate * lever[0]
+    y = by_scale * motion[1] + rate * lever[1]
+    c, s = math.cos(pose[2]), math.sin(pose[2])
+    dx, dy = c * x - s * y, s * x + c * y
+    # derivatives by the scale and by the rate
+    kx = length * (c * motion[0] - s * motion[1])
+    ky = length * (s * motion[0] + c * motion[1])
+    rx, ry = c * lever[0] - s * lever[1], s * lever[0] + c * lever[1]
     pose[0] += dx
     pose[1] += dy
-    pose[2] += motion[2] + seconds * pose[RATE]
+    pose[2] += motion[2] + rate * lever[2]
     for i in range(N_STATES):
-        turned = p[i, 2] + 0.5 * seconds * p[i, RATE]
-        p[i, 0] += wx * p[i, SCALE] - dy * turned
-        p[i, 1] += wy * p[i, SCALE] + dx * turned
-        p[i, 2] += seconds * p[i, RATE]
+        p[i, 0] += kx * p[i, SCALE] + rx * p[i, RATE] - dy * p[i, 2]
+        p[i, 1] += ky * p[i, SCALE] + ry * p[i, RATE] + dx * p[i, 2]
+        p[i, 2] += lever[2] * p[i, RATE]
     for i in range(N_STATES):
-        turned = p[2, i] + 0.5 * seconds * p[RATE, i]
-        p[0, i] += wx * p[SCALE, i] - dy * turned
-        p[1, i] += wy * p[SCALE, i] + dx * turned
-        p[2, i] += seconds * p[RATE, i]
+        p[0, i] += kx * p[SCALE, i] + rx * p[RATE, i] - dy * p[2, i]
+        p[1, i] += ky * p[SCALE, i] + ry * p[RATE, i] + dx * p[2, i]
+        p[2, i] += lever[2] * p[RATE, i]
     c, s = math.cos(pose[2]), math.sin(pose[2])
     more = way_scale - turn_scale
     xx = turn_scale * noise[0, 0] + more * way[0]
@@ -244,18 +257,21 @@ def _measure(pose, p, gain, z, offset, factor, white):  # type: ignore[no-untype
     return math.log(det) + distance, False
 
 
-@kernel(signature=(NUMBERS, ROWS, NUMBERS, ROWS, ROWS, MATRICES, ROWS, NUMBER, NUMBER, NUMBER,
-                   NUMBER, NUMBER, NUMBER, FLAG), allocates=True)
+@kernel(signature=(NUMBERS, ROWS, NUMBERS, ROWS, ROWS, MATRICES, ROWS, ROWS, ROWS, NUMBER, NUMBER,
+                   NUMBER, NUMBER, NUMBER, NUMBER, FLAG), allocates=True)
 def filtered(  # type: ignore[no-untyped-def]
-    seconds, position, variance, offset, motion, noise, way, tau, correlated, by_way, by_turn,
-    white, heading, constant,
+    seconds, position, variance, offset, motion, noise, way, lever, taken_out, tau, correlated,
+    by_way, by_turn, white, heading, constant,
 ):
     """
     Return twice the negative logarithm of the likelihood of positions, and how often it was lost.
 
+    Then come the constant errors of odometry and their variances: of the yaw rate, of the scale.
+
     Parameters
     ----------
-    seconds, position, variance, offset, motion, noise, way : ndarray, columns of a `MeasuredPath`
+    seconds, position, variance, offset, motion, noise, way, lever, taken_out : ndarray
+        Columns of a `MeasuredPath`.
     tau : float, time constant of the correlated error [s]
     correlated, white : float, variances of the two parts, in units of the claimed variance
     by_way, by_turn : float, factors on the two parts of the noise of the motions
@@ -272,7 +288,7 @@ def filtered(  # type: ignore[no-untyped-def]
     for k in range(len(seconds)):
         if k > 0:
             gap = seconds[k] - seconds[k - 1]
-            _move(pose, p, motion[k], gap, noise[k], way[k], by_way, by_turn)
+            _move(pose, p, motion[k], lever[k], taken_out[k], noise[k], way[k], by_way, by_turn)
             _fade(pose, p, math.exp(-gap / tau))
         n_lost += 1 if left_out >= LOST else 0
         if k == 0 or left_out >= LOST or noise[k, 2, 2] > UNKNOWN:
@@ -283,4 +299,4 @@ def filtered(  # type: ignore[no-untyped-def]
                                math.sqrt(correlated * variance[k]), white * variance[k])
         total += cost
         left_out = left_out + 1 if wrong else 0
-    return total, n_lost
+    return total, n_lost, pose[RATE], pose[SCALE], p[RATE, RATE], p[SCALE, SCALE]

@@ -371,7 +371,7 @@ class FactorBuilder:
                     saved, errors=self.errors_in_use(source),
                     noise=constraints.noise.values.copy(), edges=constraints.edges.values.copy(),
                     next_estimate=constraints.next_estimate,
-                    odometry_scale=constraints.odometry_scale, past=constraints.past)
+                    odometry=np.array(constraints.odometry), past=constraints.past)
             result[source] = saved
         return result
 

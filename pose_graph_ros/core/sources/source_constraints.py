@@ -10,7 +10,8 @@ import numpy as np
 from pose_graph_ros.core.compiled.growing_array import GrowingArray
 from pose_graph_ros.core.geometry.se2 import BoolArray, FloatArray, IntArray
 from pose_graph_ros.core.graph.graph import Graph
-from pose_graph_ros.core.saved_columns import Integers, Pairs, Rows2
+from pose_graph_ros.core.odometry.odometry_errors import AS_CLAIMED, OdometryErrors
+from pose_graph_ros.core.saved_columns import Integers, Numbers, Pairs, Rows2
 from pose_graph_ros.core.sources.error_estimate import LEAST_POSITIONS
 from pose_graph_ros.core.sources.gauss_markov import CorrelatedErrors, SavedBins
 from pose_graph_ros.core.sources.past_path import PastPath
@@ -45,11 +46,13 @@ class SavedSource:
     next_estimate: int = LEAST_POSITIONS
     """Number of measurements at which its errors are estimated next."""
     odometry_scale: float = 1.0
-    """Factor on the sigmas of odometry that its measurements show."""
+    """In files of older versions, factor on the sigmas of odometry."""
     n_gone: int = 0
     """Number of its measurements that have left the graph."""
     past: PastPath | None = None
     """Their positions, where its errors are estimated."""
+    odometry: Numbers = field(default_factory=lambda: np.empty(0))
+    """`OdometryErrors` that its measurements show; empty in files of older versions."""
 
 
 class Held(NamedTuple):
@@ -86,8 +89,8 @@ class SourceConstraints:
         """Constraints of a loaded graph that were added under other settings."""
         self.next_estimate = LEAST_POSITIONS
         """Number of measurements at which the errors are estimated next."""
-        self.odometry_scale = 1.0
-        """Factor on the sigmas of odometry that the measurements show."""
+        self.odometry = AS_CLAIMED
+        """Errors of odometry that the measurements show."""
 
     def __len__(self) -> int:
         return len(self.rows)
@@ -182,7 +185,8 @@ class SourceConstraints:
         self.noise.append(saved.noise if len(saved.noise) == n else np.zeros((n, 2)))
         self.edges.append(saved.edges if len(saved.edges) == n else np.full(n, -1))
         self.n_gone, self.past = saved.n_gone, saved.past
-        if self.past is not None and len(self.past.way) == 0:
-            self.past = None    # of an older version, which did not tell way from turn
+        if self.past is not None and len(self.past.lever) == 0:
+            self.past = None    # of an older version, which knew less of odometry
         self.next_estimate = saved.next_estimate
-        self.odometry_scale = saved.odometry_scale
+        self.odometry = (OdometryErrors(*saved.odometry.tolist()) if len(saved.odometry) > 0
+                         else OdometryErrors.scaled(saved.odometry_scale))
