@@ -3,6 +3,7 @@
 """Correlated errors are found, the graph treats them so, and all of it can be undone."""
 
 from dataclasses import replace
+import functools
 
 import numpy as np
 import pytest
@@ -18,8 +19,9 @@ from pose_graph_ros.core.config import (
     POSITIONS,
 )
 from pose_graph_ros.core.geometry import se2
-from pose_graph_ros.core.graph.constraints import EdgeKind
+from pose_graph_ros.core.graph.constraints import EdgeKind, Edges
 from pose_graph_ros.core.measurements import Measurement, OdometrySample, Position
+from pose_graph_ros.core.odometry.odometry_errors import AS_CLAIMED, OdometryErrors
 from pose_graph_ros.core.smoother.results import UpdateResult
 from pose_graph_ros.core.sources.gauss_markov import CorrelatedErrors
 
@@ -204,42 +206,50 @@ def test_a_change_that_fails_is_undone_as_a_whole(
     np.testing.assert_allclose(path(backend), white, atol=1e-9)
 
 
-def weights_of_odometry(backend: PoseGraphBackend) -> np.ndarray:
+def sigmas_of_odometry(backend: PoseGraphBackend) -> np.ndarray:
+    """Return those of the position along each edge, relative to what is claimed by default."""
     edges = backend.graph.edges
-    return edges.weight[edges.kind == EdgeKind.ODOMETRY]
+    rows = edges.kind == EdgeKind.ODOMETRY
+    assert set(edges.weight[rows]) == {1.0}
+    return np.sqrt(np.linalg.inv(edges.information[rows])[:, 0, 0]) / np.sqrt(
+        np.linalg.inv(fed_once().information[rows])[:, 0, 0])
 
 
-def test_an_odometry_that_drifts_more_than_it_claims_gets_a_lower_weight() -> None:
+@functools.cache
+def fed_once() -> Edges:
+    """Return the edges of a drive as odometry claims them."""
+    claimed = PoseGraphBackend(BackendConfig(
+        measurements={'fix': SOURCE}, odometry={'odom': OdometrySource(sigma_scale=1.0)}))
+    go_on(claimed, drive(8, 1e-3, drift=4.0))
+    claimed.finish()
+    return claimed.graph.edges
+
+
+def test_an_odometry_that_drifts_more_than_it_claims_gets_more_noise() -> None:
     events = drive(8, 1e-3, drift=4.0)
     backend = fed(events[:240])
-    assert backend._tuner.odometry_scale > 2.0
-    assert np.ptp(weights_of_odometry(backend)) < 1e-12     # those that came later as well
+    assert np.sqrt(backend.estimate().odometry_errors.way) > 2.0
     for each in (backend, PoseGraphBackend.restored(backend._config, backend.saved())):
         go_on(each, events[230:])   # again what waited for odometry when it was saved
         each.optimize()
-        scale = each._tuner.odometry_scale
-        assert 2.0 < scale < 6.0
-        np.testing.assert_allclose(weights_of_odometry(each), scale**-2)
-    claimed = PoseGraphBackend(BackendConfig(
-        measurements={'fix': SOURCE}, odometry={'odom': OdometrySource(sigma_scale=scale)}))
-    go_on(claimed, events)
-    claimed.optimize()
-    np.testing.assert_allclose(path(claimed), path(each), atol=1e-6)
+        errors = each.estimate().odometry_errors
+        assert 2.0 < np.sqrt(errors.way) < 6.0
+        if errors.rate == 0.0:
+            np.testing.assert_allclose(sigmas_of_odometry(each), np.sqrt(errors.way), rtol=0.1)
+    np.testing.assert_allclose(path(each), path(backend), atol=1e-6)
 
 
 @pytest.mark.parametrize('scale', [0.0, 1.0])
-def test_an_odometry_as_it_claims_or_whose_scale_is_given_keeps_its_weight(scale: float) -> None:
-    """The paths are those without a scale, to the bit."""
+def test_an_odometry_as_it_claims_or_whose_scale_is_given_keeps_its_noise(scale: float) -> None:
     source = OdometrySource(sigma_scale=scale)
     backend = PoseGraphBackend(BackendConfig(
         measurements={'fix': SOURCE}, odometry={'odom': source}))
     go_on(backend, drive(8, 1e-3, drift=4.0 if scale > 0.0 else 1.0))
     backend.optimize()
-    assert backend._tuner.odometry_scale == 1.0
-    assert set(weights_of_odometry(backend)) == {1.0}
+    assert backend.estimate().odometry_errors == AS_CLAIMED
 
 
-def test_the_weight_of_odometry_stays_if_the_solver_fails_with_another_one(
+def test_the_noise_of_odometry_stays_if_the_solver_fails_with_another_one(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     backend = fed(drive(9, 1e-3, n=60))
@@ -247,12 +257,12 @@ def test_the_weight_of_odometry_stays_if_the_solver_fails_with_another_one(
     before = path(backend)
     monkeypatch.setattr(backend._smoother, 'update', lambda _: UpdateResult(
         Status.FAILED, 'for once', 0, 0, 0, 0))
-    backend._factors.constraints('fix').odometry_scale = 3.0
+    backend._factors.constraints('fix').odometry = OdometryErrors.scaled(3.0)
     backend._tuner.step()
     monkeypatch.undo()
     assert backend._tuner.n_failures == 1
     assert backend._tuner.is_idle
-    assert set(weights_of_odometry(backend)) == {1.0}
+    assert backend.estimate().odometry_errors == AS_CLAIMED
     np.testing.assert_array_equal(path(backend), before)
 
 

@@ -9,10 +9,17 @@ import pytest
 
 from pose_graph_ros.core.batch.optimizer import to_the_end
 from pose_graph_ros.core.geometry import se2
-from pose_graph_ros.core.graph.constraints import EdgeKind, Edges, ObservedKind, ObservedNodes
+from pose_graph_ros.core.graph.constraints import (
+    EdgeKind,
+    Edges,
+    ObservedKind,
+    ObservedNodes,
+    upper,
+)
 from pose_graph_ros.core.graph.graph import Graph, GraphUpdate
+from pose_graph_ros.core.odometry.odometry_errors import AS_CLAIMED, OdometryErrors
 from pose_graph_ros.core.sources import error_estimate
-from pose_graph_ros.core.sources.error_estimate import measured_path, search
+from pose_graph_ros.core.sources.error_estimate import measured_path, PathOdometry, search
 from pose_graph_ros.core.sources.error_likelihood import (
     chain_motions,
     filtered,
@@ -63,7 +70,13 @@ def a_drive(
     seen[jumps] += rng.uniform(-50.0, 50.0, (np.sum(jumps), 2))
     told = steps * (1.0 + longer, 1.0, 1.0) + (0.0, 0.0, rate * period)
     return MeasuredPath(period * np.arange(n), seen, np.ones(n), np.zeros((n, 2)), told,
-                        np.tile(cov, (n, 1, 1)), np.tile((cov[0, 0], 0.0, cov[1, 1]), (n, 1)))
+                        np.tile(cov, (n, 1, 1)), np.tile((cov[0, 0], 0.0, cov[1, 1]), (n, 1)),
+                        levers(told, np.full(n, period)), np.zeros((n, 2)))
+
+
+def levers(motion: np.ndarray, seconds: np.ndarray) -> np.ndarray:
+    """Return how a yaw rate changes short motions."""
+    return np.column_stack((-0.5 * seconds * motion[:, 1], 0.5 * seconds * motion[:, 0], seconds))
 
 
 @pytest.mark.parametrize('constant', [False, True])
@@ -77,7 +90,8 @@ def test_the_likelihood_is_that_of_the_full_covariance(*, constant: bool) -> Non
     position = np.column_stack((np.arange(n), np.zeros(n))) + 0.3 * rng.standard_normal((n, 2))
     given = MeasuredPath(seconds, position, variance, np.zeros((n, 2)),
                          np.tile((1.0, 0.0, 0.0), (n, 1)), np.tile(cov, (n, 1, 1)),
-                         np.tile((0.04, 0.0, 0.09), (n, 1)))
+                         np.tile((0.04, 0.0, 0.09), (n, 1)), np.zeros((n, 3)), np.zeros((n, 2)))
+    given = given._replace(lever=levers(given.motion, np.diff(seconds, prepend=0.0)))
     sigma = np.sqrt(variance)
     bias = correlated * np.outer(sigma, sigma) * np.exp(
         -np.abs(np.subtract.outer(seconds, seconds)) / tau)
@@ -95,7 +109,7 @@ def test_the_likelihood_is_that_of_the_full_covariance(*, constant: bool) -> Non
                 + constant * slow * np.outer(shape, shape))
         off = position[:, axis] - np.arange(n) * (axis == 0) - position[0, axis]
         expected += np.linalg.slogdet(full)[1] + off @ np.linalg.solve(full, off)
-    found, n_lost = filtered(
+    found, n_lost, *_ = filtered(
         *given, tau, correlated, odometry, 3.0, white, 0.0, constant)   # no noise of turns
     assert n_lost == 0
     assert found == pytest.approx(expected, abs=0.05)
@@ -199,8 +213,9 @@ def test_the_noise_of_odometry_is_found_where_it_is_more_than_claimed(
     drift: float, tau: float, n: int,
 ) -> None:
     """Odometry that is as it says keeps its noise; a better one as well, beside slow errors."""
-    scales = [to_the_end(search(a_drive(seed, n=n, tau=tau, drift=drift))).odometry_scale
+    scales = [to_the_end(search(a_drive(seed, n=n, tau=tau, drift=drift))).odometry.way
               for seed in range(5)]
+    scales = np.sqrt(scales).tolist()
     assert max(drift, 1.0) / 1.35 < np.median(scales) < 1.35 * max(drift, 1.0)
     assert drift > 1.0 or sum(scale > 1.0 for scale in scales) <= 1
 
@@ -208,15 +223,20 @@ def test_the_noise_of_odometry_is_found_where_it_is_more_than_claimed(
 @pytest.mark.parametrize('settings', [
     {'drift': 0.1}, {'drift': 0.3}, {'drift': 0.1, 'longer': 0.01}, {'drift': 0.1, 'rate': 0.002},
     {'drift': 0.3, 'turns': 3.0}, {'drift': 1.0, 'turns': 0.1}], ids=str)
-def test_better_odometry_gets_no_less_noise_than_what_is_likely(
+def test_the_noise_of_way_and_turns_and_constant_errors_are_found(
     settings: dict[str, float],
 ) -> None:
-    """The factor of the graph is that of way and turn, and it has to cover constant errors."""
-    scales = [to_the_end(search(a_drive(seed, n=400, speed=8.0, **settings))).odometry_scale
-              for seed in range(6)]
-    worse = settings['drift'] * max(1.0, settings.get('turns', 1.0))
-    assert all(0.7 * worse < scale < 1.5 for scale in scales)
-    assert len(settings) > 1 or np.median(scales) < 4.0 * worse
+    found = [to_the_end(search(a_drive(seed, n=400, speed=8.0, **settings))).odometry
+             for seed in range(6)]
+    way = settings['drift']
+    turn = way * settings.get('turns', 1.0)
+    for each in found:
+        assert 0.7 * way < np.sqrt(each.way) < 1.5  # fixes of 1 m hardly show it
+        assert 0.5 * turn < np.sqrt(each.turn) < 4.0 * turn
+    assert np.median([each.rate for each in found]) == pytest.approx(
+        -settings.get('rate', 0.0), abs=5e-4)
+    assert np.median([each.scale for each in found]) == pytest.approx(
+        -settings.get('longer', 0.0), abs=2e-3)
 
 
 def line(n: int) -> Graph:
@@ -236,11 +256,16 @@ def line(n: int) -> Graph:
     return graph
 
 
+def odometry_of(n: int, **errors: float) -> PathOdometry:
+    """Return that of nodes at every second, with errors that the edges do not know of."""
+    return PathOdometry(np.arange(n), SECOND * np.arange(n), AS_CLAIMED, OdometryErrors(**errors))
+
+
 def test_a_path_has_the_motions_of_the_primary_odometry_in_the_order_of_stamps() -> None:
     graph, rng = line(30), np.random.default_rng(0)
     rows = np.sort(rng.choice(30, 12, replace=False))
     some = rng.permutation(rows)
-    found = to_the_end(measured_path(graph, SECOND * (some + 5), some))
+    found = to_the_end(measured_path(graph, odometry_of(30), SECOND * (some + 5), some))
     np.testing.assert_allclose(found.seconds, rows - rows[0])
     np.testing.assert_allclose(found.position, np.column_stack((rows + 0.2, np.full(12, 0.1))))
     np.testing.assert_allclose(found.variance, 0.25)
@@ -251,16 +276,14 @@ def test_a_path_has_the_motions_of_the_primary_odometry_in_the_order_of_stamps()
 
 def test_chained_motions_are_those_of_an_oracle() -> None:
     rng, n = np.random.default_rng(4), 20
-    motion = rng.normal(0.0, 1.0, (n, 3))
+    motion, seconds = rng.normal(0.0, 1.0, (n, 3)), rng.uniform(0.5, 2.0, n)
     root = rng.normal(0.0, 0.1, (n, 3, 3)) + np.eye(3)
     noise, until = root @ np.swapaxes(root, 1, 2), np.array((2, 2, 7, 20))
-    graph, poses = Graph(), np.arange(n)
-    graph.apply(GraphUpdate(hidden=np.zeros((n + 1, 3)), fix=(0,), edges=Edges(
-        poses, poses + 1, motion, np.linalg.inv(noise), [EdgeKind.ODOMETRY] * n)))
-    edge_after = np.where(poses == 10, -1, poses)
-    got, spread, ways = np.zeros((4, 3)), np.zeros((4, 3, 3)), np.zeros((4, 3))
+    information = np.ascontiguousarray(upper(np.linalg.inv(noise)))
+    information[10] = 0.0
+    got, spread, ways, lever = np.zeros((4, 3)), np.zeros((4, 3, 3)), *np.zeros((2, 4, 3))
     for part in ((0, 3), (3, 4)):
-        chain_motions(graph.memory['edge_f'], edge_after, until, *part, got, spread, ways)
+        chain_motions(motion, information, seconds, until, *part, got, spread, ways, lever)
     motion[10], noise[10] = 0.0, np.diag(NO_ODOMETRY)
     for k in range(1, 4):
         pose, cov, way = np.zeros(3), np.zeros((3, 3)), np.zeros((2, 2))
@@ -273,10 +296,33 @@ def test_chained_motions_are_those_of_an_oracle() -> None:
         assert se2.wrap(got[k, 2] - pose[2]) == pytest.approx(0.0, abs=1e-12)
         np.testing.assert_allclose(spread[k], cov, rtol=1e-10, atol=1e-10)
         np.testing.assert_allclose(ways[k], way[[0, 0, 1], [0, 1, 1]], rtol=1e-10, atol=1e-10)
+        ends = []
+        for rate in (-1e-4, 1e-4):
+            turned = OdometryErrors(rate=rate).motions(motion, seconds)
+            turned[10] = 0.0
+            pose = np.zeros(3)
+            for row in range(until[k - 1], until[k]):
+                pose = se2.compose(pose, turned[row])
+            ends.append(pose)
+        by_rate = (ends[1] - ends[0]) / 2e-4
+        np.testing.assert_allclose(lever[k, :2], by_rate[:2], rtol=1e-6, atol=1e-6)
+        assert lever[k, 2] == pytest.approx(np.sum(seconds[until[k - 1]:until[k]]))
+
+
+def test_a_path_without_known_errors_is_as_likely_with_them_as_states() -> None:
+    """What is taken out of the motions is not taken out of their prior."""
+    graph, ids = line(40), np.arange(40)
+    values = []
+    for errors in ({}, {'rate': 1e-5, 'scale': 1e-4}):
+        path = to_the_end(measured_path(graph, odometry_of(40, **errors), SECOND * ids, ids))
+        value, _, rate, scale, *_ = filtered(
+            *path, 1.0, 0.0, 1.0, 1.0, 1.0, 0.0, True)  # noqa: FBT003
+        values.append((value, rate, scale))
+    np.testing.assert_allclose(values[1], values[0], rtol=1e-4, atol=1e-6)
 
 
 def test_a_long_path_is_joined_in_steps(monkeypatch: pytest.MonkeyPatch) -> None:
-    arguments = line(40), SECOND * np.arange(40), np.arange(40)
+    arguments = line(40), odometry_of(40), SECOND * np.arange(40), np.arange(40)
     at_once = to_the_end(measured_path(*arguments))
     monkeypatch.setattr(error_estimate, 'NODES_PER_STEP', 7)
     assert len(list(measured_path(*arguments))) >= 40 // 7
@@ -289,6 +335,7 @@ def test_of_many_positions_the_newest_and_a_sample_of_the_others_are_used(
 ) -> None:
     monkeypatch.setattr(error_estimate, 'NEWEST', 10)
     monkeypatch.setattr(error_estimate, 'OLDER', 5)
-    found = to_the_end(measured_path(line(40), SECOND * np.arange(40), np.arange(40)))
+    found = to_the_end(measured_path(
+        line(40), odometry_of(40), SECOND * np.arange(40), np.arange(40)))
     assert len(found.seconds) == 15
     np.testing.assert_allclose(found.seconds[-10:], np.arange(30, 40))

@@ -11,8 +11,9 @@ from pose_graph_ros.core.batch.optimizer import to_the_end
 from pose_graph_ros.core.geometry import se2
 from pose_graph_ros.core.graph.constraints import EdgeKind, Edges, ObservedKind, ObservedNodes
 from pose_graph_ros.core.graph.graph import Graph, GraphUpdate, NextIds
+from pose_graph_ros.core.odometry.odometry_errors import AS_CLAIMED
 from pose_graph_ros.core.sources import past_path
-from pose_graph_ros.core.sources.error_estimate import left_behind, measured_path
+from pose_graph_ros.core.sources.error_estimate import left_behind, measured_path, PathOdometry
 from pose_graph_ros.core.sources.error_models import InflatedWeights
 from pose_graph_ros.core.sources.gauss_markov import Additions, GaussMarkovBias
 from pose_graph_ros.core.sources.waiting import SeenStamps
@@ -123,20 +124,26 @@ def drive(seed: int, n: int) -> tuple[Graph, np.ndarray, np.ndarray]:
     return graph, nodes * SECOND, np.arange(len(nodes))
 
 
+ODOMETRY = PathOdometry(np.arange(100), SECOND * np.arange(100), AS_CLAIMED, AS_CLAIMED)
+
+
 @settings(max_examples=20)
 @given(st.integers(0, 2**32 - 1))
 def test_the_measured_path_goes_on_before_the_window(seed: int) -> None:
     n = 30
     graph, stamps_ns, ids = drive(seed, n)
-    whole, past = to_the_end(measured_path(graph, stamps_ns, ids)), None
+    whole, past = to_the_end(measured_path(graph, ODOMETRY, stamps_ns, ids)), None
     for first in (0, 4, 5, 17):
         begin = int(graph.node_ids[0])
         gone = np.flatnonzero((stamps_ns >= begin * SECOND) & (stamps_ns < first * SECOND))
-        past = left_behind(graph, stamps_ns[gone], ids[gone], past, first)
+        past = left_behind(
+            graph, ODOMETRY, stamps_ns[gone], ids[gone], past=past, node=first)
         graph.begin()
         graph.apply(GraphUpdate(remove_nodes=tuple(range(begin, first))))
         graph.commit()
-        again = to_the_end(measured_path(graph, stamps_ns, ids, past))
+        again = to_the_end(measured_path(graph, ODOMETRY, stamps_ns, ids, past))
+        for each in (whole, again):
+            each.motion[:, 2] = se2.wrap(each.motion[:, 2])
         for one, other in zip(whole, again, strict=True):
             np.testing.assert_allclose(one[1:], other[1:], atol=1e-9)
     assert past is not None
@@ -158,10 +165,11 @@ def test_the_measured_path_goes_on_before_the_window(seed: int) -> None:
 def test_the_past_is_bounded() -> None:
     path = past_path.no_past(0)
     graph, stamps_ns, ids = drive(1, 12)
-    part = to_the_end(measured_path(graph, stamps_ns, ids))
+    part = to_the_end(measured_path(graph, ODOMETRY, stamps_ns, ids))
     grown = part._replace(motion=np.zeros((len(ids) + 1, 3)),
                           noise=np.tile(np.eye(3), (len(ids) + 1, 1, 1)),
-                          way=np.tile((1.0, 0.0, 1.0), (len(ids) + 1, 1)))
+                          way=np.tile((1.0, 0.0, 1.0), (len(ids) + 1, 1)),
+                          lever=np.zeros((len(ids) + 1, 3)))
     for k in range(600):
         path = path.extended(stamps_ns + k * 100 * SECOND, grown, 0)
         assert len(path.stamps_ns) <= 2 * past_path.KEPT
