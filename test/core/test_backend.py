@@ -251,7 +251,8 @@ def test_the_path_is_near_the_truth_and_exact_without_noise() -> None:
     at = np.searchsorted(stamps, backend.estimate().path.stamps_ns)
     # interpolating straight between samples of a curve costs 0.4 mm
     np.testing.assert_allclose(path(backend), exact.truth[at], atol=2e-3)
-    assert backend.estimate().chi2 < 1e-3
+    # odometry is found to be that good, so that the millimetre counts for more
+    assert backend.estimate().chi2 < 2e-2
 
 
 # --- Answers ---------------------------------------------------------------------------------

@@ -15,6 +15,7 @@ from pose_graph_ros.core.geometry import covariance, se2
 from pose_graph_ros.core.geometry.se2 import FloatArray
 from pose_graph_ros.core.measurements import GlobalPose, OdometrySample
 from pose_graph_ros.core.odometry.motion import Motion, NO_MOTION, odometry_covariance
+from pose_graph_ros.core.odometry.odometry_errors import OdometryErrors
 from pose_graph_ros.core.prediction import predict
 
 SECOND = 1_000_000_000
@@ -109,11 +110,16 @@ SOURCES = st.builds(
     covariance_scale=st.floats(0.01, 100.0), sigma_scale=st.just(0.0))
 
 
+ERRORS = st.builds(
+    OdometryErrors, st.floats(0.01, 100.0), st.floats(0.01, 100.0), st.floats(-0.1, 0.1),
+    st.floats(-0.1, 0.1))
+
+
 @given(poses, poses, poses, st.integers(0, 2**32 - 1), st.booleans(), SOURCES,
-       st.floats(0.1, 10.0), st.booleans())
+       ERRORS, st.booleans())
 def test_plain_numbers_say_what_matrices_say(  # noqa: PLR0917
     T_map_base: FloatArray, T_odom_base: FloatArray, now: FloatArray, seed: int, near: bool,
-    source: OdometrySource, scale: float, has_twist: bool,
+    source: OdometrySource, errors: OdometryErrors, has_twist: bool,
 ) -> None:
     if not ESTIMATE:
         backend = PoseGraphBackend()
@@ -126,7 +132,7 @@ def test_plain_numbers_say_what_matrices_say(  # noqa: PLR0917
     root, twist = rng.normal(0.0, 1.0, (3, 3)), rng.uniform(0.01, 1.0, 3)
     estimate = replace(
         ESTIMATE[0], T_map_base=T_map_base, T_odom_base=T_odom_base, covariance=root @ root.T,
-        odometry=source, odometry_scale=scale)
+        odometry=source, odometry_errors=errors)
     prediction = predict(estimate, OdometrySample(
         estimate.stamp_ns + SECOND // 10, now, twist_variance=twist if has_twist else None))
     increment = se2.between(T_odom_base, now)
@@ -136,9 +142,11 @@ def test_plain_numbers_say_what_matrices_say(  # noqa: PLR0917
     if by_twist:
         rests = step < 0.01 and turn < 0.01
         motion = Motion(increment, 0.0, 0.0, twist * (0.0 if rests else 0.1))
+    claimed = source.covariance_scale * odometry_covariance(source.noise, motion, floor=False)
+    seconds = np.array((0.1,))
+    increment = errors.motions(increment[None], seconds)[0]
     expected = covariance.propagated(
-        T_map_base, estimate.covariance, increment, scale**2 * source.covariance_scale
-        * odometry_covariance(source.noise, motion, floor=False))
+        T_map_base, estimate.covariance, increment, errors.covariances(claimed[None])[0])
     pose = se2.compose(T_map_base, increment)
     np.testing.assert_allclose(prediction.T_map_base[:2], pose[:2], rtol=0.0, atol=1e-10)
     assert abs(se2.wrap(prediction.T_map_base[2] - pose[2])) < 1e-12

@@ -108,7 +108,6 @@ def chain_motions(  # type: ignore[no-untyped-def]
                 cov[2, 2] += NO_ODOMETRY[2]
                 way_xx += NO_ODOMETRY[0]
                 way_yy += NO_ODOMETRY[1]
-                time += seconds[n]
                 continue
             dx, dy, turn = means[n]
             c, s = math.cos(turn), math.sin(turn)
