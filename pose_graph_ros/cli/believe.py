@@ -6,7 +6,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from pose_graph_ros.cli.solve_starts import METHODS
+from pose_graph_ros.cli.arguments import METHODS
 from pose_graph_ros.core.batch import gnc
 from pose_graph_ros.core.batch.optimizer import (
     optimize,

@@ -1,11 +1,6 @@
 # Copyright 2026 The pose_graph_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""
-Draw a small graph: as pose graph, factor graph, Markov random field or dynamic Bayesian network.
-
-The suffix of the picture's name says what it is: .svg, .png, or .dot for Graphviz. Hidden nodes
-stand where they are in the file, to scale where there is room; ids are those of the file.
-"""
+"""Draw a small graph."""
 
 import argparse
 from collections.abc import Sequence
@@ -16,7 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from pose_graph_ros.cli.graph_input import add_graph, NamedRows, read, rows_of
+from pose_graph_ros.cli.graph_input import NamedRows, read, rows_of
 from pose_graph_ros.core.exceptions import ConfigError
 from pose_graph_ros.core.geometry.se2 import IntArray
 from pose_graph_ros.offline.drawing.diagram import Diagram, diagram, View
@@ -26,50 +21,6 @@ from pose_graph_ros.offline.drawing.pattern import elimination_order, Pattern, p
 from pose_graph_ros.offline.drawing.structure import part, Structure, structure, within
 
 N_MOST = 200  # hidden nodes in a picture; with more of them names can't be read
-SUFFIXES = ('.svg', '.png', '.dot')
-EXAMPLES = """
-examples:
-  pose-graph draw --example -o states.svg             five states of a graph, with H
-  pose-graph draw graph.g2o -o graph.svg --pattern
-  pose-graph draw graph.g2o --as factor-graph -o factors.png
-  pose-graph draw map.json --as dbn --nodes 0:20 -o start.svg
-  pose-graph draw graph.g2o --around 17 --hops 3 -o near.dot
-"""
-
-
-def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Add the arguments of this tool."""
-    add_graph(parser, nargs='?')
-    parser.add_argument('-o', '--out', metavar='PICTURE', type=_picture, required=True,
-                        help='.svg, .png or .dot file')
-    parser.add_argument('--as', dest='view', choices=[view.value for view in View],
-                        default=View.POSE_GRAPH.value, help='(default: %(default)s)')
-    parser.add_argument('--pattern', action='store_true',
-                        help='with the pattern of H, its blocks in the order of the nodes')
-    parser.add_argument('--ordering', choices=('file', 'elimination'), default='file',
-                        help='order of the blocks of H; elimination: a fill-reducing one, with '
-                             'the fill of the factor R (default: %(default)s)')
-    parser.add_argument('--headings', action='store_true', help='show where poses head')
-    chosen = parser.add_mutually_exclusive_group()
-    chosen.add_argument('--nodes', metavar='IDS', help='draw only these, such as 3,7,20:25')
-    chosen.add_argument('--around', metavar='ID', type=int,
-                        help='draw only this node and those near it')
-    parser.add_argument('--hops', metavar='K', type=int, default=2,
-                        help='with --around: how many constraints away (default: %(default)s)')
-    parser.add_argument('--example', action='store_true',
-                        help='draw five states of a growing graph, with --pattern, in place of a '
-                             'file')
-    parser.add_argument('--json', action='store_true',
-                        help='print what is drawn as JSON (docs/tools.md)')
-    parser.epilog = EXAMPLES
-
-
-def _picture(text: str) -> Path:
-    """Return the path of a picture whose format is known."""
-    if Path(text).suffix.lower() not in SUFFIXES:
-        raise argparse.ArgumentTypeError(
-            f'expected a name that ends with {", ".join(SUFFIXES)}, got {text!r}')
-    return Path(text)
 
 
 def execute(options: argparse.Namespace) -> int:

@@ -2,12 +2,11 @@
 # SPDX-License-Identifier: Apache-2.0
 """Write the corrected path in the formats that other programs read."""
 
-import argparse
 from collections.abc import Callable, Iterator
 from pathlib import Path
-from typing import NamedTuple
 
 from pose_graph_ros.adapters.fixes import Datum
+from pose_graph_ros.cli.arguments import Exports
 from pose_graph_ros.core.alignment.monitor import AlignmentState
 from pose_graph_ros.core.backend import PoseGraphBackend
 from pose_graph_ros.core.estimate import Estimate
@@ -16,48 +15,11 @@ from pose_graph_ros.core.geometry.se2 import FloatArray
 from pose_graph_ros.core.io.path_files import csv_lines, kitti_lines
 from pose_graph_ros.core.io.track_files import geojson_lines, gpx_lines, kml_lines
 
-ON_EARTH = {'geojson': geojson_lines, 'kml': kml_lines, 'gpx': gpx_lines}
-"""Formats whose positions are latitudes and longitudes."""
-FORMATS = ('kitti', 'csv', *ON_EARTH)
-"""Formats by name, which is also the ending of the file."""
-ALL = 'all'
+LINES = {'geojson': geojson_lines, 'kml': kml_lines, 'gpx': gpx_lines}
 
 
 class ExportError(PoseGraphError, ValueError):
     """A path cannot be written in a format."""
-
-
-class Exports(NamedTuple):
-    """Formats that were asked for."""
-
-    formats: tuple[str, ...] = ()
-    strict: bool = True
-    """Whether it is an error if one of them cannot be written."""
-
-    @property
-    def on_earth(self) -> str:
-        """The formats that need a datum, as a text; empty if there are none."""
-        return ', '.join(name for name in self.formats if name in ON_EARTH)
-
-
-def add_exports(parser: argparse.ArgumentParser) -> None:
-    """Add the option that chooses formats."""
-    parser.add_argument(
-        '--export', metavar='FORMATS', type=parse_exports, default=Exports(),
-        help=f'more files with the path: {", ".join(FORMATS)}, separated by commas, or {ALL}; '
-             f'{", ".join(ON_EARTH)} need fixes or a datum')
-
-
-def parse_exports(text: str) -> Exports:
-    """Return the formats that a comma-separated text names; raises ArgumentTypeError."""
-    if text == ALL:
-        return Exports(FORMATS, strict=False)
-    names = tuple(dict.fromkeys(name.strip() for name in text.split(',')))
-    for name in names:
-        if name not in FORMATS:
-            raise argparse.ArgumentTypeError(
-                f'{name!r} is no format; expected {ALL} or some of {", ".join(FORMATS)}')
-    return Exports(names)
 
 
 def require_datum(exports: Exports, *, known: bool) -> None:
@@ -99,7 +61,7 @@ def write_exports(
             lines = csv_lines(estimate.path, covariances(backend, estimate))
         elif placed:
             assert datum is not None
-            lines = _on_earth(ON_EARTH[name], estimate, datum, title)
+            lines = _on_earth(LINES[name], estimate, datum, title)
         else:
             continue
         written.append(folder / f'path.{name}')

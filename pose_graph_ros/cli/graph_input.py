@@ -2,7 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Read a graph from a g2o file or a saved graph, and choose its nodes by their ids in the file."""
 
-import argparse
 from pathlib import Path
 import re
 import sys
@@ -14,7 +13,7 @@ from pose_graph_ros.core.exceptions import ConfigError
 from pose_graph_ros.core.geometry.se2 import IntArray
 from pose_graph_ros.core.graph.graph_update import GraphRows
 from pose_graph_ros.core.io.edge2_order import Guess, read_guessed
-from pose_graph_ros.core.io.g2o import EDGE2_ORDERS, GraphFile, read_g2o
+from pose_graph_ros.core.io.g2o import GraphFile, read_g2o
 
 N_TAGS = 10  # number of tags that are warned of
 SAVED = b'{\n"sha256": "'
@@ -26,15 +25,6 @@ class NamedRows(NamedTuple):
 
     rows: GraphRows
     ids: IntArray
-
-
-def add_graph(parser: argparse.ArgumentParser, *, nargs: str | None = None) -> None:
-    """Add the arguments that give a graph."""
-    parser.add_argument('graph', type=Path, nargs=nargs,
-                        help='g2o file, or saved graph (its .json file, or the .g2o file beside '
-                             'it)')
-    parser.add_argument('--edge2', choices=EDGE2_ORDERS,
-                        help='format of the tag EDGE2 in this file (default: found out)')
 
 
 def read(path: Path, edge2_order: str | None) -> NamedRows:

@@ -1,20 +1,11 @@
 # Copyright 2026 The pose_graph_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""
-Run bags or a g2o file through the engine of the node, without ROS and as fast as possible.
-
-Bags may be of ROS 1 or ROS 2 and compressed; several are read in the order of recording. Messages
-are read and added as in the node, but without threads, and the same full optimisation follows at
-the end. The path is the one of a node that receives the same messages. Of a g2o file, edges to the
-next vertex are odometry, with the noise of the file (odom.noise:=model takes that of the
-parameters); all others are loop closures, which come when their later end is reached.
-"""
+"""Run bags or a g2o file through the engine of the node, without ROS."""
 
 import argparse
 from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import ExitStack
-from pathlib import Path
 import time
 from types import MappingProxyType
 from typing import Any, NamedTuple
@@ -43,7 +34,6 @@ from pose_graph_ros.cli import options as shared
 from pose_graph_ros.cli.corrected_bag import LATCHED, write_corrected
 from pose_graph_ros.cli.evaluation import Drive, evaluate
 from pose_graph_ros.cli.exports import (
-    add_exports,
     covariances,
     require_datum,
     write_exports,
@@ -62,18 +52,11 @@ from pose_graph_ros.core.batch.optimizer import Status
 from pose_graph_ros.core.estimate import Estimate, UpdateReport
 from pose_graph_ros.core.geometry.geodesy import MapOrigin
 from pose_graph_ros.core.geometry.trajectory import Trajectory
-from pose_graph_ros.core.io.g2o import EDGE2_ORDERS
 from pose_graph_ros.core.io.g2o_writing import write_g2o
 from pose_graph_ros.core.judgement.texts import Key, short, states_by_stamps
 from pose_graph_ros.core.judgement.verdicts import State, Verdict
 from pose_graph_ros.core.measurements import Answer, LoopClosure, Measurement, OdometrySample
 
-EXAMPLES = """examples:
-  pose-graph replay my_bag --odom /wheel/odometry --fix /gnss/fix -o tuesday
-  pose-graph replay monday.bag tuesday.bag --until 600 --export kitti,csv
-  pose-graph replay my_bag --export gpx,geojson --bag corrected_bag
-  pose-graph replay my_bag --hold-out 5 --json | jq .errors
-"""
 UPDATE_EVERY = 10  # new hidden nodes after which the graph is updated, to stay near the optimum
 
 
@@ -189,54 +172,6 @@ def run_measurements(
         if live is not None:
             live.add(measurement, source)
     return backend, backend.optimize()
-
-
-def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Add the arguments of this tool."""
-    parser.add_argument('bags', metavar='BAG', type=Path, nargs='+',
-                        help='rosbag2 folder, .mcap, .db3, ROS 1 .bag; or one .g2o or .graph file')
-    parser.add_argument('-o', '--out', metavar='DIR', type=Path, default=Path('replay'),
-                        help='folder for the results (default: %(default)s)')
-    add_exports(parser)
-    parser.add_argument('--bag', metavar='OUT', type=Path, dest='new_bag',
-                        help='new rosbag2 folder with all messages, the corrected path, odometry '
-                             'in the map and the transform from map to odom; its poses know all '
-                             'that came later')
-    parser.add_argument('--live', action='store_true',
-                        help='also write live.csv: the poses that a robot would have had at each '
-                             'moment, with their covariances')
-    parser.add_argument('--json', action='store_true',
-                        help='print the contents of summary.json instead of a text')
-    add_sources(parser)
-    shared.add_inputs(parser)
-    shared.add_parameters(parser)
-    parser.epilog = EXAMPLES
-
-
-def add_sources(parser: argparse.ArgumentParser) -> None:
-    """Add the options that say which part of a bag is read, and how a .g2o file is."""
-    add_span(parser)
-    parser.add_argument('--stamps', metavar='FILE', type=Path,
-                        help='text file with the stamps [s] of the vertices of a .g2o file '
-                             '(default: a second apart)')
-    parser.add_argument('--edge2', choices=EDGE2_ORDERS,
-                        help='format of the tag EDGE2 in a .g2o file')
-
-
-def add_span(parser: argparse.ArgumentParser) -> None:
-    """Add the options that say which part of a bag is read."""
-    parser.add_argument('--from', metavar='SECONDS', type=_seconds, dest='begin', default=None,
-                        help='leave out what was recorded before, counted from the first message')
-    parser.add_argument('--until', metavar='SECONDS', type=_seconds,
-                        help='leave out what was recorded from then on')
-
-
-def _seconds(text: str) -> float:
-    """Return a time [s], 0 included."""
-    value = float(text)
-    if not 0.0 <= value < np.inf:
-        raise argparse.ArgumentTypeError(f'expected a finite number of at least 0, got {text}')
-    return value
 
 
 def execute(options: argparse.Namespace) -> int:

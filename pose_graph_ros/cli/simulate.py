@@ -1,16 +1,6 @@
 # Copyright 2026 The pose_graph_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""
-Simulate a drive with known ground truth, and write it as a rosbag2 or as a g2o file.
-
-Worlds: `drive`, a car that laps some city blocks twice; `hall`, a robot in the aisles of a hall;
-`grid`, a walk at random through the streets of a small Manhattan. Each has the sensors and the
-disturbances that are usual there; options change them. Equal options give equal drives, and what
-is said of one sensor changes no other.
-
-A bag has the true poses on /ground_truth. What was false, moved or left out is in OUT_truth.json;
-of a graph OUT.g2o the truth is in OUT_truth.g2o, with the same ids.
-"""
+"""Simulate a drive with known ground truth, and write it as a rosbag2 or as a g2o file."""
 
 import argparse
 from collections.abc import Iterator, Mapping
@@ -20,67 +10,20 @@ from pathlib import Path
 from typing import Any
 
 from pose_graph_ros.cli.simulation_files import about_graph, graph_texts, write_recording
-from pose_graph_ros.cli.simulation_options import (
-    add_sensors,
-    changed,
-    number,
-    refuse_what_graphs_lack,
-)
+from pose_graph_ros.cli.simulation_options import changed, PICTURES, refuse_what_graphs_lack
 from pose_graph_ros.core.exceptions import ConfigError, FileWriteError
 from pose_graph_ros.core.io.atomic_files import write_files
 from pose_graph_ros.core.io.tum import tum_text
 from pose_graph_ros.offline.simulation.graph import graph_of, SimulatedGraph
 from pose_graph_ros.offline.simulation.recording import course, record, Recording
-from pose_graph_ros.offline.simulation.settings import Gyro, Setup
+from pose_graph_ros.offline.simulation.settings import DURATIONS_S, Gyro, NODE_DISTANCES, Setup
 from pose_graph_ros.offline.simulation.worlds import WORLDS
 
 GRAPH_SUFFIX = '.g2o'
-LONGEST_S = 100_000.0  # of a simulation, which takes 100 MB an hour
-PICTURES = ('.png', '.pdf', '.svg')
-EXAMPLES = """\
-examples:
-  pose-graph simulate city                                        # as in `pose-graph demo`
-  pose-graph simulate hall --world hall --duration 3600 --closures 0.5 --false-rate 0.1
-  pose-graph simulate gnss --world grid --closures 0 --fix-sigma 0.5 --fix-correlated 1,30
-  pose-graph simulate bad --outage /gps/fix:60:120 --jump /odom:200:3,0 --jump /gps/fix:250:20,5:30
-  pose-graph simulate late --delay /gps/fix:2:3 --duplicate /loop_closure:0.2 --gyro
-  pose-graph simulate city.g2o --world grid --duration 2300 --false-rate 0.3 --false-groups 9:5
-  pose-graph replay hall --odom /odom --truth /ground_truth
-
-exit code: 0 written, 2 wrong input
-"""
-
-
-def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Add the arguments of this tool."""
-    parser.epilog = EXAMPLES
-    parser.add_argument('out', metavar='OUT', type=Path,
-                        help='folder of the rosbag2, or a graph if the name ends in .g2o')
-    parser.add_argument('--world', choices=WORLDS, default='drive',
-                        help='(default: %(default)s)')
-    parser.add_argument('--duration', metavar='S', type=number(10.0, LONGEST_S),
-                        help='length [s] (default: ' + ', '.join(
-                            f'{each.duration_s:g} for {name}' for name, each in WORLDS.items())
-                        + ')')
-    parser.add_argument('--seed', metavar='N', type=number(0, whole=True), default=1,
-                        help='(default: %(default)s)')
-    add_sensors(parser)
-    out = parser.add_argument_group('output')
-    out.add_argument('--node-distance', metavar='M', type=number(0.01),
-                     help='distance of the nodes of a graph [m] (default: ' + ', '.join(
-                         f'{each.node_distance:g} for {name}' for name, each in WORLDS.items())
-                     + ')')
-    out.add_argument('--tum', action='store_true', help='also write the truth as OUT_truth.tum')
-    out.add_argument('--plot', metavar='FILE', type=Path,
-                     help=f'draw a map; the name ends in {", ".join(PICTURES)}')
-    out.add_argument('--json', action='store_true',
-                     help='print what was simulated, the content of OUT_truth.json, as JSON '
-                          '(docs/tools.md)')
 
 
 def execute(options: argparse.Namespace) -> int:
     """Run the tool; return the exit code."""
-    world = WORLDS[options.world]
     if options.plot is not None and options.plot.suffix not in PICTURES:
         raise ConfigError(f'--plot {options.plot}: the name must end in {", ".join(PICTURES)}')
     beside = {kind: options.out.with_name(f'{options.out.stem}_truth.{kind}'
@@ -98,13 +41,15 @@ def execute(options: argparse.Namespace) -> int:
     for path in written:
         if path.exists():
             raise FileWriteError(f'{path}: exists already, not overwritten')
-    way = course(world, options.seed, options.duration, lambda usual: changed(usual, options))
+    way = course(WORLDS[options.world], options.seed,
+                 options.duration or DURATIONS_S[options.world],
+                 lambda usual: changed(usual, options))
     about = {'world': options.world, 'seed': options.seed,
              'duration_s': float(way.motion.time[-1])}
     files = dict[Path, bytes]()
     simulated: SimulatedGraph | Recording
     if is_graph:
-        simulated = graph_of(way, options.node_distance or world.node_distance)
+        simulated = graph_of(way, options.node_distance or NODE_DISTANCES[options.world])
         about |= about_graph(way, simulated)
         files = {path: text.encode() for path, text in zip(
             (options.out, beside['g2o']), graph_texts(simulated), strict=True)}
