@@ -232,8 +232,7 @@ def draw(parser: argparse.ArgumentParser) -> None:
 
     It is drawn as pose graph, factor graph, Markov random field or dynamic Bayesian network.
     The suffix of the picture's name says what it is: .svg, .png, or .dot for Graphviz. Hidden
-    nodes stand where they are in the file, to scale where there is room; ids are those of the
-    file.
+    nodes stand where they are in the file, to scale; ids are those of the file.
     """
     _add_graph(parser, nargs='?')
     parser.add_argument('-o', '--out', metavar='PICTURE', type=_picture, required=True,
@@ -246,6 +245,8 @@ def draw(parser: argparse.ArgumentParser) -> None:
                         help='order of the blocks of H; elimination: a fill-reducing one, with '
                              'the fill of the factor R (default: %(default)s)')
     parser.add_argument('--headings', action='store_true', help='show where poses head')
+    parser.add_argument('--spring', action='store_true',
+                        help='hidden nodes apart from each other, as by springs, not to scale')
     chosen = parser.add_mutually_exclusive_group()
     chosen.add_argument('--nodes', metavar='IDS', help='draw only these, such as 3,7,20:25')
     chosen.add_argument('--around', metavar='ID', type=int,
