@@ -6,6 +6,7 @@ import argparse
 from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import ExitStack
+from dataclasses import asdict
 import time
 from types import MappingProxyType
 from typing import Any, NamedTuple
@@ -32,7 +33,7 @@ from pose_graph_ros.adapters.sources import (
 )
 from pose_graph_ros.cli import options as shared
 from pose_graph_ros.cli.corrected_bag import LATCHED, write_corrected
-from pose_graph_ros.cli.evaluation import Drive, evaluate
+from pose_graph_ros.cli.evaluation import consistency, consistency_lines, Drive, evaluate
 from pose_graph_ros.cli.exports import (
     covariances,
     require_datum,
@@ -274,8 +275,11 @@ def _report(
     counts = {f'{source}.{answer}': count for (source, answer), count
               in sorted((backend.counts + result.refused).items())}
     title = options.bags[0].stem
+    nees = {} if drive.truth is None or report.status is Status.FAILED else consistency(
+        drive, covariances(backend, estimate))
     table = write_results(drive, options.out, title, {
-        **facts, 'alignment': estimate.alignment.value,
+        **facts, **{f'nees_{name}': each and asdict(each) for name, each in nees.items()},
+        'alignment': estimate.alignment.value,
         'hidden_nodes': estimate.n_hidden, 'frozen_nodes': estimate.n_frozen,
         'thinned_nodes': estimate.n_thinned, 'edges': estimate.n_edges,
         'observed_nodes': estimate.n_observed, 'biases': estimate.n_biases,
@@ -301,6 +305,7 @@ def _report(
         print('counts: ' + ', '.join(f'{name} {count}' for name, count in counts.items()))
         names = ['drive.png', 'summary.json', 'run.json', 'graph.g2o',
                  *(path.name for path in exported)]
+        table = '\n'.join([table, *consistency_lines(nees)])
         print(f'\n{table}\n\nwritten: {options.out}/path.tum, {", ".join(names)}')
     return 0 if report.status is Status.CONVERGED else 1
 
