@@ -36,13 +36,12 @@ from pose_graph_ros.cli.corrected_bag import LATCHED, write_corrected
 from pose_graph_ros.cli.evaluation import consistency, consistency_lines, Drive, evaluate
 from pose_graph_ros.cli.exports import (
     covariances,
+    LivePoses,
     require_datum,
     write_exports,
     write_lines,
 )
-from pose_graph_ros.cli.g2o_inputs import GRAPH_SUFFIXES, read_measurements
-from pose_graph_ros.cli.judgement import judgement, judgement_lines
-from pose_graph_ros.cli.live import LivePoses
+from pose_graph_ros.cli.graph_input import GRAPH_SUFFIXES, read_measurements
 from pose_graph_ros.cli.progress import WatchedBag
 from pose_graph_ros.cli.results import collect_drive, with_refused, write_results
 from pose_graph_ros.cli.run.content import Run
@@ -54,11 +53,26 @@ from pose_graph_ros.core.estimate import Estimate, UpdateReport
 from pose_graph_ros.core.geometry.geodesy import MapOrigin
 from pose_graph_ros.core.geometry.trajectory import Trajectory
 from pose_graph_ros.core.io.g2o_writing import write_g2o
-from pose_graph_ros.core.judgement.texts import Key, short, states_by_stamps
-from pose_graph_ros.core.judgement.verdicts import State, Verdict
+from pose_graph_ros.core.judgement.texts import (
+    as_json,
+    is_notable,
+    Key,
+    ORDER,
+    sentence,
+    short,
+    states_by_stamps,
+    totals_text,
+)
+from pose_graph_ros.core.judgement.verdicts import (
+    Judged,
+    SourceVerdicts,
+    State,
+    Verdict,
+)
 from pose_graph_ros.core.measurements import Answer, LoopClosure, Measurement, OdometrySample
 
 UPDATE_EVERY = 10  # new hidden nodes after which the graph is updated, to stay near the optimum
+NAMED = 10  # number of constraints of a source that the text names
 
 
 class Replayed(NamedTuple):
@@ -335,3 +349,44 @@ def _lines(
     if 'new_bag' in facts:
         yield ('new bag: {original} messages copied, {left_out} left out, {corrected} poses of '
                'odometry corrected'.format(**facts['new_bag']))
+
+
+def judgement(
+    totals: Mapping[str, SourceVerdicts], verdicts: Sequence[Verdict],
+) -> dict[str, object]:
+    """
+    Return counts and scale of each source, and all closures and all that is not believed.
+
+    Parameters
+    ----------
+    totals : mapping, what is believed of each source
+
+    """
+    return {
+        'sources': {source: {
+            'states': {state.value: each.counts.get(state, 0) for state in ORDER},
+            'scale': each.scale, 'forgotten': each.n_forgotten}
+            for source, each in totals.items()},
+        'constraints': [as_json(each) for each in verdicts
+                        if each.kind is Judged.LOOP_CLOSURE or is_notable(each)]}
+
+
+def judgement_lines(
+    totals: Mapping[str, SourceVerdicts], verdicts: Sequence[Verdict],
+) -> Iterator[str]:
+    """
+    Yield a line for each source, and for the first of its constraints that are doubted.
+
+    Parameters
+    ----------
+    totals : mapping, what is believed of each source
+
+    """
+    for source, each in totals.items():
+        yield f'{source}: {totals_text(each)}'
+        doubted = [verdict for verdict in verdicts
+                   if verdict.source == source and verdict.state is State.DOUBTED]
+        for verdict in doubted[:NAMED]:
+            yield f'  {verdict.id}: {sentence(verdict)}'
+        if len(doubted) > NAMED:
+            yield f'  and {len(doubted) - NAMED} more, all of which are in summary.json'

@@ -20,8 +20,8 @@ from pose_graph_ros.core.exceptions import ConfigError, PoseGraphError
 from pose_graph_ros.core.geometry.se2 import FloatArray, IntArray
 
 if TYPE_CHECKING:
+    from pose_graph_ros.cli.believe import Doubt
     from pose_graph_ros.cli.marginals import Marginals
-    from pose_graph_ros.cli.solve_robust import Doubt
 
 TOLD = 1e-6  # relative error of covariances from which on it is told
 N_LARGEST = 5  # number of edges, of observed nodes, and of names, that are printed
@@ -173,7 +173,7 @@ def _decision(doubt: 'Doubt | None') -> dict[str, Any] | None:
 
 def _doubt(problem: Problem, options: argparse.Namespace) -> 'Doubt':
     """Decide about closures; what does so takes longer to load than all else here."""
-    from pose_graph_ros.cli.solve_robust import doubt  # noqa: PLC0415
+    from pose_graph_ros.cli.believe import doubt  # noqa: PLC0415
 
     return doubt(problem, options.robust, options.closure_sigma)
 
