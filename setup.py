@@ -81,6 +81,7 @@ setup(
         'numba>=0.60,<0.69',
         'pyproj>=3.6',
         'matplotlib>=3.6',
+        'networkx>=2.8',
         'rosbags>=0.11',
         'tqdm>=4.66',
         'PyYAML>=6.0',

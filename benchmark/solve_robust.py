@@ -22,7 +22,7 @@ import numpy as np
 from benchmark.files import DEFAULT_FOLDER
 from benchmark.robust_closures import read_recording, Recording, TRUE
 from benchmark.robust_worlds import with_false
-from pose_graph_ros.cli.solve_starts import METHODS
+from pose_graph_ros.cli.arguments import METHODS
 from pose_graph_ros.core.geometry import se2
 from pose_graph_ros.core.geometry.similarity import fit_similarity
 from pose_graph_ros.core.io.g2o import read_g2o

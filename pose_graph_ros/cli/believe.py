@@ -2,11 +2,14 @@
 # SPDX-License-Identifier: Apache-2.0
 """Which loop closures of a graph from a file to believe; part of the tool `pose-graph solve`."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
+import sys
 
 import numpy as np
 
-from pose_graph_ros.cli.solve_starts import METHODS
+from pose_graph_ros.cli.arguments import METHODS
+from pose_graph_ros.cli.solve_starts import Problem
 from pose_graph_ros.core.batch import gnc
 from pose_graph_ros.core.batch.optimizer import (
     optimize,
@@ -17,16 +20,19 @@ from pose_graph_ros.core.batch.optimizer import (
 from pose_graph_ros.core.batch.truncated import Choice, CONFIG, TruncatedProblem
 from pose_graph_ros.core.geometry.se2 import BoolArray, FloatArray, IntArray
 from pose_graph_ros.core.graph.constraints import EdgeKind, Edges
+from pose_graph_ros.core.graph.error_functions import energies as energies_of
 from pose_graph_ros.core.graph.graph import Graph, GraphUpdate
 from pose_graph_ros.core.judgement import selection
 from pose_graph_ros.core.judgement.floors import floored, FLOORS, forward
 from pose_graph_ros.core.judgement.residual_scale import give_scale
+from pose_graph_ros.core.judgement.texts import short
 from pose_graph_ros.core.solver_config import SolverConfig
 
 # Ways to decide: the lowest truncated cost of several sets, or graduated non-convexity alone.
 SURROGATES = {'gnc': gnc.Surrogate.TRUNCATED, 'gnc-gm': gnc.Surrogate.GEMAN_MCCLURE}
 # Number of sets of closures that are tried to join parts that no odometry joins.
 TRIES = 5
+N_LARGEST = 5  # number of edges that are named
 
 
 @dataclass(frozen=True, slots=True)
@@ -204,3 +210,70 @@ def _joining(edges: Edges, closures: IntArray, parts: _Parts, number: int) -> In
     order = np.lexsort((table.j, table.i, -np.linalg.det(table.information)))
     order = np.roll(order, -(number * len(order)) // TRIES)
     return closures[order[parts.join(table.rows(order))]]
+
+
+@dataclass(frozen=True, slots=True)
+class Doubt:
+    """What was decided, and lines about it for people."""
+
+    method: str
+    doubted: IntArray
+    """Rows of the edges that are left out."""
+    n_closures: int
+    scale: float
+    """Factor on the sigmas of the closures that are believed."""
+    cost: float | None
+    """Truncated cost; None if there was no decision."""
+    cost_of_all: float | None
+    """The same with all closures, if it was computed."""
+    lines: tuple[str, ...]
+
+
+def doubt(problem: Problem, method: str, sigma: Sequence[float]) -> Doubt:
+    """
+    Return which closures are not believed, after giving them the weight 0.
+
+    Parameters
+    ----------
+    problem : Problem
+    method : str, one of `believe.METHODS`
+    sigma : sequence of float, least sigmas of closures for the decision [m, rad]
+
+    """
+    graph, ids = problem.engine, problem.ids
+    beliefs = believe(graph, np.array([sigma[0], sigma[0], sigma[1]]), method,
+                      given=problem.has_start)
+    if beliefs is None:
+        print('warning: there is no set of loop closures with a solution; all are believed',
+              file=sys.stderr)
+        return Doubt(method, np.empty(0, np.int64), 0, 1.0, None, None, ())
+    lines = []
+    if beliefs.n_parts > 1:
+        lines.append(f'odometry, edges between neighbouring poses, leaves '
+                     f'{beliefs.n_parts} parts; loop closures that join them are believed')
+    doubted = beliefs.closures[~beliefs.believed]
+    lines.append(f'{len(beliefs.closures)} loop closures: {int(np.sum(beliefs.believed))} '
+                 f'believed, {len(doubted)} doubted')
+    lines.append(f'truncated cost {beliefs.cost:.6g}' + (
+        '' if beliefs.cost_of_all is None else
+        f'; {beliefs.cost_of_all:.6g} at the minimum of chi2 with all of them'))
+    graph.set_poses(beliefs.poses)
+    graph.apply(GraphUpdate(remove_edges=doubted.tolist()))
+    if beliefs.scale > 1.0:
+        lines.append('by their residuals, sigmas of loop closures are '
+                     f'{short(beliefs.scale)} times those of the file, and count so')
+        graph.apply(GraphUpdate(weigh_edges=dict.fromkeys(
+            beliefs.closures[beliefs.believed].tolist(), beliefs.scale**-2.0)))
+    edges = graph.edges_at(doubted)
+    errors = graph.edge_errors(edges)
+    squares = energies_of(errors, edges.information)
+    for k in np.argsort(-squares, kind='stable')[:N_LARGEST]:
+        x, y, theta = errors[k]
+        lines.append(f'  doubted edge {ids[edges.i[k]]} -> {ids[edges.j[k]]}: '
+                     f'{short(np.hypot(x, y), 3)} m and {short(abs(theta), 3)} rad off, '
+                     f'{short(np.sqrt(squares[k]), 3)} sigma')
+    if len(doubted) > N_LARGEST:
+        lines.append(f'  and {len(doubted) - N_LARGEST} more; a file written with --out has them '
+                     f'all as comments')
+    return Doubt(method, doubted, len(beliefs.closures), beliefs.scale, beliefs.cost,
+                 beliefs.cost_of_all, tuple(lines))

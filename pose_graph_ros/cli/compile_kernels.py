@@ -1,13 +1,6 @@
 # Copyright 2026 The pose_graph_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""
-Compile the solver and keep its code, so that the next start of the node need not.
-
-For a robot's image, run this as the user who installs the package, on the model of processor that
-the robot has. The code is kept beside the package, where the node of any user finds it; or in
-NUMBA_CACHE_DIR if that is set, which the node needs as well. Code for another processor, another
-version of Numba or of this package is not used, but compiled again when the node starts.
-"""
+"""Compile the solver and keep its code, so that the next start of the node need not."""
 
 import argparse
 import os
@@ -20,10 +13,6 @@ from pose_graph_ros.core.compiled import jit
 from pose_graph_ros.core.exceptions import ConfigError
 from pose_graph_ros.core.warm_up import warm_up
 from pose_graph_ros.offline.tuning import likelihood  # noqa: F401  has kernels of its own
-
-
-def add_arguments(_: argparse.ArgumentParser) -> None:
-    """Add no arguments: this tool has none."""
 
 
 def execute(_: argparse.Namespace) -> int:

@@ -1,11 +1,6 @@
 # Copyright 2026 The pose_graph_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""
-Play a bag to the node over DDS, and write the corrected path and a picture.
-
-The node and the player run as separate processes in a ROS domain of their own, restricted to this
-machine. Without a bag, a drive with known ground truth is simulated first.
-"""
+"""Play a bag to the node over DDS, and write the corrected path and a picture."""
 
 import argparse
 from collections import deque
@@ -50,21 +45,6 @@ NOT_CONVERGED = 3  # exit code of the player, whose module cannot be imported wi
 
 class DemoError(PoseGraphError):
     """A process of the demo failed, which the message names."""
-
-
-def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Add the arguments of this tool."""
-    parser.add_argument('--bag', type=Path,
-                        help='rosbag2 folder, .mcap or .db3 (default: a simulated drive)')
-    parser.add_argument('-o', '--out', metavar='DIR', type=Path, default=Path('demo'),
-                        help='folder for the results (default: %(default)s)')
-    parser.add_argument('--rate', type=float, default=50.0,
-                        help='speed as a multiple of real time, 0 for as fast as the node can '
-                             '(default: %(default)s)')
-    parser.add_argument('--seed', type=int, default=1, help='seed of the simulated drive '
-                             '(default: %(default)s)')
-    shared.add_inputs(parser)
-    shared.add_parameters(parser)
 
 
 def execute(options: argparse.Namespace) -> int:

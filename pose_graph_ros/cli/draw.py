@@ -1,176 +1,341 @@
 # Copyright 2026 The pose_graph_ros authors
 # SPDX-License-Identifier: Apache-2.0
 """
-Draw a small graph: as pose graph, factor graph, Markov random field or dynamic Bayesian network.
+Draw a small graph with networkx and matplotlib, or write it for Graphviz.
 
-The suffix of the picture's name says what it is: .svg, .png, or .dot for Graphviz. Hidden nodes
-stand where they are in the file, to scale where there is room; ids are those of the file.
+Lines and texts show on light and on dark backgrounds.
 """
 
 import argparse
+from collections import defaultdict
 from collections.abc import Sequence
+from dataclasses import dataclass
 import json
 from pathlib import Path
 import sys
+import textwrap
 from typing import Any
 
+from matplotlib import rc_context
+from matplotlib.axes import Axes
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.colors import ListedColormap
+from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
+import networkx as nx
 import numpy as np
 
-from pose_graph_ros.cli.graph_input import add_graph, NamedRows, read, rows_of
+from pose_graph_ros.cli.graph_input import NamedRows, read, rows_of
 from pose_graph_ros.core.exceptions import ConfigError
-from pose_graph_ros.core.geometry.se2 import IntArray
-from pose_graph_ros.offline.drawing.diagram import Diagram, diagram, View
-from pose_graph_ros.offline.drawing.example import five_states
-from pose_graph_ros.offline.drawing.layout import Layout, place
+from pose_graph_ros.core.geometry.se2 import FloatArray, IntArray
 from pose_graph_ros.offline.drawing.pattern import elimination_order, Pattern, pattern
-from pose_graph_ros.offline.drawing.structure import part, Structure, structure, within
+from pose_graph_ros.offline.drawing.views import (
+    factor_graph,
+    five_states,
+    hidden,
+    map_places,
+    markov_random_field,
+    part,
+    Role,
+    Sort,
+    time_slices,
+    VIEWS,
+)
 
-N_MOST = 200  # hidden nodes in a picture; with more of them names can't be read
-SUFFIXES = ('.svg', '.png', '.dot')
-EXAMPLES = """
-examples:
-  pose-graph draw --example -o states.svg             five states of a graph, with H
-  pose-graph draw graph.g2o -o graph.svg --pattern
-  pose-graph draw graph.g2o --as factor-graph -o factors.png
-  pose-graph draw map.json --as dbn --nodes 0:20 -o start.svg
-  pose-graph draw graph.g2o --around 17 --hops 3 -o near.dot
-"""
-
-
-def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Add the arguments of this tool."""
-    add_graph(parser, nargs='?')
-    parser.add_argument('-o', '--out', metavar='PICTURE', type=_picture, required=True,
-                        help='.svg, .png or .dot file')
-    parser.add_argument('--as', dest='view', choices=[view.value for view in View],
-                        default=View.POSE_GRAPH.value, help='(default: %(default)s)')
-    parser.add_argument('--pattern', action='store_true',
-                        help='with the pattern of H, its blocks in the order of the nodes')
-    parser.add_argument('--ordering', choices=('file', 'elimination'), default='file',
-                        help='order of the blocks of H; elimination: a fill-reducing one, with '
-                             'the fill of the factor R (default: %(default)s)')
-    parser.add_argument('--headings', action='store_true', help='show where poses head')
-    chosen = parser.add_mutually_exclusive_group()
-    chosen.add_argument('--nodes', metavar='IDS', help='draw only these, such as 3,7,20:25')
-    chosen.add_argument('--around', metavar='ID', type=int,
-                        help='draw only this node and those near it')
-    parser.add_argument('--hops', metavar='K', type=int, default=2,
-                        help='with --around: how many constraints away (default: %(default)s)')
-    parser.add_argument('--example', action='store_true',
-                        help='draw five states of a growing graph, with --pattern, in place of a '
-                             'file')
-    parser.add_argument('--json', action='store_true',
-                        help='print what is drawn as JSON (docs/tools.md)')
-    parser.epilog = EXAMPLES
+N_MOST = 300  # hidden nodes in a picture; with more of them names can't be read
+INK, GREY = '#111111', '#7a828c'
+COLOURS = {     # after Okabe and Ito, but for grey
+    Sort.ODOMETRY: GREY, Sort.LOOP_CLOSURE: '#2F8FD0', Sort.TURN: '#B9A51C',
+    Sort.LANDMARK: '#009E73', Sort.OBSERVED: '#E69F00', Sort.BIAS: '#B583A4',
+    Sort.PRIOR: '#D55E00'}
+FILLS = {Role.POSE: '#ffffff', Role.LANDMARK: '#D9F2E6', Role.BIAS: '#F0E2EC',
+         Role.CONTROL: '#C2CAD4', Role.MEASUREMENT: '#C2CAD4', Role.JOINT: '#D55E00'}
+"""Of vertices whose colour is not that of their term."""
+SIZES = {Role.FACTOR: 0.5, Role.JOINT: 0.25}
+"""Diameters of vertices as parts of that of a hidden node."""
+BLOCK, FILL = '#4C78A8', '#E69F00'  # of the pattern of H, of the fill of its factor
+UNIT, LARGEST = 0.8, 14.0  # distance of neighbours, and most of the width and height [inch]
+DIAMETER = 0.32  # of a hidden node [inch]; less where neighbours are nearer
+SETTINGS: dict[Any, Any] = {
+    'svg.fonttype': 'none', 'svg.hashsalt': 'pose_graph_ros', 'text.color': GREY,
+    'font.family': ['DejaVu Sans', 'sans-serif'], 'font.size': 8.0}
 
 
-def _picture(text: str) -> Path:
-    """Return the path of a picture whose format is known."""
-    if Path(text).suffix.lower() not in SUFFIXES:
-        raise argparse.ArgumentTypeError(
-            f'expected a name that ends with {", ".join(SUFFIXES)}, got {text!r}')
-    return Path(text)
+@dataclass(frozen=True, slots=True)
+class Panel:
+    """A view of a graph with the places of its vertices, and the pattern of H if it is drawn."""
+
+    title: str
+    view: Any
+    at: dict[int, FloatArray]
+    pattern: Pattern | None
+
+    @property
+    def arcs(self) -> list[tuple[int, int, dict[str, Any]]]:
+        """Ends and attributes of all arcs."""
+        return list(self.view.edges(data=True))
 
 
 def execute(options: argparse.Namespace) -> int:
     """Run the tool; return the exit code."""
     if (options.graph is None) != options.example:
         raise ConfigError('expected a graph or --example, and not both')
-    view = View(options.view)
     graphs: Sequence[tuple[str, NamedRows]]
     if options.example:
         graphs = [(title, NamedRows(rows, rows.node_ids)) for title, rows in five_states()]
     else:
         graphs = [('', read(options.graph, options.edge2))]
     notes: list[str] = []
-    panels: list[tuple[str, Diagram, Layout]] = []
-    patterns: list[Pattern | None] = []
-    for title, graph in graphs:
-        whole = structure(graph.rows, graph.ids)
-        chosen = _chosen(options, graph.ids, whole)
-        shown, n_cut = part(whole, np.isin(np.arange(whole.n_nodes), chosen))
-        drawing = diagram(shown, view)
-        layout = place(drawing, shown)
-        panels.append((title, drawing, layout))
-        has_pattern = options.pattern or options.example or options.ordering == 'elimination'
+    panels: list[Panel] = []
+    for title, (rows, ids) in graphs:
+        whole = factor_graph(rows, ids)
+        shown, n_cut = part(whole, _chosen(options, ids, whole))
+        view = VIEWS[options.view](shown)
+        at, n_near = ((time_slices(view), 0) if options.view == 'dbn'
+                      else map_places(view, spring=options.spring))
         order = elimination_order(shown) if options.ordering == 'elimination' else None
-        patterns.append(pattern(shown, order) if has_pattern else None)
-        notes += [*drawing.notes, *_notes(shown, whole, n_cut, layout, patterns[-1])]
+        blocks = (pattern(shown, order) if options.pattern or options.example or order is not None
+                  else None)
+        panels.append(Panel(title, view, at, blocks))
+        notes += view.graph['notes']
+        n_shown, n_whole = len(hidden(shown)), len(hidden(whole))
+        if n_shown < n_whole:
+            notes.append(f'{n_shown} of {n_whole} hidden nodes; '
+                         f'{n_cut} constraints lead to others.')
+        if options.spring and options.view != 'dbn':
+            notes.append('Not to scale: hidden nodes stand apart, as by springs.')
+        elif n_near > 0:
+            notes.append(f'{n_near} hidden nodes lie on others; --spring moves them apart.')
+        fixed = [shown.nodes[node]['name'] for node in hidden(shown) if shown.nodes[node]['fixed']]
+        if blocks is not None and len(fixed) > 0:
+            notes.append(f'H has no row for what is fixed: {", ".join(fixed[:5])}'
+                         f'{", ..." if len(fixed) > 5 else ""}.')
     notes = list(dict.fromkeys(notes))
-    if options.example and view is View.MRF:
+    if options.example and options.view == 'mrf':
         notes = ['Terms of a single node are not in the picture: a Markov random field has lines '
                  'for pairs of nodes only.']
     for note in notes:
         print(note, file=sys.stderr)
-    _write(options, panels, patterns, notes)
-    if options.json:
-        print(json.dumps(_facts(view, panels, notes, options.out), indent=2))
+    if options.out.suffix.lower() == '.dot':
+        options.out.write_text(_dot(panels, notes), encoding='utf-8')
     else:
-        print(f'written: {options.out}')
+        _draw(panels, options.out, notes, headings=options.headings)
+    print(json.dumps(_facts(options.view, panels, notes, options.out), indent=2) if options.json
+          else f'written: {options.out}')
     return 0
 
 
-def _chosen(options: argparse.Namespace, ids: IntArray, whole: Structure) -> IntArray:
+def _chosen(options: argparse.Namespace, ids: IntArray, whole: Any) -> set[int]:
     """Return the rows that are drawn; raise ConfigError if they are too many."""
+    chosen = set(hidden(whole))
     if options.nodes is not None:
-        rows = rows_of(ids, options.nodes, '--nodes')
+        chosen = set(rows_of(ids, options.nodes, '--nodes').tolist())
     elif options.around is not None:
         start = int(rows_of(ids, str(options.around), '--around')[0])
-        rows = np.flatnonzero(within(whole, start, options.hops))
-    else:
-        rows = np.arange(whole.n_nodes)
-    if len(rows) > N_MOST:
+        field = nx.Graph(markov_random_field(whole))
+        chosen = set(nx.ego_graph(field, start, radius=options.hops))
+    if len(chosen) > N_MOST:
         raise ConfigError(
-            f'{options.graph}: {len(rows)} hidden nodes are too many for a picture, which has '
+            f'{options.graph}: {len(chosen)} hidden nodes are too many for a picture, which has '
             f'room for {N_MOST}; draw a part with --around ID --hops K or --nodes A:B')
-    return rows
+    return chosen
 
 
-def _notes(
-    shown: Structure, whole: Structure, n_cut: int, layout: Layout, blocks: Pattern | None,
-) -> list[str]:
-    """Return what a reader has to know of a picture."""
-    notes = []
-    if shown.n_nodes < whole.n_nodes:
-        notes.append(f'{shown.n_nodes} of {whole.n_nodes} hidden nodes; '
-                     f'{n_cut} constraints lead to others.')
-    if layout.n_moved > 0:
-        notes.append(f'Not to scale: {layout.n_moved} hidden nodes were moved apart.')
-    if blocks is not None and any(shown.fixed):
-        names = [name for name, fixed in zip(shown.names, shown.fixed, strict=True) if fixed]
-        notes.append(f'H has no row for what is fixed: {", ".join(names[:5])}'
-                     f'{", ..." if len(names) > 5 else ""}.')
-    return notes
+def _fill(data: dict[str, Any]) -> str:
+    """Return the colour of a vertex."""
+    return FILLS[data['role']] if data['role'] in FILLS else COLOURS[data['term'].sort]
 
 
-def _write(
-    options: argparse.Namespace, panels: list[tuple[str, Diagram, Layout]],
-    patterns: list[Pattern | None], notes: list[str],
-) -> None:
-    if options.out.suffix.lower() == '.dot':
-        from pose_graph_ros.cli.graph_dot import dot_text  # noqa: PLC0415
-
-        options.out.write_text(dot_text(panels, notes), encoding='utf-8')
-        return
-    # matplotlib takes longer to load than all else here
-    from pose_graph_ros.cli.graph_picture import draw, Panel  # noqa: PLC0415
-
-    draw([Panel(*panel, blocks) for panel, blocks in zip(panels, patterns, strict=True)],
-         options.out, notes, headings=options.headings)
+def _line(arc: dict[str, Any]) -> str:
+    """Return the colour of an arc; grey if it stands for all terms of its ends."""
+    return GREY if arc['sort'] is None else COLOURS[arc['sort']]
 
 
-def _facts(
-    view: View, panels: list[tuple[str, Diagram, Layout]], notes: list[str], out: Path,
-) -> dict[str, Any]:
+def _has_name(data: dict[str, Any]) -> bool:
+    return data['role'] not in SIZES
+
+
+def _facts(view: str, panels: Sequence[Panel], notes: list[str], out: Path) -> dict[str, Any]:
     """Return what is drawn, for machines."""
-    return {'view': view.value, 'file': str(out), 'notes': notes, 'diagrams': [{
-        'title': title,
-        'vertices': [{'name': vertex.name, 'role': vertex.role.name.lower(),
-                      'sort': None if vertex.sort is None else vertex.sort.name.lower(),
-                      'fixed': vertex.fixed, 'used': vertex.used,
-                      'nodes': [drawing.vertices[node].name for node in vertex.nodes],
-                      'at': np.round(at, 3).tolist()}
-                     for vertex, at in zip(drawing.vertices, layout.at, strict=True)],
-        'arcs': [{'start': arc.start, 'end': arc.end, 'directed': arc.directed,
-                  'sort': None if arc.sort is None else arc.sort.name.lower(), 'used': arc.used}
-                 for arc in drawing.arcs]} for title, drawing, layout in panels]}
+    diagrams = []
+    for panel in panels:
+        place = {node: n for n, node in enumerate(panel.view)}
+        vertices = []
+        for node, data in panel.view.nodes(data=True):
+            term = data.get('term')
+            vertices.append({
+                'name': data['name'], 'role': data['role'].name.lower(),
+                'sort': None if term is None else term.sort.name.lower(),
+                'fixed': data.get('fixed', False), 'used': term is None or term.used,
+                'nodes': [panel.view.nodes[each]['name']
+                          for each in ([node] if term is None else term.nodes)],
+                'at': np.round(panel.at[node], 3).tolist()})
+        diagrams.append({'title': panel.title, 'vertices': vertices, 'arcs': [
+            {'start': place[start], 'end': place[end], 'directed': arc['directed'],
+             'sort': None if arc['sort'] is None else arc['sort'].name.lower(),
+             'used': arc['used']} for start, end, arc in panel.arcs]})
+    return {'view': view, 'file': str(out), 'notes': notes, 'diagrams': diagrams}
+
+
+def _draw(panels: Sequence[Panel], path: Path, notes: Sequence[str], *, headings: bool) -> None:
+    """Draw views below each other into a file, each beside its pattern."""
+    places = [np.array(list(panel.at.values())) for panel in panels]
+    sizes = np.array([np.ptp(at, axis=0) + 1.0 for at in places])
+    unit = min(UNIT, LARGEST / float(np.max(sizes)))
+    side = 0.4 + max((min(0.06 * sum(panel.pattern.sizes), 4.5) for panel in panels
+                      if panel.pattern is not None), default=-0.4)
+    heights = [max(unit * float(size[1]), 0.5 * side if len(panels) > 1 else side)
+               + (0.3 if panel.title else 0.1) for size, panel in zip(sizes, panels, strict=True)]
+    width = max(unit * float(np.max(sizes[:, 0])) + side, 5.0)
+    text = [line for note in notes for line in textwrap.wrap(note, int(width / 0.065))]
+    entries = _legend(panels)
+    columns = max(int(width / 2.2), 1)
+    below = 0.17 * (-(-len(entries) // columns)) + 0.15 * len(text) + 0.15
+    height = sum(heights) + below
+    with rc_context(SETTINGS):
+        figure = Figure(figsize=(width, height), dpi=200)
+        FigureCanvasAgg(figure)
+        top = height
+        for panel, at, tall in zip(panels, places, heights, strict=True):
+            top -= tall
+            axes = figure.add_axes((0.0, top / height, 1.0 - side / width, tall / height))
+            _draw_view(axes, panel, unit, headings=headings)
+            low, high = np.min(at, axis=0) - 0.5, np.max(at, axis=0) + 0.5
+            axes.set(aspect='equal', xlim=(low[0], high[0]), ylim=(low[1], high[1]))
+            if panel.title:
+                figure.text(0.01, (top + tall - 0.15) / height, panel.title, size=9, va='center')
+            if panel.pattern is not None and len(panel.pattern.names) > 0:
+                own = min(0.06 * sum(panel.pattern.sizes), 4.5)
+                _draw_pattern(figure.add_axes((
+                    1.0 - (side - 0.3) / width, (top + 0.5 * (tall - 0.3 - own)) / height,
+                    own / width, own / height)), panel.pattern, own)
+        figure.legend(handles=entries, loc='upper left', bbox_to_anchor=(0.0, below / height),
+                      ncol=columns, frameon=False, borderaxespad=0.3, handletextpad=0.4)
+        figure.text(0.01, 0.02 / height, '\n'.join(text), va='bottom')
+        options = {'metadata': {'Date': None}} if path.suffix.lower() == '.svg' else {}
+        figure.savefig(path, transparent=True, **options)
+
+
+def _draw_view(axes: Axes, panel: Panel, unit: float, *, headings: bool) -> None:
+    axes.set_axis_off()
+    diameter = 72.0 * min(DIAMETER, 0.5 * unit)  # [pt]
+    vertices = dict(panel.view.nodes(data=True))
+    area = {node: (diameter * SIZES.get(data['role'], 1.0))**2 for node, data in vertices.items()}
+    width = 0.05 * diameter
+    groups: dict[Any, Any] = defaultdict(nx.DiGraph)  # arcs that look alike
+    drawn = set[tuple[int, int]]()
+    for start, end, arc in panel.arcs:
+        # of several between the same vertices, all but the first are bent
+        style = f'arc3,rad={0.25 * (not drawn.isdisjoint({(start, end), (end, start)}))}'
+        drawn.add((start, end))
+        if vertices[end]['role'] is Role.MEASUREMENT and panel.at[end][1] > 1.5:
+            style = 'angle,angleA=90,angleB=0,rad=0'
+        groups[_line(arc), style, arc['used'], arc['directed']].add_edge(start, end)
+    for (colour, style, used, directed), alike in groups.items():
+        nx.draw_networkx_edges(
+            alike, panel.at, ax=axes, edge_color=colour, width=width, connectionstyle=style,
+            style='solid' if used else 'dashed', arrows=True, arrowsize=0.45 * diameter,
+            arrowstyle='-|>' if directed else '-', nodelist=list(alike),
+            node_size=[area[node] for node in alike])
+    looks: dict[Any, list[int]] = defaultdict(list)
+    for node, data in vertices.items():
+        opaque = 1.0 if 'term' not in data or data['term'].used else 0.5
+        look = (_fill(data), area[node], 's' if data['role'] is Role.FACTOR else 'o', opaque)
+        looks[look].append(node)
+        if data.get('fixed', False):
+            looks[look[0], 0.6 * look[1], *look[2:]].append(node)
+    for (colour, size, shape, opaque), nodes in looks.items():
+        nx.draw_networkx_nodes(
+            panel.view, panel.at, nodelist=nodes, ax=axes, node_color=colour, node_size=size,
+            linewidths=width, edgecolors=INK, node_shape=shape, alpha=opaque)
+    longest = max((len(data['name']) for data in vertices.values()), default=1)
+    nx.draw_networkx_labels(
+        panel.view, panel.at, {node: data['name'] for node, data in vertices.items()
+                               if _has_name(data)}, ax=axes, font_color=INK,
+        font_size=min(0.42, 1.2 / longest) * diameter)
+    poses = [node for node, data in vertices.items() if data['role'] is Role.POSE]
+    if headings:
+        turns = np.array([vertices[node]['pose'][2] for node in poses])
+        ways = np.column_stack((np.cos(turns), np.sin(turns)))
+        radius = 0.5 * diameter / 72.0 / unit
+        at = np.array([panel.at[node] for node in poses]) + radius * ways
+        axes.quiver(*at.T, *(0.6 * radius * ways).T, angles='xy', scale_units='xy', scale=1.0,
+                    color=INK, units='inches', width=0.02, headlength=3, headaxislength=3,
+                    zorder=3)
+
+
+def _draw_pattern(axes: Axes, blocks: Pattern, side: float) -> None:
+    """Draw the pattern of H on axes of a size [inch]."""
+    ends = np.concatenate(([0], np.cumsum(blocks.sizes)))
+    cells = np.where(blocks.blocks, 0.0, np.where(blocks.fill, 1.0, np.nan))
+    axes.pcolormesh(ends, ends, np.ma.masked_invalid(cells), vmin=0.0, vmax=1.0,
+                    cmap=ListedColormap([BLOCK, FILL]), edgecolors='white',
+                    linewidth=min(0.5, 4.0 * side / len(blocks.names)))
+    axes.invert_yaxis()
+    every = -(-len(blocks.names) // max(int(side / 0.11), 1))
+    middles, names = (0.5 * (ends[:-1] + ends[1:]))[::every], blocks.names[::every]
+    axes.set_xticks(middles, names, rotation=90 if every > 1 or max(map(len, names)) > 2 else 0)
+    axes.set_yticks(middles, names)
+    axes.tick_params(length=0, pad=1, labelsize=6, labelcolor=GREY, top=True, labeltop=True,
+                     bottom=False, labelbottom=False)
+    for spine in axes.spines.values():
+        spine.set(color=GREY, linewidth=0.8)
+
+
+def _legend(panels: Sequence[Panel]) -> list[Line2D]:
+    """Return the entries of a legend of all that is in some views of the same kind."""
+    entries: dict[str, Line2D] = {}
+
+    def add(words: str, colour: str, **shape: Any) -> None:
+        entries.setdefault(words, Line2D([], [], color=colour, label=words, **shape))
+
+    marker = {'linestyle': 'none', 'markeredgecolor': INK, 'markeredgewidth': 0.8}
+    vertices = [data for panel in panels for data in panel.view.nodes(data=True)]
+    for _, data in sorted(vertices, key=lambda each: list(Role).index(each[1]['role'])):
+        role = data['role']
+        words = role.value if role in FILLS else f'{role.value}: {data["term"].sort.value}'
+        add(words, _fill(data), marker='s' if role is Role.FACTOR else 'o', **marker)
+    if any(data.get('fixed', False) for _, data in vertices):
+        add('fixed (known): double border', '#ffffff', marker='o', **marker)
+    named = {data['term'].sort for _, data in vertices
+             if 'term' in data and data['role'] not in FILLS}
+    for _, _, arc in [arc for panel in panels for arc in panel.arcs]:
+        if arc['sort'] is None:
+            add('in a term together', GREY)
+        elif arc['sort'] not in named:
+            add(arc['sort'].value, _line(arc))
+    patterns = [panel.pattern for panel in panels if panel.pattern is not None]
+    if len(patterns) > 0:
+        add('block of H that is not zero', BLOCK, marker='s', linestyle='none')
+    if any(np.any(each.fill) for each in patterns):
+        add('fill of its factor R', FILL, marker='s', linestyle='none')
+    return list(entries.values())
+
+
+def _dot(panels: Sequence[Panel], notes: Sequence[str]) -> str:
+    """Return a text for Graphviz, with the places of a picture and a cluster for each view."""
+    lines = ['digraph pose_graph {', '  layout=neato; overlap=true; splines=true; bgcolor=none;',
+             f'  label={json.dumps(" ".join(notes))}; fontcolor="{GREY}"; fontsize=10;',
+             f'  node [fixedsize=true, style=filled, color="{INK}", fontcolor="{INK}", '
+             'fontsize=9];']
+    bottom = 0.0
+    for n, panel in enumerate(panels):
+        places = np.array(list(panel.at.values()))
+        top, bottom = bottom, bottom - float(np.ptp(places[:, 1])) - 2.0
+        if len(panels) > 1:
+            lines.append(f'  subgraph cluster_{n} {{ label={json.dumps(panel.title)};')
+        for node, data in panel.view.nodes(data=True):
+            x, y = UNIT * (panel.at[node] + (0.0, top - float(np.max(places[:, 1]))))
+            shape = ('doublecircle' if data.get('fixed', False) else
+                     {Role.FACTOR: 'square', Role.JOINT: 'point'}.get(data['role'], 'circle'))
+            lines.append(
+                f'  n{n}_{node} [label={json.dumps(data["name"] if _has_name(data) else "")}, '
+                f'shape={shape}, width={DIAMETER * SIZES.get(data["role"], 1.0):.3g}, '
+                f'fillcolor="{_fill(data)}", pos="{x:.4f},{y:.4f}!"];')
+        for start, end, arc in panel.arcs:
+            style = ('' if arc['directed'] else ', dir=none') + (
+                '' if arc['used'] else ', style=dashed')
+            lines.append(f'  n{n}_{start} -> n{n}_{end} [color="{_line(arc)}"{style}];')
+        if len(panels) > 1:
+            lines.append('  }')
+    return '\n'.join([*lines, '}']) + '\n'

@@ -15,6 +15,7 @@ from typing import Any
 
 import numpy as np
 import numpy.typing as npt
+from scipy.special import gammaincinv
 
 from pose_graph_ros.core.geometry import se2
 from pose_graph_ros.core.geometry.se2 import FloatArray, IntArray
@@ -178,6 +179,55 @@ def evaluate(drive: Drive) -> list[ErrorRow]:
             _, errors = distances(path, stamps[chosen], positions[chosen])
             rows += error_rows(f'{name} to fixes {kind}', errors)
     return rows
+
+
+@dataclass(frozen=True, slots=True)
+class Consistency:
+    """The NEES of a path: squared errors in units of their covariances."""
+
+    mean: float
+    expected: int
+    """What the mean is of covariances that are right."""
+    interval: tuple[float, float]
+    """Where the mean of so many independent errors is in 95 % of all cases."""
+    within: float
+    """Share below the 95 % quantile."""
+    count: int
+
+
+def consistency(drive: Drive, covariances: FloatArray) -> dict[str, Consistency | None]:
+    """
+    Return the NEES of the corrected path to the truth, of positions and of poses.
+
+    It is None if there is no valid covariance. Covariances, shape (N, 3, 3), are in map axes, and
+    NaN where there is none. The truth was moved to fit the path, which makes errors and so the
+    NEES smaller; errors along a path are not independent, so that the true interval is wider.
+    """
+    truth, path = drive.truth, drive.corrected
+    assert truth is not None, 'only a truth tells errors'
+    inside = truth.covers(path.stamps_ns) & np.all(np.isfinite(covariances), axis=(1, 2))
+    errors = path.poses[inside] - truth.at(path.stamps_ns[inside])
+    errors[:, 2] = se2.wrap(errors[:, 2])
+    found: dict[str, Consistency | None] = {}
+    for name, size in (('position', 2), ('pose', 3)):
+        blocks = covariances[inside][:, :size, :size]
+        valid = np.linalg.eigvalsh(blocks)[:, 0] > 0.0
+        e, n = errors[valid, :size, None], int(np.sum(valid))
+        nees = np.sum(e * np.linalg.solve(blocks[valid], e), axis=(1, 2))
+        # quantiles of chi-square
+        low, high = 2.0 * gammaincinv(0.5 * max(n, 1) * size, (0.025, 0.975)) / max(n, 1)
+        found[name] = None if n == 0 else Consistency(
+            float(np.mean(nees)), size, (float(low), float(high)),
+            float(np.mean(nees < 2.0 * gammaincinv(0.5 * size, 0.95))), n)
+    return found
+
+
+def consistency_lines(found: Mapping[str, Consistency | None]) -> list[str]:
+    """Return the NEES as text."""
+    return [f'NEES of the {name}: ' + ('no valid covariance' if each is None else (
+        f'{each.mean:.4g}, expected {each.expected}, {each.interval[0]:.4f} to '
+        f'{each.interval[1]:.4f} if errors were independent; {100.0 * each.within:.1f} % below '
+        f'the 95 % quantile')) for name, each in found.items()]
 
 
 def format_table(rows: Sequence[ErrorRow]) -> str:

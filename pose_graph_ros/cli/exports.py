@@ -2,62 +2,34 @@
 # SPDX-License-Identifier: Apache-2.0
 """Write the corrected path in the formats that other programs read."""
 
-import argparse
 from collections.abc import Callable, Iterator
 from pathlib import Path
-from typing import NamedTuple
+
+import numpy as np
 
 from pose_graph_ros.adapters.fixes import Datum
+from pose_graph_ros.cli.arguments import Exports
 from pose_graph_ros.core.alignment.monitor import AlignmentState
 from pose_graph_ros.core.backend import PoseGraphBackend
 from pose_graph_ros.core.estimate import Estimate
 from pose_graph_ros.core.exceptions import PoseGraphError
 from pose_graph_ros.core.geometry.se2 import FloatArray
-from pose_graph_ros.core.io.path_files import csv_lines, kitti_lines
-from pose_graph_ros.core.io.track_files import geojson_lines, gpx_lines, kml_lines
+from pose_graph_ros.core.geometry.trajectory import Trajectory
+from pose_graph_ros.core.io.path_files import (
+    csv_lines,
+    geojson_lines,
+    gpx_lines,
+    kitti_lines,
+    kml_lines,
+)
+from pose_graph_ros.core.measurements import Measurement, OdometrySample
+from pose_graph_ros.core.prediction import predict
 
-ON_EARTH = {'geojson': geojson_lines, 'kml': kml_lines, 'gpx': gpx_lines}
-"""Formats whose positions are latitudes and longitudes."""
-FORMATS = ('kitti', 'csv', *ON_EARTH)
-"""Formats by name, which is also the ending of the file."""
-ALL = 'all'
+LINES = {'geojson': geojson_lines, 'kml': kml_lines, 'gpx': gpx_lines}
 
 
 class ExportError(PoseGraphError, ValueError):
     """A path cannot be written in a format."""
-
-
-class Exports(NamedTuple):
-    """Formats that were asked for."""
-
-    formats: tuple[str, ...] = ()
-    strict: bool = True
-    """Whether it is an error if one of them cannot be written."""
-
-    @property
-    def on_earth(self) -> str:
-        """The formats that need a datum, as a text; empty if there are none."""
-        return ', '.join(name for name in self.formats if name in ON_EARTH)
-
-
-def add_exports(parser: argparse.ArgumentParser) -> None:
-    """Add the option that chooses formats."""
-    parser.add_argument(
-        '--export', metavar='FORMATS', type=parse_exports, default=Exports(),
-        help=f'more files with the path: {", ".join(FORMATS)}, separated by commas, or {ALL}; '
-             f'{", ".join(ON_EARTH)} need fixes or a datum')
-
-
-def parse_exports(text: str) -> Exports:
-    """Return the formats that a comma-separated text names; raises ArgumentTypeError."""
-    if text == ALL:
-        return Exports(FORMATS, strict=False)
-    names = tuple(dict.fromkeys(name.strip() for name in text.split(',')))
-    for name in names:
-        if name not in FORMATS:
-            raise argparse.ArgumentTypeError(
-                f'{name!r} is no format; expected {ALL} or some of {", ".join(FORMATS)}')
-    return Exports(names)
 
 
 def require_datum(exports: Exports, *, known: bool) -> None:
@@ -99,7 +71,7 @@ def write_exports(
             lines = csv_lines(estimate.path, covariances(backend, estimate))
         elif placed:
             assert datum is not None
-            lines = _on_earth(ON_EARTH[name], estimate, datum, title)
+            lines = _on_earth(LINES[name], estimate, datum, title)
         else:
             continue
         written.append(folder / f'path.{name}')
@@ -126,3 +98,68 @@ def write_lines(path: Path, lines: Iterator[str]) -> None:
     """Write a text file."""
     with path.open('w', encoding='utf-8') as file:
         file.writelines(f'{line}\n' for line in lines)
+
+
+class LivePoses:
+    """
+    Poses at the messages of odometry, each by the newest estimate that there was by then.
+
+    As in the node, odometry goes on from the estimate of the last update, and the graph is updated
+    as often; but each update is ready at once.
+
+    Parameters
+    ----------
+    frequency : float, of updates [Hz], by the stamps of odometry
+
+    """
+
+    def __init__(self, frequency: float) -> None:
+        self._period_ns = round(1e9 / frequency)
+        self._estimate: Estimate | None = None
+        self._next_ns = self._newest_ns = 0
+        self._stamps: list[int] = []
+        self._poses: list[FloatArray] = []
+        self._covariances: list[FloatArray] = []
+
+    def is_due(self, sample: OdometrySample | Measurement, n_nodes: int) -> bool:
+        """
+        Return whether the graph is to be updated with a measurement.
+
+        Parameters
+        ----------
+        n_nodes : int, hidden nodes
+
+        """
+        return (isinstance(sample, OdometrySample) and n_nodes > 0
+                and sample.stamp_ns >= self._next_ns)
+
+    def updated(self, backend: PoseGraphBackend) -> None:
+        """Take the estimate of an update."""
+        self._estimate = backend.estimate(with_path=False)
+        if self._estimate is not None:
+            self._next_ns = self._estimate.stamp_ns + self._period_ns
+
+    def add(self, sample: OdometrySample | Measurement, source: str) -> None:
+        """
+        Add the pose at a sample of the primary odometry, unless it is late.
+
+        Parameters
+        ----------
+        source : str
+
+        """
+        estimate = self._estimate
+        if not isinstance(sample, OdometrySample) or estimate is None or (
+                estimate.primary != source or sample.stamp_ns <= self._newest_ns):
+            return
+        self._newest_ns = sample.stamp_ns
+        found = predict(estimate, sample)
+        self._stamps.append(sample.stamp_ns)
+        self._poses.append(found.T_map_base)
+        self._covariances.append(found.covariance)
+
+    def lines(self) -> Iterator[str]:
+        """Yield the lines of a table, as that of the path."""
+        return csv_lines(Trajectory(np.array(self._stamps, dtype=np.int64),
+                                    np.array(self._poses).reshape(-1, 3)),
+                         np.array(self._covariances).reshape(-1, 3, 3))

@@ -1,8 +1,15 @@
 # Copyright 2026 The pose_graph_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""Read a graph from a g2o file or a saved graph, and choose its nodes by their ids in the file."""
+"""
+Read a graph from a g2o file or a saved graph, and choose its nodes by their ids in the file.
 
-import argparse
+A g2o, TORO or iSAM file as odometry and loop closures over time, as if a robot sent them.
+
+An edge from each vertex to the next one is odometry; its other edges are loop closures, which come
+when the later one of their ends is reached. The vertices are a second apart, or have given stamps.
+"""
+
+from collections.abc import Iterator
 from pathlib import Path
 import re
 import sys
@@ -10,15 +17,20 @@ from typing import NamedTuple
 
 import numpy as np
 
-from pose_graph_ros.core.exceptions import ConfigError
-from pose_graph_ros.core.geometry.se2 import IntArray
+from pose_graph_ros.core.exceptions import ConfigError, FileFormatError
+from pose_graph_ros.core.geometry import covariance, se2
+from pose_graph_ros.core.geometry.se2 import FloatArray, IntArray
+from pose_graph_ros.core.graph.constraints import Edges
 from pose_graph_ros.core.graph.graph_update import GraphRows
 from pose_graph_ros.core.io.edge2_order import Guess, read_guessed
-from pose_graph_ros.core.io.g2o import EDGE2_ORDERS, GraphFile, read_g2o
+from pose_graph_ros.core.io.g2o import GraphFile, read_g2o
+from pose_graph_ros.core.measurements import LoopClosure, OdometrySample
 
 N_TAGS = 10  # number of tags that are warned of
 SAVED = b'{\n"sha256": "'
 """Begin of the JSON file of a saved graph."""
+GRAPH_SUFFIXES = ('.g2o', '.graph')
+SECOND = 1_000_000_000
 
 
 class NamedRows(NamedTuple):
@@ -26,15 +38,6 @@ class NamedRows(NamedTuple):
 
     rows: GraphRows
     ids: IntArray
-
-
-def add_graph(parser: argparse.ArgumentParser, *, nargs: str | None = None) -> None:
-    """Add the arguments that give a graph."""
-    parser.add_argument('graph', type=Path, nargs=nargs,
-                        help='g2o file, or saved graph (its .json file, or the .g2o file beside '
-                             'it)')
-    parser.add_argument('--edge2', choices=EDGE2_ORDERS,
-                        help='format of the tag EDGE2 in this file (default: found out)')
 
 
 def read(path: Path, edge2_order: str | None) -> NamedRows:
@@ -99,3 +102,87 @@ def rows_of(ids: IntArray, text: str, option: str) -> IntArray:
                               f'{ids[0]} to {ids[-1]}')
         chosen |= found
     return np.flatnonzero(chosen)
+
+
+def read_measurements(
+    path: Path, stamps: Path | None = None, edge2: str | None = None,
+) -> list[OdometrySample | LoopClosure]:
+    """
+    Return the measurements in a g2o file, in the order in which they come.
+
+    The covariance of an odometry edge is that of the twist: `odom.noise: twist` uses it. Raises
+    FileFormatError if a vertex has no edge to the next one.
+
+    Parameters
+    ----------
+    stamps : Path, optional, text file with a line for each vertex that begins with its stamp [s]
+    edge2 : str, optional, format of the tag EDGE2; by default it is found out
+
+    """
+    file, _ = read_file(path, edge2)
+    edges, n = file.graph.edges, file.graph.n_nodes
+    stamps_ns = SECOND * np.arange(1, n + 1) if stamps is None else _read_stamps(stamps, n)
+    steps = np.flatnonzero(np.abs(edges.i - edges.j) == 1)
+    # of several edges the first one in the file is odometry
+    starts, first = np.unique(np.minimum(edges.i, edges.j)[steps], return_index=True)
+    if len(starts) < n - 1:
+        lone = int(np.setdiff1d(np.arange(n - 1), starts)[0])
+        raise FileFormatError(f'{path}: expected an edge from each vertex to the next, as '
+                              f'odometry; there is none from {file.ids[lone]} to '
+                              f'{file.ids[lone + 1]}')
+    odometry = steps[first]
+    closures = np.setdiff1d(np.arange(len(edges)), odometry)
+    last = np.maximum(edges.i, edges.j)[closures]
+    closures, last = closures[np.argsort(last, kind='stable')], np.sort(last)
+    samples = list(_odometry(edges.rows(odometry), stamps_ns))
+    found: list[OdometrySample | LoopClosure] = []
+    begin = 0
+    for k, sample in enumerate(samples):
+        end = int(np.searchsorted(last, k, side='right'))
+        found += [sample, *_closures(edges.rows(closures[begin:end]), stamps_ns)]
+        begin = end
+    return found
+
+
+def _read_stamps(path: Path, n: int) -> IntArray:
+    """Return the first n stamps in a file [ns], shape (n,)."""
+    try:
+        words = [line.split()[0] for line in path.read_text(encoding='utf-8').splitlines()
+                 if line.strip() != '' and not line.startswith('#')]
+        stamps = np.array([round(float(word) * SECOND) for word in words], dtype=np.int64)
+    except (OSError, ValueError, OverflowError) as error:
+        raise FileFormatError(f'{path}: expected a stamp [s] at the begin of each line '
+                              f'({error})') from error
+    if len(stamps) < n or np.any(np.diff(stamps[:n]) <= 0):
+        raise FileFormatError(f'{path}: expected {n} increasing stamps, got {len(stamps)}')
+    return stamps[:n]
+
+
+def _odometry(edges: Edges, stamps_ns: IntArray) -> Iterator[OdometrySample]:
+    """Yield composed poses at all stamps, given the edge from each vertex to the next."""
+    forward = (edges.i < edges.j)[:, None]
+    motions = np.where(forward, edges.mean, se2.inverse(edges.mean))
+    variances = np.diagonal(_covariances(edges), axis1=1, axis2=2)
+    elapsed = np.diff(stamps_ns) * 1e-9
+    pose = np.zeros(3)
+    for k, stamp_ns in enumerate(stamps_ns.tolist()):
+        step = min(k, len(motions) - 1)
+        yield OdometrySample(
+            stamp_ns, pose, float(np.hypot(*motions[step, :2]) / elapsed[step]),
+            variances[step] / elapsed[step])
+        pose = se2.compose(pose, motions[step])
+
+
+def _closures(edges: Edges, stamps_ns: IntArray) -> Iterator[LoopClosure]:
+    for i, j, mean, cov in zip(edges.i, edges.j, edges.mean, _covariances(edges), strict=True):
+        # from the axes of the measured pose to those of the reference
+        yield LoopClosure(int(stamps_ns[j]), mean, covariance.turned(cov, -float(mean[2])),
+                          reference_ns=int(stamps_ns[i]))
+
+
+def _covariances(edges: Edges) -> FloatArray:
+    """Return the inverses of the information, shape (M, 3, 3); zero if there is none."""
+    covariances = np.zeros((len(edges), 3, 3))
+    regular = np.linalg.det(edges.information) > 0.0
+    covariances[regular] = np.linalg.inv(edges.information[regular])
+    return covariances

@@ -3,8 +3,9 @@
 """
 The command `pose-graph` with the tools around the node.
 
-A tool is the module of this package with its name, and has `add_arguments` and `execute`. Only the
-module of the tool that is used is imported: the imports of all take seconds.
+A tool is the module of this package with its name, whose `execute` is called. It is imported when
+its arguments are known to be right, as the imports take up to seconds; what these arguments are is
+told by a function with its name in `arguments`, of `simulate` in `simulation_options`.
 """
 
 import argparse
@@ -14,6 +15,7 @@ import importlib
 import os
 import signal
 import sys
+import textwrap
 import threading
 from types import FrameType
 
@@ -50,19 +52,21 @@ def main(args: list[str] | None = None) -> int:
 
     def run() -> int:
         if chosen in parsers:
-            _complete(parsers[chosen], chosen)
+            _declare(parsers[chosen], chosen)
         options = parser.parse_args(words)
-        return int(options.execute(options))
+        module = importlib.import_module(f'pose_graph_ros.cli.{chosen.replace("-", "_")}')
+        return int(module.execute(options))
     return guarded(run)
 
 
-def _complete(parser: argparse.ArgumentParser, tool: str) -> None:
-    """Import the module of a tool, and add its description and arguments to a parser."""
-    module = importlib.import_module(f'pose_graph_ros.cli.{tool.replace("-", "_")}')
-    parser.description = module.__doc__
+def _declare(parser: argparse.ArgumentParser, tool: str) -> None:
+    """Add the description and the arguments of a tool to a parser."""
+    name = 'simulation_options' if tool == 'simulate' else 'arguments'
+    declare = getattr(importlib.import_module(f'pose_graph_ros.cli.{name}'),
+                      tool.replace('-', '_'))
+    parser.description = textwrap.dedent(declare.__doc__).strip()
     parser.formatter_class = argparse.RawDescriptionHelpFormatter
-    module.add_arguments(parser)
-    parser.set_defaults(execute=module.execute)
+    declare(parser)
 
 
 def guarded(run: Callable[[], int]) -> int:

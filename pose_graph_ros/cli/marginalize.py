@@ -1,21 +1,15 @@
 # Copyright 2026 The pose_graph_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""
-Take hidden nodes out of a graph; what their constraints say about the others remains.
-
-What remains is linear at the poses in the file, so solve it first. A single neighbour gets an
-observed node, two poses an edge; more than two a dense prior, which g2o does not have. With
---sparse, edges stand for it which tell no more than it does.
-"""
+"""Take hidden nodes out of a graph; what their constraints say about the others remains."""
 
 import argparse
 import json
-from pathlib import Path
 import sys
 
 import numpy as np
 
-from pose_graph_ros.cli.graph_input import add_graph, NamedRows, read, rows_of
+from pose_graph_ros.cli.arguments import LANDMARKS
+from pose_graph_ros.cli.graph_input import NamedRows, read, rows_of
 from pose_graph_ros.core.exceptions import ConfigError
 from pose_graph_ros.core.geometry.se2 import IntArray
 from pose_graph_ros.core.graph.constraints import NodeKind
@@ -23,27 +17,6 @@ from pose_graph_ros.core.graph.graph import Graph, GraphUpdate
 from pose_graph_ros.core.io.g2o_writing import write_g2o
 from pose_graph_ros.core.io.saved_priors import standing_for
 from pose_graph_ros.core.marginalization.marginalize import marginalize
-
-LANDMARKS = 'landmarks'
-EXAMPLES = """
-examples:
-  pose-graph marginalize graph.g2o --nodes landmarks --sparse -o poses.g2o
-  pose-graph marginalize graph.g2o --nodes 3,7,20:25 -o smaller.g2o
-"""
-
-
-def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Add the arguments of this tool."""
-    add_graph(parser)
-    parser.add_argument('--nodes', metavar='IDS', required=True,
-                        help=f'nodes that leave, such as 3,7,20:25, or {LANDMARKS!r} for all of '
-                             'them')
-    parser.add_argument('-o', '--out', metavar='FILE', type=Path, required=True,
-                        help='g2o file of the graph without them')
-    parser.add_argument('--sparse', action='store_true',
-                        help='write conservative edges in place of dense priors')
-    parser.add_argument('--json', action='store_true', help='print JSON (docs/tools.md)')
-    parser.epilog = EXAMPLES
 
 
 def execute(options: argparse.Namespace) -> int:

@@ -1,6 +1,6 @@
 # Copyright 2026 The pose_graph_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""Command line options shared by several tools."""
+"""Topics and parameters that the options of several tools give."""
 
 import argparse
 from collections.abc import Mapping
@@ -17,41 +17,6 @@ from pose_graph_ros.core.exceptions import ConfigError
 
 OF_RCLPY = ('qos_overrides.', 'use_sim_time', 'start_type_description_service')
 """What the names of parameters begin with that every node has."""
-
-
-def add_inputs(parser: argparse.ArgumentParser, *, hold_out: bool = True) -> None:
-    """Add the options that choose topics and, if it is asked for, the fixes to hold out."""
-    group = parser.add_argument_group(
-        'topics in the bag',
-        'by default, the only topic of the type is used, apart from that of the truth')
-    pose = 'geometry_msgs/PoseWithCovarianceStamped'
-    for option, text in (
-            ('--odom', 'nav_msgs/Odometry'), ('--fix', 'sensor_msgs/NavSatFix'),
-            ('--global-pose', f'{pose} in the map'),
-            ('--loop-closure', f'{pose} relative to another pose'),
-            ('--imu', 'sensor_msgs/Imu with an absolute heading, if the parameter sources lists '
-                      'imu'),
-            ('--gyro', 'sensor_msgs/Imu with an angular velocity, if the parameter sources lists '
-                       'gyro'),
-            ('--truth', 'Odometry, PoseStamped or PoseWithCovarianceStamped in the map, only used '
-                        'for comparison')):
-        group.add_argument(option, metavar='TOPIC', type=_topic, help=text)
-    if hold_out:
-        parser.add_argument('--hold-out', metavar='N', type=int, default=0,
-                            help='keep every N-th fix out of the graph and use it for comparison')
-
-
-def _topic(text: str) -> str:
-    """Return a topic with the slash that recorders of ROS 1 may leave out."""
-    return '/' + text.removeprefix('/')
-
-
-def add_parameters(parser: argparse.ArgumentParser) -> None:
-    """Add the options that set parameters of the node."""
-    parser.add_argument('--params-file', metavar='FILE', type=Path,
-                        help='ROS 2 parameter file of the node')
-    parser.add_argument('-p', '--param', metavar='NAME:=VALUE', action='append', default=[],
-                        help='parameter of the node, as after --ros-args; may be repeated')
 
 
 def wanted_topics(options: argparse.Namespace) -> dict[str, str | None]:

@@ -7,11 +7,6 @@ import argparse
 from pose_graph_ros.adapters.parameter_texts import as_markdown, as_yaml, sources_as_markdown
 
 
-def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Add the arguments of this tool."""
-    parser.add_argument('--yaml', action='store_true', help='print them as a parameter file')
-
-
 def execute(options: argparse.Namespace) -> int:
     """Run the tool; return the exit code."""
     print(as_yaml() if options.yaml else f'{as_markdown()}\n{sources_as_markdown()}', end='')

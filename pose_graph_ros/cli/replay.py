@@ -1,21 +1,13 @@
 # Copyright 2026 The pose_graph_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""
-Run bags or a g2o file through the engine of the node, without ROS and as fast as possible.
-
-Bags may be of ROS 1 or ROS 2 and compressed; several are read in the order of recording. Messages
-are read and added as in the node, but without threads, and the same full optimisation follows at
-the end. The path is the one of a node that receives the same messages. Of a g2o file, edges to the
-next vertex are odometry, with the noise of the file (odom.noise:=model takes that of the
-parameters); all others are loop closures, which come when their later end is reached.
-"""
+"""Run bags or a g2o file through the engine of the node, without ROS."""
 
 import argparse
 from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import ExitStack
+from dataclasses import asdict
 import math
-from pathlib import Path
 import time
 from types import MappingProxyType
 from typing import Any, NamedTuple
@@ -42,17 +34,15 @@ from pose_graph_ros.adapters.sources import (
 )
 from pose_graph_ros.cli import options as shared
 from pose_graph_ros.cli.corrected_bag import LATCHED, write_corrected
-from pose_graph_ros.cli.evaluation import Drive, evaluate
+from pose_graph_ros.cli.evaluation import consistency, consistency_lines, Drive, evaluate
 from pose_graph_ros.cli.exports import (
-    add_exports,
     covariances,
+    LivePoses,
     require_datum,
     write_exports,
     write_lines,
 )
-from pose_graph_ros.cli.g2o_inputs import GRAPH_SUFFIXES, read_measurements
-from pose_graph_ros.cli.judgement import judgement, judgement_lines
-from pose_graph_ros.cli.live import LivePoses
+from pose_graph_ros.cli.graph_input import GRAPH_SUFFIXES, read_measurements
 from pose_graph_ros.cli.progress import WatchedBag
 from pose_graph_ros.cli.results import collect_drive, with_refused, write_results
 from pose_graph_ros.cli.run.content import Run
@@ -63,20 +53,28 @@ from pose_graph_ros.core.batch.optimizer import Status
 from pose_graph_ros.core.estimate import Estimate, UpdateReport
 from pose_graph_ros.core.geometry.geodesy import MapOrigin
 from pose_graph_ros.core.geometry.trajectory import Trajectory
-from pose_graph_ros.core.io.g2o import EDGE2_ORDERS
 from pose_graph_ros.core.io.g2o_writing import write_g2o
-from pose_graph_ros.core.judgement.texts import Key, short, states_by_stamps
-from pose_graph_ros.core.judgement.verdicts import State, Verdict
+from pose_graph_ros.core.judgement.texts import (
+    as_json,
+    is_notable,
+    Key,
+    ORDER,
+    sentence,
+    short,
+    states_by_stamps,
+    totals_text,
+)
+from pose_graph_ros.core.judgement.verdicts import (
+    Judged,
+    SourceVerdicts,
+    State,
+    Verdict,
+)
 from pose_graph_ros.core.measurements import Answer, LoopClosure, Measurement, OdometrySample
 from pose_graph_ros.core.odometry.odometry_errors import AS_CLAIMED
 
-EXAMPLES = """examples:
-  pose-graph replay my_bag --odom /wheel/odometry --fix /gnss/fix -o tuesday
-  pose-graph replay monday.bag tuesday.bag --until 600 --export kitti,csv
-  pose-graph replay my_bag --export gpx,geojson --bag corrected_bag
-  pose-graph replay my_bag --hold-out 5 --json | jq .errors
-"""
 UPDATE_EVERY = 10  # new hidden nodes after which the graph is updated, to stay near the optimum
+NAMED = 10  # number of constraints of a source that the text names
 
 
 class Replayed(NamedTuple):
@@ -193,54 +191,6 @@ def run_measurements(
     return backend, backend.optimize()
 
 
-def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Add the arguments of this tool."""
-    parser.add_argument('bags', metavar='BAG', type=Path, nargs='+',
-                        help='rosbag2 folder, .mcap, .db3, ROS 1 .bag; or one .g2o or .graph file')
-    parser.add_argument('-o', '--out', metavar='DIR', type=Path, default=Path('replay'),
-                        help='folder for the results (default: %(default)s)')
-    add_exports(parser)
-    parser.add_argument('--bag', metavar='OUT', type=Path, dest='new_bag',
-                        help='new rosbag2 folder with all messages, the corrected path, odometry '
-                             'in the map and the transform from map to odom; its poses know all '
-                             'that came later')
-    parser.add_argument('--live', action='store_true',
-                        help='also write live.csv: the poses that a robot would have had at each '
-                             'moment, with their covariances')
-    parser.add_argument('--json', action='store_true',
-                        help='print the contents of summary.json instead of a text')
-    add_sources(parser)
-    shared.add_inputs(parser)
-    shared.add_parameters(parser)
-    parser.epilog = EXAMPLES
-
-
-def add_sources(parser: argparse.ArgumentParser) -> None:
-    """Add the options that say which part of a bag is read, and how a .g2o file is."""
-    add_span(parser)
-    parser.add_argument('--stamps', metavar='FILE', type=Path,
-                        help='text file with the stamps [s] of the vertices of a .g2o file '
-                             '(default: a second apart)')
-    parser.add_argument('--edge2', choices=EDGE2_ORDERS,
-                        help='format of the tag EDGE2 in a .g2o file')
-
-
-def add_span(parser: argparse.ArgumentParser) -> None:
-    """Add the options that say which part of a bag is read."""
-    parser.add_argument('--from', metavar='SECONDS', type=_seconds, dest='begin', default=None,
-                        help='leave out what was recorded before, counted from the first message')
-    parser.add_argument('--until', metavar='SECONDS', type=_seconds,
-                        help='leave out what was recorded from then on')
-
-
-def _seconds(text: str) -> float:
-    """Return a time [s], 0 included."""
-    value = float(text)
-    if not 0.0 <= value < np.inf:
-        raise argparse.ArgumentTypeError(f'expected a finite number of at least 0, got {text}')
-    return value
-
-
 def execute(options: argparse.Namespace) -> int:
     """Run the tool; return the exit code."""
     if any(path.suffix in GRAPH_SUFFIXES for path in options.bags):
@@ -341,8 +291,11 @@ def _report(
     counts = {f'{source}.{answer}': count for (source, answer), count
               in sorted((backend.counts + result.refused).items())}
     title = options.bags[0].stem
+    nees = {} if drive.truth is None or report.status is Status.FAILED else consistency(
+        drive, covariances(backend, estimate))
     table = write_results(drive, options.out, title, {
-        **facts, 'alignment': estimate.alignment.value,
+        **facts, **{f'nees_{name}': each and asdict(each) for name, each in nees.items()},
+        'alignment': estimate.alignment.value,
         'hidden_nodes': estimate.n_hidden, 'frozen_nodes': estimate.n_frozen,
         'thinned_nodes': estimate.n_thinned, 'edges': estimate.n_edges,
         'observed_nodes': estimate.n_observed, 'biases': estimate.n_biases,
@@ -368,6 +321,7 @@ def _report(
         print('counts: ' + ', '.join(f'{name} {count}' for name, count in counts.items()))
         names = ['drive.png', 'summary.json', 'run.json', 'graph.g2o',
                  *(path.name for path in exported)]
+        table = '\n'.join([table, *consistency_lines(nees)])
         print(f'\n{table}\n\nwritten: {options.out}/path.tum, {", ".join(names)}')
     return 0 if report.status is Status.CONVERGED else 1
 
@@ -399,3 +353,44 @@ def _lines(
     if 'new_bag' in facts:
         yield ('new bag: {original} messages copied, {left_out} left out, {corrected} poses of '
                'odometry corrected'.format(**facts['new_bag']))
+
+
+def judgement(
+    totals: Mapping[str, SourceVerdicts], verdicts: Sequence[Verdict],
+) -> dict[str, object]:
+    """
+    Return counts and scale of each source, and all closures and all that is not believed.
+
+    Parameters
+    ----------
+    totals : mapping, what is believed of each source
+
+    """
+    return {
+        'sources': {source: {
+            'states': {state.value: each.counts.get(state, 0) for state in ORDER},
+            'scale': each.scale, 'forgotten': each.n_forgotten}
+            for source, each in totals.items()},
+        'constraints': [as_json(each) for each in verdicts
+                        if each.kind is Judged.LOOP_CLOSURE or is_notable(each)]}
+
+
+def judgement_lines(
+    totals: Mapping[str, SourceVerdicts], verdicts: Sequence[Verdict],
+) -> Iterator[str]:
+    """
+    Yield a line for each source, and for the first of its constraints that are doubted.
+
+    Parameters
+    ----------
+    totals : mapping, what is believed of each source
+
+    """
+    for source, each in totals.items():
+        yield f'{source}: {totals_text(each)}'
+        doubted = [verdict for verdict in verdicts
+                   if verdict.source == source and verdict.state is State.DOUBTED]
+        for verdict in doubted[:NAMED]:
+            yield f'  {verdict.id}: {sentence(verdict)}'
+        if len(doubted) > NAMED:
+            yield f'  and {len(doubted) - NAMED} more, all of which are in summary.json'

@@ -1,11 +1,6 @@
 # Copyright 2026 The pose_graph_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""
-Make one HTML page of a run: map, errors, residuals by source, what is doubted and why.
-
-RUN is the folder of a replay or a demo, its run.json, or a bag or g2o file, which is replayed
-first with the options of `replay`. The page needs no network and no other file.
-"""
+"""Make one HTML page of a run: map, errors, residuals by source, what is doubted and why."""
 
 import argparse
 from contextlib import redirect_stdout
@@ -17,18 +12,11 @@ import webbrowser
 
 from pose_graph_ros.adapters.bags import BagError
 from pose_graph_ros.cli import options as shared, replay
-from pose_graph_ros.cli.exports import Exports
+from pose_graph_ros.cli.arguments import Exports
 from pose_graph_ros.cli.page.render import render
 from pose_graph_ros.cli.run.reading import FILE, read_document
 from pose_graph_ros.core.exceptions import ConfigError, FileFormatError
 
-EXAMPLES = """
-examples:
-  pose-graph report replay                       # of a replay's folder: replay/report.html
-  pose-graph report demo -o tuesday.html --open
-  pose-graph report my_bag --odom /wheel/odometry --fix /gnss/fix --run tuesday
-  pose-graph report replay --json | jq '.findings[] | select(.level == "warning")'
-"""
 SUMMARY = ('title', 'subtitle', 'start', 'duration', 'facts', 'findings', 'error_table', 'sources',
            'springs')
 """Keys of run.json that --json prints; sources without their series and histograms."""
@@ -37,25 +25,6 @@ OF_REPLAY = ('begin', 'until', 'stamps', 'edge2', 'params_file', 'truth')
 """Options that are of use for a bag or a g2o file alone, with inputs and parameters."""
 PAGES = ('.html', '.htm')
 BAG_SUFFIXES = ('.mcap', '.db3', '.bag', '.g2o', '.graph')
-
-
-def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Add the arguments of this tool."""
-    parser.epilog = EXAMPLES
-    parser.add_argument('runs', metavar='RUN', type=Path, nargs='+',
-                        help='folder of a replay or a demo, run.json, bags, or a .g2o or '
-                             '.graph file')
-    parser.add_argument('-o', '--out', metavar='FILE', type=Path,
-                        help='the page (default: report.html in the folder of the run)')
-    parser.add_argument('--run', metavar='DIR', type=Path, default=Path('report'), dest='folder',
-                        help='of a bag: folder for the results of the replay '
-                             '(default: %(default)s)')
-    parser.add_argument('--json', action='store_true',
-                        help='print what was found as JSON instead of a text')
-    parser.add_argument('--open', action='store_true', help='show the page in a browser')
-    replay.add_sources(parser)
-    shared.add_inputs(parser)
-    shared.add_parameters(parser)
 
 
 def execute(options: argparse.Namespace) -> int:

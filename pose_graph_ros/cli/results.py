@@ -22,7 +22,7 @@ from pose_graph_ros.core.geometry import se2
 from pose_graph_ros.core.geometry.geodesy import MapOrigin
 from pose_graph_ros.core.geometry.se2 import BoolArray, FloatArray
 from pose_graph_ros.core.geometry.trajectory import Trajectory
-from pose_graph_ros.core.io.tum import write_tum
+from pose_graph_ros.core.io.path_files import write_tum
 from pose_graph_ros.core.judgement.texts import Key
 from pose_graph_ros.core.judgement.verdicts import State
 from pose_graph_ros.core.measurements import Fix, GlobalPose, LoopClosure, OdometrySample

@@ -1,86 +1,58 @@
 # Copyright 2026 The pose_graph_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""
-Simulate a drive with known ground truth, and write it as a rosbag2 or as a g2o file.
-
-Worlds: `drive`, a car that laps some city blocks twice; `hall`, a robot in the aisles of a hall;
-`grid`, a walk at random through the streets of a small Manhattan. Each has the sensors and the
-disturbances that are usual there; options change them. Equal options give equal drives, and what
-is said of one sensor changes no other.
-
-A bag has the true poses on /ground_truth. What was false, moved or left out is in OUT_truth.json;
-of a graph OUT.g2o the truth is in OUT_truth.g2o, with the same ids.
-"""
+"""Simulate a drive with known ground truth, and write it as a rosbag2 or as a g2o file."""
 
 import argparse
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import replace
+import heapq
 import json
+from operator import itemgetter
 from pathlib import Path
 from typing import Any
 
-from pose_graph_ros.cli.simulation_files import about_graph, graph_texts, write_recording
-from pose_graph_ros.cli.simulation_options import (
-    add_sensors,
-    changed,
-    number,
-    refuse_what_graphs_lack,
+import numpy as np
+
+from pose_graph_ros.adapters.bag_writer import BagWriter
+from pose_graph_ros.cli.bag_messages import (
+    fix_messages,
+    loop_closure_messages,
+    Message,
+    odometry_messages,
+    pose_messages,
+    rate_messages,
 )
+from pose_graph_ros.cli.progress import watched
+from pose_graph_ros.cli.simulation_options import changed, PICTURES, refuse_what_graphs_lack
 from pose_graph_ros.core.exceptions import ConfigError, FileWriteError
+from pose_graph_ros.core.geometry.se2 import IntArray
 from pose_graph_ros.core.io.atomic_files import write_files
-from pose_graph_ros.core.io.tum import tum_text
+from pose_graph_ros.core.io.g2o_writing import g2o_text
+from pose_graph_ros.core.io.path_files import tum_text
 from pose_graph_ros.offline.simulation.graph import graph_of, SimulatedGraph
-from pose_graph_ros.offline.simulation.recording import course, record, Recording
-from pose_graph_ros.offline.simulation.settings import Gyro, Setup
+from pose_graph_ros.offline.simulation.motion import PERIOD_S
+from pose_graph_ros.offline.simulation.recording import Course, course, record, Recording
+from pose_graph_ros.offline.simulation.settings import (
+    CLOSURES,
+    DURATIONS_S,
+    FIXES,
+    GYRO,
+    Gyro,
+    Jump,
+    NODE_DISTANCES,
+    ODOMETRY,
+    POSES,
+    Setup,
+    TRUTH,
+)
 from pose_graph_ros.offline.simulation.worlds import WORLDS
 
 GRAPH_SUFFIX = '.g2o'
-LONGEST_S = 100_000.0  # of a simulation, which takes 100 MB an hour
-PICTURES = ('.png', '.pdf', '.svg')
-EXAMPLES = """\
-examples:
-  pose-graph simulate city                                        # as in `pose-graph demo`
-  pose-graph simulate hall --world hall --duration 3600 --closures 0.5 --false-rate 0.1
-  pose-graph simulate gnss --world grid --closures 0 --fix-sigma 0.5 --fix-correlated 1,30
-  pose-graph simulate bad --outage /gps/fix:60:120 --jump /odom:200:3,0 --jump /gps/fix:250:20,5:30
-  pose-graph simulate late --delay /gps/fix:2:3 --duplicate /loop_closure:0.2 --gyro
-  pose-graph simulate city.g2o --world grid --duration 2300 --false-rate 0.3 --false-groups 9:5
-  pose-graph replay hall --odom /odom --truth /ground_truth
-
-exit code: 0 written, 2 wrong input
-"""
-
-
-def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Add the arguments of this tool."""
-    parser.epilog = EXAMPLES
-    parser.add_argument('out', metavar='OUT', type=Path,
-                        help='folder of the rosbag2, or a graph if the name ends in .g2o')
-    parser.add_argument('--world', choices=WORLDS, default='drive',
-                        help='(default: %(default)s)')
-    parser.add_argument('--duration', metavar='S', type=number(10.0, LONGEST_S),
-                        help='length [s] (default: ' + ', '.join(
-                            f'{each.duration_s:g} for {name}' for name, each in WORLDS.items())
-                        + ')')
-    parser.add_argument('--seed', metavar='N', type=number(0, whole=True), default=1,
-                        help='(default: %(default)s)')
-    add_sensors(parser)
-    out = parser.add_argument_group('output')
-    out.add_argument('--node-distance', metavar='M', type=number(0.01),
-                     help='distance of the nodes of a graph [m] (default: ' + ', '.join(
-                         f'{each.node_distance:g} for {name}' for name, each in WORLDS.items())
-                     + ')')
-    out.add_argument('--tum', action='store_true', help='also write the truth as OUT_truth.tum')
-    out.add_argument('--plot', metavar='FILE', type=Path,
-                     help=f'draw a map; the name ends in {", ".join(PICTURES)}')
-    out.add_argument('--json', action='store_true',
-                     help='print what was simulated, the content of OUT_truth.json, as JSON '
-                          '(docs/tools.md)')
+ODOMETRY_VARIANCES = (1e-3, 1e-3, 1e6, 1e6, 1e6, 3e-2)  # constant, as many drivers set them
 
 
 def execute(options: argparse.Namespace) -> int:
     """Run the tool; return the exit code."""
-    world = WORLDS[options.world]
     if options.plot is not None and options.plot.suffix not in PICTURES:
         raise ConfigError(f'--plot {options.plot}: the name must end in {", ".join(PICTURES)}')
     beside = {kind: options.out.with_name(f'{options.out.stem}_truth.{kind}'
@@ -98,13 +70,15 @@ def execute(options: argparse.Namespace) -> int:
     for path in written:
         if path.exists():
             raise FileWriteError(f'{path}: exists already, not overwritten')
-    way = course(world, options.seed, options.duration, lambda usual: changed(usual, options))
+    way = course(WORLDS[options.world], options.seed,
+                 options.duration or DURATIONS_S[options.world],
+                 lambda usual: changed(usual, options))
     about = {'world': options.world, 'seed': options.seed,
              'duration_s': float(way.motion.time[-1])}
     files = dict[Path, bytes]()
     simulated: SimulatedGraph | Recording
     if is_graph:
-        simulated = graph_of(way, options.node_distance or world.node_distance)
+        simulated = graph_of(way, options.node_distance or NODE_DISTANCES[options.world])
         about |= about_graph(way, simulated)
         files = {path: text.encode() for path, text in zip(
             (options.out, beside['g2o']), graph_texts(simulated), strict=True)}
@@ -130,7 +104,7 @@ def execute(options: argparse.Namespace) -> int:
 
 def _draw(simulated: SimulatedGraph | Recording, file: Path, title: str) -> None:
     # matplotlib takes half a second to load
-    from pose_graph_ros.cli import simulation_picture as picture  # noqa: PLC0415
+    from pose_graph_ros.cli import picture  # noqa: PLC0415
 
     scene = (picture.scene_of_graph(simulated) if isinstance(simulated, SimulatedGraph)
              else picture.scene_of_recording(simulated))
@@ -188,3 +162,147 @@ def write_drive(drive: Recording, folder: str | Path, *, overwrite: bool = False
 
     """
     write_recording(drive, Path(folder), overwrite=overwrite)
+
+
+def write_recording(
+    drive: Recording, folder: Path, *, overwrite: bool = False,
+) -> dict[str, Any]:
+    """
+    Write a recording as a rosbag2, message by message.
+
+    Parameters
+    ----------
+    overwrite : bool, whether to replace an existing bag; otherwise one raises `BagError`
+
+    Returns
+    -------
+    about : dict, what there is to say of it
+
+    """
+    total = sum(len(recorded) for _, recorded in drive.arrivals.values())
+    messages = heapq.merge(*(
+        _delivered(each, *drive.arrivals[topic]) for topic, each in _messages(drive).items()),
+        key=itemgetter(2))
+    with BagWriter(folder, overwrite=overwrite) as bag:
+        for topic, type_name, recorded_ns, message in watched(messages, 'writing', total):
+            bag.write(topic, type_name, recorded_ns, message)
+    return _about_recording(drive)
+
+
+def _messages(drive: Recording) -> dict[str, Iterator[Message]]:
+    """Return the messages of all topics by stamp; of equally late ones the first is written."""
+    setup = drive.setup
+    topics = {
+        ODOMETRY: odometry_messages(
+            ODOMETRY, 'odom', drive.odometry, ODOMETRY_VARIANCES, drive.velocities),
+        TRUTH: odometry_messages(TRUTH, 'map', drive.truth, (0.0,) * 6)}
+    if setup.gyro is not None:
+        topics[GYRO] = rate_messages(
+            GYRO, drive.rate_stamps_ns, drive.rates,
+            setup.claimed(GYRO) * setup.gyro.sigma / np.sqrt(PERIOD_S))
+    if setup.fixes is not None:
+        topics[FIXES] = fix_messages(FIXES, drive.fix_stamps_ns, drive.fixes,
+                                     setup.claimed(FIXES) * setup.fixes.sigma)
+    if setup.poses is not None:
+        sigmas = setup.claimed(POSES) * np.array(setup.poses.sigmas)
+        topics[POSES] = pose_messages(
+            POSES, drive.pose_stamps_ns, drive.poses, np.diag(np.square(sigmas[[0, 0, 1]])))
+    if setup.closures is not None:
+        sigmas = setup.claimed(CLOSURES) * np.array(setup.closures.sigmas)
+        topics[CLOSURES] = loop_closure_messages(
+            CLOSURES, drive.loop_stamps_ns, drive.loop_poses, np.diag(np.square(sigmas)))
+    return topics
+
+
+def _delivered(
+    messages: Iterable[Message], index: IntArray, recorded_ns: IntArray,
+) -> Iterator[Message]:
+    """Yield messages in the order in which they arrive; only those on their way are kept."""
+    left = np.bincount(index).tolist()
+    made, kept = enumerate(messages), dict[int, Message]()
+    for k, recorded in zip(index.tolist(), recorded_ns.tolist(), strict=True):
+        while k not in kept:
+            number, message = next(made)
+            kept[number] = message
+        topic, type_name, _, message = kept[k]
+        left[k] -= 1
+        if left[k] == 0:
+            del kept[k]
+        yield topic, type_name, recorded, message
+
+
+def graph_texts(simulated: SimulatedGraph) -> tuple[str, str]:
+    """Return the texts of g2o files of a graph: at the poses by odometry, and at the true ones."""
+    start, truth = (g2o_text(simulated.graph(poses).rows())
+                    for poses in (simulated.start, simulated.truth.poses))
+    return start, truth
+
+
+def about_graph(way: Course, simulated: SimulatedGraph) -> dict[str, Any]:
+    """Return what there is to say of a graph."""
+    true = simulated.graph(simulated.truth.poses)
+    n, closures = len(simulated.truth), len(simulated.group)
+    loops = simulated.loops
+    return {
+        'distance_m': float(way.motion.distance[-1]), 'nodes': n,
+        'edges': n - 1 + closures, 'observed_nodes': len(simulated.observed),
+        'measured_numbers': _measured_numbers(simulated),
+        'chi2_of_the_truth': true.energies().chi2,
+        **_closures(simulated.group, simulated.missing_groups, 'ids', np.column_stack(
+            (loops.i, loops.j))),
+        'wrong_observed_nodes': simulated.observed.node[simulated.wrong].tolist(),
+        **_disturbances(way.setup, int(way.truth.stamps_ns[0]))}
+
+
+def _measured_numbers(simulated: SimulatedGraph) -> int:
+    """Return how many numbers were measured, the degrees of freedom of chi2 at the truth."""
+    information = simulated.observed.information
+    return 3 * len(simulated.edges) + int(np.sum(np.diagonal(information, 0, 1, 2) > 0.0))
+
+
+def _about_recording(drive: Recording) -> dict[str, Any]:
+    setup = drive.setup
+    about = {
+        'distance_m': drive.distance,
+        'topics': {topic: len(recorded) for topic, (_, recorded) in drive.arrivals.items()
+                   if len(recorded) > 0},
+        **_closures(drive.loop_group, drive.missing_groups, 'stamps_ns', drive.loop_stamps_ns),
+        'wrong_fixes_ns': drive.fix_stamps_ns[drive.fix_is_wrong].tolist(),
+        'wrong_global_poses_ns': drive.pose_stamps_ns[drive.pose_is_wrong].tolist(),
+        **_disturbances(setup, drive.start_ns)}
+    for each, silenced in zip(about['outages'], drive.silenced, strict=True):
+        each['left_out'] = silenced
+    return about
+
+
+def _closures(
+    group: IntArray, missing: int, what: str, ends: IntArray,
+) -> dict[str, Any]:
+    false = np.flatnonzero(group >= 0)
+    return {'true_closures': int(np.sum(group < 0)),
+            'false_closures': [{what: pair, 'group': number} for pair, number in zip(
+                ends[false].tolist(), group[false].tolist(), strict=True)],
+            'missing_groups': missing}
+
+
+def _disturbances(setup: Setup, start_ns: int) -> dict[str, Any]:
+    """Return what is disturbed, with times as stamps."""
+    def stamp(seconds: float) -> int:
+        return start_ns + round(seconds * 1e9)
+
+    def end(jump: Jump) -> int | None:
+        return stamp(jump.at_s + jump.seconds) if np.isfinite(jump.seconds) else None
+
+    return {
+        'start_ns': start_ns,
+        'outages': [{'topic': each.topic, 'begin_ns': stamp(each.begin_s),
+                     'end_ns': stamp(each.end_s)} for each in setup.outages],
+        'jumps': [{'topic': each.topic, 'at_ns': stamp(each.at_s), 'end_ns': end(each),
+                   'step': each.step} for each in setup.jumps],
+        'delays': [{'topic': each.topic, 'seconds': each.seconds, 'jitter_s': each.jitter_s}
+                   for each in setup.delays],
+        'clock_offsets': [{'topic': each.topic, 'seconds': each.seconds}
+                          for each in setup.offsets],
+        'duplicates': [{'topic': each.topic, 'share': each.share} for each in setup.duplicates],
+        'claimed_sigmas': [{'topic': each.topic, 'factor': each.factor}
+                           for each in setup.claims]}

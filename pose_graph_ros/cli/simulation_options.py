@@ -1,13 +1,19 @@
 # Copyright 2026 The pose_graph_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""Options of `pose-graph simulate` for sensors and disturbances, and what they change."""
+"""
+Arguments of `pose-graph simulate`, and what they change of the usual sensors and disturbances.
+
+As in `arguments`, nothing is imported here that takes time.
+"""
 
 import argparse
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 import math
+from pathlib import Path
 from typing import Any
 
+from pose_graph_ros.cli.arguments import number
 from pose_graph_ros.core.exceptions import ConfigError
 from pose_graph_ros.offline.simulation.settings import (
     ClaimedSigma,
@@ -16,6 +22,7 @@ from pose_graph_ros.offline.simulation.settings import (
     Closures,
     Delay,
     Duplicates,
+    DURATIONS_S,
     FalseClosures,
     FIXES,
     Fixes,
@@ -23,6 +30,7 @@ from pose_graph_ros.offline.simulation.settings import (
     GYRO,
     Gyro,
     Jump,
+    NODE_DISTANCES,
     ODOMETRY,
     OdometryErrors,
     Outage,
@@ -31,6 +39,8 @@ from pose_graph_ros.offline.simulation.settings import (
     Wheels,
 )
 
+LONGEST_S = 100_000.0  # of a simulation, which takes 100 MB an hour
+PICTURES = ('.png', '.pdf', '.svg')
 NONE, RESET = 'none', 'reset'
 FALSE_SIZE = 4  # closures of a group of false ones
 # Options of what a graph does not have, by their names among the parsed ones.
@@ -39,9 +49,59 @@ ONLY_IN_BAGS = ('odometry', 'wheel_scale', 'slip', 'heading_drift', 'gyro', 'gyr
 Change = tuple[str, Any]  # a topic and what happens to it, None if nothing shall
 
 
-def add_sensors(parser: argparse.ArgumentParser) -> None:
-    """Add the options on sensors and disturbances."""
+def simulate(parser: argparse.ArgumentParser) -> None:
+    """
+    Simulate a drive with known ground truth, and write it as a rosbag2 or as a g2o file.
+
+    Worlds: `drive`, a car that laps some city blocks twice; `hall`, a robot in the aisles of a
+    hall; `grid`, a walk at random through the streets of a small Manhattan. Each has the sensors
+    and the disturbances that are usual there; options change them. Equal options give equal
+    drives, and what is said of one sensor changes no other.
+
+    A bag has the true poses on /ground_truth. What was false, moved or left out is in
+    OUT_truth.json; of a graph OUT.g2o the truth is in OUT_truth.g2o, with the same ids.
+    """
     parser.usage = '%(prog)s OUT [options]'
+    parser.epilog = """
+examples:
+  pose-graph simulate city                                        # as in `pose-graph demo`
+  pose-graph simulate hall --world hall --duration 3600 --closures 0.5 --false-rate 0.1
+  pose-graph simulate gnss --world grid --closures 0 --fix-sigma 0.5 --fix-correlated 1,30
+  pose-graph simulate bad --outage /gps/fix:60:120 --jump /odom:200:3,0 --jump /gps/fix:250:20,5:30
+  pose-graph simulate late --delay /gps/fix:2:3 --duplicate /loop_closure:0.2 --gyro
+  pose-graph simulate city.g2o --world grid --duration 2300 --false-rate 0.3 --false-groups 9:5
+  pose-graph replay hall --odom /odom --truth /ground_truth
+
+exit code: 0 written, 2 wrong input
+"""
+    parser.add_argument('out', metavar='OUT', type=Path,
+                        help='folder of the rosbag2, or a graph if the name ends in .g2o')
+    parser.add_argument('--world', choices=DURATIONS_S, default='drive',
+                        help='(default: %(default)s)')
+    parser.add_argument('--duration', metavar='S', type=number(10.0, LONGEST_S),
+                        help=f'length [s] (default: {_by_world(DURATIONS_S)})')
+    parser.add_argument('--seed', metavar='N', type=number(0, whole=True), default=1,
+                        help='(default: %(default)s)')
+    _add_sensors(parser)
+    _add_disturbances(parser)
+    out = parser.add_argument_group('output')
+    out.add_argument('--node-distance', metavar='M', type=number(0.01),
+                     help='distance of the nodes of a graph [m] '
+                          f'(default: {_by_world(NODE_DISTANCES)})')
+    out.add_argument('--tum', action='store_true', help='also write the truth as OUT_truth.tum')
+    out.add_argument('--plot', metavar='FILE', type=Path,
+                     help=f'draw a map; the name ends in {", ".join(PICTURES)}')
+    out.add_argument('--json', action='store_true',
+                     help='print what was simulated, the content of OUT_truth.json, as JSON '
+                          '(docs/tools.md)')
+
+
+def _by_world(values: dict[str, float]) -> str:
+    return ', '.join(f'{value:g} for {name}' for name, value in values.items())
+
+
+def _add_sensors(parser: argparse.ArgumentParser) -> None:
+    """Add the options on sensors and disturbances."""
     wheels = parser.add_argument_group('odometry on /odom, 20 Hz')
     wheels.add_argument('--odometry', choices=[each.value for each in OdometryErrors],
                         help='errors of two wheels, or a random walk as the node assumes it '
@@ -86,7 +146,6 @@ def add_sensors(parser: argparse.ArgumentParser) -> None:
     loops.add_argument('--false-groups', metavar='N[:SIZE]', type=_groups,
                        help='of the false ones so many groups agree with one another, as if a '
                             f'stretch was taken for another (default of SIZE: {FALSE_SIZE})')
-    _add_disturbances(parser)
 
 
 def _add_disturbances(parser: argparse.ArgumentParser) -> None:
@@ -193,33 +252,6 @@ def _closures(usual: Closures, options: argparse.Namespace) -> Closures:
 
 def _present(values: dict[str, Any]) -> dict[str, Any]:
     return {name: value for name, value in values.items() if value is not None}
-
-
-def number(
-    least: float = -math.inf, most: float = math.inf, *, whole: bool = False,
-) -> Callable[[str], Any]:
-    """
-    Return what reads a finite number, and raises ArgumentTypeError if it cannot.
-
-    Parameters
-    ----------
-    least, most : float, smallest and largest number that is accepted
-    whole : bool, whether it must be an integer
-
-    """
-    kind = 'a whole number' if whole else 'a number'
-    expected = kind if least == -math.inf else f'{kind} of at least {least:g}'
-    expected += '' if most == math.inf else f' and at most {most:g}'
-
-    def read(text: str) -> Any:
-        try:
-            value = int(text) if whole else float(text)
-        except ValueError:
-            value = math.nan
-        if not (math.isfinite(value) and least <= value <= most):
-            raise argparse.ArgumentTypeError(f'expected {expected}, got {text!r}')
-        return value
-    return read
 
 
 def _numbers(count: int) -> Callable[[str], tuple[float, ...]]:

@@ -1,13 +1,6 @@
 # Copyright 2026 The pose_graph_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""
-Optimise a g2o, TORO or iSAM file, and print the constraints with the largest energies.
-
-With `--robust` wrong loop closures are found first. A file that is written then has them as
-comments, `# not used EDGE_SE2 ...`, so that other programs read the graph without them. Unless
-`--no-certificate` is given, it is proved whether the minimum is the global one, for an objective
-that is nearly chi2; if it is not, a lower one is searched for.
-"""
+"""Optimise a g2o, TORO or iSAM file, and print the constraints with the largest energies."""
 
 import argparse
 import json
@@ -19,73 +12,19 @@ from typing import Any, TYPE_CHECKING
 
 import numpy as np
 
+from pose_graph_ros.cli.arguments import METHODS
 from pose_graph_ros.cli.graph_input import read_file
-from pose_graph_ros.cli.solve_starts import METHODS, Problem, Solution, solve, STARTS
+from pose_graph_ros.cli.solve_starts import Problem, Solution, solve
 from pose_graph_ros.core.batch.outcome import Status
 from pose_graph_ros.core.exceptions import ConfigError, PoseGraphError
 from pose_graph_ros.core.geometry.se2 import FloatArray, IntArray
-from pose_graph_ros.core.io.g2o import EDGE2_ORDERS
-from pose_graph_ros.core.solver_config import CLOSURE_FLOORS
 
 if TYPE_CHECKING:
+    from pose_graph_ros.cli.believe import Doubt
     from pose_graph_ros.cli.marginals import Marginals
-    from pose_graph_ros.cli.solve_robust import Doubt
 
 TOLD = 1e-6  # relative error of covariances from which on it is told
 N_LARGEST = 5  # number of edges, of observed nodes, and of names, that are printed
-EXAMPLES = """\
-examples:
-  pose-graph solve graph.g2o -o optimised.g2o
-  pose-graph solve graph.graph --edge2 toro --start best
-  pose-graph solve graph.g2o --marginals newest
-  pose-graph solve graph.g2o --marginals all -o covariances.csv --json
-  pose-graph solve graph.g2o --robust -o optimised.g2o
-  pose-graph solve graph.g2o --robust gnc --closure-sigma 0 0 --json
-
-exit code: 0 converged, 1 not converged, 2 wrong input
-"""
-
-
-def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Add the arguments of this tool."""
-    parser.epilog = EXAMPLES
-    parser.add_argument('graph', type=Path, nargs='?',  # see `_arguments`
-                        help='g2o, TORO or iSAM file, also compressed by gzip')
-    parser.add_argument('-o', '--out', metavar='FILE', type=Path, action='append', default=[],
-                        help='optimised g2o file, or marginals if the name ends in .csv; may be '
-                             'repeated')
-    parser.add_argument('--start', choices=STARTS, default='chordal',
-                        help='start from the constraints, from the poses in the file, from '
-                             'composed odometry, or from each, and take the lowest minimum '
-                             '(default: %(default)s); with --robust, from the poses of its '
-                             'decision')
-    parser.add_argument('--certificate', action=argparse.BooleanOptionalAction, default=True,
-                        help='prove whether the minimum is the global one (default: yes)')
-    parser.add_argument('--marginals', metavar='{all,newest,ID[,ID...]}',
-                        help='covariances of these nodes as CSV: the last output, or -o FILE.csv '
-                             '(default, with such a file: all)')
-    parser.add_argument('--json', action='store_true', help='print JSON (docs/tools.md)')
-    parser.add_argument('--robust', nargs='?', metavar='|'.join(METHODS), const=METHODS[0],
-                        help='decide which loop closures to believe, and leave the others out, by '
-                             'comparing sets of them (selection, the default), or by graduated '
-                             'non-convexity with the surrogate for truncated least squares (gnc) '
-                             'or for Geman-McClure (gnc-gm); an edge is odometry if no id of a '
-                             'pose lies between its two; sightings of landmarks are believed')
-    parser.add_argument('--closure-sigma', nargs=2, type=_sigma, metavar=('M', 'RAD'),
-                        default=(CLOSURE_FLOORS[0], CLOSURE_FLOORS[2]),
-                        help='least standard deviations of loop closures for this decision '
-                             f'(default: {CLOSURE_FLOORS[0]} {CLOSURE_FLOORS[2]}); the result '
-                             'has those of the file, times what the residuals show')
-    parser.add_argument('--edge2', choices=EDGE2_ORDERS,
-                        help='format of the tag EDGE2 in this file; by default both are tried')
-
-
-def _sigma(text: str) -> float:
-    """Return a standard deviation, 0 included."""
-    value = float(text)
-    if not 0.0 <= value < np.inf:
-        raise argparse.ArgumentTypeError(f'expected a finite number of at least 0, got {text}')
-    return value
 
 
 def _arguments(options: argparse.Namespace) -> None:
@@ -234,7 +173,7 @@ def _decision(doubt: 'Doubt | None') -> dict[str, Any] | None:
 
 def _doubt(problem: Problem, options: argparse.Namespace) -> 'Doubt':
     """Decide about closures; what does so takes longer to load than all else here."""
-    from pose_graph_ros.cli.solve_robust import doubt  # noqa: PLC0415
+    from pose_graph_ros.cli.believe import doubt  # noqa: PLC0415
 
     return doubt(problem, options.robust, options.closure_sigma)
 

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from pose_graph_ros.cli.arguments import STARTS
 from pose_graph_ros.core.batch.outcome import BatchResult, Start, Status
 from pose_graph_ros.core.batch.plain_graph import PlainGraph
 from pose_graph_ros.core.batch.plain_optimizer import PlainOptimizer
@@ -22,9 +23,6 @@ from pose_graph_ros.core.solver_config import SolverConfig
 if TYPE_CHECKING:
     from pose_graph_ros.core.graph.graph import Graph
 
-STARTS = ('chordal', 'file', 'odometry', 'best')
-# Ways to decide which closures to believe; the first one is the default.
-METHODS = ('selection', 'gnc', 'gnc-gm')
 WEAK = 1e-7  # information of a weak prior, as a fraction of that of the median constraint
 CONFIG = SolverConfig(max_iterations=200)
 # Nodes up to which a graph is solved without compiled kernels, if possible.

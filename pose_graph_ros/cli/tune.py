@@ -1,21 +1,12 @@
 # Copyright 2026 The pose_graph_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""
-Estimate the noise of odometry and of what measures in the map from bags; write a parameter file.
-
-Parameters are those under which the measurements are the most likely, each with an interval.
-Those that the data do not tell stay as they are, and none becomes surer than the data prove. The
-table shows how well a path predicts fixes (global poses) of whole stretches of the drive that were
-held out, from the tuning too, before and after. If that is not better, no file is written. The
-exit code is 1 then, 2 for wrong input.
-"""
+"""Estimate the noise of odometry and of what measures in the map; write a parameter file."""
 
 import argparse
 from collections.abc import Mapping
 from dataclasses import asdict
 import json
 import os
-from pathlib import Path
 import sys
 import time
 from typing import Any
@@ -26,56 +17,13 @@ from pose_graph_ros.adapters.bags import BagError
 from pose_graph_ros.adapters.sources import source_list
 from pose_graph_ros.cli import options as shared
 from pose_graph_ros.cli.progress import WatchedBag
-from pose_graph_ros.cli.replay import add_span, span_of
+from pose_graph_ros.cli.replay import span_of
 from pose_graph_ros.cli.results import read_truth
 from pose_graph_ros.cli.tuned_parameters import interval, yaml_text
 from pose_graph_ros.cli.tuning import Outcome, Tuning, Verdict
 from pose_graph_ros.cli.tuning_drive import TuningDrive
 from pose_graph_ros.offline.tuning.fit import CONTRADICTION
 from pose_graph_ros.offline.tuning.held_out import Summary
-
-EXAMPLES = """examples:
-  pose-graph tune my_bag --odom /wheel/odometry --fix /gnss/fix -o tuned.yaml
-  pose-graph tune monday.bag tuesday.bag --params-file robot.yaml --json | jq .parameters
-  ros2 run pose_graph_ros pose_graph_node --ros-args --params-file tuned.yaml
-"""
-
-
-def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Add the arguments of this tool."""
-    parser.add_argument('bags', metavar='BAG', type=Path, nargs='+',
-                        help='rosbag2 folder, .mcap, .db3, ROS 1 .bag')
-    parser.add_argument('-o', '--out', metavar='FILE', type=Path, default=Path('tuned.yaml'),
-                        help='parameter file to write (default: %(default)s)')
-    parser.add_argument('--folds', metavar='N', type=_folds, default=4,
-                        help='parts of the drive that are held out in turn '
-                             '(default: %(default)s)')
-    parser.add_argument('--budget', metavar='SECONDS', type=_budget, default=600.0,
-                        help='with less time, fewer parts are held out (default: %(default)g)')
-    parser.add_argument('--json', action='store_true', help='print the results as JSON')
-    add_span(parser)
-    shared.add_inputs(parser, hold_out=False)
-    shared.add_parameters(parser)
-    parser.epilog = EXAMPLES
-
-
-def _folds(text: str) -> int:
-    """Return a number of folds."""
-    value = int(text) if text.isdecimal() else 0
-    if not 2 <= value <= 50:
-        raise argparse.ArgumentTypeError(f'expected a number from 2 to 50, got {text}')
-    return value
-
-
-def _budget(text: str) -> float:
-    """Return a time [s]."""
-    try:
-        value = float(text)
-    except ValueError:
-        value = 0.0
-    if not value > 0.0:
-        raise argparse.ArgumentTypeError(f'expected a positive number, got {text}')
-    return value
 
 
 def execute(options: argparse.Namespace) -> int:

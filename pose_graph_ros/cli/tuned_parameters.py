@@ -10,7 +10,7 @@ from typing import Any
 from pose_graph_ros.cli.tuning_drive import SourceOfPoses
 from pose_graph_ros.offline.tuning import likelihood as lk
 from pose_graph_ros.offline.tuning.fit import Fit, Found
-from pose_graph_ros.offline.tuning.problem import Role
+from pose_graph_ros.offline.tuning.likelihood import Role
 
 ODOMETRY = ('sigma_distance', 'sigma_lateral', 'sigma_heading_distance', 'sigma_heading_turn')
 LARGEST_SIGMA = 10.0  # of odometry, by the range of its parameters

@@ -34,21 +34,21 @@ from pose_graph_ros.core.geometry.trajectory import Trajectory
 from pose_graph_ros.core.measurements import LoopClosure
 from pose_graph_ros.offline.tuning.closure_fit import ClosureProblem, fit_closures, MOST_NODES
 from pose_graph_ros.offline.tuning.drive_rows import drive_rows, timeline
-from pose_graph_ros.offline.tuning.estimation import estimate
-from pose_graph_ros.offline.tuning.evidence import proven, shown_variances
-from pose_graph_ros.offline.tuning.fit import Fit
+from pose_graph_ros.offline.tuning.fit import estimate, Fit
 from pose_graph_ros.offline.tuning.held_out import (
     Errors,
     fold_of,
     is_better,
     joined,
     NO_ERRORS,
+    proven,
+    shown_variances,
     stretch_length,
     Summary,
     summary,
     wrong,
 )
-from pose_graph_ros.offline.tuning.problem import Role
+from pose_graph_ros.offline.tuning.likelihood import Role
 
 
 class Verdict(Enum):

@@ -11,10 +11,10 @@ import xml.etree.ElementTree as ET
 import numpy as np
 import pytest
 
+from pose_graph_ros.cli.arguments import VIEWS
 from pose_graph_ros.cli.draw import N_MOST
 from pose_graph_ros.cli.main import main
 from pose_graph_ros.core.io.graph_files import read_graph
-from pose_graph_ros.offline.drawing.diagram import View
 
 IDENTITY = '1 0 0 1 0 1'
 SAVED = Path(__file__).parents[1] / 'data' / 'version_1.g2o'
@@ -54,7 +54,7 @@ def hidden(drawn: list[str]) -> list[str]:
     return [text for text in drawn if re.fullmatch(r'[xlb]\d+', text)]
 
 
-@pytest.mark.parametrize('view', [view.value for view in View])
+@pytest.mark.parametrize('view', VIEWS)
 def test_a_picture_names_the_nodes_by_their_ids_in_the_file(
     view: str, small: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str],
 ) -> None:
@@ -64,7 +64,7 @@ def test_a_picture_names_the_nodes_by_their_ids_in_the_file(
     assert printed.out == f'written: {out}\n'
     drawn = texts(out)
     assert hidden(drawn) == ['x10', 'x11', 'x12', 'x15', 'l20']
-    assert {'fixed (known)', 'landmark (hidden)'} <= set(drawn)
+    assert {'fixed (known): double border', 'landmark (hidden)'} <= set(drawn)
     unary = '2 terms of a single node are not in the picture'
     assert (unary in printed.err) == (view == 'mrf')
     assert (unary in ' '.join(drawn)) == (view == 'mrf')
@@ -148,8 +148,8 @@ def test_a_large_graph_is_refused_with_the_way_out(
     out = tmp_path / 'large.svg'
     assert main(['draw', str(path), '-o', str(out)]) == 2
     assert capsys.readouterr().err == (
-        f'error: {path}: 201 hidden nodes are too many for a picture, which has room for 200; '
-        f'draw a part with --around ID --hops K or --nodes A:B\n')
+        f'error: {path}: {N_MOST + 1} hidden nodes are too many for a picture, which has room '
+        f'for {N_MOST}; draw a part with --around ID --hops K or --nodes A:B\n')
     assert not out.exists()
     assert main(['draw', str(path), '--nodes', '5:9', '-o', str(out)]) == 0
 

@@ -12,8 +12,10 @@ import sys
 from matplotlib.image import imread
 import numpy as np
 import pytest
+from scipy.stats import chi2
 
 from pose_graph_ros.cli.evaluation import (
+    consistency,
     distances,
     Drive,
     error_rows,
@@ -67,6 +69,35 @@ def test_distances_interpolate_inside_the_time_of_the_path_only() -> None:
     covered, errors = distances(straight(), stamps, positions)
     np.testing.assert_array_equal(covered, stamps[1:3])
     np.testing.assert_allclose(errors, [3.0, 4.0])
+
+
+def test_the_nees_is_that_of_a_loop_over_the_poses() -> None:
+    rng = np.random.default_rng(1)
+    truth = Trajectory(np.arange(60) * SECOND, rng.normal(size=(60, 3)) + 3.0 * np.eye(3)[2])
+    stamps = np.arange(-5, 50) * SECOND + SECOND // 2
+    inside = truth.covers(stamps)
+    poses = rng.normal(size=(55, 3))
+    poses[inside] = truth.at(stamps[inside]) + 0.3 * rng.normal(size=(50, 3))
+    roots = 0.2 * rng.normal(size=(55, 3, 3)) + 0.3 * np.eye(3)
+    covariances = roots @ roots.transpose(0, 2, 1)
+    covariances[7] = np.nan     # has left the graph
+    drive = replace(without_fixes(hand_made_drive()), corrected=Trajectory(stamps, poses),
+                    truth=truth)
+    found = consistency(drive, covariances)
+    for name, size in (('position', 2), ('pose', 3)):
+        values = []
+        for k in np.flatnonzero(inside & (np.arange(55) != 7)):
+            error = poses[k] - truth.at(stamps[k:k + 1])[0]
+            error[2] = np.arctan2(np.sin(error[2]), np.cos(error[2]))
+            error, block = error[:size], covariances[k, :size, :size]
+            values.append(error @ np.linalg.inv(block) @ error)
+        each = found[name]
+        assert each is not None
+        assert (each.count, each.expected) == (len(values), size) == (49, size)
+        assert each.mean == pytest.approx(np.mean(values))
+        assert each.within == np.mean(np.array(values) < chi2.ppf(0.95, size))
+        assert each.interval == pytest.approx(chi2.ppf((0.025, 0.975), 49 * size) / 49)
+    assert consistency(drive, np.full((55, 3, 3), np.nan)) == {'position': None, 'pose': None}
 
 
 def test_statistics_of_known_errors() -> None:

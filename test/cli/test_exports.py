@@ -14,8 +14,8 @@ import pyproj
 import pytest
 from tum_files import read_tum
 
+from pose_graph_ros.cli.arguments import FORMATS, replay
 from pose_graph_ros.cli.bag_messages import write_bag
-from pose_graph_ros.cli.exports import ALL, FORMATS, parse_exports
 from pose_graph_ros.cli.main import main
 
 DATUM = 50.7, 7.1, 0.3
@@ -129,7 +129,10 @@ def test_covariances_are_empty_where_nodes_have_left_the_graph(tmp_path: Path) -
 
 
 def test_formats_are_named_once_and_unknown_ones_refused() -> None:
-    assert parse_exports(ALL).formats == FORMATS
-    assert parse_exports('csv, gpx,csv').formats == ('csv', 'gpx')
-    with pytest.raises(argparse.ArgumentTypeError, match="'gpx2' is no format; expected all or"):
-        parse_exports('csv,gpx2')
+    parser = argparse.ArgumentParser(exit_on_error=False)
+    replay(parser)
+    given = {text: parser.parse_args(['bag', '--export', text]).export.formats
+             for text in ('all', 'csv, gpx,csv')}
+    assert given == {'all': FORMATS, 'csv, gpx,csv': ('csv', 'gpx')}
+    with pytest.raises(argparse.ArgumentError, match="'gpx2' is no format; expected all or"):
+        parser.parse_args(['bag', '--export', 'csv,gpx2'])

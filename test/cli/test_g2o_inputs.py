@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from tum_files import read_tum
 
-from pose_graph_ros.cli.g2o_inputs import read_measurements
+from pose_graph_ros.cli.graph_input import read_measurements
 from pose_graph_ros.cli.main import main
 from pose_graph_ros.core.exceptions import FileFormatError
 from pose_graph_ros.core.geometry import covariance

@@ -6,7 +6,7 @@ import json
 
 import numpy as np
 
-from pose_graph_ros.cli.judgement import judgement, judgement_lines, NAMED
+from pose_graph_ros.cli.replay import judgement, judgement_lines, NAMED
 from pose_graph_ros.core.judgement.verdicts import (
     Decision,
     Judged,

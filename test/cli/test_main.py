@@ -56,9 +56,11 @@ def loaded(*words: str | Path) -> set[str]:
     return set(done.stdout.splitlines()[-1].split())
 
 
-@pytest.mark.parametrize('word', ['--help', '--version', 'no_such_tool'])
-def test_what_needs_no_tool_loads_none(word: str) -> None:
-    assert not loaded(word) & set(HEAVY)
+@pytest.mark.parametrize('words', [
+    ['--help'], ['--version'], ['no_such_tool'], *([tool, '--help'] for tool in TOOLS),
+    ['simulate', 'a', '--fix-sigma', 'b']], ids=' '.join)
+def test_help_and_wrong_words_load_nothing_that_takes_time(words: list[str]) -> None:
+    assert not loaded(*words) & set(HEAVY)
 
 
 def test_solve_loads_what_it_needs(tmp_path: Path) -> None:

@@ -10,6 +10,7 @@ import yaml
 
 from pose_graph_ros.adapters.parameters import checked
 from pose_graph_ros.cli import options as shared
+from pose_graph_ros.cli.arguments import demo
 from pose_graph_ros.core.exceptions import ConfigError
 
 FILE = """
@@ -32,8 +33,7 @@ other:
 
 def parsed(*words: str) -> argparse.Namespace:
     parser = argparse.ArgumentParser()
-    shared.add_inputs(parser)
-    shared.add_parameters(parser)
+    demo(parser)
     return parser.parse_args(words)
 
 

@@ -103,6 +103,8 @@ def test_global_poses_correct_the_path_and_all_files_are_written(
     errors = rms(content)
     assert errors['corrected path to truth'] < 0.03 < errors['odometry alone to truth']
     assert 'corrected path to truth' in printed
+    assert 'NEES of the pose: ' in printed
+    assert [content[f'nees_{name}']['expected'] for name in ('position', 'pose')] == [2, 3]
     assert 'counts: global_pose.accepted 40, loop_closure.accepted 1, odom.accepted 400' in printed
 
 

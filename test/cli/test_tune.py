@@ -23,7 +23,7 @@ from pose_graph_ros.core.geometry.geodesy import TangentPlane
 from pose_graph_ros.core.geometry.trajectory import Trajectory
 from pose_graph_ros.core.measurements import OdometrySample, Position
 from pose_graph_ros.offline.tuning.fit import Fit, Found
-from pose_graph_ros.offline.tuning.problem import Parameter, Role
+from pose_graph_ros.offline.tuning.likelihood import Parameter, Role
 
 
 @pytest.fixture(scope='module')

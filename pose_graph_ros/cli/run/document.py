@@ -19,8 +19,8 @@ from pose_graph_ros.cli.run.reading import FILE, VERSION
 from pose_graph_ros.cli.run.sources import analyse, source_entry
 from pose_graph_ros.cli.run.springs import springs
 from pose_graph_ros.core.graph.graph import Graph
-from pose_graph_ros.offline.drawing import binned_pattern
-from pose_graph_ros.offline.drawing.binned_pattern import BinnedPattern
+from pose_graph_ros.offline.drawing import pattern as patterns
+from pose_graph_ros.offline.drawing.pattern import BinnedPattern
 
 # Stamps from the year 2000 on are times of this epoch [ns]; others count from any beginning.
 _EPOCH = 946_684_800_000_000_000
@@ -151,7 +151,7 @@ def _updates(run: Run, frame: places.Frame) -> dict[str, Any] | None:
 
 def _sparsity(graph: Graph) -> list[dict[str, Any]]:
     """Return the patterns of H and of its factor."""
-    whole, factor = binned_pattern.hessian(graph), binned_pattern.factor(graph)
+    whole, factor = patterns.hessian(graph), patterns.factor(graph)
     upper = (whole.nonzeros + whole.size) // 2
     return [_pattern('H, poses in the order of time, then biases', whole, 0),
             _pattern('R, in the order of elimination', factor, factor.nonzeros - upper)]

@@ -41,9 +41,9 @@ from pose_graph_ros.core.io.g2o_text import LAYOUT
 from pose_graph_ros.core.io.g2o_writing import g2o_text, NOT_USED, STANDING_FOR_PRIORS
 from pose_graph_ros.core.io.json_values import annotations, decoded, encoded, optional
 from pose_graph_ros.core.io.old_versions import with_ids, with_judgement, with_names
+from pose_graph_ros.core.io.path_files import tum_text
 from pose_graph_ros.core.io.saved_graph import SavedGraph
 from pose_graph_ros.core.io.saved_priors import restored_priors, saved_priors, SavedPriors
-from pose_graph_ros.core.io.tum import tum_text
 from pose_graph_ros.core.saved_columns import Integers, Numbers, Rows3, Rows4, Rows6
 
 FORMAT = 'pose_graph_ros graph'

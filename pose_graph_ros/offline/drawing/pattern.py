@@ -1,14 +1,24 @@
 # Copyright 2026 The pose_graph_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""The pattern of H: which blocks are not zero, and which ones elimination fills."""
+"""
+The pattern of H and of its factor R: block by block, or counted in coarse cells for large graphs.
 
-from typing import NamedTuple
+H has a block for each node and for each two nodes in a constraint together. In cells it is in the
+order of time, and the factor R is that of the smoother, in its order of elimination: the rows of a
+clique have a block for each later frontal node and each separator node.
+"""
+
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from pose_graph_ros.core.elimination.ordering import minimum_degree
 from pose_graph_ros.core.geometry.se2 import BoolArray, IntArray
-from pose_graph_ros.offline.drawing.structure import Structure
+from pose_graph_ros.core.graph import tables as tb
+from pose_graph_ros.core.graph.graph import Graph
+from pose_graph_ros.offline.drawing.views import hidden, terms
+
+MOST_BINS = 120
 
 
 class Pattern(NamedTuple):
@@ -23,28 +33,22 @@ class Pattern(NamedTuple):
     """Which other blocks of its factor R are not zero, shape (n, n), upper triangle."""
 
 
-def pattern(graph: Structure, order: IntArray | None = None) -> Pattern:
+def pattern(graph: Any, order: list[int] | None = None) -> Pattern:
     """
-    Return the pattern of H and, if an order is given, the fill of its factor in that order.
+    Return the pattern of H of a factor graph, its hidden nodes in their order or in another.
 
-    Parameters
-    ----------
-    graph : Structure
-    order : ndarray of int, shape (N,), optional
-        Rows of all hidden nodes as they are eliminated; else that of the graph.
-
+    With an order, in which they are eliminated, it has the fill of the factor R as well.
     """
-    rows = np.arange(graph.n_nodes) if order is None else order
-    free = [row for row in rows.tolist() if not graph.fixed[row]]
+    free = [row for row in order or hidden(graph) if not graph.nodes[row]['fixed']]
     place = {row: n for n, row in enumerate(free)}
     blocks = np.zeros((len(free), len(free)), dtype=bool)
-    for term in graph.terms:
+    for term in terms(graph):
         at = [place[node] for node in term.nodes if node in place]
         if term.used:
             blocks[np.ix_(at, at)] = True
     fill = np.zeros_like(blocks) if order is None else filled(blocks) & ~blocks
-    return Pattern(tuple(graph.names[row] for row in free),
-                   tuple(graph.sizes[row] for row in free), blocks, fill)
+    return Pattern(tuple(graph.nodes[row]['name'] for row in free),
+                   tuple(graph.nodes[row]['size'] for row in free), blocks, fill)
 
 
 def filled(blocks: BoolArray) -> BoolArray:
@@ -56,17 +60,138 @@ def filled(blocks: BoolArray) -> BoolArray:
     return np.asarray(factor)
 
 
-def elimination_order(graph: Structure) -> IntArray:
+def elimination_order(graph: Any) -> list[int]:
     """
-    Return the rows of a graph in a fill-reducing order of elimination, shape (N,).
+    Return the hidden nodes of a factor graph in a fill-reducing order of elimination.
 
     It is the approximate minimum degree of `elimination.ordering`. A smoother puts its newest
     nodes last, which in a small graph leaves little to order; here none is put anywhere.
     """
-    near = [sorted(others) for others in graph.neighbours()]
+    rows = hidden(graph)
+    place = {row: n for n, row in enumerate(rows)}
+    near: list[set[int]] = [set() for _ in rows]
+    for term in terms(graph):
+        for node in term.nodes if term.used else ():
+            near[place[node]].update(place[other] for other in term.nodes if other != node)
     start = np.concatenate(([0], np.cumsum([len(others) for others in near])))
-    adjacency = np.array([row for others in near for row in others], dtype=np.int32)
+    adjacency = np.array([row for others in near for row in sorted(others)], dtype=np.int32)
     n_cliques, first, n_frontal, _, nodes = minimum_degree(
-        graph.n_nodes, 0, 0, 0, start.astype(np.int32), adjacency)
-    return np.concatenate([np.empty(0, dtype=np.int64)] + [
-        nodes[first[k]:first[k] + n_frontal[k]] for k in range(n_cliques)])
+        len(rows), 0, 0, 0, start.astype(np.int32), adjacency)
+    return [rows[node] for k in range(n_cliques)
+            for node in nodes[first[k]:first[k] + n_frontal[k]].tolist()]
+
+
+class BinnedPattern(NamedTuple):
+    """Blocks that are not zero, counted in cells."""
+
+    size: int
+    """Number of nodes, and so of block rows; fixed nodes have none."""
+    nonzeros: int
+    """Number of blocks: of H in both triangles, of R in the upper one."""
+    bins: int
+    """Number of cells along a side."""
+    cells: IntArray
+    """Row, column and number of blocks of each cell that is not empty, shape (C, 3)."""
+
+
+def hessian(graph: Graph, most_bins: int = MOST_BINS) -> BinnedPattern:
+    """
+    Return the pattern of H, poses in the order of time and then biases.
+
+    Parameters
+    ----------
+    graph : Graph
+    most_bins : int
+
+    """
+    free = np.flatnonzero(~graph.fixed)
+    order = np.concatenate((free[graph.is_pose[free]], free[~graph.is_pose[free]]))
+    place = np.full(graph.n_nodes, -1)
+    place[order] = np.arange(len(order))
+    edges = graph.edges_by_row
+    used = edges.weight > 0.0
+    ends = np.column_stack((edges.i, edges.j, edges.k))[used]
+    pairs = [np.column_stack((order, order))]
+    for a, b in ((0, 1), (0, 2), (1, 2)):
+        pairs += [ends[:, [a, b]], ends[:, [b, a]]]
+    for prior in graph.priors:
+        rows = graph.node_rows(prior.nodes)
+        pairs.append(np.column_stack([each.ravel() for each in np.meshgrid(rows, rows)]))
+    blocks = np.concatenate(pairs).astype(np.int64)
+    blocks = place[blocks[np.all(blocks >= 0, axis=1)]]
+    blocks = blocks[np.all(blocks >= 0, axis=1)]
+    numbers = np.unique(blocks[:, 0] * len(order) + blocks[:, 1])
+    return _binned(np.column_stack(np.divmod(numbers, max(len(order), 1))), len(order), most_bins)
+
+
+def factor(graph: Graph, most_bins: int = MOST_BINS) -> BinnedPattern:
+    """
+    Return the pattern of the factor R that the smoother has of a graph.
+
+    Parameters
+    ----------
+    graph : Graph, all of whose edits have been solved for
+    most_bins : int
+
+    """
+    memory, fixed = graph.memory, graph.fixed
+    cliques = memory['clique_i'][:memory.head[tb.N_CLIQUES]]
+    frontal, separator, first = (
+        cliques[:, column].tolist() for column in (tb.N_FRONTAL, tb.N_SEPARATOR, tb.NODES))
+    nodes = memory['pool_i']
+    place, n = np.full(graph.n_nodes, -1), 0
+    order = _children_first(cliques)
+    for c in order:
+        own = nodes[first[c]:first[c] + frontal[c]]
+        own = own[~fixed[own]]
+        place[own] = np.arange(n, n + len(own))
+        n += len(own)
+    bins = min(most_bins, n)
+    counts = np.zeros((bins, bins), dtype=np.int64)
+    total = 0
+    for c in order:
+        at = place[nodes[first[c]:first[c] + frontal[c] + separator[c]]]
+        own, rest = at[:frontal[c]], at[frontal[c]:]
+        own, rest = np.sort(own[own >= 0]), rest[rest >= 0]
+        rows, columns = np.triu_indices(len(own))
+        blocks = np.concatenate((
+            np.column_stack((own[rows], own[columns])),
+            np.column_stack((np.repeat(own, len(rest)), np.tile(rest, len(own))))))
+        total += len(blocks)
+        np.add.at(counts, tuple((blocks * bins // max(n, 1)).T), 1)
+    filled = np.argwhere(counts > 0)
+    return BinnedPattern(n, total, bins, np.column_stack((filled, counts[tuple(filled.T)])))
+
+
+def _children_first(cliques: IntArray) -> list[int]:
+    """Return the rows of all cliques with frontal nodes, each after those below it."""
+    parents, siblings, children = (
+        cliques[:, column].tolist() for column in (tb.PARENT, tb.SIBLING, tb.CHILD))
+    frontal = cliques[:, tb.N_FRONTAL]
+    stack = np.flatnonzero((frontal > 0) & (cliques[:, tb.PARENT] < 0)).tolist()
+    found: list[int] = []
+    while len(stack) > 0:
+        c = stack.pop()
+        found.append(c)
+        child = children[c]
+        while child >= 0:
+            if frontal[child] > 0:
+                stack.append(child)
+            child = siblings[child]
+    assert all(parents[c] < 0 or frontal[parents[c]] > 0 for c in found)
+    return found[::-1]
+
+
+def _binned(blocks: IntArray, size: int, most_bins: int) -> BinnedPattern:
+    """
+    Count blocks in cells.
+
+    Parameters
+    ----------
+    blocks : ndarray of int, shape (B, 2), rows and columns
+    size, most_bins : int
+
+    """
+    bins = min(most_bins, size)
+    cells, counts = np.unique(blocks * bins // max(size, 1), axis=0, return_counts=True)
+    return BinnedPattern(size, len(blocks), bins, np.column_stack((cells, counts)))

@@ -94,7 +94,7 @@ class Course:
 
 
 def course(
-    world: World, seed: int, duration_s: float | None = None,
+    world: World, seed: int, duration_s: float,
     change: Callable[[Setup], Setup] = lambda usual: usual,
 ) -> Course:
     """
@@ -104,13 +104,13 @@ def course(
     ----------
     world : World
     seed : int, not negative
-    duration_s : float, length, 10 s or more [s]; by default that of the world
+    duration_s : float, length, 10 s or more [s]
     change : callable, returns what is simulated from what usually is
 
     """
     streams = {name: np.random.default_rng((seed, k)) for k, name in enumerate(STREAMS)}
     generator = np.random.default_rng(seed) if world.one_stream else streams['world']
-    motion = world.drive(generator, world.duration_s if duration_s is None else duration_s)
+    motion = world.drive(generator, duration_s)
     truth = Trajectory(START_NS + np.round(motion.time * 1e9).astype(np.int64), motion.poses)
     usual = world.setup(motion)
     if world.one_stream:

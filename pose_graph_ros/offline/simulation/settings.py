@@ -11,13 +11,14 @@ from dataclasses import dataclass, field
 from enum import Enum
 import math
 
-import numpy as np
-
 from pose_graph_ros.core.exceptions import ConfigError
 from pose_graph_ros.core.setting_checks import require, require_member
 
 ODOMETRY, GYRO, FIXES, POSES, CLOSURES = (
     '/odom', '/imu/data', '/gps/fix', '/global_pose', '/loop_closure')
+DURATIONS_S = {'drive': 440.0, 'hall': 900.0, 'grid': 1800.0}
+NODE_DISTANCES = {'drive': 2.0, 'hall': 1.0, 'grid': 1.0}
+"""Usual lengths of simulations, and distances of the nodes of a graph [m], by world."""
 TRUTH = '/ground_truth'
 LATENCY_S = {ODOMETRY: 0.004, GYRO: 0.002, FIXES: 0.13, POSES: 0.05, CLOSURES: 0.8, TRUTH: 0.004}
 """Usual time from the stamp of a measurement to its recording, by topic."""
@@ -116,7 +117,7 @@ class Fixes:
     @property
     def sigma(self) -> float:
         """Standard deviation of a coordinate, of both errors together [m]."""
-        return float(np.hypot(self.correlated, self.white))
+        return math.hypot(self.correlated, self.white)
 
 
 @dataclass(frozen=True, slots=True)

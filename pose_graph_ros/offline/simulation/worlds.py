@@ -55,14 +55,10 @@ REFLECTED = Jump(FIXES, 150.0, (14.0, -9.0, 0.0), 25.0, 1.5)
 class World:
     """A place, and what moves there."""
 
-    duration_s: float
-    """Usual length of a simulation [s]."""
     drive: Callable[[np.random.Generator, float], Motion]
     """Return the motion of some length [s]."""
     setup: Callable[[Motion], Setup]
     """Return the usual sensors and disturbances."""
-    node_distance: float
-    """Usual distance of the nodes of a graph [m]."""
     one_stream: bool = False
     """Whether its usual sensors draw from one stream of random numbers, one after the other."""
 
@@ -119,7 +115,7 @@ def _grid_setup(_motion: Motion) -> Setup:
 
 
 WORLDS = {
-    'drive': World(440.0, drive_circuit, _drive_setup, 2.0, one_stream=True),
-    'hall': World(900.0, _hall, _hall_setup, 1.0),
-    'grid': World(1800.0, _grid, _grid_setup, 1.0),
+    'drive': World(drive_circuit, _drive_setup, one_stream=True),
+    'hall': World(_hall, _hall_setup),
+    'grid': World(_grid, _grid_setup),
 }

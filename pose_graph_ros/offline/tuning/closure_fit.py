@@ -28,7 +28,7 @@ from pose_graph_ros.core.graph.error_functions import edge_errors
 from pose_graph_ros.core.graph.graph import Graph
 from pose_graph_ros.core.graph.kinds import EdgeKind
 from pose_graph_ros.offline.tuning.fit import decided, Fit, Minimum, minimum
-from pose_graph_ros.offline.tuning.problem import Parameter, PRIOR_SPREAD, Role
+from pose_graph_ros.offline.tuning.likelihood import Parameter, PRIOR_SPREAD, Role
 
 # Largest number of hidden nodes: each evaluation factorises H.
 MOST_NODES = 20_000

@@ -3,7 +3,7 @@
 """
 Noise of odometry and of sources under which the measurements of a drive are the most likely.
 
-The cost of `problem` is minimised by Powell's method, first with white errors, then with
+The cost of `likelihood` is minimised by Powell's method, first with white errors, then with
 correlated ones of each source, which are taken if they are much more likely. A parameter whose
 setting is as likely as its optimum, by a likelihood ratio, keeps its setting; the others are
 fitted again. The interval of a parameter is where the cost, minimised over all others, rises by
@@ -15,17 +15,23 @@ If they do so by far, odometry is no random walk. Then the fit is made again wit
 are farther apart as well, each of these with the same weight together (a composite likelihood;
 C. Varin et al., "An overview of composite likelihood methods", Statistica Sinica 21, 2011): what
 is best for the next measurement is too sure of itself over longer times.
+
+`estimate` does so for all sources of odometry and all that measure in the map.
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 import math
 from typing import NamedTuple, Protocol
 
 import numpy as np
 from scipy.optimize import minimize
 
+from pose_graph_ros.core.config import BackendConfig, NoiseFrom
 from pose_graph_ros.core.geometry.se2 import FloatArray
-from pose_graph_ros.offline.tuning.problem import bounds, Parameter, Problem, Role
+from pose_graph_ros.core.odometry.timeline import OdometryTimeline
+from pose_graph_ros.offline.tuning import likelihood as lk
+from pose_graph_ros.offline.tuning.drive_rows import drive_rows, Measured, odometry_noise
+from pose_graph_ros.offline.tuning.likelihood import bounds, Parameter, Problem, Role
 
 # Rise of twice the negative logarithm of the likelihood at the ends of an interval of 95 %.
 RISE = 3.84
@@ -52,6 +58,10 @@ STRIDES = 1, 4, 16
 WIDE = 10.0
 # Tolerance of the logarithms, and relative one of the cost.
 X_TOLERANCE, COST_TOLERANCE = 1e-2, 1e-7
+# Number of measurements of each source that are used; of more, every second, third, ...
+MOST = 2000
+# Least path by odometry that can tell of its noise [m].
+LEAST_PATH = 5.0
 
 
 class Found(NamedTuple):
@@ -355,3 +365,60 @@ def _end(
         middle = 0.5 * (low + high)
         low, high = (middle, high) if rise(x + middle * direction) < needed else (low, middle)
     return 0.5 * (low + high)
+
+
+def estimate(
+    odometry: Mapping[str, OdometryTimeline], sources: Mapping[str, Measured],
+    config: BackendConfig, tick: Callable[[], None] = lambda: None,
+) -> dict[str, Fit]:
+    """
+    Return a fit for each source of odometry; only the first one has those of the other sources.
+
+    Parameters
+    ----------
+    odometry : mapping, the primary one first
+    sources : mapping, what was measured in the map; the indices of the fits are by this order
+    config : BackendConfig, the settings
+    tick : callable, called at each evaluation
+
+    """
+    thinned = {name: _thinned(of) for name, of in sources.items()}
+    fits: dict[str, Fit] = {}
+    errors = np.tile([1.0, 0.0, 1.0, 1.0], (len(sources), 1))
+    for name, timeline in odometry.items():
+        settings = config.odometry_source(name)
+        sigmas = odometry_noise(settings)
+        rows = drive_rows(timeline, thinned, config)
+        if not np.any((rows.source >= 0) & (rows.rows[:, lk.XX] > 0.0)):
+            continue
+        numbers = [lk.GIVEN] if settings.noise_from is NoiseFrom.TWIST else range(4)
+        parameters = [Parameter(Role.ODOMETRY, k, float(sigmas[k])) for k in numbers
+                      if sigmas[k] > 0.0]
+        if np.sum(rows.rows[:, lk.LENGTH]) < LEAST_PATH:
+            parameters = []     # it stood
+        if len(fits) == 0:
+            parameters += [Parameter(role, k, 1.0) for k, of in enumerate(sources.values())
+                           for role, there in ((Role.WHITE, of.has_positions),
+                                               (Role.HEADING, of.has_headings)) if there]
+        problem = Problem(rows, sigmas**2, errors, tick)
+        fits[name] = fit(problem, parameters)
+        if len(fits) == 1:
+            errors = _errors(fits[name], len(sources))
+    return fits
+
+
+def _thinned(of: Measured) -> Measured:
+    stride = -(-len(of.stamps_ns) // MOST)
+    return Measured(of.stamps_ns[::stride], of.values[::stride]) if stride > 1 else of
+
+
+def _errors(found: Fit, count: int) -> FloatArray:
+    """Return the statistics of the errors of the sources, shape (S, 4)."""
+    errors = np.empty((count, lk.N_SOURCE))
+    for k, row in enumerate(errors):
+        correlated = found.value(Role.CORRELATED, k, 0.0)
+        white = found.value(Role.WHITE, k, 1.0)
+        row[:] = (found.value(Role.TAU, k, 1.0), correlated,
+                  found.value(Role.SHARE, k, 0.0) * correlated or white,
+                  found.value(Role.HEADING, k, 1.0))
+    return errors

@@ -12,7 +12,7 @@ from tum_files import read_tum
 
 from pose_graph_ros.core.geometry import se2
 from pose_graph_ros.core.geometry.trajectory import Trajectory
-from pose_graph_ros.core.io.tum import write_tum
+from pose_graph_ros.core.io.path_files import write_tum
 
 # Rounding of a heading by the sine and cosine of its half [rad].
 HEADING = 1e-15

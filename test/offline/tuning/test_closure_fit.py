@@ -13,7 +13,7 @@ from pose_graph_ros.core.graph.kinds import EdgeKind
 from pose_graph_ros.core.odometry.motion import Motion, odometry_covariance
 from pose_graph_ros.offline.tuning.closure_fit import ClosureProblem, fit_closures
 from pose_graph_ros.offline.tuning.fit import Found
-from pose_graph_ros.offline.tuning.problem import Role
+from pose_graph_ros.offline.tuning.likelihood import Role
 
 LAP, N, EVERY = 40, 320, 4
 

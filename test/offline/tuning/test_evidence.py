@@ -8,10 +8,9 @@ import pytest
 
 from pose_graph_ros.core.config import BackendConfig, OdometrySource, POSITIONS
 from pose_graph_ros.offline.tuning import drive_rows as dr
-from pose_graph_ros.offline.tuning.estimation import estimate
-from pose_graph_ros.offline.tuning.evidence import largest_ratio, proven, shown_variances
-from pose_graph_ros.offline.tuning.fit import Fit
-from pose_graph_ros.offline.tuning.problem import Role
+from pose_graph_ros.offline.tuning.fit import estimate, Fit
+from pose_graph_ros.offline.tuning.held_out import largest_ratio, proven, shown_variances
+from pose_graph_ros.offline.tuning.likelihood import Role
 
 GOOD = 0.002, 0.001, 2e-5, 2e-5
 

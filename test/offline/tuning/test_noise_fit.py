@@ -9,9 +9,8 @@ import pytest
 from pose_graph_ros.core.config import BackendConfig, OdometrySource, POSITIONS
 from pose_graph_ros.core.measurements import HeadingOnly, OdometrySample, Position
 from pose_graph_ros.offline.tuning import drive_rows as dr
-from pose_graph_ros.offline.tuning.estimation import estimate
-from pose_graph_ros.offline.tuning.fit import Fit
-from pose_graph_ros.offline.tuning.problem import FIRST_MEASUREMENTS, Problem, Role
+from pose_graph_ros.offline.tuning.fit import estimate, Fit
+from pose_graph_ros.offline.tuning.likelihood import FIRST_MEASUREMENTS, Problem, Role
 
 
 def found(odometry: list[OdometrySample], fixes: list[Position]) -> Fit:

@@ -2,9 +2,10 @@
 # SPDX-License-Identifier: Apache-2.0
 """The four views of a small graph, against lists by hand and against H itself."""
 
-from graphlib import TopologicalSorter
+from typing import Any
 
 from hypothesis import given, settings, strategies as st
+import networkx as nx
 import numpy as np
 import pytest
 from random_graphs import random_graph
@@ -14,11 +15,23 @@ from pose_graph_ros.core.graph.constraints import EdgeKind, Edges, ObservedKind,
 from pose_graph_ros.core.graph.graph import Graph, GraphUpdate
 from pose_graph_ros.core.graph.priors import Prior
 from pose_graph_ros.core.marginalization.marginalize import equations
-from pose_graph_ros.offline.drawing.diagram import Diagram, diagram, Role, View
-from pose_graph_ros.offline.drawing.example import five_states
-from pose_graph_ros.offline.drawing.layout import APART, place
 from pose_graph_ros.offline.drawing.pattern import elimination_order, filled, pattern
-from pose_graph_ros.offline.drawing.structure import part, Sort, Structure, structure, within
+from pose_graph_ros.offline.drawing.views import (
+    bayesian_network,
+    factor_graph,
+    factors,
+    five_states,
+    hidden,
+    map_places,
+    markov_random_field,
+    part,
+    pose_graph,
+    Role,
+    Sort,
+    terms,
+    time_slices,
+    VIEWS,
+)
 
 seeds = st.integers(0, 2**31)
 
@@ -42,63 +55,63 @@ def small_graph() -> Graph:
     return graph
 
 
-def named(drawing: Diagram) -> list[tuple[str, str]]:
-    """Return the names of the ends of all arcs; those without a direction are sorted."""
-    names = [vertex.name for vertex in drawing.vertices]
-    pairs = [(names[arc.start], names[arc.end]) for arc in drawing.arcs]
-    return [pair if arc.directed else tuple(sorted(pair))
-            for pair, arc in zip(pairs, drawing.arcs, strict=True)]
+def named(view: Any) -> list[tuple[str, str]]:
+    """Return the names of the ends of all arcs, sorted; those without a direction are sorted."""
+    pairs = [(view.nodes[i]['name'], view.nodes[j]['name'], arc['directed'])
+             for i, j, arc in view.edges(data=True)]
+    return sorted((i, j) if directed else (min(i, j), max(i, j)) for i, j, directed in pairs)
 
 
-def roles(drawing: Diagram, role: Role) -> list[str]:
-    return [vertex.name for vertex in drawing.vertices if vertex.role is role]
+def roles(view: Any, role: Role) -> list[str]:
+    return [data['name'] for _, data in view.nodes(data=True) if data['role'] is role]
 
 
-SMALL = structure(small_graph().rows())
+SMALL = factor_graph(small_graph().rows())
 
 
 def test_a_pose_graph_has_hidden_and_observed_nodes_and_directed_edges() -> None:
-    drawing = diagram(SMALL, View.POSE_GRAPH)
-    assert roles(drawing, Role.POSE) == ['x0', 'x1', 'x2', 'x3']
-    assert roles(drawing, Role.BIAS) == ['b4']
-    assert roles(drawing, Role.LANDMARK) == ['l5']
-    assert roles(drawing, Role.OBSERVED) == ['z0', 'z1']
-    assert named(drawing) == [
+    view = pose_graph(SMALL)
+    assert roles(view, Role.POSE) == ['x0', 'x1', 'x2', 'x3']
+    assert roles(view, Role.BIAS) == ['b4']
+    assert roles(view, Role.LANDMARK) == ['l5']
+    assert roles(view, Role.OBSERVED) == ['z0', 'z1']
+    assert named(view) == sorted([
         ('x0', 'x1'), ('x1', 'x2'), ('x2', 'x3'), ('x3', 'x0'), ('0', 'x1'), ('0', 'x2'),
-        ('0', 'b4'), ('x0', 'l5'), ('x2', 'l5'), ('z0', 'x1'), ('z1', 'x2')]
-    assert [vertex.name for vertex in drawing.vertices if vertex.fixed] == ['x0']
-    assert [vertex.name for vertex in drawing.vertices if not vertex.used] == ['z1']
-    assert drawing.notes == ('Dashed: 1 constraint with weight 0.',)
+        ('0', 'b4'), ('x0', 'l5'), ('x2', 'l5'), ('z0', 'x1'), ('z1', 'x2')])
+    assert [view.nodes[node]['name'] for node in hidden(view) if view.nodes[node]['fixed']] == [
+        'x0']
+    assert [arc['sort'] for _, _, arc in view.edges(data=True) if not arc['used']] == [
+        Sort.OBSERVED]
+    assert view.graph['notes'] == ['Dashed: 1 constraint with weight 0.']
 
 
 def test_a_factor_graph_has_a_factor_for_each_term() -> None:
-    drawing = diagram(SMALL, View.FACTOR_GRAPH)
-    factors = [vertex for vertex in drawing.vertices if vertex.role is Role.FACTOR]
-    assert [vertex.sort for vertex in factors] == [
-        *[Sort.ODOMETRY] * 3, Sort.LOOP_CLOSURE, Sort.TURN, *[Sort.LANDMARK] * 2, Sort.OBSERVED]
-    assert [len(vertex.nodes) for vertex in factors] == [2, 2, 2, 2, 3, 2, 2, 1]
-    assert not any(arc.directed for arc in drawing.arcs)
-    assert len(drawing.arcs) == 16
-    assert drawing.notes == ('1 constraint with weight 0 left out.',)
+    view = factors(SMALL)
+    assert [(each.sort, len(each.nodes)) for each in terms(view)] == [
+        *[(Sort.ODOMETRY, 2)] * 3, (Sort.LOOP_CLOSURE, 2), (Sort.TURN, 3),
+        *[(Sort.LANDMARK, 2)] * 2, (Sort.OBSERVED, 1)]
+    assert not any(arc['directed'] for _, _, arc in view.edges(data=True))
+    assert view.number_of_edges() == 16
+    assert view.graph['notes'] == ['1 constraint with weight 0 left out.']
 
 
 def test_a_markov_random_field_has_a_line_for_each_pair() -> None:
-    drawing = diagram(SMALL, View.MRF)
-    assert {vertex.role for vertex in drawing.vertices} == {Role.POSE, Role.BIAS, Role.LANDMARK}
-    assert named(drawing) == [
+    view = markov_random_field(SMALL)
+    assert len(view) == len(hidden(view)) == 6
+    assert named(view) == sorted([
         ('x0', 'x1'), ('x0', 'x3'), ('l5', 'x0'), ('x1', 'x2'), ('b4', 'x1'), ('x2', 'x3'),
-        ('b4', 'x2'), ('l5', 'x2')]
-    assert drawing.notes[0].startswith('1 term of a single node is not in the picture')
+        ('b4', 'x2'), ('l5', 'x2')])
+    assert view.graph['notes'][0].startswith('1 term of a single node is not in the picture')
 
 
 def test_a_dynamic_bayesian_network_has_controls_and_measurements() -> None:
-    drawing = diagram(SMALL, View.DBN)
-    assert roles(drawing, Role.CONTROL) == ['u0', 'u1', 'u2']
-    assert roles(drawing, Role.MEASUREMENT) == ['z0', 'z1', 'z2', 'z3', 'z4']
-    assert named(drawing) == [
+    view = bayesian_network(SMALL)
+    assert roles(view, Role.CONTROL) == ['u0', 'u1', 'u2']
+    assert roles(view, Role.MEASUREMENT) == ['z0', 'z1', 'z2', 'z3', 'z4']
+    assert named(view) == sorted([
         ('x0', 'x1'), ('u0', 'x1'), ('x1', 'x2'), ('u1', 'x2'), ('x2', 'x3'), ('u2', 'x3'),
         ('x3', 'z0'), ('x0', 'z0'), ('x1', 'z1'), ('x2', 'z1'), ('b4', 'z1'),
-        ('x0', 'z2'), ('l5', 'z2'), ('x2', 'z3'), ('l5', 'z3'), ('x1', 'z4')]
+        ('x0', 'z2'), ('l5', 'z2'), ('x2', 'z3'), ('l5', 'z3'), ('x1', 'z4')])
 
 
 def test_a_dense_prior_is_one_term_of_all_its_nodes() -> None:
@@ -106,10 +119,10 @@ def test_a_dense_prior_is_one_term_of_all_its_nodes() -> None:
     graph.apply(GraphUpdate(priors=[Prior(
         np.array([1, 2, 3]), graph.poses[1:4].copy(), np.eye(9), np.zeros(9), 0.0,
         anchored=True)]))
-    whole = structure(graph.rows())
-    assert whole.terms[-1] == (Sort.PRIOR, (1, 2, 3), True)
-    assert ('x1', 'x3') in named(diagram(whole, View.MRF))
-    assert len(roles(diagram(whole, View.POSE_GRAPH), Role.JOINT)) == 2
+    whole = factor_graph(graph.rows())
+    assert terms(whole)[-1] == (Sort.PRIOR, (1, 2, 3), True)
+    assert ('x1', 'x3') in named(markov_random_field(whole))
+    assert len(roles(pose_graph(whole), Role.JOINT)) == 2
 
 
 def numeric_pattern(graph: Graph) -> np.ndarray:
@@ -125,12 +138,12 @@ def test_the_pattern_is_that_of_the_matrix_and_the_random_field_that_off_its_dia
     seed: int,
 ) -> None:
     graph = random_graph(seed, fix=(0,), n_biases=2)
-    whole = structure(graph.rows())
+    whole = factor_graph(graph.rows())
     expected = numeric_pattern(graph)
     np.testing.assert_array_equal(pattern(whole).blocks, expected)
-    pairs = np.zeros((whole.n_nodes, whole.n_nodes), dtype=bool)
-    for arc in diagram(whole, View.MRF).arcs:
-        pairs[arc.start, arc.end] = True
+    pairs = np.zeros((graph.n_nodes, graph.n_nodes), dtype=bool)
+    for i, j in markov_random_field(whole).edges():
+        pairs[i, j] = True
     np.testing.assert_array_equal(pairs[1:, 1:], np.triu(expected, 1))
 
 
@@ -155,11 +168,11 @@ def test_the_fill_is_that_of_a_numeric_factor(seed: int) -> None:
 @given(seeds)
 def test_the_elimination_takes_each_node_once(seed: int) -> None:
     graph = random_graph(seed, n_nodes=12, n_edges=20, fix=(3,))
-    whole = structure(graph.rows())
+    whole = factor_graph(graph.rows())
     order = elimination_order(whole)
-    assert sorted(order.tolist()) == list(range(12))
+    assert sorted(order) == list(range(12))
     found = pattern(whole, order)
-    assert found.names == tuple(whole.names[row] for row in order.tolist() if row != 3)
+    assert found.names == tuple(whole.nodes[row]['name'] for row in order if row != 3)
     assert not np.any(found.fill & found.blocks)
     assert not np.any(np.tril(found.fill))
 
@@ -169,8 +182,8 @@ def test_a_tree_is_eliminated_without_fill() -> None:
     graph.apply(GraphUpdate(hidden=np.zeros((7, 3)), edges=Edges(
         [0, 0, 0, 3, 3, 5], [1, 2, 3, 4, 5, 6], np.zeros((6, 3)), np.tile(np.eye(3), (6, 1, 1)),
         [EdgeKind.LOOP_CLOSURE] * 6)))
-    whole = structure(graph.rows())
-    assert np.any(pattern(whole, np.arange(7)).fill)
+    whole = factor_graph(graph.rows())
+    assert np.any(pattern(whole, list(range(7))).fill)
     assert not np.any(pattern(whole, elimination_order(whole)).fill)
 
 
@@ -178,11 +191,7 @@ def test_a_tree_is_eliminated_without_fill() -> None:
 def test_a_dynamic_bayesian_network_has_no_circle(seed: int) -> None:
     graph = random_graph(seed, n_biases=2)
     graph = with_random_kinds(graph, seed)
-    drawing = diagram(structure(graph.rows()), View.DBN)
-    before: dict[int, set[int]] = {}
-    for arc in drawing.arcs:
-        before.setdefault(arc.end, set()).add(arc.start)
-    TopologicalSorter(before).prepare()
+    assert nx.is_directed_acyclic_graph(bayesian_network(factor_graph(graph.rows())))
 
 
 def with_random_kinds(graph: Graph, seed: int) -> Graph:
@@ -197,41 +206,42 @@ def with_random_kinds(graph: Graph, seed: int) -> Graph:
 
 
 def test_the_five_states_have_the_patterns_of_the_thesis() -> None:
-    shown = [structure(rows) for _, rows in five_states()]
+    shown = [factor_graph(rows) for _, rows in five_states()]
     band = np.abs(np.subtract.outer(np.arange(5), np.arange(5))) <= 1
     expected = [np.ones((1, 1)), np.ones((1, 1)), np.ones((2, 2)), np.ones((2, 2)), band]
     for each, blocks in zip(shown, expected, strict=True):
         np.testing.assert_array_equal(pattern(each).blocks, blocks)
-    assert [len(roles(diagram(each, View.POSE_GRAPH), Role.OBSERVED)) for each in shown] == [
+    assert [len(roles(pose_graph(each), Role.OBSERVED)) for each in shown] == [
         1, 2, 2, 3, 4]
 
 
-def test_a_part_has_the_nodes_within_some_hops_and_the_terms_among_them() -> None:
-    chain = structure(five_states()[-1][1])
-    near = within(chain, 1, 1)
-    np.testing.assert_array_equal(near, [True, True, True, False, False])
-    np.testing.assert_array_equal(within(chain, 4, 0), [False] * 4 + [True])
-    shown, n_cut = part(chain, near)
-    assert shown.names == ('x0', 'x1', 'x2')
+def test_a_part_has_the_terms_among_its_nodes() -> None:
+    chain = factor_graph(five_states()[-1][1])
+    shown, n_cut = part(chain, {0, 1, 2})
+    assert [shown.nodes[node]['name'] for node in hidden(shown)] == ['x0', 'x1', 'x2']
     assert n_cut == 1
-    assert named(diagram(shown, View.MRF)) == [('x0', 'x1'), ('x1', 'x2')]
+    assert named(markov_random_field(shown)) == [('x0', 'x1'), ('x1', 'x2')]
     with pytest.raises(GraphUpdateError, match='none of the hidden nodes'):
-        part(chain, np.zeros(5, dtype=bool))
+        part(chain, set())
 
 
-@settings(max_examples=25)
-@given(seeds, st.sampled_from(list(View)))
-def test_what_is_round_does_not_overlap(seed: int, view: View) -> None:
+@settings(max_examples=10, deadline=None)
+@given(seeds, st.sampled_from(list(VIEWS)))
+def test_every_vertex_has_a_place_and_poses_are_to_scale(seed: int, name: str) -> None:
     rng = np.random.default_rng(seed)
     graph = random_graph(seed, int(rng.integers(2, 8)), n_biases=int(rng.integers(0, 2)))
-    whole = structure(graph.rows())
-    drawing = diagram(whole, view)
-    layout = place(drawing, whole)
-    assert layout.at.shape == (len(drawing.vertices), 2)
-    assert len(layout.corners) == len(drawing.arcs)
-    assert np.all(np.isfinite(layout.at))
-    rounds = whole.n_nodes if view is not View.DBN else len(drawing.vertices)
-    assert least_distance(layout.at[:rounds]) > (2.2 if view is View.DBN else APART - 0.3)
+    view = VIEWS[name](factor_graph(graph.rows()))
+    at = time_slices(view) if name == 'dbn' else map_places(view)[0]
+    assert set(at) == set(view)
+    assert np.all(np.isfinite(list(at.values())))
+    poses = np.flatnonzero(graph.is_pose)
+    if name == 'dbn':
+        assert least_distance(np.array(list(at.values()))) > 0.5
+    else:
+        shown, true = (np.array([each[node] for node in poses.tolist()])
+                       for each in (at, graph.poses[:, :2]))
+        scale = np.ptp(shown[:, 0]) / np.ptp(true[:, 0])
+        np.testing.assert_allclose(shown - shown[0], scale * (true - true[0]), atol=1e-9)
 
 
 def least_distance(at: np.ndarray) -> float:
@@ -239,18 +249,13 @@ def least_distance(at: np.ndarray) -> float:
     return float(np.min(np.hypot(apart[..., 0], apart[..., 1]) + 1e9 * np.eye(len(at))))
 
 
-def test_nodes_at_one_place_are_moved_apart_and_counted() -> None:
+def test_nodes_on_each_other_are_counted_and_springs_move_them_apart() -> None:
     graph = Graph()
-    graph.apply(GraphUpdate(hidden=np.zeros((6, 3))))
-    whole: Structure = structure(graph.rows())
-    layout = place(diagram(whole, View.MRF), whole)
-    assert least_distance(layout.at) > APART - 0.1
-    assert layout.n_moved >= 5
-
-
-def test_a_graph_with_room_is_to_scale() -> None:
-    chain = structure(five_states()[-1][1])
-    layout = place(diagram(chain, View.FACTOR_GRAPH), chain)
-    steps = np.diff(layout.at[:5], axis=0)
-    np.testing.assert_allclose(steps, np.tile(steps[0], (4, 1)), atol=1e-9)
-    assert layout.n_moved == 0
+    graph.apply(GraphUpdate(hidden=np.zeros((3, 3)), edges=Edges(
+        [0, 1], [1, 2], np.zeros((2, 3)), np.tile(np.eye(3), (2, 1, 1)),
+        [EdgeKind.ODOMETRY] * 2)))
+    view = markov_random_field(factor_graph(graph.rows()))
+    assert map_places(view)[1] == 3
+    at, n_near = map_places(view, spring=True)
+    assert n_near == 0
+    assert least_distance(np.array(list(at.values()))) > 0.5
