@@ -76,8 +76,8 @@ class Judge:
         self._smoother, self._reweighting, self._config = smoother, reweighting, config
         self._nodes = nodes
         self._fixes = FixJudge(smoother, reweighting, config)
-        self._odometry = OdometryStates(nodes, self._fixes.weight_of_odometry)
-        self._closures = ClosureJudge(smoother, reweighting, config, self._odometry)
+        self._odometry = OdometryStates(nodes)
+        self._closures = ClosureJudge(smoother, reweighting, config)
         self._staged = np.empty(0, dtype=np.int64)
         """The judged closures of the last `before`, by their numbers among its edges."""
         self._new: Sequence[NewConstraint] = ()
@@ -106,7 +106,6 @@ class Judge:
         """
         self._new = new
         change = self._fixes.before(new, change, now_ns)
-        change = change._replace(weigh_edges=self._odometry.kept(change.weigh_edges))
         first = self._smoother.graph.next_ids.edge
         closures = [
             one for one in new if one.is_edge and self._is_judged_closure(one, change, first)]
@@ -311,9 +310,9 @@ class Judge:
         leaving : Leaving, optional, what was decided on it; None if nothing of it is judged
 
         """
-        closures = self._closures.forget(nodes, edges)
+        self._closures.forget(nodes, edges)
         self._fixes.forget(nodes, edges, observed, leaving and leaving.last)
-        self._odometry.forget(self._smoother.graph, edges, closures, self._fixes.loosened)
+        self._odometry.forget(self._smoother.graph, edges, self._fixes.loosened)
         if leaving is not None:
             self._left.extend(leaving.unused)
 
@@ -373,7 +372,7 @@ class Judge:
         """
         graph = self._smoother.graph
         poses, weights, base = graph.poses.copy(), graph.weights, self._reweighting.base_weights()
-        bring_back = self._closures.state(), self._fixes.state()
+        bring_back = self._closures.state(), self._fixes.state(), self._odometry.state()
 
         def undo() -> None:
             for each in bring_back:

@@ -9,7 +9,6 @@ import numpy as np
 
 from pose_graph_ros.core.geometry.se2 import BoolArray, IntArray
 from pose_graph_ros.core.graph.graph import Graph
-from pose_graph_ros.core.judgement import jump_search
 from pose_graph_ros.core.judgement.closure_states import ClosureStates
 from pose_graph_ros.core.judgement.closures import ClosureTable
 from pose_graph_ros.core.judgement.swaps import Found, Swap
@@ -78,12 +77,10 @@ class SetSearch:
                     states.judged[known])
         while swap.step(clique):
             yield
-        found = swap.found or (yield from jump_search.search(swap, graph))
+        found = swap.found
         if found is None:
             return None
         # edges are in the order of their addition
         inside = np.zeros(len(states), dtype=bool)
         inside[states.numbers(edges)] = found.inside[np.isin(edges, states.edge)]
-        jump = found.jump and found.jump._replace(
-            seen_by=states.numbers(edges[found.jump.seen_by]))
-        return Found(inside, found.nodes, found.poses, jump)
+        return Found(inside, found.nodes, found.poses)

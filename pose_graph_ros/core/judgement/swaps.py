@@ -25,7 +25,6 @@ from pose_graph_ros.core.graph.graph import Graph, GraphRows, GraphUpdate
 from pose_graph_ros.core.judgement.closures import GATE
 from pose_graph_ros.core.judgement.consistency import Closures
 from pose_graph_ros.core.judgement.copies import copied_rows, in_rows
-from pose_graph_ros.core.judgement.jumps import Jump
 from pose_graph_ros.core.solver_config import SolverConfig
 
 _CONFIG = SolverConfig(max_iterations=20, step_tolerance=1e-3)
@@ -45,8 +44,6 @@ class Found:
     """Ids of the hidden nodes of the copy, shape (N,)."""
     poses: FloatArray
     """Their poses, shape (N, 3)."""
-    jump: Jump | None = None
-    """Odometry that is doubted with it."""
 
 
 class Swap:
