@@ -27,7 +27,14 @@ from rclpy.subscription import Subscription
 from rclpy.timer import Timer
 
 from pose_graph_ros.adapters.conversions import Message
-from pose_graph_ros.adapters.sources import backend_config, Kind, NANOSECONDS, SET_POSE, Source
+from pose_graph_ros.adapters.sources import (
+    backend_config,
+    CLOCK_JUMP_NS,
+    Kind,
+    NANOSECONDS,
+    SET_POSE,
+    Source,
+)
 from pose_graph_ros.adapters.verdict_messages import JUDGE, MOST_BELIEVED
 from pose_graph_ros.core.backend import PoseGraphBackend
 from pose_graph_ros.core.estimate import UpdateReport
@@ -311,7 +318,7 @@ class Session:
             self._jump_handle.unregister()
         threshold = JumpThreshold(
             min_forward=None, on_clock_change=False,
-            min_backward=Duration(seconds=-values['clock_jump_threshold']))
+            min_backward=Duration(nanoseconds=-CLOCK_JUMP_NS))
         self._jump_handle = self.node.get_clock().create_jump_callback(
             threshold, post_callback=guarded(self._on_clock_jump, lambda: self.active))
 

@@ -14,7 +14,6 @@ from collections.abc import Callable, Sequence
 import numpy as np
 
 from pose_graph_ros.core.compiled.growing_array import GrowingArray
-from pose_graph_ros.core.config import BackendConfig
 from pose_graph_ros.core.geometry.se2 import FloatArray, IntArray
 from pose_graph_ros.core.graph.constraints import Edges
 from pose_graph_ros.core.graph.reweighting import Reweighting
@@ -67,13 +66,11 @@ class ClosureJudge:
 
     Parameters
     ----------
-    smoother, reweighting, config : as in `Judge`
+    smoother, reweighting : as in `Judge`
 
     """
 
-    def __init__(
-        self, smoother: IncrementalSmoother, reweighting: Reweighting, config: BackendConfig,
-    ) -> None:
+    def __init__(self, smoother: IncrementalSmoother, reweighting: Reweighting) -> None:
         self._smoother, self._reweighting = smoother, reweighting
         self._chain = OdometryChain()
         self._table = ClosureTable(self._chain)
@@ -88,11 +85,7 @@ class ClosureJudge:
         """Whether a clique of closures outside of the graph supports one that is doubted."""
         self._search = SetSearch(self._states, self._table)
         self._beliefs = Beliefs(smoother, reweighting, self._states, self._table)
-        self._scales = ScaleLearner(smoother, self._states, self._table, self._beliefs, config)
-
-    def configure(self, config: BackendConfig) -> None:
-        """Set the settings."""
-        self._scales.configure(config)
+        self._scales = ScaleLearner(smoother, self._states, self._table, self._beliefs)
 
     def before(
         self, new: Sequence[NewConstraint], edges: Edges, now_ns: int,

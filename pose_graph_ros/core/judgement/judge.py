@@ -77,7 +77,7 @@ class Judge:
         self._nodes = nodes
         self._fixes = FixJudge(smoother, reweighting, config)
         self._odometry = OdometryStates(nodes)
-        self._closures = ClosureJudge(smoother, reweighting, config)
+        self._closures = ClosureJudge(smoother, reweighting)
         self._staged = np.empty(0, dtype=np.int64)
         """The judged closures of the last `before`, by their numbers among its edges."""
         self._new: Sequence[NewConstraint] = ()
@@ -88,7 +88,6 @@ class Judge:
     def configure(self, config: BackendConfig) -> None:
         """Set the settings for later constraints."""
         self._config = config
-        self._closures.configure(config)
         self._fixes.configure(config)
 
     def before(

@@ -104,7 +104,7 @@ class SourceVerdicts(NamedTuple):
     counts: Mapping[State, int]
     """Number of its constraints by state; states without any may be missing."""
     scale: float
-    """Factor on its sigmas in the graph, learnt or set; 1 where too little is known."""
+    """Factor on its sigmas in the graph; 1 where too little is known."""
     doubting: bool
     """Whether its newest measurements are doubted or wait, while the estimate goes on."""
     n_forgotten: int = 0
