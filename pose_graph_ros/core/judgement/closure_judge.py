@@ -17,8 +17,8 @@ from pose_graph_ros.core.compiled.growing_array import GrowingArray
 from pose_graph_ros.core.geometry.se2 import FloatArray, IntArray
 from pose_graph_ros.core.graph.constraints import Edges
 from pose_graph_ros.core.graph.reweighting import Reweighting
-from pose_graph_ros.core.judgement import decisions, final, relative
-from pose_graph_ros.core.judgement.belief_rule import BeliefRule
+from pose_graph_ros.core.judgement import beliefs, final, relative
+from pose_graph_ros.core.judgement.belief_rule import BeliefRule, MOST_TURNS, Retests
 from pose_graph_ros.core.judgement.beliefs import Beliefs
 from pose_graph_ros.core.judgement.closure_reports import ClosureReports
 from pose_graph_ros.core.judgement.closure_states import (
@@ -30,14 +30,13 @@ from pose_graph_ros.core.judgement.closure_states import (
 )
 from pose_graph_ros.core.judgement.closure_trial import ClosureTrial
 from pose_graph_ros.core.judgement.closures import chances, claims, ClosureTable, GATE
-from pose_graph_ros.core.judgement.listing import MOST_OTHERS
 from pose_graph_ros.core.judgement.odometry_chain import OdometryChain
 from pose_graph_ros.core.judgement.residual_scale import ScaleLeft
-from pose_graph_ros.core.judgement.retests import MOST_TURNS, Retests
 from pose_graph_ros.core.judgement.scale_learner import ScaleLearner
-from pose_graph_ros.core.judgement.set_search import SetSearch
+from pose_graph_ros.core.judgement.swaps import SetSearch
 from pose_graph_ros.core.judgement.verdicts import (
     Decision,
+    MOST_OTHERS,
     SourceVerdicts,
     State,
     Verdict,
@@ -421,5 +420,5 @@ class ClosureJudge:
         name : str, `Verdict.id`
 
         """
-        return decisions.decide(name, decision, (self._states, self._table, self._beliefs),
+        return beliefs.decide(name, decision, (self._states, self._table, self._beliefs),
                                 self.reports, self._smoother.graph)

@@ -28,10 +28,15 @@ from pose_graph_ros.core.judgement.closure_judge import ClosureJudge, LARGE
 from pose_graph_ros.core.judgement.closure_states import SavedClosures
 from pose_graph_ros.core.judgement.fix_states import SavedFixes
 from pose_graph_ros.core.judgement.fixes import FixJudge
-from pose_graph_ros.core.judgement.listing import MOST_OTHERS
 from pose_graph_ros.core.judgement.odometry_states import OdometryStates, SavedOdometry
 from pose_graph_ros.core.judgement.tracks import Track
-from pose_graph_ros.core.judgement.verdicts import Change, Decision, SourceVerdicts, Verdict
+from pose_graph_ros.core.judgement.verdicts import (
+    Change,
+    Decision,
+    MOST_OTHERS,
+    SourceVerdicts,
+    Verdict,
+)
 from pose_graph_ros.core.measurements import Answer, LoopClosure
 from pose_graph_ros.core.odometry.hidden_nodes import HiddenNodes
 from pose_graph_ros.core.smoother.incremental import IncrementalSmoother
@@ -233,7 +238,7 @@ class Judge:
         return self._closures.work()
 
     def verdicts(self, most_believed: int | None = None) -> list[Verdict]:
-        """Return the verdicts that are listed, see `listing.listed`, and on what left unused."""
+        """Return the verdicts that are listed, see `verdicts.listed`, and on what left unused."""
         graph = self._smoother.graph
         return [*self._closures.reports.verdicts(graph, most_believed),
                 *self._odometry.verdicts(graph, self._believed_after),

@@ -20,7 +20,7 @@ from pose_graph_ros.core.judgement import relative
 from pose_graph_ros.core.judgement.closures import claims, GATE
 from pose_graph_ros.core.judgement.floors import forward
 from pose_graph_ros.core.judgement.scale_learner import ScaleLearner
-from pose_graph_ros.core.judgement.set_search import SetSearch
+from pose_graph_ros.core.judgement.swaps import SetSearch
 from pose_graph_ros.core.judgement.verdicts import Decision, State, Verdict
 from pose_graph_ros.core.measurements import (
     AnswerStatus,
