@@ -129,7 +129,7 @@ def test_what_does_not_go_together_is_mended_while_unconfigured(tmp_path: Path) 
         assert manager.change(Transition.TRANSITION_CONFIGURE)
         client.close()
         assert node.signal_and_wait(signal.SIGTERM) == 0
-        assert 'ceiling' in node.stderr()
+        assert 'fix.sigma_floor' in node.stderr()
         assert 'no transition: parameter load_graph_on_start: ' in node.stderr()
         assert 'no.json: cannot be read' in node.stderr()
         assert 'no transition: parameter fix.topic: expected a topic of' in node.stderr()
