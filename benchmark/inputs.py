@@ -24,7 +24,6 @@ from benchmark.section import say, Section, Table
 from pose_graph_ros.core.alignment.monitor import AlignmentState
 from pose_graph_ros.core.backend import PoseGraphBackend
 from pose_graph_ros.core.config import (
-    Correlation,
     CovariancePolicy,
     Loss,
     MeasurementSource,
@@ -116,7 +115,7 @@ def uncertainty(runs: int, cases: Sequence[str] = ()) -> Section:
                       str(missing), f'{np.median(taus):.1f}', str(runs))
             say('  ' + ' | '.join(table.rows[-1]))
             beside = name == 'a bias' and kind in (*BRIEF, *FURTHER)
-            if (name == 'white' and kind.tau > 0.0) or name == 'inflated' or beside:
+            if (name == 'white' and kind.tau > 0.0) or beside:
                 continue
             section.metrics += [
                 Metric(f'{kind.name}, {name}: NEES, from above', mean,
@@ -130,8 +129,6 @@ def uncertainty(runs: int, cases: Sequence[str] = ()) -> Section:
 def _treatments(kind: Kind) -> dict[str, MeasurementSource]:
     return {
         'white': MeasurementSource(), 'default': POSITIONS,
-        'inflated': MeasurementSource(
-            correlation_time=kind.tau, correlation=Correlation.INFLATE),
         'a bias': _told(kind)}
 
 

@@ -9,7 +9,13 @@ from pose_graph_ros.adapters import conversions
 from pose_graph_ros.adapters.conversions import frame, Message
 from pose_graph_ros.adapters.fixes import datum_of, FixReader
 from pose_graph_ros.adapters.rates import GyroReader, TwistReader, VELOCITY_READERS
-from pose_graph_ros.adapters.sources import Kind, NANOSECONDS, Source, source_list
+from pose_graph_ros.adapters.sources import (
+    CLOCK_JUMP_NS,
+    Kind,
+    NANOSECONDS,
+    Source,
+    source_list,
+)
 from pose_graph_ros.adapters.static_frames import StaticFrames
 from pose_graph_ros.core.measurements import Answer, Measurement, OdometrySample, rejected
 from pose_graph_ros.core.odometry.time_keeper import TimeKeeper
@@ -40,10 +46,9 @@ class MessageReader:
         keeper: TimeKeeper | None = None,
     ) -> None:
         self.sources = {source.name: source for source in source_list(values)}  # sources by name
-        threshold_ns = round(values['clock_jump_threshold'] * NANOSECONDS)
         self.keeper = keeper or TimeKeeper(
             [name for name, source in self.sources.items() if source.kind.is_odometry],
-            threshold_ns)
+            CLOCK_JUMP_NS)
         """The one judge of stamps."""
         self._map_frame = frame(values['map_frame'])
         base_frame = frame(values['base_link_frame'])
@@ -63,7 +68,6 @@ class MessageReader:
 
         Sources, topics, frames, datum, static transforms and counts stay.
         """
-        self.keeper.threshold_ns = round(values['clock_jump_threshold'] * NANOSECONDS)
         for source in source_list(values):
             before = self.sources[source.name]
             self.keeper.shift(source.name, source.time_offset_ns - before.time_offset_ns)

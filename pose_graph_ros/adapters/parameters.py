@@ -10,12 +10,11 @@ generated from them. Defaults come from `core.config`. This module imports no RO
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
 from enum import Enum
-import math
 import re
 import sys
 from typing import Any
 
-from pose_graph_ros.adapters.parameter_names import explanation
+from pose_graph_ros.adapters.parameter_names import explanation, removed
 from pose_graph_ros.adapters.sources import (
     DEFAULT_SOURCES,
     Kind,
@@ -66,7 +65,7 @@ def _values(choices: type[Enum]) -> tuple[str, ...]:
 _BACKEND, _ODOMETRY = config.BackendConfig(), config.OdometrySource()
 _MEASUREMENT, _COVARIANCE = config.MeasurementSource(), config.CovariancePolicy()
 _RATES = GyroSource()
-_NODES, _ALIGNMENT, _NOISE = _BACKEND.nodes, _BACKEND.alignment, _ODOMETRY.noise
+_NODES, _NOISE = _BACKEND.nodes, _ODOMETRY.noise
 _WINDOW, _THINNING = _BACKEND.window, _BACKEND.thinning
 
 PARAMETERS: tuple[Parameter, ...] = (
@@ -88,23 +87,17 @@ PARAMETERS: tuple[Parameter, ...] = (
               'lists one that tells: fixes or global poses.'),
     Parameter('transform_time_offset', 0.0, 's', 'Time added to the stamp of the published '
               'transform.', 0.0, 10.0),
-    Parameter('transform_slew_linear', 0.0, 'm/s', 'Maximum linear speed at which corrections '
-              'move the robot in the published transform. If 0, corrections are applied at once.',
-              0.0, 1000.0),
-    Parameter('transform_slew_angular', 0.0, 'rad/s', 'Maximum angular speed at which corrections '
-              'turn the robot in the published transform. If 0, corrections are applied at once.',
-              0.0, 1000.0),
+    Parameter('transform_slew', [0.0, 0.0], 'm/s, rad/s', 'Maximum linear and angular speed at '
+              'which corrections move the robot in the published transform. If 0, corrections '
+              'are applied at once.', 0.0, 1000.0, sizes=(2,)),
     Parameter('frequency', 10.0, 'Hz', 'Frequency of the incremental optimisation of the graph.',
               0.01, 100.0),
-    Parameter('path_period', 1.0, 's', 'Minimum time between two published paths.', 0.0, 3600.0),
-    Parameter('graph_period', 2.0, 's', 'Minimum time between two published sets of graph '
-              'markers.', 0.1, 3600.0),
+    Parameter('path_period', 1.0, 's', 'Minimum time between two published paths; markers of the '
+              'graph and verdicts come half as often.', 0.0, 3600.0),
     Parameter('diagnostics_period', 1.0, 's', 'Time between two messages on /diagnostics.',
               0.01, 60.0),
     Parameter('closing_silence', 2.0, 's', 'Time without any message after which the whole graph '
               'is optimised until convergence. If 0, it never is.', 0.0, 3600.0),
-    Parameter('clock_jump_threshold', 1.0, 's', 'The graph is reset if the clock of the node or '
-              'the stamps of the odometry jump back by more than this time.', 0.01, 3600.0),
     Parameter('graph_file', '', '', 'File that `~/save_graph` writes and `~/load_graph` reads, '
               'such as graph.g2o. Files with the suffixes .json and .tum are stored next to it.'),
     Parameter('load_graph_on_start', False, '', 'Whether to continue with the graph in '
@@ -120,15 +113,6 @@ PARAMETERS: tuple[Parameter, ...] = (
               'Distance from the last hidden node at which a new one is added.', 0.0, 1000.0),
     Parameter('minimum_travel_heading', _NODES.minimum_travel_heading, 'rad',
               'Rotation since the last hidden node at which a new one is added.', 0.0, 3.2),
-    Parameter('minimum_node_interval', _NODES.minimum_interval, 's', 'Minimum time between two '
-              'hidden nodes that are added because of distance or rotation.', 0.0, 60.0),
-    Parameter('moving_node_interval', _NODES.moving_interval, 's',
-              'Maximum time between two hidden nodes while the robot moves.', 0.05, 3600.0),
-    Parameter('node_heartbeat', _NODES.heartbeat, 's', 'Maximum time between two hidden nodes, '
-              'also while the robot stands still.', 0.1, 86400.0),
-    Parameter('odometry_patience', _BACKEND.odometry_patience, 's', 'Hidden nodes are added from '
-              'another odometry source if the present one lags behind it by more than this time.',
-              0.05, 3600.0),
     Parameter('window.seconds', _WINDOW.seconds, 's', 'Time that the graph looks back. What is '
               'older leaves it: its path stays as it is, and what its measurements told is kept '
               'as a prior. If 0, there is no limit; the smallest of the three limits applies.',
@@ -145,30 +129,14 @@ PARAMETERS: tuple[Parameter, ...] = (
               'hidden nodes stay in the graph: one leaves it if an older one stays within this '
               'distance and its position relative to that is certain. If 0, all stay. Twice the '
               'distance between hidden nodes is a good value.', 0.0, 1000.0),
-    Parameter('thinning.angle', _THINNING.angle, 'rad', 'A hidden node only leaves for others '
-              'whose heading differs from its own by less than this.', 0.01, 2.0 * math.pi),
-    Parameter('thinning.poses', float(_THINNING.poses), '', 'Number of hidden nodes that '
-              'must stay within `thinning.cell` of one that leaves.', 1.0, 1000.0),
-    Parameter('thinning.newest', float(_THINNING.newest), '', 'Number of newest hidden nodes that '
-              'stay in any case, with their fixes and odometry samples.', 2.0, 1e6),
-    Parameter('alignment.sigma_heading', _ALIGNMENT.sigma_heading, 'rad', 'The map is aligned '
-              'with the odometry from positions alone once the standard deviation of the angle '
-              'between them is at most this.', 1e-3, 1.0),
-    Parameter('alignment.minimum_baseline', _ALIGNMENT.minimum_baseline, 'm', 'Minimum length '
-              'that the positions must span for the alignment.', 0.1, 1000.0),
-    Parameter('alignment.baseline_in_sigmas', _ALIGNMENT.baseline_in_sigmas, '', 'Minimum length '
-              'that the positions must span for the alignment, in standard deviations of a '
-              'position.', 1.0, 100.0),
     *(Parameter(f'outputs.{name}', topic, '', f'Topic of the {content}.',
                 change=Change.UNCONFIGURED) for name, (topic, _, content) in OUTPUTS.items()),
 )
 
 _ALL = tuple(Kind)
 _WHEELS, _GYRO = ODOMETRY_KINDS, (Kind.GYRO,)
-_NOT_GYROS = tuple(kind for kind in Kind if kind is not Kind.GYRO)
-_OTHERS = tuple(kind for kind in _NOT_GYROS if not kind.is_odometry)
+_OTHERS = tuple(kind for kind in Kind if kind is not Kind.GYRO and not kind.is_odometry)
 _POSITIONS = (Kind.GLOBAL_POSE, Kind.FIX)
-_NOT_POSITIONS = tuple(kind for kind in _NOT_GYROS if kind not in _POSITIONS)
 _JUDGED = (*_POSITIONS, Kind.LOOP_CLOSURE)
 _NOT_CLOSURES = tuple(kind for kind in _OTHERS if kind is not Kind.LOOP_CLOSURE)
 
@@ -194,12 +162,6 @@ SOURCE_PARAMETERS: tuple[Parameter, ...] = (
               'noise of the heading, per square root of the distance.', 0.0, 10.0, kinds=_WHEELS),
     Parameter('sigma_heading_turn', _NOISE.sigma_heading_turn, 'rad/sqrt(rad)', 'Odometry noise '
               'of the heading, per square root of the rotation.', 0.0, 10.0, kinds=_WHEELS),
-    Parameter('sigma_floor', [_NOISE.sigma_floor_position, _NOISE.sigma_floor_heading], 'm, rad',
-              'Odometry noise of position and heading added once between two hidden nodes.', 1e-6,
-              100.0, sizes=(2,), kinds=_WHEELS),
-    Parameter('reorder_window', _ODOMETRY.reorder_window, 's', 'Messages older than the newest '
-              'one by less than this time are sorted in; older ones are ignored.', 0.0, 60.0,
-              kinds=(*_WHEELS, *_GYRO)),
     Parameter('maximum_speed', _ODOMETRY.maximum_speed, 'm/s', 'Faster motion is treated as a '
               'jump of the odometry.', 0.01, 1e4, kinds=_WHEELS),
     Parameter('mounting', 'tf', '', 'Whether the z axis of the gyroscope points `up` or `down`. '
@@ -225,10 +187,6 @@ SOURCE_PARAMETERS: tuple[Parameter, ...] = (
     Parameter('maximum_gap', _RATES.maximum_gap, 's', 'Longest time between two messages over '
               'which the rate is integrated. A longer one leaves the rotation between two hidden '
               'nodes out.', 1e-3, 10.0, kinds=_GYRO),
-    *(Parameter('covariance_policy', 'repair' if policy.repair else 'refuse', '',
-                'Whether to repair an invalid covariance or to refuse its measurement.',
-                choices=('repair', 'refuse'), kinds=kinds) for kinds, policy in (
-        (_NOT_CLOSURES, _COVARIANCE), ((Kind.LOOP_CLOSURE,), config.LOOP_CLOSURES.covariance))),
     Parameter('covariance_override', [], 'm, rad', 'Standard deviation of the position and, '
               'optionally, of the heading, used instead of the covariance in the messages.', 1e-6,
               1e6, sizes=(0, 1, 2), kinds=_OTHERS),
@@ -236,13 +194,7 @@ SOURCE_PARAMETERS: tuple[Parameter, ...] = (
               kinds=_ALL),
     Parameter('sigma_floor', [_COVARIANCE.position_floor, _COVARIANCE.heading_floor], 'm, rad',
               'Minimum standard deviation of position and heading.', 1e-6, 100.0, sizes=(2,),
-              kinds=_OTHERS),
-    Parameter('sigma_ceiling', _COVARIANCE.position_ceiling, 'm',
-              'Maximum standard deviation of the position.', 1e-3, 1e6, kinds=_OTHERS),
-    Parameter('default_sigma', [_COVARIANCE.default_position, _COVARIANCE.default_heading],
-              'm, rad', 'Standard deviation of position and heading used for variances that are '
-              'zero, negative or NaN, if `covariance_policy` is `repair`.', 1e-5, 1e4,
-              sizes=(2,), kinds=_OTHERS),
+              kinds=_NOT_CLOSURES),
     Parameter('heading', _COVARIANCE.heading.value, '', 'Whether to use the heading of the pose. '
               'With `auto` it is used if its variance is positive and less than that of a uniform '
               'distribution on the circle.', choices=_values(config.Heading),
@@ -259,40 +211,23 @@ SOURCE_PARAMETERS: tuple[Parameter, ...] = (
          '`robust_loss`; `loss` uses all, with the `robust_loss`; `none` uses all, without it.'),
         ((Kind.IMU,), config.HEADINGS.robust, _values(config.Robust)[1:], 'Whether the '
          '`robust_loss` is used.'))),
-    Parameter('sigma_scale', _MEASUREMENT.sigma_scale, '', 'Factor on the standard deviations of '
-              'the loop closures that are used, if `robust` is `judged`. If 0, it is learnt from '
-              'their residuals and from how well neighbours agree, and at least 1.', 0.0, 1e3,
-              kinds=(Kind.LOOP_CLOSURE,)),
     Parameter('sigma_scale', _ODOMETRY.sigma_scale, '', 'Factor on the standard deviations of the '
               'primary odometry. If 0, it is 1, but more or less where global poses or fixes '
               'with a `correlation_time` of -1 show that odometry drifts more or less than it '
               'claims.',
               0.0, 1e3, kinds=_WHEELS),
     *(Parameter('robust_loss', loss.value, '', 'Robust loss applied to the errors. The last four '
-                'are bounded: very wrong measurements have no influence, and the start matters.',
-                choices=_values(config.Loss), kinds=kinds) for kinds, loss in (
-        (_POSITIONS, config.POSITIONS.loss), (_NOT_POSITIONS, _MEASUREMENT.loss))),
-    Parameter('rejection_threshold', _MEASUREMENT.rejection_threshold, '', 'Error in standard '
-              'deviations above which the robust loss reduces the weight of a measurement. If '
-              'none is wrong, 0.3 % of headings, 1.1 % of positions and 2.9 % of poses exceed 3. '
-              'For `tukey` take 5.', 0.1, 1e3, kinds=_NOT_GYROS),
-    *(Parameter('minimum_period', period, 's', 'Minimum time between the stamps of two '
-                'measurements; of closer ones the first to arrive is used. If 0, all are used.',
-                0.0, 3600.0, kinds=kinds) for kinds, period in (
-        (_POSITIONS, _MEASUREMENT.minimum_period), ((Kind.IMU,), config.HEADINGS.minimum_period))),
+                'are bounded: very wrong measurements have no influence, and the start matters. '
+                'The weight of a measurement falls above an error of 3 standard deviations, for '
+                '`tukey` of 5.', choices=_values(config.Loss), kinds=kinds) for kinds, loss in (
+        (_POSITIONS, config.POSITIONS.loss),
+        ((Kind.IMU, Kind.LOOP_CLOSURE), _MEASUREMENT.loss))),
     *(Parameter('correlation_time', time, 's', 'Time constant of time-correlated errors. If 0, '
                 'errors are white noise. If -1, the errors themselves show whether they are '
-                'correlated and for how long, and `white_share` has no effect.', config.FOUND,
-                1e5, kinds=kinds, change=Change.UNCONFIGURED) for kinds, time in (
+                'correlated and for how long.', config.FOUND, 1e5, kinds=kinds,
+                change=Change.UNCONFIGURED) for kinds, time in (
         (_POSITIONS, config.POSITIONS.correlation_time),
         ((Kind.IMU,), _MEASUREMENT.correlation_time))),
-    Parameter('correlation_model', _MEASUREMENT.correlation.value, '', 'Treatment of '
-              'time-correlated errors: `bias` estimates them, `inflate` increases the '
-              'covariances.', choices=_values(config.Correlation), kinds=_NOT_CLOSURES,
-              change=Change.UNCONFIGURED),
-    Parameter('white_share', _MEASUREMENT.white_share, '', 'Fraction of the variance that is '
-              'white noise, if a bias with a given `correlation_time` is estimated.', 0.0, 1.0,
-              kinds=_NOT_CLOSURES, change=Change.UNCONFIGURED),
 )
 
 OF_SOURCES = frozenset(parameter.name for parameter in SOURCE_PARAMETERS)
@@ -370,21 +305,25 @@ def checked(given: Mapping[str, Any]) -> dict[str, Any]:
     """
     parameters = all_parameters(given)
     known = {parameter.name for parameter in parameters}
-    for name in sorted(set(given) - known):
-        raise unknown(name, known)
+    wrong = [str(unknown(name, known)) for name in sorted(set(given) - known)]
+    if len(wrong) > 0:
+        raise ConfigError('; '.join(wrong))
     return {parameter.name: checked_value(parameter, given[parameter.name])
             if parameter.name in given else parameter.default for parameter in parameters}
 
 
 def unknown(name: str, known: Collection[str]) -> ConfigError:
     """
-    Return the error for a parameter that is not known, with what may have been meant.
+    Return the error for a parameter that is not known, with what to do about it.
 
     Parameters
     ----------
     known : collection of str, names of all parameters
 
     """
+    gone = removed(name)
+    if gone != '':
+        return ConfigError(f'parameter {name} no longer exists: {gone}')
     hint = explanation(name, known, OF_SOURCES)
     return ConfigError(f'parameter {name} is not known' + (hint and f': {hint}'))
 

@@ -3,7 +3,7 @@
 """The sources of measurements by the ROS parameters, and the settings of the engine for them."""
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from enum import Enum
 import math
 from typing import Any
@@ -13,6 +13,8 @@ from pose_graph_ros.core.exceptions import ConfigError
 from pose_graph_ros.core.gyro_config import GyroSource, Integrate, RateNoise
 
 NANOSECONDS = 1_000_000_000
+CLOCK_JUMP_NS = NANOSECONDS
+"""The graph is reset if the clock or the stamps of odometry jump back by more than this [ns]."""
 _POSE = 'geometry_msgs/msg/PoseWithCovarianceStamped'
 
 
@@ -107,8 +109,13 @@ def source_names(listed: list[str]) -> list[str]:
 
 
 # Parameters of a source by the setting that the error messages of the engine name.
-_SETTINGS = {'CovariancePolicy.position_ceiling': 'sigma_ceiling',
-             'CovariancePolicy.heading_floor': 'sigma_floor'}
+_SETTINGS = {'CovariancePolicy.heading_floor': 'sigma_floor'}
+DEFAULTS = {
+    Kind.GLOBAL_POSE: config.POSITIONS, Kind.FIX: config.POSITIONS, Kind.IMU: config.HEADINGS,
+    Kind.LOOP_CLOSURE: config.LOOP_CLOSURES}
+"""Settings of the sources of measurements, but for those that have parameters."""
+TUKEY_THRESHOLD = 5.0
+"""Threshold of Tukey's loss, for 95 % of the accuracy of least squares [sigma]."""
 
 
 def backend_config(values: Mapping[str, Any]) -> config.BackendConfig:
@@ -128,7 +135,7 @@ def backend_config(values: Mapping[str, Any]) -> config.BackendConfig:
             elif source.kind is Kind.GYRO:
                 gyros[source.name] = _gyro_source(own)
             else:
-                measurements[source.name] = _measurement_source(own)
+                measurements[source.name] = _measurement_source(own, DEFAULTS[source.kind])
         except ConfigError as error:
             setting, _, rest = str(error).partition(': ')
             raise ConfigError(
@@ -139,61 +146,42 @@ def backend_config(values: Mapping[str, Any]) -> config.BackendConfig:
     return config.BackendConfig(
         nodes=config.NodePolicy(
             minimum_travel_distance=values['minimum_travel_distance'],
-            minimum_travel_heading=values['minimum_travel_heading'],
-            minimum_interval=values['minimum_node_interval'],
-            moving_interval=values['moving_node_interval'],
-            heartbeat=values['node_heartbeat']),
-        alignment=config.AlignmentPolicy(
-            sigma_heading=values['alignment.sigma_heading'],
-            minimum_baseline=values['alignment.minimum_baseline'],
-            baseline_in_sigmas=values['alignment.baseline_in_sigmas']),
+            minimum_travel_heading=values['minimum_travel_heading']),
         odometry=odometry, measurements=measurements, gyros=gyros,
-        odometry_patience=values['odometry_patience'],
         window=config.WindowConfig(
             seconds=values['window.seconds'], metres=values['window.metres'],
             nodes=math.ceil(values['window.nodes']), prior=config.Prior(values['window.prior'])),
-        thinning=config.ThinningConfig(
-            cell=values['thinning.cell'], angle=values['thinning.angle'],
-            poses=math.ceil(values['thinning.poses']),
-            newest=math.ceil(values['thinning.newest'])))
+        thinning=config.ThinningConfig(cell=values['thinning.cell']))
 
 
 def _odometry_source(own: Mapping[str, Any], source: Source) -> config.OdometrySource:
-    position, heading = own['sigma_floor']
     return config.OdometrySource(
         noise=config.OdometryNoise(
             sigma_distance=own['sigma_distance'], sigma_lateral=own['sigma_lateral'],
             sigma_heading_distance=own['sigma_heading_distance'],
-            sigma_heading_turn=own['sigma_heading_turn'],
-            sigma_floor_position=position, sigma_floor_heading=heading),
+            sigma_heading_turn=own['sigma_heading_turn']),
         noise_from=config.NoiseFrom(own['noise']), covariance_scale=own['covariance_scale'],
         integrate=Integrate.TWIST if source.integrates_twist else Integrate.POSE,
-        sigma_scale=own['sigma_scale'],
-        reorder_window=own['reorder_window'], maximum_speed=own['maximum_speed'],
-        loss=config.Loss(own['robust_loss']), rejection_threshold=own['rejection_threshold'])
+        sigma_scale=own['sigma_scale'], maximum_speed=own['maximum_speed'])
 
 
 def _gyro_source(own: Mapping[str, Any]) -> GyroSource:
     same = ('sigma_rate', 'sigma_bias', 'sigma_bias_walk', 'sigma_turn', 'bias_period',
-            'maximum_gap', 'covariance_scale', 'reorder_window')
+            'maximum_gap', 'covariance_scale')
     return GyroSource(RateNoise(own['noise']), **{name: own[name] for name in same})
 
 
-def _measurement_source(own: Mapping[str, Any]) -> config.MeasurementSource:
-    position_floor, heading_floor = own['sigma_floor']
-    default_position, default_heading = own['default_sigma']
-    return config.MeasurementSource(
-        covariance=config.CovariancePolicy(
-            repair=own['covariance_policy'] == 'repair',
-            override=tuple(own['covariance_override']), scale=own['covariance_scale'],
-            position_floor=position_floor, heading_floor=heading_floor,
-            position_ceiling=own['sigma_ceiling'], default_position=default_position,
-            default_heading=default_heading, heading=config.Heading(own.get('heading', 'auto'))),
-        robust=config.Robust(own['robust']),
-        loss=config.Loss(own['robust_loss']), rejection_threshold=own['rejection_threshold'],
-        sigma_scale=own.get('sigma_scale', 0.0),
-        # sources of loop closures have neither a minimum period nor correlated errors
-        **{} if 'correlation_time' not in own else {
-            'minimum_period': own['minimum_period'], 'correlation_time': own['correlation_time'],
-            'correlation': config.Correlation(own['correlation_model']),
-            'white_share': own['white_share']})
+def _measurement_source(
+    own: Mapping[str, Any], default: config.MeasurementSource,
+) -> config.MeasurementSource:
+    policy, loss = default.covariance, config.Loss(own['robust_loss'])
+    floors = own.get('sigma_floor', (policy.position_floor, policy.heading_floor))
+    return replace(
+        default, covariance=replace(
+            policy, override=tuple(own['covariance_override']), scale=own['covariance_scale'],
+            position_floor=floors[0], heading_floor=floors[1],
+            heading=config.Heading(own.get('heading', 'auto'))),
+        robust=config.Robust(own['robust']), loss=loss,
+        rejection_threshold=(TUKEY_THRESHOLD if loss is config.Loss.TUKEY
+                             else default.rejection_threshold),
+        correlation_time=own.get('correlation_time', 0.0))

@@ -107,7 +107,9 @@ def closure_parameters(
         yield Tuned(f'{odometry}.sigma_scale', values[f'{odometry}.sigma_scale'], 1.0,
                     note='the sigmas are those of this odometry')
     for source in closures:
-        yield _one(f'{source}.sigma_scale', of_closures, values, float)
+        at = values[f'{source}.covariance_scale']
+        yield _one(f'{source}.covariance_scale', of_closures, values,
+                   lambda factor, at=at: at * factor**2)
 
 
 def source_parameters(
@@ -139,7 +141,6 @@ def source_parameters(
     yield from _sizes(source, size, heading, values, more)
     if Role.TAU in of and share <= 1.0:
         yield _one(f'{source.name}.correlation_time', of[Role.TAU], values, float)
-        yield _one(f'{source.name}.white_share', of[Role.SHARE], values, lambda x: min(x, 1.0))
 
 
 def _sizes(

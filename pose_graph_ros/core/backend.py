@@ -285,9 +285,9 @@ class PoseGraphBackend:
             self._quarantine, lambda one: cn.queued(one, self._nodes)[0])
 
     def _settle(self) -> bool:
-        """Set all weights that wait; tell whether an update without new constraints succeeds."""
+        """Tell whether an update without new constraints succeeds."""
         with self._transaction() as transaction:
-            change = self._factors.build(Queue(), self.graph, settle=True)
+            change = self._factors.build(Queue(), self.graph)
             transaction.solved(self._smoother.update(change))
             self._factors.commit()
         return transaction.failure == ''

@@ -56,15 +56,6 @@ class Robust(Enum):
     """All are used, as if the source had no robust loss."""
 
 
-class Correlation(Enum):
-    """Model of time-correlated errors of measurements."""
-
-    BIAS = 'bias'
-    """A Gauss-Markov bias of the source is estimated in the graph."""
-    INFLATE = 'inflate'
-    """Covariances are inflated."""
-
-
 class Heading(Enum):
     """Whether the heading of a global pose is used."""
 
@@ -192,27 +183,18 @@ class MeasurementSource:
     """Of what is believed; see `applied_loss`."""
     rejection_threshold: float = 3.0
     """Threshold k of the loss [sigma]."""
-    sigma_scale: float = 0.0
-    """Factor on the sigmas of judged loop closures; 0 for one that they show themselves."""
     minimum_period: float = 0.0
     """Of measurements with stamps closer than this only the first to arrive is used [s]."""
     correlation_time: float = 0.0
     """Time constant of the errors [s]; 0 for white noise, `FOUND` for one that they show."""
-    correlation: Correlation = Correlation.BIAS
-    white_share: float = 0.05
-    """Fraction of the variance that is white noise if errors are correlated, in [0, 1]."""
 
     def __post_init__(self) -> None:
         require(self, 'rejection_threshold', positive=True)
-        require(self, 'sigma_scale', 'minimum_period', 'white_share')
+        require(self, 'minimum_period')
         if not self.finds_correlation:
             require(self, 'correlation_time')
         require_member(self, 'robust', Robust)
         require_member(self, 'loss', Loss)
-        require_member(self, 'correlation', Correlation)
-        if self.white_share > 1.0:
-            raise ConfigError('MeasurementSource.white_share: expected a number in [0, 1], '
-                              f'got {self.white_share!r}')
 
     @property
     def finds_correlation(self) -> bool:
@@ -427,6 +409,5 @@ class BackendConfig:
         default = MeasurementSource()
         for name in sorted({*self.measurements, *wanted.measurements}):
             require_same(f'{name}: MeasurementSource', self.measurements.get(name, default),
-                         wanted.measurements.get(name, default), 'correlation_time',
-                         'correlation', 'white_share')
+                         wanted.measurements.get(name, default), 'correlation_time')
         return wanted

@@ -17,7 +17,6 @@ import math
 import numpy as np
 
 from pose_graph_ros.core.batch.optimizer import Status, to_the_end
-from pose_graph_ros.core.config import Correlation
 from pose_graph_ros.core.geometry.se2 import FloatArray, IntArray
 from pose_graph_ros.core.graph import tables as tb
 from pose_graph_ros.core.graph.constraints import EdgeKind
@@ -362,9 +361,6 @@ class ErrorTuner:
 
     def _begin(self, source: str, errors: CorrelatedErrors | None) -> None:
         """Begin to change the error model of a source."""
-        if self._factors.correlation(source) is Correlation.INFLATE:
-            self._factors.inflate(source, errors)
-            return
         constraints = self._factors.constraints(source)
         n = len(constraints)
         self._change = _Change(

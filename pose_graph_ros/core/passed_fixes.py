@@ -22,7 +22,6 @@ from pose_graph_ros.core.io.capture import Parts
 from pose_graph_ros.core.measurements import Absolute, Fix, LoopClosure, Position, value_defect
 from pose_graph_ros.core.odometry.motion import Attachment
 from pose_graph_ros.core.smoother.incremental import IncrementalSmoother
-from pose_graph_ros.core.sources.error_models import InflatedWeights
 from pose_graph_ros.core.sources.gauss_markov import (
     biased_constraint,
     CorrelatedErrors,
@@ -76,8 +75,6 @@ def _passed(parts: Parts) -> list[_Passed]:
                 or not parts.factors.has(source)):
             continue
         model = parts.factors.error_model(source)
-        if isinstance(model, InflatedWeights):
-            continue    # it would take as much weight off the others
         measurement = given.placed() if isinstance(given, Fix) else given
         if isinstance(measurement, Position) and value_defect(measurement.position) is not None:
             continue

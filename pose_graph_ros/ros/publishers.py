@@ -62,6 +62,8 @@ OUTPUTS = {
     '~/verdicts': (DiagnosticArray, LATCHED_QOS),
     '/diagnostics': (DiagnosticArray, OUTPUT_QOS)}
 """Messages and quality of service by default topic, but for /tf."""
+LEAST_GRAPH_PERIOD = 0.1
+"""Least time between two sets of markers, and between two lists of verdicts [s]."""
 UNPLACED = np.diag((
     output_cdr.UNKNOWN_VARIANCE, output_cdr.UNKNOWN_VARIANCE, UNKNOWN_HEADING_VARIANCE))
 """Covariance of a pose of which only the motion since the start is known."""
@@ -134,8 +136,9 @@ class Publishers:
             self.transforms = None
         self._waits = values['wait_for_map']
         self._tf_offset_ns = round(values['transform_time_offset'] * NANOSECONDS)
-        self._slew_limits = values['transform_slew_linear'], values['transform_slew_angular']
-        self._path_period, self._graph_period = values['path_period'], values['graph_period']
+        self._slew_limits = tuple(values['transform_slew'])
+        self._path_period = values['path_period']
+        self._graph_period = max(2.0 * self._path_period, LEAST_GRAPH_PERIOD)
 
     def publish_pose(
         self, estimate: Estimate, odometry: Message, sample: OdometrySample, datum: Datum,

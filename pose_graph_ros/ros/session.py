@@ -27,7 +27,14 @@ from rclpy.subscription import Subscription
 from rclpy.timer import Timer
 
 from pose_graph_ros.adapters.conversions import Message
-from pose_graph_ros.adapters.sources import backend_config, Kind, NANOSECONDS, SET_POSE, Source
+from pose_graph_ros.adapters.sources import (
+    backend_config,
+    CLOCK_JUMP_NS,
+    Kind,
+    NANOSECONDS,
+    SET_POSE,
+    Source,
+)
 from pose_graph_ros.adapters.verdict_messages import JUDGE, MOST_BELIEVED
 from pose_graph_ros.core.backend import PoseGraphBackend
 from pose_graph_ros.core.estimate import UpdateReport
@@ -307,13 +314,11 @@ class Session:
         self._set_timer('update', 1.0 / values['frequency'], self._on_update_timer)
         self._set_timer('silence', SILENCE_PERIOD, self._on_silence_timer)
         self._set_timer('views', max(min(values['path_period'], 0.5), 0.1), self._on_views_timer)
-        if self._jump_handle is not None:
-            self._jump_handle.unregister()
-        threshold = JumpThreshold(
-            min_forward=None, on_clock_change=False,
-            min_backward=Duration(seconds=-values['clock_jump_threshold']))
-        self._jump_handle = self.node.get_clock().create_jump_callback(
-            threshold, post_callback=guarded(self._on_clock_jump, lambda: self.active))
+        if self._jump_handle is None:
+            self._jump_handle = self.node.get_clock().create_jump_callback(
+                JumpThreshold(min_forward=None, on_clock_change=False,
+                              min_backward=Duration(nanoseconds=-CLOCK_JUMP_NS)),
+                post_callback=guarded(self._on_clock_jump, lambda: self.active))
 
     def _on_clock_jump(self, jump: TimeJump) -> None:
         back_ns = -jump.delta.nanoseconds

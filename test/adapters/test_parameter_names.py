@@ -13,7 +13,7 @@ KNOWN = {parameter.name for parameter in all_parameters({})}
 @pytest.mark.parametrize(('name', 'said'), [
     ('frequncy', 'did you mean frequency?'), ('Frequency', 'did you mean frequency?'),
     ('odom.sigma_distnce', 'did you mean odom.sigma_distance?'),
-    ('alignment.sigma_headings', 'did you mean alignment.sigma_heading?'),
+    ('window.second', 'did you mean window.seconds?'),
     ('odm.sigma_distance', 'odm is not in sources; did you mean odom.sigma_distance?'),
     ('imu.topic', 'imu is not in sources'), ('wheels.type', 'wheels is not in sources'),
     ('odom.lever_arm', 'a source of the type of odom has none'),
@@ -25,6 +25,7 @@ def test_the_nearest_name_is_offered(name: str, said: str) -> None:
 
 @pytest.mark.parametrize(('name', 'own'), [
     ('gain', True), ('odom.gain', True), ('odm.topic', True), ('planner.gain', False),
-    ('local_costmap.robot.radius', False), ('alignment.gain', True)])
+    ('local_costmap.robot.radius', False), ('window.gain', True),
+    ('alignment.sigma_heading', True), ('alignment.gain', False)])
 def test_groups_that_the_node_does_not_have_are_for_other_nodes(name: str, own: bool) -> None:
     assert is_own(name, KNOWN, OF_SOURCES) is own

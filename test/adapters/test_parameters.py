@@ -39,7 +39,6 @@ from pose_graph_ros.adapters.sources import (
 )
 from pose_graph_ros.core.config import (
     BackendConfig,
-    Correlation,
     FOUND,
     Heading,
     LOOP_CLOSURES,
@@ -97,9 +96,8 @@ def test_every_parameter_says_when_it_changes() -> None:
              and not name.startswith('outputs.')}
     assert {changes[f'outputs.{name}'] for name in OUTPUTS} == {Change.UNCONFIGURED}
     assert taken == {'map_frame', 'odom_frame', 'base_link_frame', 'datum', 'wait_for_datum',
-                     'topic', 'noise', 'correlation_time', 'correlation_model', 'white_share',
-                     'load_graph_on_start', 'integrate', 'sigma_bias', 'sigma_bias_walk',
-                     'bias_period'}
+                     'topic', 'noise', 'correlation_time', 'load_graph_on_start',
+                     'integrate', 'sigma_bias', 'sigma_bias_walk', 'bias_period'}
     assert {name for name, change in changes.items() if change is Change.START} == {
         'sources', 'autostart', 'odom.type', 'global_pose.type', 'fix.type', 'imu.type',
         'loop_closure.type', 'gyro.type'}
@@ -175,8 +173,8 @@ def test_a_number_out_of_range_is_refused(parameter: object) -> None:
 @pytest.mark.parametrize('values', [
     {'no_such': 1.0}, {'map_frame': 1}, {'publish_tf': 'yes'}, {'frequency': True},
     {'frequency': '1.0'}, {'datum': 'x'}, {'datum': [1.0, 'x']}, {'datum': [1.0]},
-    {'fix.lever_arm': 1.0}, {'fix.lever_arm': [1.0]}, {'odom.robust_loss': 'l1'},
-    {'odom.sigma_floor': [0.1]}, {'fix.covariance_override': [1.0, 1.0, 1.0]},
+    {'fix.lever_arm': 1.0}, {'fix.lever_arm': [1.0]}, {'fix.robust_loss': 'l1'},
+    {'fix.sigma_floor': [0.1]}, {'fix.covariance_override': [1.0, 1.0, 1.0]},
     {'fix.reorder_window': 1.0}, {'odom.heading': 'auto'}, {'imu.topic': 'imu'},
     {'fix.topic': ''}, {'fix.topic': 'a b'}, {'fix.type': 'gps'}, {'fix.type': 1},
     {'sources': 'odom'}, {'sources': [1]}, {'sources': ['odom', 'odom']},
@@ -201,8 +199,6 @@ def test_a_name_that_is_not_known_has_to_have_a_type() -> None:
 
 @pytest.mark.parametrize(('values', 'said'), [
     ({'sources': ['fix']}, 'at least one of type odometry'),
-    ({'fix.sigma_floor': [2.0, 0.1], 'fix.sigma_ceiling': 1.0},
-     r'fix\.sigma_ceiling: expected at least'),
     ({'fix.sigma_floor': [0.1, 3.0]}, r'fix\.sigma_floor: expected less'),
     ({'datum': [95.0, 10.0]}, r'datum: expected latitude'),
     ({'map_frame': ''}, "parameter map_frame: expected the name of a frame, got ''"),
@@ -214,45 +210,35 @@ def test_values_that_do_not_go_together_are_refused(values: dict[str, object], s
 
 def test_every_setting_of_a_source_reaches_the_engine() -> None:
     values = checked({
-        'sources': ['visual', 'odom', 'rear', 'compass', 'closer'], 'odometry_patience': 3.0,
+        'sources': ['visual', 'odom', 'rear', 'compass', 'closer'],
         'visual.type': 'odometry', 'visual.topic': '/vo', 'visual.time_offset': -0.125,
         'visual.noise': 'twist', 'visual.sigma_distance': 0.1, 'visual.sigma_lateral': 0.2,
         'visual.sigma_heading_distance': 0.3, 'visual.sigma_heading_turn': 0.4,
-        'visual.sigma_floor': [0.5, 0.6], 'visual.covariance_scale': 0.7,
-        'visual.reorder_window': 0.8, 'visual.maximum_speed': 9.0, 'visual.robust_loss': 'huber',
-        'visual.rejection_threshold': 1.1,
-        'rear.type': 'fix', 'rear.covariance_policy': 'refuse',
-        'rear.covariance_override': [1.2], 'rear.covariance_scale': 1.3,
-        'rear.sigma_floor': [1, 1.5], 'rear.sigma_ceiling': 16.0, 'rear.default_sigma': [1.7, 1.8],
-        'rear.robust_loss': 'cauchy', 'rear.rejection_threshold': 1.9,
-        'compass.robust_loss': 'cauchy',
-        'rear.minimum_period': 0.19,
-        'rear.correlation_time': 20.0, 'rear.correlation_model': 'inflate',
-        'rear.white_share': 0.21, 'rear.lever_arm': [0.22, 0.23],
+        'visual.covariance_scale': 0.7, 'visual.maximum_speed': 9.0,
+        'rear.type': 'fix', 'rear.covariance_override': [1.2], 'rear.covariance_scale': 1.3,
+        'rear.sigma_floor': [1, 1.5], 'rear.robust_loss': 'cauchy', 'rear.robust': 'loss',
+        'rear.correlation_time': 20.0, 'rear.lever_arm': [0.22, 0.23],
+        'compass.robust_loss': 'tukey',
         'compass.type': 'imu', 'compass.yaw_offset': 0.24,
         'closer.type': 'loop_closure'})
     config, sources = backend_config(values), source_list(values)
     assert list(config.odometry) == ['visual', 'odom']
     visual = config.odometry['visual']
-    assert (visual.noise_from, visual.covariance_scale, visual.reorder_window,
-            visual.maximum_speed, visual.loss, visual.rejection_threshold) == (
-                NoiseFrom.TWIST, 0.7, 0.8, 9.0, Loss.HUBER, 1.1)
+    assert (visual.noise_from, visual.covariance_scale, visual.maximum_speed) == (
+        NoiseFrom.TWIST, 0.7, 9.0)
     noise = visual.noise
     assert (noise.sigma_distance, noise.sigma_lateral, noise.sigma_heading_distance,
-            noise.sigma_heading_turn, noise.sigma_floor_position, noise.sigma_floor_heading) == (
-                0.1, 0.2, 0.3, 0.4, 0.5, 0.6)
+            noise.sigma_heading_turn) == (0.1, 0.2, 0.3, 0.4)
     assert config.odometry['odom'] == OdometrySource()
     rear, policy = config.measurements['rear'], config.measurements['rear'].covariance
-    assert (rear.loss, rear.rejection_threshold, rear.correlation_time, rear.correlation,
-            rear.white_share) == (Loss.CAUCHY, 1.9, 20.0, Correlation.INFLATE, 0.21)
-    assert rear.minimum_period == 0.19
-    assert config.measurements['compass'].loss is Loss.CAUCHY
+    assert (rear.robust, rear.loss, rear.rejection_threshold, rear.correlation_time) == (
+        Robust.LOSS, Loss.CAUCHY, 3.0, 20.0)
+    compass = config.measurements['compass']
+    assert (compass.loss, compass.rejection_threshold, compass.minimum_period) == (
+        Loss.TUKEY, 5.0, 0.5)
     assert (policy.repair, policy.override, policy.scale, policy.position_floor,
-            policy.heading_floor, policy.position_ceiling, policy.default_position,
-            policy.default_heading, policy.heading) == (
-                False, (1.2,), 1.3, 1.0, 1.5, 16.0, 1.7, 1.8, Heading.AUTO)
+            policy.heading_floor, policy.heading) == (True, (1.2,), 1.3, 1.0, 1.5, Heading.AUTO)
     assert config.measurements['closer'] == LOOP_CLOSURES
-    assert config.odometry_patience == 3.0
     assert sources == (
         Source('visual', Kind.ODOMETRY, '/vo', -125_000_000),
         Source('odom', Kind.ODOMETRY, 'odom'),
@@ -326,7 +312,7 @@ def test_what_can_be_unset_is_unset(nothing: object) -> None:
     ({'frequncy': 1.0}, r'frequncy is not known: did you mean frequency\?'),
     ({'sources': ['odom']}, r'sources is read at the start: .*start the node again'),
     ({'fix.type': 'imu'}, r'fix\.type is read at the start'),
-    ({'fix.sigma_ceiling': 0.001}, r'fix\.sigma_ceiling: expected at least the floor 0\.01'),
+    ({'fix.sigma_floor': [0.1, 3.0]}, r'fix\.sigma_floor: expected less than'),
     ({'map_frame': 'world'}, r'map_frame is taken when the node is configured: .*cleanup'),
     ({'odom.noise': 'twist'}, r'odom\.noise is taken when'),
     ({'fix.correlation_time': 20.0}, r'fix\.correlation_time is taken when')])
@@ -349,14 +335,29 @@ def test_what_is_taken_at_configuration_can_be_changed_before() -> None:
 
 
 def test_what_goes_together_only_with_its_like_is_changed_together() -> None:
-    wanted = {'fix.sigma_floor': [2.0, 0.1], 'fix.sigma_ceiling': 1.0}
-    with pytest.raises(ConfigError, match=r'fix\.sigma_ceiling'):
-        changed(PRESENT, wanted, configured=True)
-    new = changed(PRESENT, {**wanted, 'fix.sigma_ceiling': 3.0}, configured=True)
-    assert new['fix.sigma_floor'] == [2.0, 0.1]
-    # the two floors must not be lifted one by one over the ceiling
-    with pytest.raises(ConfigError, match=r'fix\.sigma_ceiling: expected at least the floor 4'):
-        changed(new, {'fix.sigma_floor': [4.0, 0.1]}, configured=True)
+    wanted = {'map_frame': 'odom', 'odom_frame': 'wheels'}
+    with pytest.raises(ConfigError, match='expected three different names'):
+        changed(PRESENT, {'map_frame': 'odom'}, configured=False)
+    new = changed(PRESENT, wanted, configured=False)
+    assert (new['map_frame'], new['odom_frame']) == ('odom', 'wheels')
+
+
+@pytest.mark.parametrize(('name', 'said'), [
+    ('node_heartbeat', r'node_heartbeat no longer exists: it is 10 s now, remove it'),
+    ('transform_slew_linear', r'no longer exists: set transform_slew'),
+    ('fix.correlation_model', r'fix\.correlation_model no longer exists: .*bias'),
+    ('odom.robust_loss', r'odom\.robust_loss no longer exists: odometry has none'),
+    ('loop_closure.sigma_scale', r'loop_closure\.sigma_scale no longer exists: .*covariance_')])
+def test_what_has_become_of_a_parameter_is_said(name: str, said: str) -> None:
+    with pytest.raises(ConfigError, match=said):
+        checked({name: 1.0})
+    with pytest.raises(ConfigError, match=said):
+        changed(PRESENT, {name: 1.0}, configured=True)
+
+
+def test_all_that_a_file_has_too_much_is_said_in_one_line() -> None:
+    with pytest.raises(ConfigError, match=r'node_heartbeat no longer .*; parameter white_shar is'):
+        checked({'node_heartbeat': 10.0, 'white_shar': 0.1, 'frequency': 5.0})
 
 
 def test_setting_everything_as_it_is_changes_nothing_even_while_configured() -> None:

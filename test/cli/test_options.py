@@ -20,7 +20,7 @@ FILE = """
     frequency: 5.0
     sources: [odom, fix, rear]
     rear: {type: fix, lever_arm: [-0.5, 0.25]}
-    alignment: {minimum_baseline: 2.0}
+    window: {seconds: 2.0}
     qos_overrides: {/path: {publisher: {depth: 1}}}
 /robot/pose_graph:
   ros__parameters: {path_period: 3.0}
@@ -58,7 +58,7 @@ def test_parameters_come_from_the_file_and_from_the_command_line(tmp_path: Path)
     path.write_text(FILE, encoding='utf-8')
     in_file = {
         'frequency': 5.0, 'sources': ['odom', 'fix', 'rear'], 'rear.type': 'fix',
-        'rear.lever_arm': [-0.5, 0.25], 'alignment.minimum_baseline': 2.0, 'path_period': 3.0}
+        'rear.lever_arm': [-0.5, 0.25], 'window.seconds': 2.0, 'path_period': 3.0}
     assert shared.parameter_values(parsed('--params-file', str(path))) == checked(in_file)
     # the command line wins, and its values are read as yaml
     given = parsed('--params-file', str(path), '-p', 'frequency:=20', '--param',
@@ -80,11 +80,11 @@ def test_a_file_without_a_section_for_the_node_sets_nothing(tmp_path: Path) -> N
 def test_a_file_of_ros2_param_dump_is_taken(tmp_path: Path) -> None:
     path = tmp_path / 'dump.yaml'
     path.write_text(yaml.safe_dump({'/pose_graph': {'ros__parameters': {
-        'datum': None, 'fix': {'covariance_override': None, 'sigma_ceiling': 9.0},
+        'datum': None, 'fix': {'covariance_override': None, 'covariance_scale': 9.0},
         'use_sim_time': False, 'start_type_description_service': True,
         'qos_overrides': {'/odom': {'subscription': {'depth': 7}}}}}}), encoding='utf-8')
     assert shared.parameter_values(parsed('--params-file', str(path))) == checked(
-        {'fix.sigma_ceiling': 9.0})
+        {'fix.covariance_scale': 9.0})
 
 
 @pytest.mark.parametrize(('text', 'said'), [

@@ -28,7 +28,7 @@ NUMBERS = [(kind, item.name)
 MAY_BE_ZERO = {
     'minimum_travel_distance', 'minimum_travel_heading', 'minimum_interval', 'sigma_distance',
     'sigma_lateral', 'sigma_heading_distance', 'sigma_heading_turn',
-    'reorder_window', 'correlation_time', 'white_share', 'minimum_period', 'sigma_scale',
+    'reorder_window', 'correlation_time', 'minimum_period', 'sigma_scale',
 }
 
 
@@ -50,7 +50,7 @@ def test_zero_is_taken_where_it_means_something(kind: type, name: str) -> None:
 
 @pytest.mark.parametrize(('kind', 'name', 'value'), [
     (MeasurementSource, 'loss', 'huber'), (OdometrySource, 'loss', 1),
-    (MeasurementSource, 'correlation', 'inflate'), (OdometrySource, 'noise_from', 'twist'),
+    (OdometrySource, 'noise_from', 'twist'),
     (CovariancePolicy, 'heading', Loss.NONE)])
 def test_a_choice_is_a_member_of_its_enumeration(kind: type, name: str, value: object) -> None:
     with pytest.raises(ConfigError, match=f'{kind.__name__}.{name}: expected one of .*, got'):
@@ -101,5 +101,3 @@ def test_ranges_are_ranges() -> None:
         CovariancePolicy(position_floor=2.0, position_ceiling=1.0)
     with pytest.raises(ConfigError, match='heading_floor: expected less than'):
         CovariancePolicy(heading_floor=1.9)
-    with pytest.raises(ConfigError, match=r'white_share: expected a number in \[0, 1\]'):
-        MeasurementSource(white_share=1.1)

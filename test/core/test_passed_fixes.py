@@ -8,7 +8,6 @@ import pytest
 from pose_graph_ros.core.backend import PoseGraphBackend
 from pose_graph_ros.core.config import (
     BackendConfig,
-    Correlation,
     Loss,
     MeasurementSource,
     Robust,
@@ -115,14 +114,6 @@ def test_neither_what_odometry_has_not_reached_nor_the_first_of_a_source_is_used
     before = newest(backend)
     backend.add_measurement(fix(LAST + 2, (1.0, 1.0)), 'fix')
     backend.add_measurement(fix(LAST - 2, (1.0, 1.0)), 'another')
-    np.testing.assert_array_equal(newest(backend).T_map_base, before.T_map_base)
-
-
-def test_where_weights_are_inflated_it_waits_as_it_takes_weight_off_others() -> None:
-    backend, _ = driven(
-        MeasurementSource(correlation_time=5.0, correlation=Correlation.INFLATE))
-    before = newest(backend)
-    backend.add_measurement(fix(LAST - 2, (1.0, 1.0)), 'fix')
     np.testing.assert_array_equal(newest(backend).T_map_base, before.T_map_base)
 
 

@@ -15,7 +15,6 @@ from pose_graph_ros.core.batch.optimizer import Status
 from pose_graph_ros.core.config import (
     AlignmentPolicy,
     BackendConfig,
-    Correlation,
     CovariancePolicy,
     Loss,
     MeasurementSource,
@@ -147,8 +146,6 @@ def test_the_same_settings_again_change_no_bit(config: BackendConfig) -> None:
 @pytest.mark.parametrize(('wanted', 'said'), [
     (with_odometry(noise_from=NoiseFrom.TWIST), r'odom: .*noise_from: .*MODEL.*TWIST'),
     (with_fix(correlation_time=5.0), r'fix: .*correlation_time: .* expected 0\.0, got 5\.0'),
-    (with_fix(correlation=Correlation.INFLATE), r'fix: .*correlation: '),
-    (with_fix(white_share=0.5), r'fix: .*white_share: '),
     (replace(CONFIG, measurements={}), r'gnss: .*correlation_time: .* expected 20\.0, got 0\.0'),
     (replace(CONFIG, smoother=SmootherConfig(alpha=0.5)), r'BackendConfig\.smoother: ')])
 def test_what_must_stay_is_refused_and_then_nothing_changes(

@@ -292,14 +292,6 @@ def test_after_a_jump_of_the_clock_messages_of_the_old_time_are_rejected() -> No
     assert not given.receive('odom', odometry(52.1)).is_old
 
 
-def test_the_threshold_of_a_jump_can_change() -> None:
-    given = Given()
-    given.receive('odom', odometry(100.0))
-    assert given.receive('odom', odometry(98.0)).released == []
-    given.input.configure(checked({'clock_jump_threshold': 5.0}))
-    assert len(given.receive('odom', odometry(98.1)).released) == 2
-
-
 def test_another_time_offset_shifts_measurements_and_is_no_jump() -> None:
     given = Given()
     for step in range(20):

@@ -111,13 +111,13 @@ def test_an_impossible_transition_is_answered(managed: tuple[Client, Manager]) -
 
 
 def test_what_does_not_go_together_is_mended_while_unconfigured(tmp_path: Path) -> None:
-    arguments = ('-p', 'autostart:=false', '-p', 'fix.sigma_ceiling:=0.001')
+    arguments = ('-p', 'autostart:=false', '-p', 'fix.sigma_floor:=[0.1, 3.0]')
     with NodeProcess(tmp_path, arguments) as node:
         client = Client(int(node.env['ROS_DOMAIN_ID']))
         manager = Manager(client)
         assert not manager.change(Transition.TRANSITION_CONFIGURE)
         assert manager.state == State.PRIMARY_STATE_UNCONFIGURED
-        assert client.set_parameter('fix.sigma_ceiling', 100.0) == (True, '')
+        assert client.set_parameter('fix.sigma_floor', [0.1, 0.1]) == (True, '')
         assert client.set_parameter('fix.topic', '/odom') == (True, '')
         assert not manager.change(Transition.TRANSITION_CONFIGURE)
         assert client.set_parameter('fix.topic', '/fix') == (True, '')
@@ -129,7 +129,7 @@ def test_what_does_not_go_together_is_mended_while_unconfigured(tmp_path: Path) 
         assert manager.change(Transition.TRANSITION_CONFIGURE)
         client.close()
         assert node.signal_and_wait(signal.SIGTERM) == 0
-        assert 'ceiling' in node.stderr()
+        assert 'fix.sigma_floor' in node.stderr()
         assert 'no transition: parameter load_graph_on_start: ' in node.stderr()
         assert 'no.json: cannot be read' in node.stderr()
         assert 'no transition: parameter fix.topic: expected a topic of' in node.stderr()

@@ -195,27 +195,6 @@ def test_the_path_is_current_without_an_optimisation(client: Client) -> None:
     assert 0.0 < float(client.values['solve_mean_ms']) <= float(client.values['solve_max_ms'])
 
 
-@pytest.mark.parametrize('node', [('-p', 'global_pose.sigma_ceiling:=100000.0')], indirect=True)
-def test_what_cannot_be_solved_for_is_set_aside_and_the_node_goes_on(
-    node: NodeProcess, client: Client,
-) -> None:
-    drive(client, 5.0, fixes=False)
-    # a sharp heading, but 100 km uncertain of the place: it holds the graph nowhere
-    client.global_pose.publish(pose(
-        START + 2.0, 0.0, 0.0, 1.0, variances=(1e10, 1e10, 1e-6)))
-    client.spin_until(lambda: client.values.get('quarantined') == '1', 'it is set aside')
-    assert client.values['solver.failed'] == '1'
-    assert client.values['quarantined.1'] == f'global_pose at {START + 2.0:.3f} s near x3'
-    # the level is that of the newest update, which may be a later one
-    assert 'the solver failed with what is set aside' in node.stderr()
-    assert client.values['alignment'] == 'local'
-    client.global_pose.publish(pose(START + 3.0, *true_pose(3.0).tolist()))
-    client.spin_until(lambda: client.values['alignment'] == 'aligned', 'it is aligned')
-    client.spin_until(lambda: len(client.paths) > 0 and path_error(client) < 1e-3,
-                      'the path lies in the map')
-    client.wait_level(DiagnosticStatus.OK)
-
-
 def test_malformed_messages_are_counted_and_the_node_goes_on(
     node: NodeProcess, client: Client,
 ) -> None:
@@ -310,7 +289,7 @@ BAD = (
     ('map_frame:=3', 'map_frame'), ('odom_frame:=map', 'different'),
     ('fix.lever_arm:=[1.0]', 'fix.lever_arm'),
     ('sources:=[odom, wheels]', 'wheels.type'), ('sources:=[]', 'odometry or twist, got []'),
-    ('odom.robust_loss:=l1', 'none, huber, cauchy'), ('fix.sigma_ceiling:=0.001', 'ceiling'),
+    ('fix.robust_loss:=l1', 'none, huber, cauchy'), ('fix.sigma_floor:=[0.1, 3.0]', 'sigma_floor'),
     ('fix.topic:=/odom', 'fix.topic: expected a topic of sensor_msgs/msg/NavSatFix, got /odom'),
     ('qos_overrides./odom.subscription.reliability:=bestefort', 'best_effort'),
     ('load_graph_on_start:=true', 'parameter graph_file: expected the name of a file'),

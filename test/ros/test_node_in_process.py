@@ -112,11 +112,11 @@ def test_it_goes_through_all_its_states_and_back(managed: Managed) -> None:
 
 def test_a_configuration_that_fails_says_why_and_can_be_repaired(managed: Managed) -> None:
     node = managed.local.node
-    assert managed.set('fix.sigma_ceiling', 0.001)[0] is False
-    node._given = node._given | {'fix.sigma_ceiling': 0.001}
-    with pytest.raises(ConfigError, match='ceiling'):
+    assert managed.set('fix.sigma_floor', [0.1, 3.0])[0] is False
+    node._given = node._given | {'fix.sigma_floor': [0.1, 3.0]}
+    with pytest.raises(ConfigError, match='sigma_floor'):
         node.start()
-    assert managed.set('fix.sigma_ceiling', 100.0) == (True, '')
+    assert managed.set('fix.sigma_floor', [0.1, 0.1]) == (True, '')
     node.start()
 
 
@@ -150,8 +150,8 @@ def test_parameters_are_checked_and_reach_the_session(managed: Managed) -> None:
     assert managed.set('map_frame', 'world') == (True, '')
     managed.start()
     assert managed.session.out.map_frame == 'world'
-    assert managed.set('clock_jump_threshold', 3.0) == (True, '')
-    assert managed.session.input.reader.keeper.threshold_ns == 3_000_000_000
+    assert managed.set('path_period', 3.0) == (True, '')
+    assert managed.session.values['path_period'] == 3.0
     for name, value in (('map_frame', 'elsewhere'), ('frequency', -1.0), ('fix.topic', 'other')):
         successful, reason = managed.set(name, value)
         assert not successful

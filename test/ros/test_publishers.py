@@ -202,7 +202,7 @@ def test_without_tf2_msgs_all_but_the_transform_is_published(
 def test_a_correction_is_slow_unless_the_map_or_the_robot_was_put_elsewhere(
     local: LocalNode, event: str,
 ) -> None:
-    given = Given(local, transform_slew_linear=0.5, transform_slew_angular=0.1)
+    given = Given(local, transform_slew=[0.5, 0.1])
     messages = given.subscribe(TFMessage, '/tf')
     before, after = AlignmentState.ALIGNED, AlignmentState.ALIGNED
     if event in ('alignment', 'new graph'):
@@ -230,7 +230,7 @@ def test_a_correction_is_slow_unless_the_map_or_the_robot_was_put_elsewhere(
         assert math.hypot(*(second - first)[:2]) == pytest.approx(0.5)
         assert second[2] - first[2] == pytest.approx(0.1)
         # without limits it arrives at once
-        given.configure(transform_slew_linear=0.0, transform_slew_angular=0.0)
+        given.configure(transform_slew=[0.0, 0.0])
         given.publish(3.0, target, x=10.0)
         given.wait_for(messages, 3)
     np.testing.assert_allclose(corrections(messages)[-1], target, atol=1e-12)
@@ -323,7 +323,7 @@ def test_a_late_subscriber_receives_the_newest_path_and_graph(local: LocalNode) 
 
 
 def test_markers_are_due_after_their_period_and_only_for_a_subscriber(local: LocalNode) -> None:
-    given = Given(local, graph_period=1000.0)
+    given = Given(local, path_period=1000.0)
     assert not given.out.graph_is_due()
     graphs = given.subscribe(MarkerArray, 'graph', latched=True)
     assert given.out.graph_is_due()

@@ -41,7 +41,7 @@ from pose_graph_ros.ros.session import Session
 
 pytestmark = pytest.mark.timeout(PREPARE_PATIENCE)
 OK, WARN, ERROR = DiagnosticStatus.OK, DiagnosticStatus.WARN, DiagnosticStatus.ERROR
-PERIODS = {'diagnostics_period': 0.02, 'frequency': 50.0, 'path_period': 0.0, 'graph_period': 0.1}
+PERIODS = {'diagnostics_period': 0.02, 'frequency': 50.0, 'path_period': 0.0}
 
 
 @pytest.fixture(autouse=True, scope='module')
@@ -188,16 +188,13 @@ def test_parameters_reach_input_outputs_and_engine(active: Robot) -> None:
     engine = session.worker._backend
     configure = engine.configure
     engine.configure = lambda config: (configs.append(config), configure(config))
-    handle = session._jump_handle
-    active.configure(publish_tf=False, clock_jump_threshold=7.0, path_period=3.0,
-                     odom__maximum_speed=4.5, fix__rejection_threshold=2.0)
+    active.configure(publish_tf=False, path_period=3.0, odom__maximum_speed=4.5,
+                     fix__robust_loss='tukey')
     assert session.out.transforms is None
-    assert session.input.reader.keeper.threshold_ns == 7_000_000_000
     assert session._continuity['odom'].maximum_speed == 4.5
-    assert session._jump_handle is not handle
     assert session._timers['views'].timer_period_ns == 500_000_000
     active.wait(lambda: len(configs) > 0, 'the engine has them')
-    assert configs[0].measurements['fix'].rejection_threshold == 2.0
+    assert configs[0].measurements['fix'].rejection_threshold == 5.0
     assert session.n_resets == 0
     active.drive(4.0, 3.0)
 

@@ -10,8 +10,7 @@ import pytest
 pytestmark = pytest.mark.untraced
 
 
-@pytest.mark.parametrize(
-    'node', [('-p', 'thinning.cell:=6.0', '-p', 'thinning.newest:=10.0')], indirect=True)
+@pytest.mark.parametrize('node', [('-p', 'thinning.cell:=6.0')], indirect=True)
 def test_the_path_stays_whole_and_late_measurements_are_taken(
     node: object, client: Client,
 ) -> None:
@@ -20,7 +19,7 @@ def test_the_path_stays_whole_and_late_measurements_are_taken(
     client.wait_current()
     # a few nodes leave with each update, of which a busy machine makes fewer
     while int(client.values['thinned_nodes']) <= 10:
-        assert end < 100.0, 'no nodes have left'
+        assert end < 140.0, 'no nodes have left'
         drive(client, end + 2.0, begin=end)
         client.wait_current()
         end += 2.0

@@ -72,8 +72,7 @@ def test_the_same_stamp_is_never_sent_twice(client: Client) -> None:
 
 def test_the_published_transform_moves_no_faster_than_asked(tmp_path: Path) -> None:
     # a single pose that contradicts odometry would be doubted
-    limits = ('-p', 'transform_slew_linear:=0.5', '-p', 'transform_slew_angular:=0.1',
-              '-p', 'global_pose.robust:=loss')
+    limits = ('-p', 'transform_slew:=[0.5, 0.1]', '-p', 'global_pose.robust:=loss')
     with NodeProcess(tmp_path, limits) as node, \
             Client(int(node.env['ROS_DOMAIN_ID'])) as client:
         drive(client, 10.0)

@@ -69,7 +69,7 @@ class Verdicts:
 @pytest.fixture
 def verdicts(client: Client) -> Iterator[Verdicts]:
     """Drive a round and a bit, with three true closures and two false ones."""
-    before = client.set_parameter('graph_period', 0.1)
+    before = client.set_parameter('path_period', 0.05)
     assert before[0], before[1]
     found = Verdicts(client)
     drive(client, 70.0, fixes=False)
@@ -81,7 +81,7 @@ def verdicts(client: Client) -> Iterator[Verdicts]:
         processed += 1
         client.wait_processed(processed)
     yield found
-    assert client.set_parameter('graph_period', 2.0)[0]
+    assert client.set_parameter('path_period', 1.0)[0]
     assert client.set_parameter('graph_file', '')[0]
 
 

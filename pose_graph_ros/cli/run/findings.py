@@ -14,7 +14,6 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from pose_graph_ros.adapters.sources import Kind
 from pose_graph_ros.cli.run import measurement_findings
 from pose_graph_ros.cli.run.content import Run
 from pose_graph_ros.cli.run.sources import claim, SourceAnalysis, WRONG
@@ -63,7 +62,7 @@ def _whole(run: Run) -> Iterator[Finding]:
     if estimate.alignment is AlignmentState.UNALIGNED:
         yield Finding(
             'warning', 'the angle between odometry and map is unknown, as fixes are too few or '
-            'from too short a path: drive farther, or set alignment.minimum_baseline', 'map')
+            'from too short a path: drive farther', 'map')
     elif estimate.alignment is AlignmentState.LOCAL:
         yield Finding('notice', 'nothing was measured in the map, so the path begins at its '
                                 'origin, and nothing but loop closures bounds its drift', 'map')
@@ -119,7 +118,7 @@ def _advice(run: Run, analysis: SourceAnalysis) -> str:
     """Return the parameter that makes the sigmas of a source right, with its value."""
     source, ratio = analysis.residuals.source, analysis.fit.ratio
     # other odometry than the primary one has no sigma_scale that is used
-    if analysis.kind is Kind.LOOP_CLOSURE or source == run.estimate.primary:
+    if source == run.estimate.primary:
         return f'{source}.sigma_scale to {short(ratio)}'
     factor = ratio**2 * float(run.values.get(f'{source}.covariance_scale', 1.0))
     return f'{source}.covariance_scale to {short(factor)}'

@@ -40,14 +40,19 @@ from pose_graph_ros.core.io.atomic_files import write_files
 from pose_graph_ros.core.io.g2o_text import LAYOUT
 from pose_graph_ros.core.io.g2o_writing import g2o_text, NOT_USED, STANDING_FOR_PRIORS
 from pose_graph_ros.core.io.json_values import annotations, decoded, encoded, optional
-from pose_graph_ros.core.io.old_versions import with_ids, with_judgement, with_names
+from pose_graph_ros.core.io.old_versions import (
+    with_ids,
+    with_judgement,
+    with_names,
+    without_jumps,
+)
 from pose_graph_ros.core.io.path_files import tum_text
 from pose_graph_ros.core.io.saved_graph import SavedGraph
 from pose_graph_ros.core.io.saved_priors import restored_priors, saved_priors, SavedPriors
 from pose_graph_ros.core.saved_columns import Integers, Numbers, Rows3, Rows4, Rows6
 
 FORMAT = 'pose_graph_ros graph'
-VERSION = 4
+VERSION = 5
 
 SUFFIXES = ('.g2o', '.json', '.tum')
 _OPENING, _MIDDLE = b'{\n"sha256": "', b'",\n'
@@ -230,7 +235,8 @@ def _checked_members(path: Path, content: bytes) -> dict[str, Any]:
             f'this one is of version {version!r}, created by {members.get("created_by")!r}')
     members = with_names(members) if version == 1 else dict(members)
     members = with_judgement(members) if version < 3 else members
-    return with_ids(members) if version < 4 else members
+    members = with_ids(members) if version < 4 else members
+    return without_jumps(members) if version < 5 else members
 
 
 def _saved_rows(rows: GraphRows) -> SavedRows:

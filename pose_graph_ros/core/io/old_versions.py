@@ -4,7 +4,7 @@
 Saved graphs of older versions.
 
 Version 1 holds losses and kinds as numbers, version 2 holds names. Neither has judgements. In
-version 3 the ids of hidden nodes are `rows`.
+version 3 the ids of hidden nodes are `rows`. In version 4 loop closures may have doubted odometry.
 """
 
 from typing import Any
@@ -25,8 +25,7 @@ EMPTY_JUDGEMENT: dict[str, Any] = {'closures': {
     'distance': []}, 'fixes': {
     'sources': [], 'rows': [], 'edges': [], 'source': [], 'stamps_ns': [], 'believed': [],
     'since_ns': [], 'decision': {'names': [], 'of': []}, 'observed': [], 'distance': [],
-    'loosened': [], 'weights': []}, 'odometry': {
-    'rows': [], 'ends': [], 'weights': [], 'since_ns': []}}
+    'loosened': [], 'weights': []}, 'odometry': {}}
 
 
 def with_judgement(members: dict[str, Any]) -> dict[str, Any]:
@@ -56,3 +55,17 @@ def with_ids(members: dict[str, Any]) -> dict[str, Any]:
         return members
     renamed = {'ids' if name == 'rows' else name: value for name, value in nodes.items()}
     return {**members, 'nodes': renamed}
+
+
+def without_jumps(members: dict[str, Any]) -> dict[str, Any]:
+    """
+    Return the members of a file of version 4 as those of version 5.
+
+    Odometry that closures had doubted keeps the weight that it has in the file.
+    """
+    judgement = members.get('judgement')
+    odometry = judgement.get('odometry') if isinstance(judgement, dict) else None
+    if not isinstance(judgement, dict) or not isinstance(odometry, dict):
+        return members
+    kept = {name: odometry[name] for name in odometry.keys() & {'left_sources', 'left'}}
+    return {**members, 'judgement': {**judgement, 'odometry': kept}}

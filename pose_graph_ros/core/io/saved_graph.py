@@ -239,13 +239,7 @@ class SavedGraph:
 
     def _check_doubts(self, odometry: SavedOdometry) -> None:
         where = 'judgement.odometry'
-        _same_length(where, odometry, 'rows', 'ends', 'weights', 'since_ns')
         _same_length(where, odometry, 'left_sources', 'left')
-        _in_graph(where, odometry.rows, self.rows.edge_ids)
-        _require(self._kinds(odometry.rows) == EdgeKind.ODOMETRY,
-                 f'{where}: expected rows of odometry')
-        _require(np.isin(odometry.ends, self.nodes.ids), f'{where}: expected hidden nodes')
-        _require(odometry.weights > 0.0, f'{where}: expected positive weights')
 
     def _check_source(
         self, where: str, source: SavedSource, ids: Mapping[str, IntArray],

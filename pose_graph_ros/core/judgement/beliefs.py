@@ -7,21 +7,30 @@ Some beliefs cannot be changed in the time of an update, as its iterations diver
 are tried on a copy, part by part (`closure_trial`), and kept if they fit there.
 """
 
-from collections.abc import Collection, Mapping
+from collections.abc import Mapping
 
 import numpy as np
 
 from pose_graph_ros.core.batch.optimizer import Status
 from pose_graph_ros.core.geometry.se2 import BoolArray, FloatArray, IntArray
-from pose_graph_ros.core.graph.graph import GraphUpdate
+from pose_graph_ros.core.graph.graph import Graph, GraphUpdate
 from pose_graph_ros.core.graph.reweighting import Reweighting
-from pose_graph_ros.core.judgement.closure_states import ClosureStates, DOUBTED, STATES, USED
+from pose_graph_ros.core.judgement.closure_reports import ClosureReports
+from pose_graph_ros.core.judgement.closure_states import (
+    AUTO,
+    ClosureStates,
+    DECISIONS,
+    DOUBTED,
+    STATES,
+    USED,
+)
 from pose_graph_ros.core.judgement.closure_trial import ClosureTrial
-from pose_graph_ros.core.judgement.closures import ClosureTable
-from pose_graph_ros.core.judgement.odometry_states import Doubt, OdometryStates
+from pose_graph_ros.core.judgement.closures import claims, ClosureTable
 from pose_graph_ros.core.judgement.residual_scale import ScaleLeft
 from pose_graph_ros.core.judgement.swaps import Found
-from pose_graph_ros.core.judgement.verdicts import State
+from pose_graph_ros.core.judgement.texts import sentence, unknown
+from pose_graph_ros.core.judgement.verdicts import Decision, State
+from pose_graph_ros.core.measurements import Answer, AnswerStatus, rejected
 from pose_graph_ros.core.smoother.incremental import IncrementalSmoother
 from pose_graph_ros.core.smoother.results import DIVERGED
 from pose_graph_ros.core.smoother.trial import continued
@@ -39,9 +48,9 @@ class Beliefs:
 
     def __init__(
         self, smoother: IncrementalSmoother, reweighting: Reweighting, states: ClosureStates,
-        table: ClosureTable, odometry: OdometryStates,
+        table: ClosureTable,
     ) -> None:
-        self._smoother, self._reweighting, self._odometry = smoother, reweighting, odometry
+        self._smoother, self._reweighting = smoother, reweighting
         self._states, self._table = states, table
         self.scales: list[float] = []
         """Of each source, the factor on its sigmas in the graph."""
@@ -51,9 +60,6 @@ class Beliefs:
         self.trial = ClosureTrial(smoother)
         self.scales_left: list[ScaleLeft] = []
         """Of each source, what its closures have shown that have left the graph."""
-        self._doubts: dict[int, Doubt] | None = None
-        """Odometry that is doubted with the set that is tried, if that changes."""
-        self._odometry_round = -1
 
     def weights(self, numbers: IntArray) -> FloatArray:
         """Return the weights of closures by their states."""
@@ -65,10 +71,7 @@ class Beliefs:
         for number, weight in zip(numbers.tolist(), self.weights(numbers).tolist(), strict=True):
             self._reweighting.set_base_weight(int(self._states.edge[number]), weight, edge=True)
 
-    def apply(
-        self, changes: Mapping[int, State], *, at_once: bool = False,
-        doubts: Mapping[int, Doubt] | None = None,
-    ) -> bool:
+    def apply(self, changes: Mapping[int, State], *, at_once: bool = False) -> bool:
         """
         Return whether states and weights could be changed; else nothing has.
 
@@ -77,22 +80,19 @@ class Beliefs:
         Parameters
         ----------
         changes : mapping, new states by the numbers of closures
-        doubts : mapping, optional, the doubted odometry edges by id, if they change as well
 
         """
-        weights = self.weights_with(changes, doubts)
+        weights = self.weights_with(changes)
         result = self._smoother.update(GraphUpdate(weigh_edges=weights), fall_back=at_once)
         if result.status is Status.FAILED:
             if result.reason == DIVERGED:
                 self.trial.begin(changes, weights)
             return False
         self.trial.was_not_needed()
-        self._keep(changes, doubts)
+        self._keep(changes)
         return True
 
-    def change_to(
-        self, inside: BoolArray, poses: FloatArray, doubts: Mapping[int, Doubt],
-    ) -> bool:
+    def change_to(self, inside: BoolArray, poses: FloatArray) -> bool:
         """
         Return whether another set could be believed, at the poses of its solution.
 
@@ -100,13 +100,12 @@ class Beliefs:
         ----------
         inside : ndarray of bool, shape (M,), which closures are believed
         poses : ndarray, shape (N, 3)
-        doubts : mapping, doubted odometry edges by id
 
         """
         graph = self._smoother.graph
         before = graph.poses.copy()
         graph.set_poses(continued(graph, poses))
-        done = self.apply(self._states.changes_to(inside), at_once=True, doubts=doubts)
+        done = self.apply(self._states.changes_to(inside), at_once=True)
         if not done:
             graph.set_poses(before)
             self._smoother.update(GraphUpdate())
@@ -114,32 +113,18 @@ class Beliefs:
         return done
 
     def try_set(self, found: Found) -> None:
-        """Try another set of closures, and odometry that is doubted with it, on a copy."""
+        """Try another set of closures on a copy."""
         changes, graph = self._states.changes_to(found.inside), self._smoother.graph
-        self._doubts = None if found.jump is None else {
-            **self._odometry.doubts, **self._odometry.doubted(
-                graph, (found.jump,), self.now_ns, self._states.name)}
-        self.trial.begin(changes, self.weights_with(changes, self._doubts),
+        self.trial.begin(changes, self.weights_with(changes),
                          continued(graph, found.poses, found.nodes))
 
-    def believe_odometry_again(self) -> bool:
-        """Believe odometry that no believed closure leads over; tell whether there was any."""
-        if self.round == self._odometry_round or len(self._odometry.doubts) == 0:
-            return False
-        self._odometry_round = self.round
-        edges = self._smoother.graph.edges_at(self._states.edge[self._states.in_graph])
-        left = self._odometry.still_doubted(edges)
-        return len(left) < len(self._odometry.doubts) and self.apply({}, doubts=left)
-
-    def weights_with(
-        self, changes: Mapping[int, State], doubts: Mapping[int, Doubt] | None = None,
-    ) -> dict[int, float]:
+    def weights_with(self, changes: Mapping[int, State]) -> dict[int, float]:
         """
         Return the weights of edges, by id, after a change of states.
 
         Parameters
         ----------
-        changes, doubts : as in `apply`
+        changes : as in `apply`
 
         """
         numbers = np.array(sorted(changes), dtype=np.int64)
@@ -147,22 +132,15 @@ class Beliefs:
         self._states.state[numbers] = [STATES.index(changes[k]) for k in numbers.tolist()]
         weights = self.weights(numbers).tolist()
         self._states.state[numbers] = before
-        odometry = {} if doubts is None else self._odometry.weights_with(doubts)
-        return {**dict(zip(self._states.edge[numbers].tolist(), weights, strict=True)), **odometry}
+        return dict(zip(self._states.edge[numbers].tolist(), weights, strict=True))
 
-    def _keep(
-        self, changes: Mapping[int, State], doubts: Mapping[int, Doubt] | None,
-    ) -> None:
+    def _keep(self, changes: Mapping[int, State]) -> None:
         """Change states, of which the graph has the weights already."""
         for number, state in sorted(changes.items()):
             before = int(self._states.state[number])
             self._states.state[number] = STATES.index(state)
             self._states.announce(number, before, self.now_ns)
         self.set_base_weights(np.array(sorted(changes), dtype=np.int64))
-        if doubts is not None:
-            for edge, weight in self._odometry.weights_with(doubts).items():
-                self._reweighting.set_base_weight(edge, weight, edge=True)
-            self._odometry.keep(doubts, self._smoother.graph)
         self.round += 1
 
     def try_part(self) -> list[int] | None:
@@ -177,21 +155,20 @@ class Beliefs:
         if not trial.is_finished:
             return []
         changes, later = trial.changes, trial.later
-        is_of_closures = len(changes) > 0 or self._doubts is not None
-        if trial.is_outdated or (is_of_closures and (
-                trial.weights != self.weights_with(changes, self._doubts)
+        if trial.is_outdated or (len(changes) > 0 and (
+                trial.weights != self.weights_with(changes)
                 or not np.all(states.judged[[*changes]]))):
             later |= set(changes)
         else:
             bad = trial.misfits(self._table)
             if len(bad) == 0 and trial.adopt():
-                self._keep(changes, self._doubts)
+                self._keep(changes)
                 later |= set(changes)
             for number in bad:
                 before, states.state[number] = int(states.state[number]), DOUBTED
                 states.announce(number, before, self.now_ns)
             later |= set(changes) - set(bad) if len(bad) > 0 else set()
-        self.end_trial()
+        trial.end()
         return sorted(later)
 
     def closures_left(self, numbers: IntArray) -> None:
@@ -201,22 +178,36 @@ class Beliefs:
             used = USED[states.state[numbers]] & (states.source[numbers] == source)
             self.scales_left[source].add(int(np.count_nonzero(used)), self.scales[source])
 
-    def forget(self, edges: Collection[int], numbers: Collection[int]) -> None:
-        """
-        Forget what has left the graph.
 
-        Parameters
-        ----------
-        edges : collection of int, ids
-        numbers : collection of int, closures
+def decide(
+    name: str, decision: Decision, closures: tuple[ClosureStates, ClosureTable, Beliefs],
+    reports: ClosureReports, graph: Graph,
+) -> Answer:
+    """
+    Return the answer to a decision, which is applied at once; see `ClosureJudge.decide`.
 
-        """
-        self.trial.forget(edges, numbers)
-        if self._doubts is not None:
-            self._doubts = {edge: doubt for edge, doubt in self._doubts.items()
-                            if edge not in edges}
+    Parameters
+    ----------
+    name : str, `Verdict.id`
+    closures : tuple, what is known and believed of all closures
 
-    def end_trial(self) -> None:
-        """Forget what is tried."""
-        self.trial.end()
-        self._doubts = None
+    """
+    states, table, beliefs = closures
+    number = states.find(name)
+    if number < 0:
+        return unknown(name, has_left=states.has_left(name))
+    before = int(states.decision[number])
+    state = {Decision.IN: State.BELIEVED, Decision.OUT: State.DOUBTED,
+             Decision.AUTO: State.WAITING}[decision]
+    forced = decision is not Decision.AUTO or before != AUTO
+    states.decision[number] = DECISIONS.index(decision)
+    if states.forgotten[number]:
+        states.forgotten[number] = False
+        table.bring_back(
+            np.array([number]), claims(graph.edges_at(states.edge[number:number + 1])))
+    if forced and not beliefs.apply({number: state}, at_once=True):
+        states.decision[number] = before
+        return rejected('failed', 'the solver failed with it')
+    beliefs.round += 1
+    verdict, = reports.of(graph, [number])
+    return Answer(AnswerStatus.ACCEPTED, detail=f'{name}: {sentence(verdict)}')

@@ -14,12 +14,11 @@ from collections.abc import Callable, Sequence
 import numpy as np
 
 from pose_graph_ros.core.compiled.growing_array import GrowingArray
-from pose_graph_ros.core.config import BackendConfig
 from pose_graph_ros.core.geometry.se2 import FloatArray, IntArray
 from pose_graph_ros.core.graph.constraints import Edges
 from pose_graph_ros.core.graph.reweighting import Reweighting
-from pose_graph_ros.core.judgement import decisions, final, relative
-from pose_graph_ros.core.judgement.belief_rule import BeliefRule
+from pose_graph_ros.core.judgement import beliefs, final, relative
+from pose_graph_ros.core.judgement.belief_rule import BeliefRule, MOST_TURNS, Retests
 from pose_graph_ros.core.judgement.beliefs import Beliefs
 from pose_graph_ros.core.judgement.closure_reports import ClosureReports
 from pose_graph_ros.core.judgement.closure_states import (
@@ -31,15 +30,13 @@ from pose_graph_ros.core.judgement.closure_states import (
 )
 from pose_graph_ros.core.judgement.closure_trial import ClosureTrial
 from pose_graph_ros.core.judgement.closures import chances, claims, ClosureTable, GATE
-from pose_graph_ros.core.judgement.listing import MOST_OTHERS
 from pose_graph_ros.core.judgement.odometry_chain import OdometryChain
-from pose_graph_ros.core.judgement.odometry_states import OdometryStates
 from pose_graph_ros.core.judgement.residual_scale import ScaleLeft
-from pose_graph_ros.core.judgement.retests import MOST_TURNS, Retests
 from pose_graph_ros.core.judgement.scale_learner import ScaleLearner
-from pose_graph_ros.core.judgement.set_search import SetSearch
+from pose_graph_ros.core.judgement.swaps import SetSearch
 from pose_graph_ros.core.judgement.verdicts import (
     Decision,
+    MOST_OTHERS,
     SourceVerdicts,
     State,
     Verdict,
@@ -68,17 +65,12 @@ class ClosureJudge:
 
     Parameters
     ----------
-    smoother, reweighting, config : as in `Judge`
-    odometry : OdometryStates, which odometry is doubted
+    smoother, reweighting : as in `Judge`
 
     """
 
-    def __init__(
-        self, smoother: IncrementalSmoother, reweighting: Reweighting, config: BackendConfig,
-        odometry: OdometryStates,
-    ) -> None:
+    def __init__(self, smoother: IncrementalSmoother, reweighting: Reweighting) -> None:
         self._smoother, self._reweighting = smoother, reweighting
-        self._odometry = odometry
         self.chain = self._chain = OdometryChain()
         self._table = ClosureTable(self._chain)
         self.states = self._states = ClosureStates()
@@ -91,12 +83,8 @@ class ClosureJudge:
         self._corroborated = GrowingArray((), np.bool_)
         """Whether a clique of closures outside of the graph supports one that is doubted."""
         self._search = SetSearch(self._states, self._table)
-        self._beliefs = Beliefs(smoother, reweighting, self._states, self._table, odometry)
-        self._scales = ScaleLearner(smoother, self._states, self._table, self._beliefs, config)
-
-    def configure(self, config: BackendConfig) -> None:
-        """Set the settings."""
-        self._scales.configure(config)
+        self._beliefs = Beliefs(smoother, reweighting, self._states, self._table)
+        self._scales = ScaleLearner(smoother, self._states, self._table, self._beliefs)
 
     def before(
         self, new: Sequence[NewConstraint], edges: Edges, now_ns: int,
@@ -325,9 +313,9 @@ class ClosureJudge:
                 self._change(self._rule.choose(*self._test(waiting[:IN_UPDATE])))
         return self.reports.of(graph, leaving[~states.in_graph[leaving]][-MOST_OTHERS:].tolist())
 
-    def forget(self, nodes: IntArray, edges: IntArray) -> IntArray:
+    def forget(self, nodes: IntArray, edges: IntArray) -> None:
         """
-        Return the nodes of believed closures that have left the graph, and forget all that have.
+        Forget all closures that have left the graph.
 
         Parameters
         ----------
@@ -335,8 +323,7 @@ class ClosureJudge:
 
         """
         states, gone = self._states, self._states.numbers(edges)
-        used = self._table.rows(gone[states.in_graph[gone]])
-        self._beliefs.forget(set(edges.tolist()), set(gone.tolist()))
+        self._beliefs.trial.forget(set(edges.tolist()), set(gone.tolist()))
         if len(gone) > 0:
             self._table.forget(gone[~states.forgotten[gone]])
             self._beliefs.closures_left(gone)
@@ -347,7 +334,6 @@ class ClosureJudge:
                 table.select(kept)
             self.reports.forget()
         self._chain.forget(nodes)
-        return np.column_stack((used.i, used.j))
 
     def decide_finally(self) -> None:
         """
@@ -362,17 +348,13 @@ class ClosureJudge:
             return
         forced = states.edge[states.in_graph & ~states.judged]
         inside = states.in_graph
-        choice, jumps = final.decide(
-            graph, self._reweighting, states.edge[judged], forced, inside[judged],
-            odometry=self._odometry.weights_with(self._odometry.final))
+        choice = final.decide(
+            graph, self._reweighting, states.edge[judged], forced, inside[judged])
         if choice is None:
             return
         inside[judged] = choice.believed
         self._scales.begin()
-        doubts = self._odometry.doubts if jumps is None else self._odometry.final | (
-            self._odometry.doubted(
-                graph, jumps, self._beliefs.now_ns, lambda k: states.name(int(judged[k]))))
-        if not self._beliefs.change_to(inside, choice.poses, doubts):
+        if not self._beliefs.change_to(inside, choice.poses):
             return
         self._scales.learn_all()
         # nothing is to be tested again until something changes
@@ -382,14 +364,12 @@ class ClosureJudge:
     def state(self) -> Callable[[], None]:
         """Return what brings the present state back, as long as no closure is added."""
         states, scales = self._states.state_of_all(), self._scales.state()
-        odometry = self._odometry.state()
 
         def bring_back() -> None:
-            odometry()
             self._states.set_state_of_all(*states)
             self._scales.set_state(*scales)
             self._search = SetSearch(self._states, self._table)
-            self._beliefs.end_trial()
+            self._beliefs.trial.end()
             self._retests.again(slice(None))
             self._table.forget_spread()
         return bring_back
@@ -400,7 +380,7 @@ class ClosureJudge:
             self._smoother.graph, self._corroborated.values, self._beliefs.round)
         if self._search.found is not None:
             self._beliefs.try_set(self._search.found)
-        return more or self._beliefs.believe_odometry_again()
+        return more
 
     def saved(self) -> SavedClosures:
         """Return the state; what is left to be tested is not part of it."""
@@ -440,5 +420,5 @@ class ClosureJudge:
         name : str, `Verdict.id`
 
         """
-        return decisions.decide(name, decision, (self._states, self._table, self._beliefs),
+        return beliefs.decide(name, decision, (self._states, self._table, self._beliefs),
                                 self.reports, self._smoother.graph)

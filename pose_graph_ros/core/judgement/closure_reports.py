@@ -19,10 +19,10 @@ from pose_graph_ros.core.judgement.closure_states import (
     WAITING,
 )
 from pose_graph_ros.core.judgement.closures import ClosureTable, GATE
-from pose_graph_ros.core.judgement.listing import listed
 from pose_graph_ros.core.judgement.texts import ODOMETRY
 from pose_graph_ros.core.judgement.verdicts import (
     Judged,
+    listed,
     MOST_NAMED,
     SourceVerdicts,
     State,
@@ -46,7 +46,7 @@ class ClosureReports:
 
     def verdicts(self, graph: Graph, most_believed: int | None) -> list[Verdict]:
         """
-        Return the verdicts that are listed; see `listing.listed`.
+        Return the verdicts that are listed; see `verdicts.listed`.
 
         Parameters
         ----------

@@ -6,7 +6,6 @@ Copies of a graph to decide on, in which nodes and constraints are numbered by t
 What works on such a copy indexes arrays with these numbers; only its result is given ids again.
 """
 
-from collections.abc import Mapping
 from dataclasses import replace
 
 import numpy as np
@@ -39,18 +38,6 @@ def in_rows(graph: Graph, edges: Edges) -> Edges:
 
     """
     return edges.renumbered(graph.node_rows)
-
-
-def weights_in_rows(graph: Graph, weights: Mapping[int, float]) -> dict[int, float]:
-    """
-    Return weights of edges by row instead of by id.
-
-    Parameters
-    ----------
-    weights : mapping
-
-    """
-    return dict(zip(graph.edge_rows([*weights]).tolist(), weights.values(), strict=True))
 
 
 def losses_in_rows(graph: Graph, reweighting: Reweighting) -> Reweighting:

@@ -11,8 +11,6 @@ That would take long for a very large graph. There the set that is believed alre
 for retests of all closures at its poses.
 """
 
-from collections.abc import Mapping
-
 import numpy as np
 
 from pose_graph_ros.core.batch import final_optimization, optimizer
@@ -22,14 +20,9 @@ from pose_graph_ros.core.geometry.se2 import BoolArray, IntArray
 from pose_graph_ros.core.graph.constraints import Edges
 from pose_graph_ros.core.graph.graph import Graph, GraphUpdate
 from pose_graph_ros.core.graph.reweighting import Reweighting
-from pose_graph_ros.core.judgement import jumps
-from pose_graph_ros.core.judgement.copies import (
-    copied_rows,
-    losses_in_rows,
-    weights_in_rows,
-)
+from pose_graph_ros.core.judgement import selection
+from pose_graph_ros.core.judgement.copies import copied_rows, losses_in_rows
 from pose_graph_ros.core.judgement.floors import floored, forward
-from pose_graph_ros.core.judgement.jumps import Jump
 from pose_graph_ros.core.solver_config import SolverConfig
 
 CONFIG = SolverConfig(max_iterations=100)
@@ -39,13 +32,11 @@ MOST, RETESTS = 30_000, 3
 
 def decide(
     graph: Graph, reweighting: Reweighting, ids: IntArray, forced: IntArray, inside: BoolArray,
-    *, odometry: Mapping[int, float],
-) -> tuple[Choice | None, tuple[Jump, ...] | None]:
+) -> Choice | None:
     """
-    Return which loop closures to believe, and which odometry not to; poses are by row.
+    Return which loop closures to believe, with poses by row; None if the graph cannot be solved.
 
-    There is no choice if the graph cannot be solved. With more than `MOST` nodes and closures it
-    is `inside`, improved, and the same odometry is doubted as before: None.
+    With more than `MOST` nodes and closures it is `inside`, improved.
 
     Parameters
     ----------
@@ -54,7 +45,6 @@ def decide(
     ids : ndarray of int, shape (M,), edges that may be doubted; their weights do not matter
     forced : ndarray of int, ids of edges that a person has decided to believe
     inside : ndarray of bool, shape (M,), which of `ids` are believed now
-    odometry : mapping, weights of the odometry edges that are doubted now, as if they were not
 
     """
     rows, forced = graph.edge_rows(ids), graph.edge_rows(forced)
@@ -62,9 +52,8 @@ def decide(
     if graph.n_nodes + len(rows) > MOST:
         problem = TruncatedProblem(copy, rows, start=copy.poses.copy())
         present = problem.choice(inside)
-        return None if present is None else problem.improved(present, RETESTS), None
-    weights = dict.fromkeys(rows.tolist(), 0.0) | dict.fromkeys(
-        forced.tolist(), 1.0) | weights_in_rows(graph, odometry)
+        return None if present is None else problem.improved(present, RETESTS)
+    weights = dict.fromkeys(rows.tolist(), 0.0) | dict.fromkeys(forced.tolist(), 1.0)
     copy.apply(GraphUpdate(weigh_edges=weights))
     others = losses_in_rows(graph, reweighting)
     for row, weight in weights.items():
@@ -74,10 +63,9 @@ def decide(
     if result.status is not Status.FAILED and len(others) > 0:
         result = final_optimization.optimize(copy, others, CONFIG, optimizer.optimize)
     if result.status is Status.FAILED:
-        return None, None
+        return None
     problem = TruncatedProblem(copy, rows, start=copy.poses.copy())
-    choice, found = jumps.best(problem)
-    return choice, tuple(jump.with_ids(graph.edge_ids, graph.node_ids) for jump in found)
+    return selection.best(problem, insured=True)
 
 
 def _copy(graph: Graph, closures: IntArray) -> Graph:

@@ -20,14 +20,13 @@ from pose_graph_ros.core.judgement.fix_states import (
     SOURCE,
     STAMP,
 )
-from pose_graph_ros.core.judgement.listing import listed
 from pose_graph_ros.core.judgement.runs import EVENT
-from pose_graph_ros.core.judgement.verdicts import Judged, MOST_NAMED, State, Verdict
+from pose_graph_ros.core.judgement.verdicts import Judged, listed, MOST_NAMED, State, Verdict
 
 
 def verdicts(states: FixStates, graph: Graph, most_believed: int | None) -> list[Verdict]:
     """
-    Return the verdicts that are listed; see `listing.listed`.
+    Return the verdicts that are listed; see `verdicts.listed`.
 
     Parameters
     ----------

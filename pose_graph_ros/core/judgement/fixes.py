@@ -20,7 +20,6 @@ from pose_graph_ros.core.graph.graph import GraphUpdate
 from pose_graph_ros.core.graph.reweighting import Reweighting
 from pose_graph_ros.core.judgement import fix_states as fs, fix_verdicts
 from pose_graph_ros.core.judgement.decision_cost import decision_cost
-from pose_graph_ros.core.judgement.listing import MOST_OTHERS
 from pose_graph_ros.core.judgement.odometry_chain import OdometryChain
 from pose_graph_ros.core.judgement.run_set import NOWHERE, RunSet, Turn
 from pose_graph_ros.core.judgement.runs import odometry_between
@@ -31,7 +30,7 @@ from pose_graph_ros.core.judgement.tracks import (
     observations,
     Track,
 )
-from pose_graph_ros.core.judgement.verdicts import Decision, State, Verdict
+from pose_graph_ros.core.judgement.verdicts import Decision, MOST_OTHERS, State, Verdict
 from pose_graph_ros.core.measurements import (
     Answer,
     AnswerStatus,

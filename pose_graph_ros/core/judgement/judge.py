@@ -28,10 +28,15 @@ from pose_graph_ros.core.judgement.closure_judge import ClosureJudge, LARGE
 from pose_graph_ros.core.judgement.closure_states import SavedClosures
 from pose_graph_ros.core.judgement.fix_states import SavedFixes
 from pose_graph_ros.core.judgement.fixes import FixJudge
-from pose_graph_ros.core.judgement.listing import MOST_OTHERS
 from pose_graph_ros.core.judgement.odometry_states import OdometryStates, SavedOdometry
 from pose_graph_ros.core.judgement.tracks import Track
-from pose_graph_ros.core.judgement.verdicts import Change, Decision, SourceVerdicts, Verdict
+from pose_graph_ros.core.judgement.verdicts import (
+    Change,
+    Decision,
+    MOST_OTHERS,
+    SourceVerdicts,
+    Verdict,
+)
 from pose_graph_ros.core.measurements import Answer, LoopClosure
 from pose_graph_ros.core.odometry.hidden_nodes import HiddenNodes
 from pose_graph_ros.core.odometry.odometry_errors import OdometryErrors
@@ -77,8 +82,8 @@ class Judge:
         self._smoother, self._reweighting, self._config = smoother, reweighting, config
         self._nodes = nodes
         self._fixes = FixJudge(smoother, reweighting, config)
-        self._odometry = OdometryStates(nodes, self._fixes.weight_of_odometry)
-        self._closures = ClosureJudge(smoother, reweighting, config, self._odometry)
+        self._odometry = OdometryStates(nodes)
+        self._closures = ClosureJudge(smoother, reweighting)
         self._staged = np.empty(0, dtype=np.int64)
         """The judged closures of the last `before`, by their numbers among its edges."""
         self._new: Sequence[NewConstraint] = ()
@@ -89,7 +94,6 @@ class Judge:
     def configure(self, config: BackendConfig) -> None:
         """Set the settings for later constraints."""
         self._config = config
-        self._closures.configure(config)
         self._fixes.configure(config)
 
     def before(
@@ -107,7 +111,6 @@ class Judge:
         """
         self._new = new
         change = self._fixes.before(new, change, now_ns)
-        change = change._replace(weigh_edges=self._odometry.kept(change.weigh_edges))
         first = self._smoother.graph.next_ids.edge
         closures = [
             one for one in new if one.is_edge and self._is_judged_closure(one, change, first)]
@@ -236,7 +239,7 @@ class Judge:
         return self._closures.work()
 
     def verdicts(self, most_believed: int | None = None) -> list[Verdict]:
-        """Return the verdicts that are listed, see `listing.listed`, and on what left unused."""
+        """Return the verdicts that are listed, see `verdicts.listed`, and on what left unused."""
         graph = self._smoother.graph
         return [*self._closures.reports.verdicts(graph, most_believed),
                 *self._odometry.verdicts(graph, self._believed_after),
@@ -312,9 +315,9 @@ class Judge:
         leaving : Leaving, optional, what was decided on it; None if nothing of it is judged
 
         """
-        closures = self._closures.forget(nodes, edges)
+        self._closures.forget(nodes, edges)
         self._fixes.forget(nodes, edges, observed, leaving and leaving.last)
-        self._odometry.forget(self._smoother.graph, edges, closures, self._fixes.loosened)
+        self._odometry.forget(self._smoother.graph, edges, self._fixes.loosened)
         if leaving is not None:
             self._left.extend(leaving.unused)
 
@@ -376,7 +379,7 @@ class Judge:
         """
         graph = self._smoother.graph
         poses, weights, base = graph.poses.copy(), graph.weights, self._reweighting.base_weights()
-        bring_back = self._closures.state(), self._fixes.state()
+        bring_back = self._closures.state(), self._fixes.state(), self._odometry.state()
 
         def undo() -> None:
             for each in bring_back:

@@ -4,7 +4,6 @@
 
 import numpy as np
 
-from pose_graph_ros.core.config import BackendConfig
 from pose_graph_ros.core.geometry.se2 import BoolArray, IntArray
 from pose_graph_ros.core.judgement.beliefs import Beliefs
 from pose_graph_ros.core.judgement.closure_states import ClosureStates, STATES
@@ -18,7 +17,6 @@ from pose_graph_ros.core.judgement.residual_scale import (
     ScaleLeft,
     together,
 )
-from pose_graph_ros.core.measurements import LoopClosure
 from pose_graph_ros.core.smoother.incremental import IncrementalSmoother
 
 # A source is looked at again when so many more of its closures are believed than the last time: a
@@ -30,7 +28,7 @@ MOST_AT_END = 1000
 
 class ScaleLearner:
     """
-    Learns the factors on the sigmas of sources in the graph, but of those that are set.
+    Learns the factors on the sigmas of sources in the graph.
 
     Parameters
     ----------
@@ -40,25 +38,20 @@ class ScaleLearner:
 
     def __init__(
         self, smoother: IncrementalSmoother, states: ClosureStates, table: ClosureTable,
-        beliefs: Beliefs, config: BackendConfig,
+        beliefs: Beliefs,
     ) -> None:
         self._smoother, self._states, self._table = smoother, states, table
-        self._beliefs, self._config = beliefs, config
+        self._beliefs = beliefs
         self._learnt_from: list[int] = []
         """Number of believed closures of each source when its factor was learnt."""
 
-    def configure(self, config: BackendConfig) -> None:
-        """Set the settings."""
-        self._config = config
-
     def add_sources(self) -> None:
-        """Give new sources a factor, 1 if none is set."""
+        """Give new sources the factor that closures have shown that have left, or 1."""
         for source in range(len(self._learnt_from), len(self._states.sources)):
             if source == len(self._beliefs.scales_left):
                 self._beliefs.scales_left.append(ScaleLeft())
             self._beliefs.scales.append(
-                self._fixed(self._states.sources[source])
-                or together(1.0, 0.0, self._beliefs.scales_left[source]))
+                together(1.0, 0.0, self._beliefs.scales_left[source]))
             self._learnt_from.append(0)
 
     def begin(self) -> None:
@@ -82,10 +75,6 @@ class ScaleLearner:
 
         """
         self._beliefs.scales[:], self._learnt_from[:] = scales, learnt_from
-
-    def _fixed(self, source: str) -> float:
-        """Return the factor that is set for a source, 0 if it is learnt."""
-        return self._config.measurement_source(source, LoopClosure).sigma_scale
 
     def learn(self) -> bool:
         """Learn the factor of a source with many more closures; tell whether one has changed."""
@@ -121,8 +110,6 @@ class ScaleLearner:
     def _learn(self, source: int, *, larger: bool = False) -> bool:
         """Learn the factor of a source, if it is a `larger` one; tell whether it has changed."""
         before = self._beliefs.scales[source]
-        if self._fixed(self._states.sources[source]):
-            return False
         numbers = np.flatnonzero(self._of(source))
         scale = self._shown(source, numbers, MOST_AT_END if larger else MOST)
         if scale == before or (larger and scale < before):

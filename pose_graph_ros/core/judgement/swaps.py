@@ -9,10 +9,13 @@ chosen anew by their residuals, with a limit that narrows. Sets are compared by 
 
     chi2 of all that is not judged + sum over the judged closures of min(r^2, limit)
 
-with r^2 by the floored covariances, which closures have in the copy.
+with r^2 by the floored covariances, which closures have in the copy. `SetSearch` says when, and
+with which closures.
 """
 
+from collections.abc import Generator
 from dataclasses import dataclass
+import math
 
 import numpy as np
 
@@ -22,10 +25,10 @@ from pose_graph_ros.core.geometry.se2 import BoolArray, FloatArray, IntArray
 from pose_graph_ros.core.graph.constraints import Edges
 from pose_graph_ros.core.graph.error_functions import energies
 from pose_graph_ros.core.graph.graph import Graph, GraphRows, GraphUpdate
-from pose_graph_ros.core.judgement.closures import GATE
+from pose_graph_ros.core.judgement.closure_states import ClosureStates
+from pose_graph_ros.core.judgement.closures import ClosureTable, GATE
 from pose_graph_ros.core.judgement.consistency import Closures
 from pose_graph_ros.core.judgement.copies import copied_rows, in_rows
-from pose_graph_ros.core.judgement.jumps import Jump
 from pose_graph_ros.core.solver_config import SolverConfig
 
 _CONFIG = SolverConfig(max_iterations=20, step_tolerance=1e-3)
@@ -45,8 +48,6 @@ class Found:
     """Ids of the hidden nodes of the copy, shape (N,)."""
     poses: FloatArray
     """Their poses, shape (N, 3)."""
-    jump: Jump | None = None
-    """Odometry that is doubted with it."""
 
 
 class Swap:
@@ -173,3 +174,76 @@ def write(edges: Edges, rows: IntArray, closures: Edges, inside: BoolArray) -> N
     columns = (*closures.columns[:5], inside.astype(np.float64))
     for column, values in zip(edges.columns, columns, strict=False):
         column[rows] = values
+
+
+# Another set is tried when so many more closures speak for one than the last time, and half more.
+MORE_CORROBORATED = 5
+# Most closures from which the clique is grown that is forced in.
+MOST_SEEDS = 50
+
+
+class SetSearch:
+    """Tries other sets, one bounded part at each call."""
+
+    def __init__(self, states: ClosureStates, table: ClosureTable) -> None:
+        self._states, self._table = states, table
+        self._next = MORE_CORROBORATED
+        self._parts: Generator[None, None, Found | None] | None = None
+        """The trial that goes on."""
+        self._began = 0
+        self.found: Found | None = None
+        """What the last part has ended with."""
+
+    def work(self, graph: Graph, corroborated: BoolArray, now: int) -> bool:
+        """
+        Return whether there was anything to do.
+
+        Goes on with a trial, or begins one if enough speaks against what is believed.
+
+        Parameters
+        ----------
+        corroborated : ndarray of bool, shape (M,), which are supported by doubted ones
+        now : int, a number that changes with what is believed, so that a trial is given up
+
+        """
+        self.found = None
+        if self._parts is not None and self._began != now:
+            self._parts = None
+            return True
+        if self._parts is None:
+            against = np.flatnonzero(
+                corroborated & ~self._states.in_graph & self._states.judged)
+            if len(against) < self._next:
+                return False
+            self._next = max(len(against) + MORE_CORROBORATED, math.ceil(1.5 * len(against)))
+            self._parts = self._trial(graph, self._states.edge[against[-MOST_SEEDS:]])
+            self._began = now
+        try:
+            next(self._parts)
+        except StopIteration as end:
+            self._parts, self.found = None, end.value
+        return True
+
+    def _trial(self, graph: Graph, seeds: IntArray) -> Generator[None, None, Found | None]:
+        """Return a better set, part by part; closures are ids of edges, as some may leave."""
+        states, clique = self._states, seeds[:0]
+        for edge in seeds.tolist():
+            for number in states.numbers(np.array([edge])).tolist():
+                if states.judged[number]:
+                    other = self._table.support(number, ~states.in_graph & states.judged).clique
+                    clique = states.edge[other] if len(other) > len(clique) else clique
+            yield
+        known = np.flatnonzero(~states.forgotten)
+        edges = states.edge[known]
+        clique = np.flatnonzero(np.isin(edges, clique))
+        swap = Swap(graph, self._table.rows(known), edges, states.in_graph[known],
+                    states.judged[known])
+        while swap.step(clique):
+            yield
+        found = swap.found
+        if found is None:
+            return None
+        # edges are in the order of their addition
+        inside = np.zeros(len(states), dtype=bool)
+        inside[states.numbers(edges)] = found.inside[np.isin(edges, states.edge)]
+        return Found(inside, found.nodes, found.poses)

@@ -1,13 +1,15 @@
 # Copyright 2026 The pose_graph_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""What is decided on a constraint, and why."""
+"""What is decided on a constraint, and why; and which of many verdicts are listed."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass
 from enum import Enum
 from typing import NamedTuple
 
-from pose_graph_ros.core.geometry.se2 import FloatArray
+import numpy as np
+
+from pose_graph_ros.core.geometry.se2 import BoolArray, FloatArray, IntArray
 
 # Number of ids that a verdict has as a reason, or a sentence names.
 MOST_NAMED = 5
@@ -104,7 +106,7 @@ class SourceVerdicts(NamedTuple):
     counts: Mapping[State, int]
     """Number of its constraints by state; states without any may be missing."""
     scale: float
-    """Factor on its sigmas in the graph, learnt or set; 1 where too little is known."""
+    """Factor on its sigmas in the graph; 1 where too little is known."""
     doubting: bool
     """Whether its newest measurements are doubted or wait, while the estimate goes on."""
     n_forgotten: int = 0
@@ -113,3 +115,33 @@ class SourceVerdicts(NamedTuple):
     """Number of its constraints that have left the window of the graph; `counts` is without."""
     n_left_unused: int = 0
     """How many of these were not believed then."""
+
+
+# Of each source, the newest of those that are not simply believed.
+MOST_OTHERS = 500
+
+
+def listed(
+    source: IntArray, believed: BoolArray, decided: BoolArray, most_believed: int | None,
+) -> IntArray:
+    """
+    Return the numbers of constraints whose verdicts are listed, shape (K,), increasing.
+
+    All that a person has decided on are among them, of the others the newest of each source.
+
+    Parameters
+    ----------
+    source : ndarray of int, shape (M,), of all constraints in the order of their addition
+    believed : ndarray of bool, shape (M,), whether their state is `State.BELIEVED`
+    decided : ndarray of bool, shape (M,), whether a person has decided on them
+    most_believed : int, largest number of believed ones of a source; None lists all constraints
+
+    """
+    if most_believed is None:
+        return np.arange(len(source))
+    chosen = decided.copy()
+    for each in np.unique(source).tolist():
+        for most, those in ((most_believed, believed), (MOST_OTHERS, ~believed)):
+            numbers = np.flatnonzero((source == each) & those & ~decided)
+            chosen[numbers[max(len(numbers) - most, 0):]] = True
+    return np.flatnonzero(chosen)

@@ -2,20 +2,14 @@
 # SPDX-License-Identifier: Apache-2.0
 """From attached measurements to one update of the graph."""
 
-from collections.abc import Collection, Mapping
+from collections.abc import Mapping
 from dataclasses import replace
 
 import numpy as np
 
 from pose_graph_ros.core.compiled.growing_array import GrowingArray
-from pose_graph_ros.core.config import (
-    BackendConfig,
-    Correlation,
-    MeasurementSource,
-    OdometrySource,
-)
+from pose_graph_ros.core.config import BackendConfig, MeasurementSource, OdometrySource
 from pose_graph_ros.core.geometry.se2 import BoolArray, IntArray
-from pose_graph_ros.core.graph import tables as tb
 from pose_graph_ros.core.graph.graph import Graph, GraphUpdate
 from pose_graph_ros.core.graph.reweighting import Reweighting
 from pose_graph_ros.core.measurements import GlobalPose, LoopClosure
@@ -28,16 +22,11 @@ from pose_graph_ros.core.sources.constraint_queue import (
     Queue,
 )
 from pose_graph_ros.core.sources.error_estimate import LEAST_POSITIONS
-from pose_graph_ros.core.sources.error_models import (
-    ErrorModel,
-    InflatedWeights,
-    new_error_model,
-)
 from pose_graph_ros.core.sources.gauss_markov import (
     Additions,
     CorrelatedErrors,
     GaussMarkovBias,
-    LEAST_WHITE,
+    WHITE_SHARE,
 )
 from pose_graph_ros.core.sources.gyro_bias import GyroBiases
 from pose_graph_ros.core.sources.measurement_constraints import motion_noise
@@ -53,15 +42,15 @@ class FactorBuilder:
     Builds updates of the graph from queues of constraints.
 
     A measurement with a white error becomes an observed node. If the errors of its source are
-    correlated in time, it becomes an edge to a state of the source's bias (`GaussMarkovBias`), or
-    an observed node with a lower weight (`InflatedWeights`). Once the graph has taken the update,
-    the constraints are registered for reweighting, and the source of each is recorded.
+    correlated in time, it becomes an edge to a state of the source's bias (`GaussMarkovBias`).
+    Once the graph has taken the update, the constraints are registered for reweighting, and the
+    source of each is recorded.
     """
 
     def __init__(self, config: BackendConfig, reweighting: Reweighting) -> None:
         self.config = config    # for later updates; error models keep their own settings
         self._reweighting = reweighting
-        self._error_models: dict[str, ErrorModel] = {}
+        self._error_models: dict[str, GaussMarkovBias] = {}
         """Of the sources whose errors are correlated in time."""
         self._constraints: dict[str, SourceConstraints] = {}
         self._pose_edges: dict[str, GrowingArray] = {}
@@ -73,17 +62,19 @@ class FactorBuilder:
         """Biases of gyroscopes, and the edges of their rotations."""
         self._abandoned: list[int] = []
         """Ids of biases that hold no measurement any more."""
-        self._new_weights: dict[int, float] = {}
-        """Weights of observed nodes, by id, that the update sets."""
         self.n_bias_edges = 0
         """Number of edges of the graph that end at a bias."""
+
+    @property
+    def _models(self) -> list[GaussMarkovBias | GyroBiases]:
+        return [*self._error_models.values(), self.gyros]
 
     @property
     def n_measurements(self) -> int:
         """Number of measurements in the graph, without loop closures."""
         return sum(len(each) + each.n_otherwise for each in self._constraints.values())
 
-    def build(self, queue: Queue, graph: Graph, *, settle: bool = False) -> GraphUpdate:
+    def build(self, queue: Queue, graph: Graph) -> GraphUpdate:
         """
         Return the update that adds the constraints of a queue to the graph.
 
@@ -92,11 +83,10 @@ class FactorBuilder:
         Parameters
         ----------
         graph : Graph, it is not changed
-        settle : bool, whether to set all weights that older measurements wait for
 
         """
         additions = Additions(graph.next_ids)
-        for model in (*self._error_models.values(), self.gyros):
+        for model in self._models:
             model.begin()
         self.new = [
             NewConstraint(True, additions.add_edge(edge), source, stamp_ns, LoopClosure, reference)
@@ -105,15 +95,7 @@ class FactorBuilder:
             queue.observed, key=lambda attached: attached.measurement.stamp_ns)]
         self.gyros.add(queue.turns, graph, additions)
         self._n_new_bias_edges = len(additions.edges) - len(queue.edges) - self.gyros.n_new
-        for model in self._error_models.values() if settle else ():
-            if isinstance(model, InflatedWeights):
-                model.settle(additions)
-        present = _weights_of(graph, additions.weigh_observed)
-        self._new_weights = {
-            each: weight for each, weight in additions.weigh_observed.items()
-            if each not in present or self._reweighting.uses(each, present[each])}
-        return additions.update()._replace(
-            weigh_observed=self._changed_weights(self._new_weights, present))
+        return additions.update()
 
     def _add(self, attached: AttachedMeasurement, additions: Additions) -> NewConstraint:
         """Add a measurement to an update, as the errors of its source ask for."""
@@ -123,9 +105,6 @@ class FactorBuilder:
         model, noise = self._error_model(source, settings), NO_NOISE
         if settings.correlation_time != 0.0:
             noise = motion_noise(measurement, attachment)
-        if isinstance(model, InflatedWeights):
-            added = model.add(stamp_ns, observed, additions)
-            return NewConstraint(False, added, source, stamp_ns, kind, noise=noise)
         if model is None:
             added = additions.add_observed(observed)
             return NewConstraint(False, added, source, stamp_ns, kind, noise=noise)
@@ -135,34 +114,19 @@ class FactorBuilder:
         added = additions.add_observed(observed.weighted(0.0))
         return NewConstraint(False, added, source, stamp_ns, kind, noise=noise, held_by=edge)
 
-    def error_model(self, source: str) -> ErrorModel | None:
+    def error_model(self, source: str) -> GaussMarkovBias | None:
         """Return the model of the errors of a source in use; None for white errors."""
         return self._error_models.get(source)
 
-    def _changed_weights(
-        self, base_weights: Mapping[int, float], present: Mapping[int, float],
-    ) -> dict[int, float]:
-        """Return the weights that differ from those in the graph, given the new base weights."""
-        changed = {}
-        for each, wanted in base_weights.items():
-            if each not in present:
-                changed[each] = wanted
-                continue
-            base, weight = self._reweighting.base_weight(each), present[each]
-            # what a robust loss has taken off stays off
-            target = wanted if base is None else wanted * (weight / base)
-            if target != weight:
-                changed[each] = target
-        return changed
-
-    def _error_model(self, source: str, settings: MeasurementSource) -> ErrorModel | None:
+    def _error_model(
+        self, source: str, settings: MeasurementSource,
+    ) -> GaussMarkovBias | None:
         """Return the model of the correlated errors of a source; None for white errors."""
         if settings.correlation_time == 0.0:
             return None
         if source not in self._error_models and not settings.finds_correlation:
-            errors = CorrelatedErrors(
-                settings.correlation_time, 1.0, max(settings.white_share, LEAST_WHITE))
-            self._error_models[source] = new_error_model(errors, settings.correlation)
+            self._error_models[source] = GaussMarkovBias(
+                CorrelatedErrors(settings.correlation_time, 1.0, WHITE_SHARE))
         return self._error_models.get(source)
 
     def finding(self) -> list[str]:
@@ -196,22 +160,18 @@ class FactorBuilder:
             is_edge=held.is_edge | self._has_given_bias(source)))
             for source, held in every.items()}
 
-    def correlation(self, source: str) -> Correlation:
-        """Return how correlated errors of a source are treated."""
-        return self._settings(source).correlation
-
     def errors_in_use(self, source: str) -> CorrelatedErrors | None:
         """Return the statistics of the errors of a source in use; None for white errors."""
         model = self._error_models.get(source)
         return None if model is None or model.errors.tau == 0.0 else model.errors
 
-    def set_error_model(self, source: str, model: ErrorModel | None) -> None:
+    def set_error_model(self, source: str, model: GaussMarkovBias | None) -> None:
         """
         Set the model of the errors of a source from now on.
 
         Parameters
         ----------
-        model : GaussMarkovBias or InflatedWeights, optional, with all measurements of the source
+        model : GaussMarkovBias, optional, with all measurements of the source
 
         """
         old = self._error_models.pop(source, None)
@@ -276,25 +236,16 @@ class FactorBuilder:
         self._abandoned = [node for node in self._abandoned if node not in gone]
         for source, constraints in self._constraints.items():
             model, left = self._error_models.get(source), self.leaving(source, edges, observed)
-            if isinstance(model, GaussMarkovBias):
+            if model is not None:
                 model.forget(gone)
-            elif model is not None and np.any(left):
-                model.forget(constraints.rows.values[left])
             kept[source] = constraints.forget(left)
         for known in self._pose_edges.values():
             known.select(np.flatnonzero(~np.isin(known.values, edges)))
         return kept
 
-    def inflate(self, source: str, errors: CorrelatedErrors | None) -> None:
-        """Have later updates renew the weights of a source; None for white errors."""
-        # alone in a bin of a nanosecond, each measurement has the weight 1
-        model = InflatedWeights(CorrelatedErrors(0.0, 0.0, 1.0) if errors is None else errors)
-        model.restore(self._constraints[source].rows.values)
-        self.set_error_model(source, model)
-
     def rollback(self) -> None:
         """Discard the update that was built last."""
-        for model in (*self._error_models.values(), self.gyros):
+        for model in self._models:
             model.rollback()
 
     def commit(self) -> None:
@@ -316,8 +267,6 @@ class FactorBuilder:
             else:
                 edges = self._pose_edges.setdefault(source, GrowingArray((), np.int64))
                 edges.append_one(number)
-        for each, weight in self._new_weights.items():
-            self._reweighting.set_base_weight(each, weight)
         self.gyros.commit()
         # from here on there is nothing that `rollback` could forget
         for model in self._error_models.values():
@@ -348,7 +297,7 @@ class FactorBuilder:
     def bias_origin(self, node: int) -> ConstraintOrigin | None:
         """Return the source of a bias, by its id, and when its bin begins."""
         for source, model in self._error_models.items():
-            begin_ns = model.begin_ns(node) if isinstance(model, GaussMarkovBias) else None
+            begin_ns = model.begin_ns(node)
             if begin_ns is not None:
                 return ConstraintOrigin(source, begin_ns)
         found = self.gyros.begin_of(node)
@@ -364,7 +313,7 @@ class FactorBuilder:
             saved = SavedSource(
                 none, none, constraints.rows.values.copy(), constraints.n_otherwise,
                 edges.values.copy(),
-                model.saved() if isinstance(model, GaussMarkovBias) else None,
+                None if model is None else model.saved(),
                 n_gone=constraints.n_gone)
             if self._settings(source).finds_correlation:
                 saved = replace(
@@ -389,14 +338,12 @@ class FactorBuilder:
             return
         settings = self._settings(source)
         if settings.finds_correlation and saved.errors is not None:
-            self._error_models[source] = new_error_model(saved.errors, settings.correlation)
+            self._error_models[source] = GaussMarkovBias(saved.errors)
         model = self._error_model(source, settings)
-        if isinstance(model, GaussMarkovBias):
-            same = saved.bins is not None and model.restore(saved.bins)
-        else:
+        if model is None:
             same = saved.bins is None
-            if isinstance(model, InflatedWeights) and same:
-                model.restore(saved.rows)
+        else:
+            same = saved.bins is not None and model.restore(saved.bins)
         if not same and settings.finds_correlation:
             self._error_models.pop(source, None)
         same = same and settings.finds_correlation >= (saved.errors is not None)
@@ -411,7 +358,7 @@ class FactorBuilder:
 
     def _has_given_bias(self, source: str) -> bool:
         """Tell whether measurements of a source are edges to a bias from the beginning."""
-        return (isinstance(self._error_models.get(source), GaussMarkovBias)
+        return (source in self._error_models
                 and not self._settings(source).finds_correlation)
 
     def reports(self, graph: Graph) -> dict[str, SourceReport]:
@@ -431,12 +378,3 @@ class FactorBuilder:
         return source_report.report(
             graph, constraints.rows.values[used], biased=biased,
             in_use=self.errors_in_use(source), found=self._settings(source).finds_correlation)
-
-
-def _weights_of(graph: Graph, observed: Collection[int]) -> dict[int, float]:
-    """Return the weights of those of some observed nodes, given by their ids, that are there."""
-    ids = np.fromiter(observed, np.int64, len(observed))
-    rows = graph.observed_rows(ids)
-    there = rows >= 0
-    weights = graph.memory['observed_f'][rows[there], tb.WEIGHT]
-    return dict(zip(ids[there].tolist(), weights.tolist(), strict=True))

@@ -36,8 +36,8 @@ from pose_graph_ros.core.saved_columns import Integers
 
 # Number of bins in one time constant.
 BINS = 64
-# Lower bound of the white share of the variance; 0 would make the system singular.
-LEAST_WHITE = 1e-3
+# Fraction of the variance that is white noise where a time constant is given.
+WHITE_SHARE = 0.05
 # Lower bound of the variance of a measurement without the motion since its node, as a share.
 LEAST_OWN = 0.01
 # Instead of the id of a transition: the prior of the graph is on the state.
@@ -87,10 +87,9 @@ class Additions:
     observed: list[ObservedNodes] = field(default_factory=list)
     remove_edges: list[int] = field(default_factory=list)
     remove_observed: list[int] = field(default_factory=list)
-    weigh_observed: dict[int, float] = field(default_factory=dict)
 
     def update(self) -> GraphUpdate:
-        """Return the update with all changes but the weights."""
+        """Return the update with all changes."""
         return GraphUpdate(
             biases=np.array(self.biases).reshape(-1, 3), dimensions=self.dimensions,
             edges=Edges.joined(self.edges),

@@ -76,7 +76,7 @@ def validate(measurement: PoseMeasurement, policy: CovariancePolicy) -> Validate
         if not policy.repair:
             return rejected(
                 f'covariance_{defect}', f'{kind}: expected a positive definite matrix, got '
-                f'{cov.tolist()}; covariance_policy: repair would mend it')
+                f'{cov.tolist()}; covariance_override replaces it')
         cov = repaired(cov, policy)
         repairs.append(f'repaired_covariance_{defect}')
     floors = np.array([policy.position_floor, policy.position_floor, policy.heading_floor])

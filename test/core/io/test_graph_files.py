@@ -87,7 +87,7 @@ def test_other_programs_read_the_graph_and_the_path(tmp_path: Path) -> None:
     np.testing.assert_array_equal(path.stamps_ns, saved.nodes.stamps_ns)
     np.testing.assert_array_equal(path.poses[:, :2], rows.poses[saved.nodes.ids, :2])
     members = json.loads(side.read_text(encoding='ascii'))
-    assert members['version'] == 4
+    assert members['version'] == 5
     assert members['datum'] == {
         'latitude': 48.1, 'longitude': 11.6, 'altitude': 500.0, 'yaw': 0.25}
     assert members['nodes']['stamps_ns'] == saved.nodes.stamps_ns.tolist()
@@ -225,10 +225,10 @@ def test_another_version_is_refused_and_says_who_wrote_it(tmp_path: Path) -> Non
     assert_same_value(read_graph(side), small_graph())  # the layout of the text does not matter
 
     def renew(members: dict[str, Any]) -> None:
-        members['version'], members['created_by'] = 5, 'pose_graph_ros 9.9'
+        members['version'], members['created_by'] = 6, 'pose_graph_ros 9.9'
 
     rewrite(side, renew)
-    with pytest.raises(FileFormatError, match=r'version 1 to 4, .*version 5, .*9\.9'):
+    with pytest.raises(FileFormatError, match=r'version 1 to 5, .*version 6, .*9\.9'):
         read_graph(side)
 
 
@@ -257,6 +257,21 @@ def test_versions_1_and_2_of_a_graph_are_read_alike(tmp_path: Path) -> None:
     _, side, _ = write_graph(saved_drive(), tmp_path / 'map')
     rewrite(side, number_as_version_1_does)
     assert_same_value(read_graph(side), saved_drive())
+
+
+def test_odometry_that_closures_have_doubted_in_version_4_keeps_its_weight(tmp_path: Path) -> None:
+    _, side, _ = write_graph(saved_drive(), tmp_path / 'map')
+
+    def as_version_4(members: dict[str, Any]) -> None:
+        members['version'] = 4
+        members['graph']['edge_weight'][0] = 0.01
+        members['judgement']['odometry'] |= {
+            'rows': [0], 'ends': [[0, 1]], 'weights': [0.01], 'since_ns': [5], 'final': [0]}
+
+    rewrite(side, as_version_4)
+    saved = read_graph(side)
+    assert saved.rows.edges.weight[0] == 0.01
+    assert_same_value(saved.judgement, saved_drive().judgement)
 
 
 def test_losses_and_kinds_are_saved_by_their_names(tmp_path: Path) -> None:

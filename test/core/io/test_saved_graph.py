@@ -26,7 +26,6 @@ from pose_graph_ros.core.backend import PoseGraphBackend
 from pose_graph_ros.core.batch.optimizer import Status
 from pose_graph_ros.core.config import (
     BackendConfig,
-    Correlation,
     MeasurementSource,
     OdometrySource,
 )
@@ -231,8 +230,7 @@ def test_positions_that_wait_for_the_alignment_are_left_out_and_counted() -> Non
 # --- other settings than before ------------------------------------------------------------------
 
 @pytest.mark.parametrize('now', [
-    MeasurementSource(), MeasurementSource(correlation_time=7.0),
-    MeasurementSource(correlation_time=7.0, correlation=Correlation.INFLATE)])
+    MeasurementSource(), MeasurementSource(correlation_time=7.0)])
 @pytest.mark.parametrize('kind', ['plain', 'correlated'])
 def test_a_source_with_other_settings_adds_to_its_saved_constraints(
     kind: str, now: MeasurementSource,
@@ -246,8 +244,7 @@ def test_a_source_with_other_settings_adds_to_its_saved_constraints(
         replace(config, measurements=settings_), through_files(backend.saved()))
     assert_same_estimate(restored.estimate(), before)
     bins = restored.saved().sources['gps'].bins
-    assert bins is None if now.correlation is Correlation.INFLATE or (
-        now.correlation_time == 0.0) else len(bins.rows) == 0
+    assert bins is None if now.correlation_time == 0.0 else len(bins.rows) == 0
     again = PoseGraphBackend.restored(config, through_files(restored.saved()))
     for each in (again, restored):
         for name, measurement in resent:

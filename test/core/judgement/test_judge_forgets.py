@@ -11,7 +11,7 @@ from test_consistency import Drive
 from pose_graph_ros.core.judgement.closure_states import ClosureStates, STATES
 from pose_graph_ros.core.judgement.odometry_chain import OdometryChain
 from pose_graph_ros.core.judgement.residual_scale import ScaleLeft, together
-from pose_graph_ros.core.judgement.run_choice import best_runs, without_old
+from pose_graph_ros.core.judgement.run_set import best_runs, without_old
 from pose_graph_ros.core.judgement.runs import Run, Transition
 from pose_graph_ros.core.judgement.tracks import Track
 from pose_graph_ros.core.judgement.verdicts import State

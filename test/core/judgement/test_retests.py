@@ -5,7 +5,7 @@
 from hypothesis import given, settings, strategies as st
 import numpy as np
 
-from pose_graph_ros.core.judgement.retests import MOST_TURNS, Retests
+from pose_graph_ros.core.judgement.belief_rule import MOST_TURNS, Retests
 
 EACH = np.arange(3)
 

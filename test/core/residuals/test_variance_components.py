@@ -70,7 +70,7 @@ def test_closures_that_are_honest_are_not_found_wrong_and_those_that_claim_a_thi
         source = next(each for each in data['sources'] if each['name'] == CLOSURES)
         assert source['low'] < 1.05 / claim
         assert source['high'] > 0.95 / claim
-        texts = [each['text'] for each in data['findings'] if f'{CLOSURES}.sigma_scale' in (
+        texts = [each['text'] for each in data['findings'] if f'{CLOSURES}.covariance_scale' in (
             each['text'])]
         assert len(texts) == (0 if claim == 1.0 else 1)
 

@@ -10,7 +10,6 @@ import pytest
 from pose_graph_ros.core.backend import PoseGraphBackend
 from pose_graph_ros.core.config import (
     BackendConfig,
-    Correlation,
     Loss,
     MeasurementSource,
     NodePolicy,
@@ -35,8 +34,7 @@ def driven() -> PoseGraphBackend:
         odometry={name: OdometrySource(reorder_window=0.0) for name in ('wheels', 'visual')},
         measurements={
             'wander': MeasurementSource(correlation_time=20.0),
-            'inflated': MeasurementSource(
-                correlation_time=5.0, correlation=Correlation.INFLATE),
+            'plain': MeasurementSource(),
             'robust': MeasurementSource(loss=Loss.HUBER, rejection_threshold=1.0)}))
     rng = np.random.default_rng(3)
     pose, step = np.zeros(3), np.array((0.5, 0.0, np.pi / 30.0))
@@ -52,7 +50,7 @@ def driven() -> PoseGraphBackend:
         if k == 2:
             backend.add_measurement(GlobalPose(after, pose, 0.01 * np.eye(3)), 'pose')
         elif k % 4 == 2:
-            name = ('wander', 'inflated', 'robust')[k // 4 % 3]
+            name = ('wander', 'plain', 'robust')[k // 4 % 3]
             backend.add_measurement(Position(after, where, 0.01 * np.eye(2), np.zeros(2)), name)
         if k % 40 == 39:
             backend.add_measurement(HeadingOnly(after, float(pose[2]), 0.01), 'imu')
@@ -92,7 +90,7 @@ def test_every_constraint_has_the_name_of_its_source_and_of_its_ends() -> None:
         f'scans x{node(k - 60)} - x{node(k)}' for k in (70, 100)}
     expected = {'pose': {2}, 'imu': {39, 79, 119}} | {
         name: {k for k in range(6, 121, 4) if k // 4 % 3 == number}
-        for number, name in enumerate(('wander', 'inflated', 'robust'))}
+        for number, name in enumerate(('wander', 'plain', 'robust'))}
     for source, instants in expected.items():
         ours = {each.name for each in found
                 if each.source == source and each.kind != 'bias'}
@@ -100,7 +98,7 @@ def test_every_constraint_has_the_name_of_its_source_and_of_its_ends() -> None:
     kinds = {each.source: each.kind for each in found if each.kind != 'bias'}
     assert kinds == {
         'wheels': 'odometry', 'visual': 'odometry', 'scans': 'loop_closure',
-        'pose': 'global_pose', 'imu': 'heading', 'wander': 'position', 'inflated': 'position',
+        'pose': 'global_pose', 'imu': 'heading', 'wander': 'position', 'plain': 'position',
         'robust': 'position'}
     beforehand = [each for each in found if each.kind == 'bias']
     assert 1 <= len(beforehand) <= len(expected['wander'])

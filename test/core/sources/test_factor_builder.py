@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from saved_graphs import assert_same_value
 
-from pose_graph_ros.core.config import BackendConfig, Correlation, Loss, MeasurementSource
+from pose_graph_ros.core.config import BackendConfig, Loss, MeasurementSource
 from pose_graph_ros.core.graph.constraints import EdgeKind, Edges
 from pose_graph_ros.core.graph.graph import Graph, GraphUpdate
 from pose_graph_ros.core.graph.reweighting import Reweighting
@@ -21,8 +21,7 @@ N = 40
 CONFIG = BackendConfig(measurements={
     'white': MeasurementSource(loss=Loss.HUBER),
     'biased': MeasurementSource(correlation_time=64.0),
-    'inflated': MeasurementSource(
-        correlation_time=5.0, correlation=Correlation.INFLATE, loss=Loss.CAUCHY)})
+    'other': MeasurementSource(loss=Loss.CAUCHY)})
 
 
 def line() -> Graph:
@@ -49,7 +48,7 @@ def closure(i: int, j: int) -> Edges:
 
 def some(seconds: list[int]) -> Queue:
     return Queue([QueuedEdge('scan', closure(seconds[0], seconds[0] + 5))], [
-        fix(source, k) for k in seconds for source in ('white', 'biased', 'inflated')])
+        fix(source, k) for k in seconds for source in ('white', 'biased', 'other')])
 
 
 def builder() -> tuple[FactorBuilder, Reweighting]:
@@ -71,7 +70,7 @@ def test_an_update_adds_each_constraint_once() -> None:
     # one to a state for each fix, one from each state but the first to the state before
     assert len(update.biases) == 3
     assert kinds.count(EdgeKind.BIAS) == 3 + 2
-    # white, inflated, and the prior of the first state
+    # white, other, and the prior of the first state
     assert len(update.observed) == 3 + 3 + 1
     assert factors.n_measurements == 0
     assert len(reweighting) == 0
@@ -117,7 +116,7 @@ def test_every_row_knows_the_source_and_the_stamp_that_it_came_from() -> None:
     seconds = [k * SECOND for k in (1, 3, 4, 10, 20, 30)]
     assert found.pop('scan') == [-1, -1]
     assert {name: sorted(stamps) for name, stamps in found.items()} == dict.fromkeys(
-        ('white', 'biased', 'inflated'), seconds)
+        ('white', 'biased', 'other'), seconds)
     assert factors.origin(graph.n_edges, edge=True) is None
     assert factors.origin(graph.n_observed, edge=False) is None
 
@@ -148,10 +147,10 @@ def test_an_update_that_is_rolled_back_is_built_again_as_it_was() -> None:
 
 def test_what_a_loss_has_taken_off_stays_off_when_a_weight_is_renewed() -> None:
     graph, (factors, _) = line(), builder()
-    committed(factors, graph, Queue([], [fix('inflated', k) for k in (3, 4)]))
+    committed(factors, graph, Queue([], [fix('other', k) for k in (3, 4)]))
     assert graph.observed.weight.tolist() == [0.5, 0.5]
     graph.apply(GraphUpdate(weigh_observed={0: 0.05}))
-    committed(factors, graph, Queue([], [fix('inflated', 5)]))
+    committed(factors, graph, Queue([], [fix('other', 5)]))
     assert graph.observed.weight == pytest.approx([0.1 / 3, 1 / 3, 1 / 3])
 
 
@@ -178,7 +177,7 @@ def test_with_another_error_model_saved_constraints_stay_and_are_counted() -> No
     graph, (factors, _) = line(), builder()
     committed(factors, graph, some([3, 4, 20]))
     all_white = BackendConfig(measurements={name: MeasurementSource() for name in (
-        'white', 'biased', 'inflated')})
+        'white', 'biased', 'other')})
     other = restored(factors, all_white)
     assert other.n_measurements == factors.n_measurements
     assert other.saved()['biased'].n_otherwise == 3

@@ -2,9 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Correlated errors: the estimate is that of the full covariance, in any order of arrival."""
 
-from dataclasses import replace
 import itertools
-import math
 
 from hypothesis import given, settings, strategies as st
 import numpy as np
@@ -14,7 +12,6 @@ from pose_graph_ros.core.backend import PoseGraphBackend
 from pose_graph_ros.core.batch.optimizer import Status
 from pose_graph_ros.core.config import (
     BackendConfig,
-    Correlation,
     Loss,
     MeasurementSource,
     NodePolicy,
@@ -33,13 +30,12 @@ from pose_graph_ros.core.measurements import (
     Position,
 )
 from pose_graph_ros.core.odometry.motion import Attachment
-from pose_graph_ros.core.sources import error_models
-from pose_graph_ros.core.sources.error_models import InflatedWeights
 from pose_graph_ros.core.sources.gauss_markov import (
     Additions,
     BINS,
     CorrelatedErrors,
     GaussMarkovBias,
+    WHITE_SHARE,
 )
 from pose_graph_ros.core.sources.measurement_constraints import absolute_constraint
 
@@ -95,19 +91,13 @@ def test_the_order_of_arrival_does_not_change_the_transitions_of_states() -> Non
         assert transitions(list(order)) == expected
 
 
-@pytest.mark.parametrize('model', [GaussMarkovBias, InflatedWeights])
-def test_the_additions_of_a_failed_update_are_rolled_back(
-    model: type[GaussMarkovBias] | type[InflatedWeights],
-) -> None:
-    def add(chain: GaussMarkovBias | InflatedWeights, seconds: float) -> Additions:
+def test_the_additions_of_a_failed_update_are_rolled_back() -> None:
+    def add(chain: GaussMarkovBias, seconds: float) -> Additions:
         additions = Additions(NextIds(10, 20, 30))
-        if isinstance(chain, InflatedWeights):
-            chain.add(round(seconds * SECOND), None, additions)  # type: ignore[arg-type]
-        else:
-            chain.add(round(seconds * SECOND), observed(seconds), NO_NOISE, additions)
+        chain.add(round(seconds * SECOND), observed(seconds), NO_NOISE, additions)
         return additions
 
-    chains = [model(ERRORS) for _ in range(2)]
+    chains = [GaussMarkovBias(ERRORS) for _ in range(2)]
     for chain in chains:
         for seconds in (3.0, 9.0):
             chain.begin()
@@ -120,74 +110,7 @@ def test_the_additions_of_a_failed_update_are_rolled_back(
         got, expected = (add(chain, seconds) for chain in chains)
         assert got.remove_edges == expected.remove_edges
         assert got.remove_observed == expected.remove_observed
-        assert got.weigh_observed == expected.weigh_observed
         assert len(got.biases) == len(expected.biases)
-
-
-def test_the_weights_of_measurements_within_two_time_constants_add_up_to_one() -> None:
-    inflated = InflatedWeights(ERRORS._replace(tau=5.0))
-    weights: dict[int, float] = {}
-    sizes = NextIds(1, 0, 0)
-    for k, seconds in enumerate((20.5, 29.0, 31.0, 22.0)):
-        additions = Additions(sizes._replace(observed=k))
-        inflated.add(round(seconds * SECOND), None, additions)  # type: ignore[arg-type]
-        weights |= additions.weigh_observed
-    assert weights == {0: 1 / 3, 1: 1 / 3, 2: 1.0, 3: 1 / 3}
-
-
-INFLATED = MeasurementSource(correlation_time=5.0, correlation=Correlation.INFLATE)
-
-
-@settings(max_examples=60, deadline=None)
-@given(st.lists(st.tuples(st.integers(0, 300), st.sampled_from([0, 0, 0, 1, 2])), max_size=120),
-       st.sampled_from([1, 4, 32]))
-def test_weights_are_renewed_in_turn_and_all_of_them_in_the_end(
-    steps: list[tuple[int, int]], renewed: int,
-) -> None:
-    """Against the slow oracle, which sets all weights of a bin at each measurement."""
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(error_models, 'RENEWED', renewed)
-        inflated, weights, bins = InflatedWeights(ERRORS._replace(tau=5.0)), {}, {}
-        for tenths, what in steps:
-            additions = Additions(NextIds(1, 0, len(weights)))
-            inflated.begin()
-            row = inflated.add(tenths * SECOND // 10, None, additions)  # type: ignore[arg-type]
-            assert len(additions.weigh_observed) <= 2 * renewed + 1
-            if what == 1:
-                inflated.rollback()
-                continue
-            bins.setdefault(tenths // 100, []).append(row)
-            weights |= additions.weigh_observed
-            for rows in bins.values():
-                n, least = len(rows), len(rows) - math.ceil(len(rows) / renewed)
-                assert all(1 / n <= weights[each] <= 1 / max(least, 1) for each in rows)
-            if what == 2:
-                additions = Additions(NextIds(1, 0, len(weights)))
-                inflated.begin()
-                inflated.settle(additions)
-                weights |= additions.weigh_observed
-                assert weights == {row: 1 / len(rows) for rows in bins.values() for row in rows}
-        additions = Additions(NextIds(1, 0, len(weights)))
-        inflated.settle(additions)
-        weights |= additions.weigh_observed
-        assert weights == {row: 1 / len(rows) for rows in bins.values() for row in rows}
-
-
-@pytest.mark.parametrize('loss', [Loss.NONE, Loss.HUBER])
-def test_after_the_full_optimisation_inflated_weights_are_as_defined(loss: Loss) -> None:
-    fixes = [Position(round((1.0 + 0.1 * k) * SECOND), np.array([0.1 * k, 0.0]), np.eye(2),
-                      np.zeros(2)) for k in range(350)]
-    backend = run([], replace(INFLATED, loss=loss))
-    for fix in fixes:
-        backend.add_measurement(fix, 'fix')
-        backend.update()
-    restored = PoseGraphBackend.restored(backend._config, backend.saved())
-    for each in (backend, restored):
-        assert each.optimize().status is Status.CONVERGED
-        sizes = np.unique([fix.stamp_ns // (10 * SECOND) for fix in fixes], return_counts=True)[1]
-        # the start pose is the first observed node
-        np.testing.assert_array_equal(
-            each.graph.observed.weight[1:], np.repeat(1.0 / sizes, sizes))
 
 
 STIFF = OdometrySource(
@@ -230,10 +153,10 @@ def generalised_least_squares(
 
 def test_poses_and_sigma_are_those_of_the_full_covariance() -> None:
     rng = np.random.default_rng(2)
-    sigma, share = 2.0, 0.02
+    sigma, share = 2.0, WHITE_SHARE
     fixes = [position(second, second - 1.0 + rng.normal(0.0, sigma), 0.0, sigma)
              for second in range(1, 41)]
-    source = MeasurementSource(correlation_time=TAU, white_share=share)
+    source = MeasurementSource(correlation_time=TAU)
     backend = run(fixes, source)
     backend.optimize()
     estimate = backend.estimate()
@@ -264,14 +187,13 @@ def drive(seed: int) -> list[Measurement]:
 
 
 @settings(max_examples=8, deadline=None)
-@given(seed=st.integers(0, 10), data=st.data(), model=st.sampled_from(Correlation),
+@given(seed=st.integers(0, 10), data=st.data(),
        loss=st.sampled_from((Loss.NONE, Loss.HUBER, Loss.CAUCHY)))
 def test_shuffled_measurements_give_the_same_path(
-    seed: int, data: st.DataObject, model: Correlation, loss: Loss,
+    seed: int, data: st.DataObject, loss: Loss,
 ) -> None:
     # with a threshold below 1 the loss acts on most of them
-    source = MeasurementSource(
-        correlation_time=5.0, correlation=model, loss=loss, rejection_threshold=0.7)
+    source = MeasurementSource(correlation_time=5.0, loss=loss, rejection_threshold=0.7)
     measurements = drive(seed)
     paths = []
     for order in (measurements, data.draw(st.permutations(measurements))):
@@ -322,9 +244,6 @@ def test_reports_of_correlated_and_of_white_errors() -> None:
         assert 0.3 < report.energy < 1.7
 
 
-@pytest.mark.parametrize(('settings', 'expected'), [
-    ({'white_share': -0.1}, 'white_share'), ({'white_share': 1.5}, 'white_share'),
-    ({'correlation_time': -0.5}, 'correlation_time')])
-def test_settings_that_cannot_be_are_refused(settings: dict[str, object], expected: str) -> None:
-    with pytest.raises(ConfigError, match=expected):
-        replace(MeasurementSource(), **settings)
+def test_a_time_constant_that_cannot_be_is_refused() -> None:
+    with pytest.raises(ConfigError, match='correlation_time'):
+        MeasurementSource(correlation_time=-0.5)

@@ -14,7 +14,6 @@ from pose_graph_ros.core.graph.graph import Graph, GraphUpdate, NextIds
 from pose_graph_ros.core.odometry.odometry_errors import AS_CLAIMED
 from pose_graph_ros.core.sources import past_path
 from pose_graph_ros.core.sources.error_estimate import left_behind, measured_path, PathOdometry
-from pose_graph_ros.core.sources.error_models import InflatedWeights
 from pose_graph_ros.core.sources.gauss_markov import Additions, GaussMarkovBias
 from pose_graph_ros.core.sources.waiting import SeenStamps
 
@@ -94,18 +93,6 @@ def test_a_bias_of_which_old_states_have_left_stays_the_same_process(
     assert other.saved().ties.tolist() == saved.ties.tolist()
     assert other.leaving(50 * SECOND) == chain.bias.leaving(50 * SECOND)
     assert chain.bias.nodes[-1] not in chain.bias.leaving(None)
-
-
-def test_weights_count_the_measurements_that_have_left() -> None:
-    inflated, ids = InflatedWeights(ERRORS._replace(tau=5.0)), []
-    for k in range(6):
-        ids.append(inflated.add(k * SECOND, None, Additions(NextIds(0, 0, k))))  # type: ignore[arg-type]
-    inflated.forget(np.array([(k * SECOND, ids[k]) for k in range(4)]))
-    additions = Additions(NextIds(0, 0, 6))
-    inflated.settle(additions)
-    assert additions.weigh_observed == {4: 1 / 6, 5: 1 / 6}
-    inflated.forget(np.array([(k * SECOND, ids[k]) for k in (4, 5)]))
-    assert (inflated._bins, inflated._waiting) == ({}, {})
 
 
 def drive(seed: int, n: int) -> tuple[Graph, np.ndarray, np.ndarray]:
