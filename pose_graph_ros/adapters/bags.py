@@ -26,7 +26,6 @@ from rosbags.typesys import get_types_from_idl, get_types_from_msg, get_typestor
 from rosbags.typesys.store import Typestore
 
 from pose_graph_ros.adapters.damaged_bags import salvage, Salvaged
-from pose_graph_ros.adapters.odometry_cdr import LITTLE_ENDIAN, read_odometry
 from pose_graph_ros.core.exceptions import PoseGraphError
 
 logger = logging.getLogger(__name__)
@@ -34,7 +33,6 @@ logger = logging.getLogger(__name__)
 BAG_FILE_SUFFIXES = ('.mcap', '.db3', '.bag')
 IDL_SEPARATOR = '=' * 80 + '\n'
 JOURNALS = ('.db3-wal', '.db3-journal')
-ODOMETRY = 'nav_msgs/msg/Odometry'
 
 
 class BagError(PoseGraphError, ValueError):
@@ -193,14 +191,10 @@ class BagReader(Bag):
         """Return the decoder of a type, by its definition in the bag, else by the standard one."""
         name, is_ros1 = connection.msgtype, isinstance(self._reader, Rosbag1Reader)
         if name not in self._decoders:
-            standard = get_typestore(Stores.ROS1_NOETIC if is_ros1 else Stores.ROS2_JAZZY)
-            types = own_types(connection) or standard
+            types = own_types(connection) or get_typestore(
+                Stores.ROS1_NOETIC if is_ros1 else Stores.ROS2_JAZZY)
             decode = types.deserialize_ros1 if is_ros1 else types.deserialize_cdr
             self._decoders[name] = partial(decode, typename=name)
-            # most of a long bag
-            if (name == ODOMETRY and not is_ros1
-                    and types.hash_rihs01(name) == standard.hash_rihs01(name)):
-                self._decoders[name] = partial(_read_odometry, otherwise=self._decoders[name])
         return self._decoders[name]
 
 
@@ -238,10 +232,6 @@ def open_bag(path: str | Path) -> BagReader:
         raise BagError(
             f'{path}: damaged, cut short or not supported: {one_line(error)}') from error
     return BagReader(path, reader)
-
-
-def _read_odometry(data: bytes, otherwise: Callable[[bytes], Any]) -> Any:
-    return read_odometry(data) if data.startswith(LITTLE_ENDIAN) else otherwise(data)
 
 
 def own_types(connection: Connection) -> Typestore | None:

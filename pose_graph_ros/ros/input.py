@@ -162,12 +162,6 @@ class Input:
         self.refused = self._refusals.update(
             self.received, counts + self.rejected, {**details, **self._details}, now)
 
-    def refuse(self, source: str, error: Exception) -> None:
-        """Count a message that cannot be deserialised."""
-        self.received[source] += 1
-        self.liveness.receive(source, time.monotonic())
-        self.reject(source, rejected('malformed', str(error)))
-
     def reject(self, source: str, answer: Answer) -> None:
         """Count a message that cannot be used; log the first for each source and reason."""
         self.count(source, answer)

@@ -1,7 +1,7 @@
 # Copyright 2026 The pose_graph_ros authors
 # SPDX-License-Identifier: Apache-2.0
 """
-From bytes to odometry, and from estimates to messages as objects of their classes.
+The classes of messages, and messages that are made as objects of these.
 
 What is sent with each odometry message is written by `adapters.output_cdr`, which is faster.
 """
@@ -12,12 +12,9 @@ from builtin_interfaces.msg import Time
 from geometry_msgs.msg import PoseWithCovarianceStamped, TwistWithCovarianceStamped
 from nav_msgs.msg import Odometry
 import numpy as np
-from rclpy.serialization import deserialize_message
 from sensor_msgs.msg import Imu, NavSatFix, NavSatStatus
 from std_msgs.msg import Header
 
-from pose_graph_ros.adapters.conversions import Message
-from pose_graph_ros.adapters.odometry_cdr import LITTLE_ENDIAN, read_odometry
 from pose_graph_ros.adapters.output_cdr import UNKNOWN_VARIANCE
 from pose_graph_ros.adapters.sources import Kind, NANOSECONDS
 from pose_graph_ros.core.geometry import covariance as cov
@@ -35,13 +32,6 @@ def time_message(stamp_ns: int) -> Time:
     """Return a stamp [ns] as a message."""
     seconds, nanoseconds = divmod(stamp_ns, NANOSECONDS)
     return Time(sec=seconds, nanosec=nanoseconds)
-
-
-def odometry_message(data: bytes) -> Message:
-    """Return serialised odometry as an object with the same fields; raises ValueError."""
-    if data.startswith(LITTLE_ENDIAN):
-        return read_odometry(data)
-    return deserialize_message(data, Odometry)  # of a rare middleware
 
 
 def fix_message(

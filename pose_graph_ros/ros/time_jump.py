@@ -75,10 +75,13 @@ class TimeJumps:
         self._keeper.forget()
         self._drained = None
 
-    def clock_jumped(self, back_ns: int) -> None:
-        """Start again because the clock was set back by an amount [ns]."""
+    def clock_jumped(self, back_ns: int, clock_ns: int) -> None:
+        """Start again because the clock was set back by an amount, to a time [ns]."""
         newest_ns = self._keeper.now_ns
         self.forget()
+        if newest_ns > clock_ns:
+            # the clock may have run on for long without a message
+            back_ns = min(back_ns, newest_ns - clock_ns)
         if newest_ns > 0:
             self._expect_old(newest_ns, back_ns, set())
 

@@ -4,6 +4,7 @@
 
 from hypothesis import given, strategies as st
 import numpy as np
+import pytest
 
 from pose_graph_ros.core.measurements import OdometrySample, Position
 from pose_graph_ros.core.odometry.time_keeper import TimeKeeper
@@ -101,10 +102,12 @@ def test_a_gap_is_no_jump_but_a_step_back_after_it_is() -> None:
     assert decide(made(), messages) == (sent(messages), [100])
 
 
-def test_after_a_jump_of_the_clock_queued_messages_of_the_old_time_are_old() -> None:
+@pytest.mark.parametrize('back', [60, 600])
+def test_after_a_jump_of_the_clock_queued_messages_of_the_old_time_are_old(back: int) -> None:
     time_jumps = made()
     decide(time_jumps, lap(100.0, 60.0))
-    time_jumps.clock_jumped(60 * SECOND)
+    # also if the clock had run on for long without a message
+    time_jumps.clock_jumped(back * SECOND, 100 * SECOND)
     results = [time_jumps.receive(received) for received in (
         odometry(160.0), fix(159.8), odometry(100.0), fix(159.9), odometry(100.1), fix(100.1),
         fix(165.0))]
@@ -118,7 +121,7 @@ def test_new_messages_that_came_before_the_callback_of_the_clock_are_kept() -> N
     decide(time_jumps, lap(100.0, 60.0))
     early = [odometry(100.0), fix(100.0), odometry(100.1)]
     assert decide(time_jumps, early) == ([], [])
-    time_jumps.clock_jumped(60 * SECOND)
+    time_jumps.clock_jumped(60 * SECOND, 100 * SECOND)
     assert sent(time_jumps.release()) == sent(early)
     released, jumps = decide(time_jumps, lap(100.2, 5.0))
     assert len(released) == 50
