@@ -18,10 +18,8 @@ from pose_graph_ros.core.measurements import (
     rejected,
     YawRate,
 )
-from pose_graph_ros.ros.delays import Delays
-from pose_graph_ros.ros.liveness import Liveness
-from pose_graph_ros.ros.refusals import Refusals
-from pose_graph_ros.ros.time_jump import Decision, ReceivedMessage, TimeJumps
+from pose_graph_ros.ros.arrivals import Delays, Liveness, Refusals
+from pose_graph_ros.ros.jumps import Decision, ReceivedMessage, TimeJumps
 
 PAUSED = rejected('paused', 'call ~/pause with false to resume')
 BEFORE_JUMP = rejected('before_clock_jump', 'a message from before the clock was set back')

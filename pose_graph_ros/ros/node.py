@@ -54,7 +54,7 @@ class PoseGraphNode(LifecycleNode):
 
     def __init__(self, **node_options: Any) -> None:
         # what a file or the command line gives, also to parameters that are not declared
-        self._overrides: dict[str, Any] | None = None
+        self._overrides: dict[str, Any] = {}
         super().__init__(
             'pose_graph', automatically_declare_parameters_from_overrides=True, **node_options)
         self._log = NodeLog(self.get_logger())
@@ -154,8 +154,8 @@ class PoseGraphNode(LifecycleNode):
     def declare_parameters(
         self, namespace: str, parameters: Any, ignore_override: bool = False,
     ) -> list[RosParameter]:
-        """Declare parameters; of the first, by rclpy, only note what is given to them."""
-        if self._overrides is None:
+        """Return parameters after declaring them; of all that are given only note the values."""
+        if ignore_override:
             self._overrides = {name: value for name, value, _ in parameters}
             return []
         return super().declare_parameters(namespace, parameters, ignore_override)

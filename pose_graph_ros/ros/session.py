@@ -34,18 +34,16 @@ from pose_graph_ros.core.estimate import UpdateReport
 from pose_graph_ros.core.io.saved_graph import SavedGraph
 from pose_graph_ros.core.measurements import AnswerStatus, GlobalPose, OdometrySample
 from pose_graph_ros.ros import diagnostics
-from pose_graph_ros.ros.decisions import decide
 from pose_graph_ros.ros.graph_file import initial_graph, InitialGraph
 from pose_graph_ros.ros.input import Input, PAUSED
+from pose_graph_ros.ros.jumps import PoseContinuity, ReceivedMessage
 from pose_graph_ros.ros.log import ANSWER
-from pose_graph_ros.ros.messages import CLASSES
-from pose_graph_ros.ros.pose_continuity import PoseContinuity
 from pose_graph_ros.ros.publishers import Publishers
-from pose_graph_ros.ros.set_pose_input import SetPoseInput
+from pose_graph_ros.ros.requests import decide, SetPoseInput
 from pose_graph_ros.ros.spinning import guarded
 from pose_graph_ros.ros.surroundings import doubts
-from pose_graph_ros.ros.time_jump import ReceivedMessage
 from pose_graph_ros.ros.topics import (
+    CLASSES,
     JUDGE_QOS,
     JUDGE_TOPIC,
     LOOP_CLOSURE_QOS,

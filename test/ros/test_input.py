@@ -14,7 +14,7 @@ from pose_graph_ros.adapters.parameters import checked
 from pose_graph_ros.core.measurements import Fix, GlobalPose, OdometrySample
 from pose_graph_ros.ros import input as input_module
 from pose_graph_ros.ros.input import Input, LONGEST_DOUBT
-from pose_graph_ros.ros.time_jump import Decision
+from pose_graph_ros.ros.jumps import Decision
 
 SECOND = 1_000_000_000
 

@@ -17,7 +17,7 @@ from visualization_msgs.msg import Marker, MarkerArray
 
 from pose_graph_ros.adapters import markers
 from pose_graph_ros.core.graph.graph_view import GraphView, Lines
-from pose_graph_ros.ros.messages import time_message
+from pose_graph_ros.ros.publishers import time_message
 
 STAMP = 1_800_000_000_000_000_007
 frames = st.text(st.characters(codec='utf-8', exclude_characters='\0'), max_size=12)

@@ -81,34 +81,6 @@ def managed(tmp_path: Path, request: pytest.FixtureRequest) -> Iterator[Managed]
         local.node.close()
 
 
-def test_it_goes_through_all_its_states_and_back(managed: Managed) -> None:
-    node = managed.local.node
-    assert node.get_parameter('autostart').value
-    managed.start()
-    managed.drive(2.0)
-    worker = managed.session.worker
-    assert node.trigger_deactivate() is SUCCESS
-    assert node.trigger_activate() is SUCCESS
-    assert managed.session.worker is worker
-    assert node.trigger_deactivate() is SUCCESS
-    assert node.trigger_cleanup() is SUCCESS
-    assert not worker.alive
-    assert list(node.subscriptions) == []
-    node.start()
-    assert managed.session.worker.estimate is None
-    assert node.trigger_shutdown() is SUCCESS
-
-
-def test_a_configuration_that_fails_says_why_and_can_be_repaired(managed: Managed) -> None:
-    node = managed.local.node
-    assert managed.set('fix.sigma_ceiling', 0.001)[0] is False
-    node._given = node._given | {'fix.sigma_ceiling': 0.001}
-    with pytest.raises(ConfigError, match='ceiling'):
-        node.start()
-    assert managed.set('fix.sigma_ceiling', 100.0) == (True, '')
-    node.start()
-
-
 def test_a_transition_that_raises_leaves_the_node_unconfigured(
     managed: Managed, monkeypatch: pytest.MonkeyPatch,
 ) -> None:
@@ -249,16 +221,6 @@ def test_what_the_worker_and_the_core_log_is_the_nodes(
         '[ERROR] [pose_graph]: a measurement of fix could not be added',
         '[WARN] [pose_graph]: no folder',
         '[ERROR] [pose_graph]: a measurement of fix could not be added (7 more like it in T s)']
-
-
-def test_pause_answers_whether_it_changed_something(managed: Managed) -> None:
-    managed.start()
-    assert managed.pause(data=False).message == 'was not paused'
-    assert managed.pause(data=True).message.startswith('paused: ')
-    assert managed.session.input.paused
-    assert managed.pause(data=True).message == 'paused already'
-    assert managed.pause(data=False).message == 'resumed'
-    assert not managed.session.input.paused
 
 
 def test_a_fix_that_is_refused_is_not_the_datum(managed: Managed) -> None:
