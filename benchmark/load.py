@@ -46,8 +46,8 @@ CPU_RATE, CPU = 200.0, 0.6
 """[Hz], and parts of one core."""
 CPU_BESIDE, LATENCY_BESIDE = 1.5, 3.0
 """Times those of the echo by rclpy.spin, at 200 and 500 Hz, with a graph of any size."""
-MEMORY = 250.0
-"""[MB]."""
+MEMORY = 400.0
+"""[MB], of which a third are pages of libraries that the system can take back."""
 PATH_TIME, START_TIME = 10.0, 3.0
 """[ms] and [s]."""
 LADDER = (1000.0, 1500.0, 2000.0, 3000.0, 4000.0, 6000.0, 8000.0)

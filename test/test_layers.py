@@ -64,8 +64,7 @@ LIBRARIES = {'numpy', 'scipy', 'numba', 'pyproj'}
 ROS = {'rclpy', 'rosidl_runtime_py', 'ament_index_python', 'launch', 'launch_ros'}
 
 # What the node decides without ROS, so that it can be tested without.
-LOGIC = ('announcements', 'decisions', 'delays', 'input', 'liveness', 'log', 'memory',
-         'pose_continuity', 'refusals', 'set_pose_input', 'slew', 'time_jump', 'worker')
+LOGIC = ('announcements', 'arrivals', 'input', 'jumps', 'log', 'requests', 'worker')
 
 MOST_LINES = 450
 

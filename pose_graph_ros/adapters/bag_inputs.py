@@ -1,16 +1,23 @@
 # Copyright 2026 The pose_graph_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""Choose the topics of a bag that feed the sources, and read them, for player and replay alike."""
+"""
+Choose the topics of a bag that feed the sources, and read them, for player and replay alike.
+
+Planar poses can be read of any topic of odometry, poses, or poses with covariance.
+"""
 
 from collections.abc import Iterator, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, field
 import logging
 import re
 from typing import Any, NamedTuple
 
 from pose_graph_ros.adapters.bags import Bag, BagError, BagMessage, MessageError, Span, WHOLE
+from pose_graph_ros.adapters.conversions import Message, planar_pose, stamp_ns
 from pose_graph_ros.adapters.message_reader import MessageReader
 from pose_graph_ros.adapters.sources import CLOSURES, Kind, KNOWN_SOURCES, ODOMETRY_KINDS, Source
+from pose_graph_ros.core.geometry.se2 import FloatArray
 
 logger = logging.getLogger(__name__)
 
@@ -194,3 +201,42 @@ def reader_of(bag: Bag, values: Mapping[str, Any]) -> MessageReader:
     for message in read_static_frames(bag):
         reader.frames.receive(message.decode())
     return reader
+
+
+ODOMETRY, POSE, POSE_WITH_COVARIANCE = POSE_TYPES = (
+    'nav_msgs/msg/Odometry', 'geometry_msgs/msg/PoseStamped',
+    'geometry_msgs/msg/PoseWithCovarianceStamped')
+
+
+class BagPose(NamedTuple):
+    """A pose that was read from a message."""
+
+    stamp_ns: int
+    pose: FloatArray  # shape (3,) [m, m, rad]
+
+
+def poses_on(bag: Bag, topic: str, span: Span = WHOLE) -> Iterator[BagPose]:
+    """
+    Yield the valid poses on a topic with one of `POSE_TYPES`; invalid messages are ignored.
+
+    Parameters
+    ----------
+    topic : str
+    span : Span, when the messages were recorded
+
+    """
+    bare = bag.topics[topic].type == POSE
+    for bag_message in bag.messages([topic], span):
+        with suppress(MessageError):
+            message = bag_message.decode()
+            found = _pose(message, message if bare else message.pose)
+            if found is not None:
+                yield found
+
+
+def _pose(stamped: Message, holder: Message) -> BagPose | None:
+    """Return the pose of a message with a header that is in a part with a field `pose`."""
+    pose = planar_pose(holder.pose)
+    if pose is None:
+        return None
+    return BagPose(stamp_ns(stamped), pose)

@@ -11,10 +11,12 @@ short or damaged is read as far as it goes, with a warning (`damaged_bags`).
 
 from abc import ABC, abstractmethod
 from collections import Counter
-from collections.abc import Callable, Collection, Iterator
+from collections.abc import Callable, Collection, Iterator, Sequence
+from contextlib import ExitStack
 from dataclasses import dataclass, field
 from functools import partial
 import glob
+import heapq
 import logging
 from pathlib import Path
 from typing import Any, NamedTuple, Self
@@ -26,7 +28,6 @@ from rosbags.typesys import get_types_from_idl, get_types_from_msg, get_typestor
 from rosbags.typesys.store import Typestore
 
 from pose_graph_ros.adapters.damaged_bags import salvage, Salvaged
-from pose_graph_ros.adapters.odometry_cdr import LITTLE_ENDIAN, read_odometry
 from pose_graph_ros.core.exceptions import PoseGraphError
 
 logger = logging.getLogger(__name__)
@@ -34,7 +35,6 @@ logger = logging.getLogger(__name__)
 BAG_FILE_SUFFIXES = ('.mcap', '.db3', '.bag')
 IDL_SEPARATOR = '=' * 80 + '\n'
 JOURNALS = ('.db3-wal', '.db3-journal')
-ODOMETRY = 'nav_msgs/msg/Odometry'
 
 
 class BagError(PoseGraphError, ValueError):
@@ -193,14 +193,10 @@ class BagReader(Bag):
         """Return the decoder of a type, by its definition in the bag, else by the standard one."""
         name, is_ros1 = connection.msgtype, isinstance(self._reader, Rosbag1Reader)
         if name not in self._decoders:
-            standard = get_typestore(Stores.ROS1_NOETIC if is_ros1 else Stores.ROS2_JAZZY)
-            types = own_types(connection) or standard
+            types = own_types(connection) or get_typestore(
+                Stores.ROS1_NOETIC if is_ros1 else Stores.ROS2_JAZZY)
             decode = types.deserialize_ros1 if is_ros1 else types.deserialize_cdr
             self._decoders[name] = partial(decode, typename=name)
-            # most of a long bag
-            if (name == ODOMETRY and not is_ros1
-                    and types.hash_rihs01(name) == standard.hash_rihs01(name)):
-                self._decoders[name] = partial(_read_odometry, otherwise=self._decoders[name])
         return self._decoders[name]
 
 
@@ -240,10 +236,6 @@ def open_bag(path: str | Path) -> BagReader:
     return BagReader(path, reader)
 
 
-def _read_odometry(data: bytes, otherwise: Callable[[bytes], Any]) -> Any:
-    return read_odometry(data) if data.startswith(LITTLE_ENDIAN) else otherwise(data)
-
-
 def own_types(connection: Connection) -> Typestore | None:
     """Return the types by the definition in the bag; None if it has none that is usable."""
     text, kind = connection.msgdef.data, connection.msgdef.format
@@ -270,3 +262,51 @@ def own_types(connection: Connection) -> Typestore | None:
 def one_line(error: Exception) -> str:
     """Return the text of an error on one line."""
     return ' '.join(str(error).split()) or type(error).__name__
+
+
+class BagSequence(Bag):
+    """
+    Open bags whose messages come in the order in which they were recorded; a context manager.
+
+    Bags that were recorded at the same time are merged. Of a topic with several types, these are
+    joined with ` | `, as in a single bag.
+
+    Parameters
+    ----------
+    bags : sequence of BagReader, at least one
+
+    """
+
+    def __init__(self, bags: Sequence[BagReader]) -> None:
+        self._bags = sorted(bags, key=lambda bag: bag.start_ns)
+        self.path = ', '.join(str(bag.path) for bag in self._bags)
+        self.topics = {}
+        for name in sorted({name for bag in bags for name in bag.topics}):
+            found = [bag.topics[name] for bag in bags if name in bag.topics]
+            types = sorted({part for info in found for part in info.type.split(' | ')})
+            self.topics[name] = TopicInfo(' | '.join(types), sum(info.count for info in found))
+        self.start_ns = min(bag.start_ns for bag in self._bags)  # an empty one begins late
+        self.end_ns = max(bag.end_ns for bag in self._bags)
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *exception: object) -> None:
+        with ExitStack() as stack:
+            for bag in self._bags:
+                stack.push(bag)
+
+    def _messages(self, topics: Collection[str], span: Span) -> Iterator[BagMessage]:
+        parts = [bag.messages([topic for topic in topics if topic in bag.topics], span)
+                 for bag in self._bags]
+        return heapq.merge(*parts, key=lambda message: message.recorded_ns)
+
+
+def open_bags(paths: Sequence[str | Path]) -> BagReader | BagSequence:
+    """Open bags that follow each other, in any order; raises `BagError` as `open_bag` does."""
+    if len(paths) == 1:
+        return open_bag(paths[0])
+    with ExitStack() as stack:
+        bags = [stack.enter_context(open_bag(path)) for path in paths]
+        stack.pop_all()
+    return BagSequence(bags)

@@ -12,7 +12,7 @@ too, are measured positions that are not used. No rclpy.
 import numpy as np
 import numpy.typing as npt
 
-from pose_graph_ros.adapters.cdr import CdrStream
+from pose_graph_ros.adapters.output_cdr import CdrStream
 from pose_graph_ros.adapters.sources import NANOSECONDS
 from pose_graph_ros.core.geometry.se2 import FloatArray
 from pose_graph_ros.core.graph.graph_view import GraphView, Lines

@@ -13,6 +13,7 @@ import math
 import struct
 
 import numpy as np
+import numpy.typing as npt
 
 from pose_graph_ros.adapters.conversions import Message
 from pose_graph_ros.adapters.sources import NANOSECONDS
@@ -145,3 +146,27 @@ def path_cdr(path: Trajectory, stamp_ns: int, frame_id: str) -> bytes:
             parts += (first[:names_end], bytes(-(len(head) + names_end) % 8), first[-56:])
         parts.append(numbers[begin == 0:n].tobytes())
     return b''.join(parts)
+
+
+_LENGTH = struct.Struct('<I')
+
+
+class CdrStream:
+    """A stream of CDR: the position of each number is a multiple of its size."""
+
+    def __init__(self) -> None:
+        self._data = bytearray()
+
+    def add(self, code: str, *numbers: npt.ArrayLike) -> None:
+        """Add numbers, or an array, as a type of NumPy."""
+        array = np.asarray(numbers, dtype=code)
+        self._data += bytes(-len(self._data) % array.itemsize) + array.tobytes()
+
+    def add_text(self, text: str) -> None:
+        """Add a string."""
+        name = text.encode() + b'\0'
+        self._data += bytes(-len(self._data) % 4) + _LENGTH.pack(len(name)) + name
+
+    def message(self) -> bytes:
+        """Return the message, with the bytes that tell the encoding in front."""
+        return b'\x00\x01\x00\x00' + bytes(self._data)

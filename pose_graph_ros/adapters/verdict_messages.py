@@ -9,8 +9,8 @@ are not listed, so that the size of a message is bounded.
 
 from collections.abc import Mapping, Sequence
 
-from pose_graph_ros.adapters.cdr import CdrStream
 from pose_graph_ros.adapters.conversions import Message
+from pose_graph_ros.adapters.output_cdr import CdrStream
 from pose_graph_ros.adapters.sources import NANOSECONDS
 from pose_graph_ros.core.judgement.texts import (
     details,

@@ -20,9 +20,8 @@ from pose_graph_ros.adapters.bag_inputs import (
     read_inputs,
     reader_of,
 )
-from pose_graph_ros.adapters.bag_sequence import open_bags
 from pose_graph_ros.adapters.bag_writer import BagWriter
-from pose_graph_ros.adapters.bags import Bag, BagError, MessageError, Span
+from pose_graph_ros.adapters.bags import Bag, BagError, MessageError, open_bags, Span
 from pose_graph_ros.adapters.fixes import Datum
 from pose_graph_ros.adapters.message_reader import MessageReader
 from pose_graph_ros.adapters.sources import (

@@ -11,8 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from pose_graph_ros.adapters.bag_inputs import Inputs, read_inputs, reader_of
-from pose_graph_ros.adapters.bag_poses import POSE_TYPES, poses_on
+from pose_graph_ros.adapters.bag_inputs import Inputs, POSE_TYPES, poses_on, read_inputs, reader_of
 from pose_graph_ros.adapters.bags import Bag, BagError, MessageError, Span, WHOLE
 from pose_graph_ros.adapters.sources import Kind, ODOMETRY_KINDS
 from pose_graph_ros.cli.evaluation import Drive, evaluate, format_table, place_truth, summary

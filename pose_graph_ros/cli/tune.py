@@ -12,8 +12,7 @@ import time
 from typing import Any
 
 from pose_graph_ros.adapters.bag_inputs import choose_inputs
-from pose_graph_ros.adapters.bag_sequence import open_bags
-from pose_graph_ros.adapters.bags import BagError
+from pose_graph_ros.adapters.bags import BagError, open_bags
 from pose_graph_ros.adapters.sources import source_list
 from pose_graph_ros.cli import options as shared
 from pose_graph_ros.cli.progress import WatchedBag

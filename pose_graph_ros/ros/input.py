@@ -18,10 +18,8 @@ from pose_graph_ros.core.measurements import (
     rejected,
     YawRate,
 )
-from pose_graph_ros.ros.delays import Delays
-from pose_graph_ros.ros.liveness import Liveness
-from pose_graph_ros.ros.refusals import Refusals
-from pose_graph_ros.ros.time_jump import Decision, ReceivedMessage, TimeJumps
+from pose_graph_ros.ros.arrivals import Delays, Liveness, Refusals
+from pose_graph_ros.ros.jumps import Decision, ReceivedMessage, TimeJumps
 
 PAUSED = rejected('paused', 'call ~/pause with false to resume')
 BEFORE_JUMP = rejected('before_clock_jump', 'a message from before the clock was set back')
@@ -161,12 +159,6 @@ class Input:
             self._warn(f'{name} is silent while other sources are not')
         self.refused = self._refusals.update(
             self.received, counts + self.rejected, {**details, **self._details}, now)
-
-    def refuse(self, source: str, error: Exception) -> None:
-        """Count a message that cannot be deserialised."""
-        self.received[source] += 1
-        self.liveness.receive(source, time.monotonic())
-        self.reject(source, rejected('malformed', str(error)))
 
     def reject(self, source: str, answer: Answer) -> None:
         """Count a message that cannot be used; log the first for each source and reason."""

@@ -15,24 +15,20 @@ import select
 import signal
 import sys
 from threading import enumerate as all_threads, Thread
-from typing import NoReturn
 
-SWITCH_INTERVAL = 0.0005  # for which a thread may run Python while another one waits [s]
 # Longest waits at the end, for a callback and for files of the graph that are written [s].
 CALLBACK_TIMEOUT, FILES_TIMEOUT = 0.5, 1.0
 
 
-def main(args: list[str] | None = None) -> NoReturn:
-    """Run the node, by default with the arguments of the command line, and end the process."""
-    code = run(args)
-    # without ending the interpreter, which takes 0.5 s, and threads may be in compiled code
-    sys.stdout.flush()
-    sys.stderr.flush()
-    os._exit(code)
+def main(args: list[str] | None = None) -> int:
+    """
+    Run the node until SIGINT or SIGTERM; return the exit code.
 
+    Parameters
+    ----------
+    args : list of str, optional, by default those of the command line
 
-def run(args: list[str] | None = None) -> int:
-    """Run the node until SIGINT or SIGTERM; return the exit code."""
+    """
     ends, end = os.pipe()   # a byte for each signal, and one if the callbacks end by themselves
     os.set_blocking(end, False)
     signal.set_wakeup_fd(end)
@@ -47,17 +43,13 @@ def run(args: list[str] | None = None) -> int:
 
     from pose_graph_ros.core.exceptions import ConfigError, NumbaVersionError
     try:
-        from pose_graph_ros.ros import memory
         from pose_graph_ros.ros.node import PoseGraphNode
-        from pose_graph_ros.ros.services import FILE_THREADS
+        from pose_graph_ros.ros.services import SERVICE_THREAD
         from pose_graph_ros.ros.spinning import Spinner
     except NumbaVersionError as error:
         print(f'pose_graph_node: {error}', file=sys.stderr)
         return 2
 
-    memory.give_back_large_arrays()
-    # by default the thread of the engine would delay messages by 5 ms at a time
-    sys.setswitchinterval(SWITCH_INTERVAL)
     logging.captureWarnings(capture=True)  # the node logs them, as all that is logged
     if select.select([ends], [], [], 0.0)[0]:
         return 0
@@ -85,7 +77,7 @@ def run(args: list[str] | None = None) -> int:
     thread.join(CALLBACK_TIMEOUT)
     node.close()
     for each in all_threads():
-        if each.name.startswith(FILE_THREADS):
+        if each.name == SERVICE_THREAD:
             each.join(FILES_TIMEOUT)
     spinner.close()
     node.destroy_node()
@@ -94,4 +86,4 @@ def run(args: list[str] | None = None) -> int:
 
 
 if __name__ == '__main__':
-    main()
+    sys.exit(main())

@@ -53,22 +53,21 @@ class PoseGraphNode(LifecycleNode):
     """
 
     def __init__(self, **node_options: Any) -> None:
-        super().__init__('pose_graph', **node_options)
+        # what a file or the command line gives, also to parameters that are not declared
+        self._overrides: dict[str, Any] = {}
+        super().__init__(
+            'pose_graph', automatically_declare_parameters_from_overrides=True, **node_options)
         self._log = NodeLog(self.get_logger())
         self.create_timer(
             FLUSH_PERIOD, self._log.flush, clock=Clock(clock_type=ClockType.STEADY_TIME))
         self.failure = ''  # why the last transition or change of parameters failed
         self._session: Session | None = None
         self._offered: Services | None = None
-        # what a file or the command line gives, also to parameters that are not declared
-        self._overrides = {parameter.name: parameter.value for parameter in getattr(
-            self, '_parameter_overrides', {}).values()}
         self._given = self._declared()  # the node's own parameters that have a value
         self._own = {parameter.name: parameter for parameter in all_parameters(self._given)}
         self._warn_of_unknown()
         self.add_on_set_parameters_callback(self._on_set_parameters)
         self.add_post_set_parameters_callback(self._on_parameters_set)
-        self._answer_every_change_of_state()
 
     def destroy_node(self) -> None:
         """Destroy the node; what is logged from now on goes elsewhere."""
@@ -119,6 +118,8 @@ class PoseGraphNode(LifecycleNode):
             change()
         except ConfigError as error:
             self.failure = str(error)
+            if self.executor is not None:   # else `start` raises it
+                self.get_logger().error(f'no transition: {error}')
             return TransitionCallbackReturn.FAILURE
         except Exception as error:
             self.failure = f'{type(error).__name__}: {error}'
@@ -148,28 +149,16 @@ class PoseGraphNode(LifecycleNode):
             if each is not None:
                 each.close()
 
-    def _answer_every_change_of_state(self) -> None:
-        """
-        Answer also requests for transitions that are not possible now, and log why one failed.
-
-        rclpy raises for the former, so that the client would wait for ever, and logs no reasons.
-        """
-        service = self._service_change_state
-        change = service.callback
-
-        def answer(request: Any, response: Any) -> Any:
-            self.failure = ''
-            try:
-                response = change(request, response)
-            except Exception as error:
-                self.failure, response.success = str(error), False
-            if not response.success:
-                self.get_logger().error(f'no transition: {self.failure}')
-            return response
-
-        service.callback = answer
-
     # ---- parameters
+
+    def declare_parameters(
+        self, namespace: str, parameters: Any, ignore_override: bool = False,
+    ) -> list[RosParameter]:
+        """Return parameters after declaring them; of all that are given only note the values."""
+        if ignore_override:
+            self._overrides = {name: value for name, value, _ in parameters}
+            return []
+        return super().declare_parameters(namespace, parameters, ignore_override)
 
     def _declared(self) -> dict[str, Any]:
         """Declare all parameters and return those that are set."""

@@ -35,7 +35,7 @@ from pose_graph_ros.adapters.bag_inputs import (
 from pose_graph_ros.adapters.bag_writer import BagWriter
 from pose_graph_ros.adapters.bags import BagError, MessageError, open_bag
 from pose_graph_ros.adapters.sources import Kind
-from pose_graph_ros.ros.messages import CLASSES
+from pose_graph_ros.ros.topics import CLASSES
 from pose_graph_ros.ros.transforms import TFMessage
 
 NODE_NAME = 'pose_graph'  # name of the node, for its service and its diagnostics

@@ -10,10 +10,12 @@ but the transform and the diagnostics are made only while there is a subscriber.
 
 from collections.abc import Callable, Mapping, Sequence
 from copy import copy
+import math
 import threading
 import time
 from typing import Any
 
+from builtin_interfaces.msg import Time
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
 from geometry_msgs.msg import PoseWithCovarianceStamped
 from nav_msgs.msg import Odometry, Path
@@ -22,7 +24,7 @@ from rclpy.node import Node
 from rclpy.publisher import Publisher
 from rclpy.qos import QoSDurabilityPolicy, QoSProfile
 from rclpy.qos_overriding_options import QoSOverridingOptions
-from sensor_msgs.msg import NavSatFix
+from sensor_msgs.msg import NavSatFix, NavSatStatus
 from std_msgs.msg import Header
 from visualization_msgs.msg import Marker, MarkerArray
 
@@ -39,15 +41,15 @@ from pose_graph_ros.adapters.sources import (
 from pose_graph_ros.adapters.verdict_messages import verdicts_cdr
 from pose_graph_ros.core.alignment.monitor import AlignmentState
 from pose_graph_ros.core.estimate import Estimate
+from pose_graph_ros.core.geometry import covariance as cov
 from pose_graph_ros.core.geometry.covariance import UNKNOWN_HEADING_VARIANCE
+from pose_graph_ros.core.geometry.geodesy import TangentPlane
 from pose_graph_ros.core.geometry.trajectory import Trajectory
 from pose_graph_ros.core.graph.graph_view import GraphView
 from pose_graph_ros.core.judgement.verdicts import SourceVerdicts, Verdict
 from pose_graph_ros.core.measurements import OdometrySample
-from pose_graph_ros.core.prediction import predict
-from pose_graph_ros.ros import messages
-from pose_graph_ros.ros.slew import Slew
-from pose_graph_ros.ros.transforms import TF_QOS, TFMessage, TOPIC, TransformPublisher
+from pose_graph_ros.core.prediction import predict, Prediction
+from pose_graph_ros.ros.transforms import Slew, TF_QOS, TFMessage, TOPIC, TransformPublisher
 
 OUTPUT_QOS = QoSProfile(depth=10)  # reliable, as profiles are by default
 # Late subscribers receive the newest path and graph at once.
@@ -180,7 +182,7 @@ class Publishers:
         # before the first measurement in the map, its place on the Earth is unknown
         if (self._fix in wanted and plane is not None
                 and estimate.alignment is not AlignmentState.LOCAL):
-            self._fix.publish(messages.fix_message(
+            self._fix.publish(fix_message(
                 stamp, prediction, plane, datum.altitude, self.base_frame))
 
     def _holds(self, estimate: Estimate) -> bool:
@@ -306,7 +308,7 @@ class Publishers:
                 self._verdicts.publish(verdicts_cdr([], {}, verdicts_ns + 1, self.map_frame))
 
     def _after(self, stamp_ns: int) -> Header:
-        return Header(stamp=messages.time_message(stamp_ns + 1), frame_id=self.map_frame)
+        return Header(stamp=time_message(stamp_ns + 1), frame_id=self.map_frame)
 
     def publish_diagnostics(self, level: bytes, text: str, values: Mapping[str, object]) -> None:
         """
@@ -351,3 +353,33 @@ def thinned(path: Trajectory, n_frozen: int) -> Trajectory:
         return path
     kept = np.concatenate((np.arange(0, n_frozen, step), np.arange(n_frozen, len(path))))
     return Trajectory(path.stamps_ns[kept], path.poses[kept])
+
+
+def time_message(stamp_ns: int) -> Time:
+    """Return a stamp [ns] as a message."""
+    seconds, nanoseconds = divmod(stamp_ns, NANOSECONDS)
+    return Time(sec=seconds, nanosec=nanoseconds)
+
+
+def fix_message(
+    stamp_ns: int, prediction: Prediction, plane: TangentPlane, altitude: float, base_frame: str,
+) -> NavSatFix:
+    """
+    Return the robot's position on the Earth, its covariance in east and north.
+
+    Parameters
+    ----------
+    altitude : float, above the ellipsoid [m]; NaN if unknown
+
+    """
+    latitude, longitude, _ = plane.to_geodetic(
+        prediction.T_map_base[:2], altitude if math.isfinite(altitude) else plane.altitude)
+    covariance = np.diag((0.0, 0.0, output_cdr.UNKNOWN_VARIANCE))
+    turned = cov.turned(prediction.covariance[:2, :2], -plane.yaw)
+    covariance[:2, :2] = 0.5 * (turned + turned.T)
+    return NavSatFix(
+        header=Header(stamp=time_message(stamp_ns), frame_id=base_frame),
+        status=NavSatStatus(status=NavSatStatus.STATUS_FIX), latitude=float(latitude),
+        longitude=float(longitude), altitude=float(altitude),
+        position_covariance=covariance.ravel(),
+        position_covariance_type=NavSatFix.COVARIANCE_TYPE_KNOWN)

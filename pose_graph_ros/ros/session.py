@@ -40,19 +40,17 @@ from pose_graph_ros.core.backend import PoseGraphBackend
 from pose_graph_ros.core.estimate import UpdateReport
 from pose_graph_ros.core.io.saved_graph import SavedGraph
 from pose_graph_ros.core.measurements import AnswerStatus, GlobalPose, OdometrySample
-from pose_graph_ros.ros import diagnostics, memory
-from pose_graph_ros.ros.decisions import decide
+from pose_graph_ros.ros import diagnostics
 from pose_graph_ros.ros.graph_file import initial_graph, InitialGraph
 from pose_graph_ros.ros.input import Input, PAUSED
+from pose_graph_ros.ros.jumps import PoseContinuity, ReceivedMessage
 from pose_graph_ros.ros.log import ANSWER
-from pose_graph_ros.ros.messages import CLASSES, odometry_message
-from pose_graph_ros.ros.pose_continuity import PoseContinuity
 from pose_graph_ros.ros.publishers import Publishers
-from pose_graph_ros.ros.set_pose_input import SetPoseInput
+from pose_graph_ros.ros.requests import decide, SetPoseInput
 from pose_graph_ros.ros.spinning import guarded
 from pose_graph_ros.ros.surroundings import doubts
-from pose_graph_ros.ros.time_jump import ReceivedMessage
 from pose_graph_ros.ros.topics import (
+    CLASSES,
     JUDGE_QOS,
     JUDGE_TOPIC,
     LOOP_CLOSURE_QOS,
@@ -149,7 +147,6 @@ class Session:
         seconds = warm_up(stopped)
         if not stopped():   # else another worker may be compiling by now
             self.compiling = False
-            memory.release_memory()
             self.node.get_logger().info(f'kernels ready after {seconds:.1f} s')
 
     # ---- transitions of the node
@@ -166,10 +163,8 @@ class Session:
         self._subscribe(JUDGE_TOPIC, KeyValue, self._on_judge, JUDGE_QOS)
         for source in sources:
             qos = LOOP_CLOSURE_QOS if source.kind is Kind.LOOP_CLOSURE else SENSOR_QOS
-            # rclpy takes longest to fill in the message, and odometry comes at a high rate
-            raw = source.kind is Kind.ODOMETRY
-            self._subscribe(source.topic, CLASSES[source.kind], partial(
-                self._on_odometry if raw else self._on_message, source), qos, raw=raw)
+            self._subscribe(
+                source.topic, CLASSES[source.kind], partial(self._on_message, source), qos)
         self._watch_time()
         self.input.liveness.resume(time.monotonic())
         self.active, self.activated_at = True, time.monotonic()
@@ -215,12 +210,11 @@ class Session:
 
     def _subscribe(
         self, topic: str, message_type: type, callback: Callable[[Any], None], qos: QoSProfile,
-        *, raw: bool = False,
     ) -> None:
         self._subscriptions.append(self.node.create_subscription(
             message_type, topic, guarded(callback, lambda: self.active),
             copy(qos),  # rclpy writes the overrides into it
-            qos_overriding_options=QoSOverridingOptions.with_default_policies(), raw=raw))
+            qos_overriding_options=QoSOverridingOptions.with_default_policies()))
 
     def _set_timer(self, name: str, period: float, tick: Callable[[], None]) -> None:
         timer, period_ns = self._timers.get(name), round(period * NANOSECONDS)
@@ -234,15 +228,6 @@ class Session:
             timer.reset()
 
     # ---- messages
-
-    def _on_odometry(self, source: Source, data: bytes) -> None:
-        """Receive a serialised message."""
-        try:
-            message = odometry_message(data)
-        except ValueError as error:
-            self.input.refuse(source.name, error)
-        else:
-            self._on_message(source, message)
 
     def _on_message(self, source: Source, message: Message) -> None:
         """Receive a message; never raises, whatever its content."""
@@ -322,7 +307,7 @@ class Session:
 
     def _on_clock_jump(self, jump: TimeJump) -> None:
         back_ns = -jump.delta.nanoseconds
-        self.input.time_jumps.clock_jumped(back_ns)
+        self.input.time_jumps.clock_jumped(back_ns, self.node.get_clock().now().nanoseconds)
         self._start_new_graph(f'the clock jumped back by {back_ns * 1e-9:.3f} s',
                               self.input.time_jumps.release())
 

@@ -11,7 +11,7 @@ from rclpy.node import Node
 
 from pose_graph_ros.adapters.conversions import frame
 from pose_graph_ros.adapters.sources import DEFAULT_SOURCES, Kind, KNOWN_SOURCES, OUTPUTS, Source
-from pose_graph_ros.ros.liveness import QUIET
+from pose_graph_ros.ros.arrivals import QUIET
 
 if TYPE_CHECKING:
     from pose_graph_ros.ros.session import Session

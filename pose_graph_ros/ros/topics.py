@@ -11,7 +11,8 @@ from collections.abc import Iterator, Mapping
 from typing import Any
 
 from diagnostic_msgs.msg import KeyValue
-from geometry_msgs.msg import PoseWithCovarianceStamped
+from geometry_msgs.msg import PoseWithCovarianceStamped, TwistWithCovarianceStamped
+from nav_msgs.msg import Odometry
 from rclpy.node import Node
 from rclpy.qos import (
     QoSDurabilityPolicy,
@@ -19,13 +20,18 @@ from rclpy.qos import (
     QoSProfile,
     QoSReliabilityPolicy,
 )
+from sensor_msgs.msg import Imu, NavSatFix
 
-from pose_graph_ros.adapters.sources import OUTPUTS as OUTPUT_TOPICS, source_list
+from pose_graph_ros.adapters.sources import Kind, OUTPUTS as OUTPUT_TOPICS, source_list
 from pose_graph_ros.core.exceptions import ConfigError
-from pose_graph_ros.ros.messages import CLASSES
 from pose_graph_ros.ros.publishers import OUTPUTS
 from pose_graph_ros.ros.transforms import STATIC_TOPIC, TFMessage, TOPIC
 
+CLASSES = {Kind.ODOMETRY: Odometry, Kind.FIX: NavSatFix, Kind.IMU: Imu,
+           Kind.GLOBAL_POSE: PoseWithCovarianceStamped,
+           Kind.LOOP_CLOSURE: PoseWithCovarianceStamped,
+           Kind.TWIST: TwistWithCovarianceStamped, Kind.GYRO: Imu}
+"""Class of the messages by kind of source."""
 # Profiles are reliable if they do not say otherwise.
 # The queue is deep since no odometry may be lost. A best-effort reader matches reliable and
 # best-effort writers.

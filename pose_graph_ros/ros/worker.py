@@ -25,7 +25,7 @@ from pose_graph_ros.core.measurements import AnswerStatus, Measurement, Odometry
 from pose_graph_ros.core.odometry.agreement import Difference
 from pose_graph_ros.core.sources.source_report import SourceReport
 from pose_graph_ros.ros.announcements import Announcer
-from pose_graph_ros.ros.refusals import INTENDED
+from pose_graph_ros.ros.arrivals import INTENDED
 
 logger = logging.getLogger(__name__)
 

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from pose_graph_ros.adapters.bag_poses import POSE, POSE_TYPES, poses_on
+from pose_graph_ros.adapters.bag_inputs import POSE, POSE_TYPES, poses_on
 from pose_graph_ros.adapters.bag_writer import BagWriter, message_types
 from pose_graph_ros.adapters.bags import open_bag
 from pose_graph_ros.adapters.conversions import PLANAR

@@ -56,43 +56,6 @@ def test_what_is_written_is_read_back(tmp_path: Path, storage: str) -> None:
     assert files_below(tmp_path / 'deep') == [folder, *files_below(folder)]  # no scratch left
 
 
-@pytest.mark.parametrize('own', [False, True])
-def test_odometry_is_read_as_its_definition_says(tmp_path: Path, own: bool) -> None:
-    # the definition of the standard has a reader of its own, which is ten times as fast
-    types = get_typestore(Stores.ROS2_JAZZY)
-    if own:
-        text, _ = types.generate_msgdef(ODOMETRY, ros_version=2)
-        types = get_typestore(Stores.EMPTY)
-        types.register(get_types_from_msg(
-            text.replace('child_frame_id', 'child', 1), ODOMETRY))
-    kinds = types.types
-    header = kinds['std_msgs/msg/Header'](kinds['builtin_interfaces/msg/Time'](3, 4), 'odom')
-    vector, numbers = kinds['geometry_msgs/msg/Vector3'], np.arange(36.0)
-    pose = kinds['geometry_msgs/msg/Pose'](
-        kinds['geometry_msgs/msg/Point'](1.0, 2.0, 3.0),
-        kinds['geometry_msgs/msg/Quaternion'](0.0, 0.0, 0.6, 0.8))
-    twist = kinds['geometry_msgs/msg/Twist'](vector(4.0, 5.0, 6.0), vector(7.0, 8.0, 9.0))
-    sent = kinds[ODOMETRY](
-        header, 'base', kinds['geometry_msgs/msg/PoseWithCovariance'](pose, numbers),
-        kinds['geometry_msgs/msg/TwistWithCovariance'](twist, -numbers))
-    writer = Writer(tmp_path / 'bag', version=9, storage_plugin=StoragePlugin.MCAP)
-    with writer:
-        for data in (types.serialize_cdr(sent, ODOMETRY),
-                     types.serialize_cdr(sent, ODOMETRY, little_endian=False)):
-            writer.write(writer.connections[0] if writer.connections else writer.add_connection(
-                '/odom', ODOMETRY, typestore=types), 1, bytes(data))
-    with open_bag(tmp_path / 'bag') as bag:
-        read = [message.decode() for message in bag.messages(['/odom'])]
-    for message in read:
-        assert (message.header.stamp.sec, message.header.stamp.nanosec) == (3, 4)
-        assert message.header.frame_id == 'odom'
-        assert getattr(message, 'child' if own else 'child_frame_id') == 'base'
-        assert message.pose.pose.orientation.z == 0.6
-        assert message.twist.twist.angular.z == 9.0
-        np.testing.assert_array_equal(message.pose.covariance, numbers)
-        np.testing.assert_array_equal(message.twist.covariance, -numbers)
-
-
 def test_order_is_that_of_recording_not_of_writing(tmp_path: Path) -> None:
     with BagWriter(tmp_path / 'bag') as bag:
         for stamp in (30, 10, 20):

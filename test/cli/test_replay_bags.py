@@ -14,7 +14,7 @@ from rosbags.rosbag2 import CompressionMode
 from tum_files import read_tum
 
 from pose_graph_ros.adapters.bag_inputs import choose_inputs
-from pose_graph_ros.adapters.bag_sequence import open_bags
+from pose_graph_ros.adapters.bags import open_bags
 from pose_graph_ros.adapters.parameters import checked
 from pose_graph_ros.adapters.sources import source_list
 from pose_graph_ros.cli.bag_messages import Message, write_bag

@@ -209,6 +209,12 @@ class Client:
     def values(self) -> dict[str, str]:
         return {item.key: item.value for item in self.diagnostics[-1].status[0].values}
 
+    def wait_values(self, wanted: Mapping[str, str]) -> None:
+        """Wait for diagnostics with some values, which may come later than what they tell of."""
+        self.spin_until(
+            lambda: len(self.diagnostics) > 0 and wanted.items() <= self.values.items(),
+            f'the diagnostics have {wanted}')
+
     def wait_processed(self, count: int) -> None:
         self.spin_until(lambda: int(self.values['processed']) >= count,
                         f'{count} messages are processed')

@@ -82,7 +82,7 @@ def _run(arguments: list[str], env: Mapping[str, str], stderr: str) -> None:
 
     from pose_graph_ros.ros.main import main  # noqa: PLC0415  the node's only
 
-    main()
+    sys.exit(main())
 
 
 def _end_with_the_tests() -> None:

@@ -14,7 +14,7 @@ from pose_graph_ros.adapters.parameters import checked
 from pose_graph_ros.core.measurements import Fix, GlobalPose, OdometrySample
 from pose_graph_ros.ros import input as input_module
 from pose_graph_ros.ros.input import Input, LONGEST_DOUBT
-from pose_graph_ros.ros.time_jump import Decision
+from pose_graph_ros.ros.jumps import Decision
 
 SECOND = 1_000_000_000
 
@@ -284,7 +284,7 @@ def test_after_a_jump_of_the_clock_messages_of_the_old_time_are_rejected() -> No
     given = Given()
     for step in range(20):
         given.receive('odom', odometry(100.0 + 0.1 * step))
-    given.input.time_jumps.clock_jumped(50 * SECOND)
+    given.input.time_jumps.clock_jumped(50 * SECOND, 52 * SECOND)
     decision = given.receive('odom', odometry(102.0))
     assert (decision.is_old, decision.released) == (True, [])
     assert given.rejected() == {'odom.before_clock_jump': 1}

@@ -1,16 +1,12 @@
 # Copyright 2026 The pose_graph_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""The launch file, and the node as the launch file starts it; launch itself need not be there."""
+"""The launch file; launch itself need not be there."""
 
 import ast
 import importlib.util
 from pathlib import Path
-from typing import Any
 
-from circle import drive
-from harness import Client, NodeProcess, TFMessage
 import pytest
-import yaml
 
 from pose_graph_ros.adapters import launch_arguments
 from pose_graph_ros.adapters.sources import KNOWN_SOURCES
@@ -70,36 +66,3 @@ def test_launch_makes_the_node_and_rviz_only_if_it_is_there(
     with_rviz = started.execute(context)
     assert len(with_rviz) == 2
     assert type(with_rviz[0]) is type(node)
-
-
-def command_line(folder: Path, **given: str) -> list[str]:
-    """Return the arguments that launch gives to the node."""
-    given = {name: default for name, (default, _) in ARGUMENTS.items()} | given
-    own = {f'{given["namespace"]}/{given["name"]}': {
-        'ros__parameters': launch_arguments.parameters(given)}}
-    (folder / 'own.yaml').write_text(yaml.safe_dump(own))
-    arguments = ['--params-file', launch_arguments.parameter_file(given),
-                 '--params-file', str(folder / 'own.yaml'), '-r', f'__ns:={given["namespace"]}',
-                 '-r', f'__node:={given["name"]}']
-    for topic, new in launch_arguments.remappings(given):
-        arguments += ['-r', f'{topic}:={new}']
-    return arguments
-
-
-def test_arguments_win_over_the_file_and_tf_is_that_of_the_namespace(tmp_path: Path) -> None:
-    parameters: dict[str, Any] = {'odom': {'topic': '/from_file'}, 'use_sim_time': False}
-    file = tmp_path / 'user.yaml'
-    file.write_text(yaml.safe_dump({'/**': {'ros__parameters': parameters}}))
-    arguments = command_line(tmp_path, params_file=str(file), namespace='/robot', odom='/wheels',
-                             use_sim_time='True', path='/way')
-    with NodeProcess(tmp_path, arguments) as node, \
-            Client(int(node.env['ROS_DOMAIN_ID']), 'robot', '/wheels') as client:
-        drive(client, 3.0)
-        client.spin_until(lambda: 'hidden_nodes' in client.values, 'the odometry is used')
-        assert client.diagnostics[-1].header.stamp.sec == 0, 'there is no /clock'
-        assert client.node.get_subscriptions_info_by_topic('/from_file') == []
-        assert len(client.node.get_publishers_info_by_topic('/way')) == 1
-        if TFMessage is not None:
-            assert len(client.node.get_publishers_info_by_topic('/robot/tf')) == 1
-            assert client.node.get_publishers_info_by_topic('/tf') == []
-            assert len(client.node.get_subscriptions_info_by_topic('/robot/tf_static')) == 1

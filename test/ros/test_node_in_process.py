@@ -17,8 +17,6 @@ pytest.importorskip('rclpy', reason='ROS 2 is not there: no rclpy')
 
 from circle import fix_at, odometry_at, PLANE, true_pose
 from harness import PATIENCE, PREPARE_PATIENCE
-from lifecycle_msgs.msg import Transition
-from lifecycle_msgs.srv import ChangeState
 from local_node import Driver, LocalNode
 from rcl_interfaces.srv import SetParameters
 from rclpy.context import Context
@@ -30,7 +28,7 @@ from std_srvs.srv import SetBool, Trigger
 
 from pose_graph_ros.core.exceptions import ConfigError
 from pose_graph_ros.core.warm_up import warm_up
-from pose_graph_ros.ros import diagnostics, graph_file, memory, services
+from pose_graph_ros.ros import diagnostics, graph_file, services
 from pose_graph_ros.ros.node import PoseGraphNode
 from pose_graph_ros.ros.services import CLOSED, REPLACED
 from pose_graph_ros.ros.session import Session
@@ -40,13 +38,9 @@ SUCCESS, RAISED = TransitionCallbackReturn.SUCCESS, TransitionCallbackReturn.ERR
 
 
 @pytest.fixture(autouse=True, scope='module')
-def _compiled() -> Iterator[None]:
+def _compiled() -> None:
     """Compile the kernels, which may take half a minute, outside of the tests."""
     warm_up(lambda: False)
-    with pytest.MonkeyPatch.context() as patch:
-        # the process of the tests would have to read the pages again for each session
-        patch.setattr(memory, 'release_memory', lambda: None)
-        yield
 
 
 class Managed(Driver):
@@ -62,11 +56,6 @@ class Managed(Driver):
         client = self.local.client.create_client(kind, f'/pose_graph/{name}')
         self.wait(client.service_is_ready, f'{name} is there')
         return client.call_async(kind.Request() if request is None else request)
-
-    @property
-    def offered(self) -> list[str]:
-        """Names of the services of the node."""
-        return [service.service_name for service in self.local.node.services]
 
     def pause(self, *, data: bool) -> SetBool.Response:
         return self.call('pause', SetBool.Request(data=data), SetBool)
@@ -92,34 +81,6 @@ def managed(tmp_path: Path, request: pytest.FixtureRequest) -> Iterator[Managed]
         local.node.close()
 
 
-def test_it_goes_through_all_its_states_and_back(managed: Managed) -> None:
-    node = managed.local.node
-    assert node.get_parameter('autostart').value
-    managed.start()
-    managed.drive(2.0)
-    worker = managed.session.worker
-    assert node.trigger_deactivate() is SUCCESS
-    assert node.trigger_activate() is SUCCESS
-    assert managed.session.worker is worker
-    assert node.trigger_deactivate() is SUCCESS
-    assert node.trigger_cleanup() is SUCCESS
-    assert not worker.alive
-    assert list(node.subscriptions) == []
-    node.start()
-    assert managed.session.worker.estimate is None
-    assert node.trigger_shutdown() is SUCCESS
-
-
-def test_a_configuration_that_fails_says_why_and_can_be_repaired(managed: Managed) -> None:
-    node = managed.local.node
-    assert managed.set('fix.sigma_floor', [0.1, 3.0])[0] is False
-    node._given = node._given | {'fix.sigma_floor': [0.1, 3.0]}
-    with pytest.raises(ConfigError, match='sigma_floor'):
-        node.start()
-    assert managed.set('fix.sigma_floor', [0.1, 0.1]) == (True, '')
-    node.start()
-
-
 def test_a_transition_that_raises_leaves_the_node_unconfigured(
     managed: Managed, monkeypatch: pytest.MonkeyPatch,
 ) -> None:
@@ -134,16 +95,6 @@ def test_a_transition_that_raises_leaves_the_node_unconfigured(
     assert node.failure == 'OSError: no memory'
     assert node._session is None
     node.start()
-
-
-def test_a_transition_that_is_not_possible_is_answered(managed: Managed) -> None:
-    def change(transition: int) -> bool:
-        return managed.call('change_state', ChangeState.Request(
-            transition=Transition(id=transition)), ChangeState).success
-    assert not change(Transition.TRANSITION_ACTIVATE)
-    assert change(Transition.TRANSITION_CONFIGURE)
-    assert not change(Transition.TRANSITION_CONFIGURE)
-    assert change(Transition.TRANSITION_ACTIVATE)
 
 
 def test_parameters_are_checked_and_reach_the_session(managed: Managed) -> None:
@@ -270,16 +221,6 @@ def test_what_the_worker_and_the_core_log_is_the_nodes(
         '[ERROR] [pose_graph]: a measurement of fix could not be added',
         '[WARN] [pose_graph]: no folder',
         '[ERROR] [pose_graph]: a measurement of fix could not be added (7 more like it in T s)']
-
-
-def test_pause_answers_whether_it_changed_something(managed: Managed) -> None:
-    managed.start()
-    assert managed.pause(data=False).message == 'was not paused'
-    assert managed.pause(data=True).message.startswith('paused: ')
-    assert managed.session.input.paused
-    assert managed.pause(data=True).message == 'paused already'
-    assert managed.pause(data=False).message == 'resumed'
-    assert not managed.session.input.paused
 
 
 def test_a_fix_that_is_refused_is_not_the_datum(managed: Managed) -> None:
@@ -444,8 +385,8 @@ def test_a_cleanup_waits_for_no_file_and_each_request_is_answered(
     managed.wait(answer.done, 'it answers')
     assert answer.result().success
     assert (tmp_path / 'map.g2o').exists()
-    managed.wait(lambda: not any(name.endswith('save_graph')
-                                 for name in managed.offered), 'the service ends')
+    managed.wait(lambda: managed.local.client.count_services('/pose_graph/save_graph') == 0,
+                 'the service ends')
 
     node.start()
     session = managed.session

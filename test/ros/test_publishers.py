@@ -12,7 +12,6 @@ import pytest
 
 pytest.importorskip('rclpy', reason='ROS 2 is not there: no rclpy')
 
-from diagnostic_msgs.msg import DiagnosticArray
 from geometry_msgs.msg import PoseWithCovarianceStamped
 from harness import LATCHED, odometry, RELIABLE, stamp_ns, TFMessage, transform, yaw
 from hypothesis import given as given_numbers, settings, strategies as st
@@ -185,17 +184,6 @@ def test_transforms_can_be_switched_off_and_on(local: LocalNode) -> None:
     assert stamps([message.transforms[0] for message in messages]) == [2.0]
 
 
-def test_without_tf2_msgs_all_but_the_transform_is_published(
-    local: LocalNode, monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    monkeypatch.setattr(publishers_module, 'TFMessage', None)
-    given = Given(local)
-    assert given.out.transforms is None
-    poses = given.subscribe(PoseWithCovarianceStamped, 'pose')
-    given.publish(1.0)
-    given.wait_for(poses, 1)
-
-
 @needs_tf2_msgs
 @pytest.mark.parametrize(
     'event', ['correction', 'jump', 'alignment', 'new graph', 'new transform'])
@@ -271,21 +259,6 @@ def test_the_path_is_due_once_for_each_estimate_and_only_for_a_subscriber(
     assert stamps(paths[0].poses) == [1.0, 2.0]
 
 
-def test_the_published_path_has_at_most_so_many_frozen_poses_and_all_others(
-    local: LocalNode,
-) -> None:
-    path = trajectory(*range(1, 50_005))
-    frozen = 50_000
-    assert thinned(path, MOST_FROZEN) is path
-    given = Given(local)
-    paths = given.subscribe(PathMessage, 'path', latched=True)
-    given.out.publish_path(estimate(60_000.0), path, graph=0, n_frozen=frozen)
-    given.wait_for(paths, 1)
-    shown = stamps(paths[0].poses)
-    assert shown == [*range(1, frozen + 1, 3), *range(frozen + 1, frozen + 5)]
-    assert len(shown) - 4 <= MOST_FROZEN
-
-
 @settings(max_examples=30, deadline=None)
 @given_numbers(st.integers(0, 100_000), st.integers(0, 5))
 def test_frozen_poses_that_are_shown_begin_with_the_first(frozen: int, others: int) -> None:
@@ -307,19 +280,6 @@ def test_a_better_path_at_the_same_odometry_is_a_nanosecond_newer(local: LocalNo
         given.out.publish_graph(VIEW, round(seconds * SECOND), graph=0)
     given.wait_for(paths, 4)
     assert [stamp_ns(path) - 2 * SECOND for path in paths] == [0, 1, 2, SECOND]
-
-
-def test_a_late_subscriber_receives_the_newest_path_and_graph(local: LocalNode) -> None:
-    given = Given(local)
-    for seconds in (2.0, 3.0):
-        given.out.publish_path(estimate(seconds), trajectory(seconds), graph=0)
-        given.out.publish_graph(VIEW, round(seconds * SECOND), graph=0)
-    paths = given.subscribe(PathMessage, 'path', latched=True)
-    graphs = given.subscribe(MarkerArray, 'graph', latched=True)
-    given.wait_for(paths, 1)
-    given.wait_for(graphs, 1)
-    assert stamps(paths) == [3.0]
-    assert stamps(graphs[0].markers) == len(graphs[0].markers) * [3.0]
 
 
 def test_markers_are_due_after_their_period_and_only_for_a_subscriber(local: LocalNode) -> None:
@@ -360,30 +320,6 @@ def test_a_new_graph_removes_path_and_markers_and_forgets_all_stamps(local: Loca
     assert stamps(paths) == [100.0, 100.0 + 1e-9, 1.0]
     assert [item.action for item in graphs[1].markers] == [Marker.DELETEALL]
     assert stamps(graphs[2].markers)[-1] == 1.0
-
-
-@needs_tf2_msgs
-def test_a_new_graph_may_publish_older_transforms(local: LocalNode) -> None:
-    given = Given(local)
-    messages = given.subscribe(TFMessage, '/tf')
-    given.publish(100.0)
-    given.out.start_new_graph()
-    given.publish(1.0)
-    given.wait_for(messages, 2)
-    assert stamps([message.transforms[0] for message in messages]) == [100.0, 1.0]
-
-
-def test_the_diagnostics_have_the_name_of_the_node(local: LocalNode) -> None:
-    given = Given(local)
-    received = given.subscribe(DiagnosticArray, '/diagnostics')
-    given.out.publish_diagnostics(b'\x01', 'Paused.', {'received': 7, 'datum': 'none'})
-    given.wait_for(received, 1)
-    (status,) = received[0].status
-    assert (status.name, status.level, status.message) == (
-        '/pose_graph: pose graph', b'\x01', 'Paused.')
-    assert {item.key: item.value for item in status.values} == {
-        'received': '7', 'datum': 'none'}
-    assert stamp_ns(received[0]) > 0
 
 
 def test_no_publisher_is_left_after_the_end(local: LocalNode) -> None:

@@ -5,7 +5,6 @@
 from collections.abc import Iterable, Iterator
 import json
 from pathlib import Path
-import shutil
 import subprocess
 import sys
 
@@ -15,7 +14,6 @@ from rosbags.typesys import get_typestore, Stores
 from run_schema import problems
 from tum_files import read_tum
 
-from pose_graph_ros.adapters.bag_writer import BagWriter
 from pose_graph_ros.adapters.bags import open_bag
 from pose_graph_ros.cli.bag_messages import (
     fix_messages,
@@ -197,25 +195,6 @@ def test_replay_runs_without_any_ros(short_bag: Path, tmp_path: Path) -> None:
          '-o', str(tmp_path / 'out')], capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stderr
     assert (tmp_path / 'out' / 'path.tum').exists()
-
-
-def test_a_lone_file_of_sqlite_and_a_folder_give_the_same_path(
-    short_bag: Path, tmp_path: Path,
-) -> None:
-    with open_bag(short_bag) as reader, \
-            BagWriter(tmp_path / 'sqlite', storage='sqlite3') as writer:
-        for message in reader.messages(['/odom', '/gps/fix']):
-            writer.write(message.topic, message.type, message.recorded_ns, message.raw)
-    lone = tmp_path / 'lone.db3'
-    shutil.copy(next((tmp_path / 'sqlite').glob('*.db3')), lone)
-    paths = []
-    for index, source in enumerate((lone, short_bag)):
-        out = tmp_path / str(index)
-        assert main(['replay', str(source), '--odom', '/odom', '--fix', '/gps/fix',
-                     '-o', str(out)]) == 0
-        paths.append(read_tum(out / 'path.tum'))
-    assert len(paths[0]) > 50
-    assert difference(*paths) == 0.0
 
 
 @pytest.mark.parametrize(('arguments', 'expected'), [

@@ -4,7 +4,6 @@
 
 from collections.abc import Callable, Iterator
 from pathlib import Path
-import signal
 import threading
 import time
 from typing import Any
@@ -13,8 +12,7 @@ import pytest
 
 pytest.importorskip('rclpy', reason='ROS 2 is not there: no rclpy')
 
-from circle import drive, path_error
-from harness import Client, NodeProcess, PATIENCE, RELIABLE
+from harness import PATIENCE, RELIABLE
 import rclpy
 from rclpy.clock import Clock, ClockType
 from rclpy.context import Context
@@ -25,14 +23,6 @@ from std_msgs.msg import String
 from pose_graph_ros.cli.demo import isolated_environment
 from pose_graph_ros.ros import spinning
 from pose_graph_ros.ros.spinning import Spinner
-
-WITHOUT_EVENTS = '''
-import sys
-sys.modules['rclpy.experimental'] = None
-from pose_graph_ros.ros.main import main
-sys.exit(main())
-'''
-"""The node with an rclpy that has no EventsExecutor."""
 
 
 class Spun:
@@ -110,15 +100,3 @@ def test_timers_come_and_go_while_it_runs(spun: Spun) -> None:
         timer = spun.node.create_timer(0.01, replace, clock=clock)
     timer = spun.node.create_timer(0.01, replace, clock=clock)
     spun.wait(lambda: len(ticks) > 20, 'many have been made')
-
-
-def test_the_node_drives_and_answers_without_the_executor_of_events(tmp_path: Path) -> None:
-    with NodeProcess(tmp_path, program=('-c', WITHOUT_EVENTS)) as node:
-        with Client(int(node.env['ROS_DOMAIN_ID'])) as client:
-            drive(client, 10.0)
-            assert client.optimize().success
-            assert path_error(client) < 1e-2
-            assert client.set_parameter('frequency', 20.0) == (True, '')
-            assert client.trigger('reset').success
-        assert node.signal_and_wait(signal.SIGINT) == 0
-        assert 'Traceback' not in node.stderr()

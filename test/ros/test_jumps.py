@@ -2,12 +2,15 @@
 # SPDX-License-Identifier: Apache-2.0
 """Messages are held back while time may begin again; none is lost, and none mixes two times."""
 
+from types import SimpleNamespace
+
 from hypothesis import given, strategies as st
 import numpy as np
+import pytest
 
 from pose_graph_ros.core.measurements import OdometrySample, Position
 from pose_graph_ros.core.odometry.time_keeper import TimeKeeper
-from pose_graph_ros.ros.time_jump import ReceivedMessage, TimeJumps
+from pose_graph_ros.ros.jumps import PoseContinuity, ReceivedMessage, TimeJumps
 
 SECOND = 1_000_000_000
 
@@ -101,10 +104,12 @@ def test_a_gap_is_no_jump_but_a_step_back_after_it_is() -> None:
     assert decide(made(), messages) == (sent(messages), [100])
 
 
-def test_after_a_jump_of_the_clock_queued_messages_of_the_old_time_are_old() -> None:
+@pytest.mark.parametrize('back', [60, 600])
+def test_after_a_jump_of_the_clock_queued_messages_of_the_old_time_are_old(back: int) -> None:
     time_jumps = made()
     decide(time_jumps, lap(100.0, 60.0))
-    time_jumps.clock_jumped(60 * SECOND)
+    # also if the clock had run on for long without a message
+    time_jumps.clock_jumped(back * SECOND, 100 * SECOND)
     results = [time_jumps.receive(received) for received in (
         odometry(160.0), fix(159.8), odometry(100.0), fix(159.9), odometry(100.1), fix(100.1),
         fix(165.0))]
@@ -118,7 +123,7 @@ def test_new_messages_that_came_before_the_callback_of_the_clock_are_kept() -> N
     decide(time_jumps, lap(100.0, 60.0))
     early = [odometry(100.0), fix(100.0), odometry(100.1)]
     assert decide(time_jumps, early) == ([], [])
-    time_jumps.clock_jumped(60 * SECOND)
+    time_jumps.clock_jumped(60 * SECOND, 100 * SECOND)
     assert sent(time_jumps.release()) == sent(early)
     released, jumps = decide(time_jumps, lap(100.2, 5.0))
     assert len(released) == 50
@@ -160,3 +165,58 @@ def test_of_two_odometries_messages_of_the_old_time_are_not_mixed_with_the_new()
     assert decision.jump_ns > 54 * SECOND
     assert sent(decision.released) == sent(new)
     assert time_jumps.receive(odometry(105.3, 'visual')).is_old
+
+
+def drive(
+    continuity: PoseContinuity, *places: tuple[float, float], newest: float = 1e9,
+) -> list[bool]:
+    """Return whether an estimate can be propagated to places (seconds, x) along a line."""
+    estimate = SimpleNamespace(stamp_ns=newest * 1e9)
+    return [continuity.covers(estimate, OdometrySample(round(1e9 * at), np.array([x, 0.0, 0.0])))
+            for at, x in places]
+
+
+def test_no_estimate_is_propagated_over_a_jump_that_it_does_not_include() -> None:
+    continuity = PoseContinuity(60.0)
+    assert drive(continuity, *((step / 10.0, step / 10.0) for step in range(10, 50)),
+                 newest=4.9) == 40 * [True]
+    # a reset to the start
+    assert drive(continuity, (5.0, 0.0), (5.1, 0.1), newest=4.9) == [False, False]
+    assert drive(continuity, (5.2, 0.2), newest=5.0) == [True]
+
+
+def test_motion_at_the_speed_of_any_vehicle_is_no_jump() -> None:
+    for speed in (0.3, 1.0, 30.0, 55.0):
+        for period in (0.01, 0.1, 1.0):
+            places = [(1.0 + step * period, speed * step * period) for step in range(50)]
+            assert all(drive(PoseContinuity(60.0), *places)), (speed, period)
+    # starting and braking as hard as a car can, 10 m/s^2
+    places = [(1.0 + step * 0.05, 5.0 * (step * 0.05)**2) for step in range(60)]
+    assert all(drive(PoseContinuity(60.0), *places))
+
+
+def test_a_robot_is_not_faster_than_the_parameter_says() -> None:
+    places = [(1.0 + step * 0.1, 0.5 * step) for step in range(20)]
+    assert all(drive(PoseContinuity(60.0), *places))
+    assert not any(drive(PoseContinuity(1.0), *places, newest=1.0)[1:])
+    continuity = PoseContinuity(60.0)
+    assert all(drive(continuity, *places[:10], newest=1.0))
+    continuity.maximum_speed = 1.0
+    assert not any(drive(continuity, *places[10:], newest=1.0))
+
+
+def test_old_samples_and_no_estimate() -> None:
+    continuity = PoseContinuity(60.0)
+    assert drive(continuity, (2.0, 0.0), (1.0, 50.0), (2.0, 70.0), (2.1, 0.1)) == 4 * [True]
+    assert not continuity.covers(None, OdometrySample(3_000_000_000, np.zeros(3)))
+
+
+def test_one_stamp_from_the_future_does_not_stop_the_output() -> None:
+    continuity = PoseContinuity(60.0)
+    assert drive(continuity, (1.0, 0.0), (1.1, 0.1), newest=1.1) == [True, True]
+    assert drive(continuity, (31.0, 0.2), newest=1.1) == [False]
+    # the engine has an estimate with that stamp, and later drops it
+    assert drive(continuity, (1.2, 0.2), newest=31.0) == [True]
+    assert drive(continuity, (1.3, 0.3), (1.4, 0.4), newest=1.2) == [True, True]
+    # jumps are detected again
+    assert drive(continuity, (1.5, 50.0), newest=1.4) == [False]

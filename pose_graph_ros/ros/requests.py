@@ -1,13 +1,26 @@
 # Copyright 2026 The pose_graph_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""Poses that a user sets by `initialpose` or `set_pose`; imports no rclpy."""
+"""What a person asks for by messages: poses that are set, decisions on constraints; no rclpy."""
+
+from functools import partial
+import logging
 
 import numpy as np
 
 from pose_graph_ros.adapters.conversions import frame, Message, PLANAR, planar_pose, stamp_ns
+from pose_graph_ros.adapters.verdict_messages import JUDGE, read_decision
+from pose_graph_ros.core.backend import PoseGraphBackend
 from pose_graph_ros.core.estimate import Estimate
 from pose_graph_ros.core.geometry import covariance, se2
-from pose_graph_ros.core.measurements import Answer, GlobalPose, rejected, value_defect
+from pose_graph_ros.core.measurements import (
+    Answer,
+    AnswerStatus,
+    GlobalPose,
+    rejected,
+    value_defect,
+)
+from pose_graph_ros.ros.log import ANSWER
+from pose_graph_ros.ros.worker import Worker
 
 # Used if a message has no valid covariance: what RViz sends [m, m, rad].
 DEFAULT_SIGMA = (0.5, 0.5, 0.26)
@@ -78,3 +91,33 @@ class SetPoseInput:
     def forget(self) -> None:
         """Discard the pose."""
         self._waiting = None
+
+
+logger = logging.getLogger(__name__)
+
+
+def decide(message: Message, worker: Worker) -> None:
+    """
+    Hand a decision to the engine, which answers in the log; an update follows at once.
+
+    Parameters
+    ----------
+    message : diagnostic_msgs/KeyValue, the id of a constraint, and `in`, `out` or `auto`
+
+    """
+    worker.call(partial(_hand_over, message, worker), 'a decision')
+
+
+def _hand_over(message: Message, worker: Worker, backend: PoseGraphBackend) -> None:
+    """Decide in the engine, count and log its answer; for the worker's thread."""
+    read = read_decision(message)
+    answer = read if isinstance(read, Answer) else backend.decide(*read)
+    if answer.status is AnswerStatus.REJECTED:
+        backend.counts[JUDGE, answer.reason] += 1
+        logger.warning(
+            'nothing is decided: %s: %s', answer.reason, answer.detail, extra=ANSWER)
+    else:
+        backend.counts[JUDGE, 'accepted'] += 1
+        logger.info('%s', answer.detail or f'{message.key}: {message.value}')
+    # asked for here, as jobs are done after an update that was asked for before
+    worker.request_update()

@@ -1,15 +1,13 @@
 # Copyright 2026 The pose_graph_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""Silent sources, and jumps over which no estimate is propagated: both without a node."""
+"""Silent sources, and sources that all is refused from: both without a node."""
 
-from types import SimpleNamespace
+from collections import Counter
 
 import numpy as np
 import pytest
 
-from pose_graph_ros.core.measurements import OdometrySample
-from pose_graph_ros.ros.liveness import Liveness
-from pose_graph_ros.ros.pose_continuity import PoseContinuity
+from pose_graph_ros.ros.arrivals import LEAST_REFUSALS, Liveness, Refusals, REFUSED_FOR
 
 
 def receive_all(liveness: Liveness, source: str, start: float, end: float, period: float) -> None:
@@ -131,56 +129,64 @@ def test_it_is_said_when_nothing_comes_at_all() -> None:
     assert slow.quiet(320.0) == 120.0
 
 
-def drive(
-    continuity: PoseContinuity, *places: tuple[float, float], newest: float = 1e9,
-) -> list[bool]:
-    """Return whether an estimate can be propagated to places (seconds, x) along a line."""
-    estimate = SimpleNamespace(stamp_ns=newest * 1e9)
-    return [continuity.covers(estimate, OdometrySample(round(1e9 * at), np.array([x, 0.0, 0.0])))
-            for at, x in places]
+NOTHING = {}
 
 
-def test_no_estimate_is_propagated_over_a_jump_that_it_does_not_include() -> None:
-    continuity = PoseContinuity(60.0)
-    assert drive(continuity, *((step / 10.0, step / 10.0) for step in range(10, 50)),
-                 newest=4.9) == 40 * [True]
-    # a reset to the start
-    assert drive(continuity, (5.0, 0.0), (5.1, 0.1), newest=4.9) == [False, False]
-    assert drive(continuity, (5.2, 0.2), newest=5.0) == [True]
+class Counts:
+    """What a node has counted, with the time in seconds."""
+
+    def __init__(self) -> None:
+        self.refusals, self.now = Refusals(), 50.0
+        self.received, self.counts, self.details = Counter(), Counter(), {}
+
+    def add(self, source: str, answer: str, count: int = 1, detail: str = '') -> None:
+        self.received[source] += count
+        self.counts[source, answer] += count
+        if answer != 'accepted':
+            self.details[source, answer] = detail
+
+    def said(self, seconds: float = 0.0) -> dict[str, str]:
+        self.now += seconds
+        return self.refusals.update(self.received, self.counts, self.details, self.now)
 
 
-def test_motion_at_the_speed_of_any_vehicle_is_no_jump() -> None:
-    for speed in (0.3, 1.0, 30.0, 55.0):
-        for period in (0.01, 0.1, 1.0):
-            places = [(1.0 + step * period, speed * step * period) for step in range(50)]
-            assert all(drive(PoseContinuity(60.0), *places)), (speed, period)
-    # starting and braking as hard as a car can, 10 m/s^2
-    places = [(1.0 + step * 0.05, 5.0 * (step * 0.05)**2) for step in range(60)]
-    assert all(drive(PoseContinuity(60.0), *places))
+def test_a_source_from_which_nothing_was_ever_accepted() -> None:
+    counts = Counts()
+    assert counts.said() == NOTHING
+    counts.add('odom', 'zero_stamp', LEAST_REFUSALS - 1, 'got 0 ns')
+    assert counts.said() == NOTHING
+    counts.add('odom', 'zero_stamp', 15, 'got 0 ns')
+    counts.add('odom', 'not_finite', 3, 'position (nan, 0)')
+    counts.add('fix', 'accepted')
+    assert counts.said() == {'odom': (
+        '20 of 20 messages of odom were refused: 17 times zero_stamp (got 0 ns); '
+        '3 times not_finite (position (nan, 0))')}
+    counts.add('odom', 'accepted')
+    assert counts.said() == NOTHING
 
 
-def test_a_robot_is_not_faster_than_the_parameter_says() -> None:
-    places = [(1.0 + step * 0.1, 0.5 * step) for step in range(20)]
-    assert all(drive(PoseContinuity(60.0), *places))
-    assert not any(drive(PoseContinuity(1.0), *places, newest=1.0)[1:])
-    continuity = PoseContinuity(60.0)
-    assert all(drive(continuity, *places[:10], newest=1.0))
-    continuity.maximum_speed = 1.0
-    assert not any(drive(continuity, *places[10:], newest=1.0))
+def test_a_source_from_which_nothing_is_accepted_any_more() -> None:
+    counts = Counts()
+    counts.add('fix', 'no_fix', 7, 'no fix')
+    counts.add('fix', 'accepted', 30)
+    assert counts.said() == NOTHING
+    counts.add('fix', 'no_fix', 9, 'no fix')
+    assert counts.said() == NOTHING
+    assert counts.said(REFUSED_FOR + 0.1) == {
+        'fix': 'the newest 9 messages of fix were refused: no_fix (no fix)'}
+    # some of them are good
+    counts.add('fix', 'no_fix', 9, 'no fix')
+    counts.add('fix', 'accepted')
+    assert counts.said() == counts.said(REFUSED_FOR + 0.1) == NOTHING
 
 
-def test_old_samples_and_no_estimate() -> None:
-    continuity = PoseContinuity(60.0)
-    assert drive(continuity, (2.0, 0.0), (1.0, 50.0), (2.0, 70.0), (2.1, 0.1)) == 4 * [True]
-    assert not continuity.covers(None, OdometrySample(3_000_000_000, np.zeros(3)))
-
-
-def test_one_stamp_from_the_future_does_not_stop_the_output() -> None:
-    continuity = PoseContinuity(60.0)
-    assert drive(continuity, (1.0, 0.0), (1.1, 0.1), newest=1.1) == [True, True]
-    assert drive(continuity, (31.0, 0.2), newest=1.1) == [False]
-    # the engine has an estimate with that stamp, and later drops it
-    assert drive(continuity, (1.2, 0.2), newest=31.0) == [True]
-    assert drive(continuity, (1.3, 0.3), (1.4, 0.4), newest=1.2) == [True, True]
-    # jumps are detected again
-    assert drive(continuity, (1.5, 50.0), newest=1.4) == [False]
+def test_what_was_asked_for_and_what_is_no_refusal_is_not_said() -> None:
+    counts = Counts()
+    counts.add('fix', 'paused', 100, 'call ~/pause')
+    counts.add('global_pose', 'accepted')
+    counts.add('global_pose', 'thinned', 100, 'too close')
+    counts.received['odom'] = counts.counts['odom', 'sorted'] = 100
+    assert counts.said() == counts.said(REFUSED_FOR + 0.1) == NOTHING
+    counts.counts['set_pose', 'wrong_frame'] = 9
+    counts.details['set_pose', 'wrong_frame'] = 'expected map'
+    assert counts.said() == NOTHING

@@ -1,0 +1,231 @@
+# Copyright 2026 The pose_graph_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""What is noticed as messages arrive: rates, silence, delays and refusals of sources; no rclpy."""
+
+from collections import Counter, deque
+from collections.abc import Collection, Mapping
+from dataclasses import dataclass, field
+import math
+
+from pose_graph_ros.core.odometry.time_keeper import EVIDENCE, EVIDENCE_NS, LATEST_NS
+
+# A source is silent after the longest of this time [s], this many of its median gaps between two
+# messages, and this many times the second longest of its gaps and of its pauses.
+LEAST_SILENCE, MEDIANS, LONGEST = 2.0, 5.0, 3.0
+GAPS, ENOUGH = 50, 5  # number of gaps that are kept, and that make a rhythm
+# A pause, which is a much longer gap, is remembered for this many times its length. One may be a
+# failure of the driver; two show a source that comes and goes.
+MEMORY = 20.0
+QUIET = 10.0  # longest time without a message from any source that is not said [s]
+
+
+@dataclass(slots=True)
+class _Arrivals:
+    at: float  # time of the newest message [s]
+    since: float  # the same, or later if the node was inactive meanwhile [s]
+    gaps: deque[float] = field(default_factory=lambda: deque(maxlen=GAPS))
+    pauses: list[tuple[float, float]] = field(default_factory=list)  # ends and lengths [s]
+
+    @property
+    def usual(self) -> float:
+        """Longest gap that is no pause [s]; infinite before there is a rhythm."""
+        if len(self.gaps) < ENOUGH:
+            return math.inf
+        gaps = sorted(self.gaps)
+        return max(LEAST_SILENCE, MEDIANS * gaps[len(gaps) // 2], LONGEST * gaps[-2])
+
+    def patience(self, now: float) -> float:
+        """Return the longest gap that is no silence [s]."""
+        self.pauses = [pause for pause in self.pauses if now - pause[0] < MEMORY * pause[1]]
+        second = sorted((0.0, 0.0, *(length for _, length in self.pauses)))[-2]
+        return max(self.usual, LONGEST * second)
+
+    def receive(self, now: float) -> None:
+        gap = now - self.at
+        if self.since == self.at:
+            # the least is compared first, as this is called at the rate of the messages
+            if gap > LEAST_SILENCE and gap > self.usual:
+                self.pauses.append((now, gap))
+            else:
+                self.gaps.append(gap)
+        self.at = self.since = now
+
+    def is_active(self, now: float) -> bool:
+        patience = self.patience(now)
+        return now - self.since <= (patience if math.isfinite(patience) else QUIET)
+
+
+class Liveness:
+    """Times of the messages of each source; the silence of those that are rare means nothing."""
+
+    def __init__(self, rare: Collection[str] = ()) -> None:
+        self._rare = frozenset(rare)
+        self._arrivals: dict[str, _Arrivals] = {}
+
+    def receive(self, source: str, now: float) -> None:
+        """
+        Record that a message came.
+
+        Parameters
+        ----------
+        now : float, by a monotonic clock, here and below [s]
+
+        """
+        arrivals = self._arrivals.get(source)
+        if arrivals is None:
+            self._arrivals[source] = _Arrivals(now, now)
+        else:
+            arrivals.receive(now)
+
+    def resume(self, now: float) -> None:
+        """Let all silences begin at a time [s], since nothing could be received before."""
+        for arrivals in self._arrivals.values():
+            arrivals.since = now
+
+    def silence(self, source: str, now: float) -> float | None:
+        """
+        Return the time since the last message of a source [s]; None before the first.
+
+        Parameters
+        ----------
+        now : float
+
+        """
+        arrivals = self._arrivals.get(source)
+        return None if arrivals is None else now - arrivals.at
+
+    def rate(self, source: str) -> float:
+        """Return the present rate of a source [Hz]; 0 before its second message."""
+        arrivals = self._arrivals.get(source)
+        total = 0.0 if arrivals is None else sum(arrivals.gaps)
+        return 0.0 if arrivals is None or total <= 0.0 else len(arrivals.gaps) / total
+
+    def silent(self, now: float) -> list[str]:
+        """Return the sources that are silent at a time [s] at which another one is not."""
+        newest = max((arrivals.at for arrivals in self._arrivals.values()
+                      if arrivals.is_active(now)), default=-math.inf)
+        return sorted(name for name, arrivals in self._arrivals.items()
+                      if name not in self._rare
+                      and newest - arrivals.since > arrivals.patience(now))
+
+    def quiet(self, now: float) -> float:
+        """Return for how long no source has sent anything [s]; 0 if that is not long, or never."""
+        if len(self._arrivals) == 0 or any(
+                arrivals.is_active(now) for arrivals in self._arrivals.values()):
+            return 0.0
+        silence = now - max(arrivals.since for arrivals in self._arrivals.values())
+        return silence if silence > QUIET else 0.0
+
+
+@dataclass(slots=True)
+class _Delay:
+    seconds: float = 0.0  # of the newest message
+    n: int = 0  # number of the last messages that are too far ahead or behind
+    since_ns: int = 0  # stamp of odometry at the first of them
+
+
+class Delays:
+    """Compares stamps with the newest one of odometry, when they come."""
+
+    def __init__(self) -> None:
+        self._delays: dict[str, _Delay] = {}
+        self.wrong: dict[str, str] = {}
+        """What is to be said of sources whose stamps are wrong, in sentences."""
+
+    @property
+    def seconds(self) -> dict[str, float]:
+        """How late the newest message of each source was; less than 0 for ahead [s]."""
+        return {source: each.seconds for source, each in self._delays.items()}
+
+    def receive(
+        self, source: str, stamp_ns: int, clock: tuple[str, int], *, may_be_late: bool,
+    ) -> None:
+        """
+        Compare a stamp.
+
+        Parameters
+        ----------
+        clock : tuple, the odometry that is compared with, and its newest stamp [ns]
+        may_be_late : bool, whether the source may take any time to measure
+
+        """
+        odometry, clock_ns = clock
+        if odometry in ('', source):
+            return
+        delay, late_ns = self._delays.setdefault(source, _Delay()), clock_ns - stamp_ns
+        delay.seconds = 1e-9 * late_ns
+        if late_ns >= -LATEST_NS and (may_be_late or late_ns <= LATEST_NS):
+            delay.n = 0
+            self.wrong.pop(source, None)
+            return
+        if delay.n == 0:
+            delay.since_ns = clock_ns
+        delay.n += 1
+        # odometry that is silent has fallen behind itself
+        if delay.n >= EVIDENCE and clock_ns - delay.since_ns >= EVIDENCE_NS:
+            way = 'ahead of' if late_ns < 0 else 'behind'
+            waits = ', for which its measurements wait' if may_be_late else ''
+            self.wrong[source] = (
+                f'The stamps of {source} are {abs(delay.seconds):.1f} s {way} those of {odometry}'
+                f'{waits}: mend the clock of its driver (GPS time is 18 s ahead of UTC), or set '
+                f'{source}.time_offset')
+
+
+LEAST_REFUSALS = 3  # number of refused messages from which a source is reported
+REFUSED_FOR = 5.0  # time since its last accepted message from which it is, if there was one [s]
+INTENDED = ('paused', 'thinned')  # reasons that the user has asked for
+
+
+@dataclass(frozen=True, slots=True)
+class _Accepted:
+    """The state when the newest message was accepted."""
+
+    count: int = 0
+    at: float = 0.0  # [s]
+    refused: Mapping[str, int] = field(default_factory=dict)  # by reason
+
+
+class Refusals:
+    """Follows the counts of all sources, to tell those that nothing is accepted from any more."""
+
+    def __init__(self) -> None:
+        self._accepted: dict[str, _Accepted] = {}
+
+    def update(
+        self, received: Mapping[str, int], counts: Counter[tuple[str, str]],
+        details: Mapping[tuple[str, str], str], now: float,
+    ) -> dict[str, str]:
+        """
+        Return what to say of the sources of which the newest messages were all refused.
+
+        Parameters
+        ----------
+        received : mapping, number of messages by source
+        counts : Counter, number of messages by source and 'accepted' or a reason
+        details : mapping, of the newest refusal by source and reason
+        now : float, by a monotonic clock [s]
+
+        """
+        said = {}
+        for source, total in received.items():
+            refused = {reason: counts[name, reason] for name, reason in details
+                       if name == source and reason not in INTENDED}
+            accepted, before = counts[source, 'accepted'], self._accepted.get(source, _Accepted())
+            if accepted > before.count:
+                self._accepted[source] = before = _Accepted(accepted, now, refused)
+            newest = Counter({reason: count - before.refused.get(reason, 0)
+                              for reason, count in refused.items()})
+            count = newest.total()
+            if count >= LEAST_REFUSALS and (accepted == 0 or now - before.at > REFUSED_FOR):
+                begin = f'{count} of {total}' if accepted == 0 else f'the newest {count}'
+                said[source] = (f'{begin} messages of {source} were refused: '
+                                f'{_reasons(source, newest, details)}')
+        return said
+
+
+def _reasons(source: str, counts: Counter[str], details: Mapping[tuple[str, str], str]) -> str:
+    """Return all reasons with the newest detail of each, the most frequent first."""
+    found = [(reason, count) for reason, count in counts.most_common() if count > 0]
+    return '; '.join(
+        (f'{count} times ' if len(found) > 1 else '') + f'{reason} ({details[source, reason]})'
+        for reason, count in found)
