@@ -54,9 +54,8 @@ from pose_graph_ros.cli.judgement import judgement, judgement_lines
 from pose_graph_ros.cli.live import LivePoses
 from pose_graph_ros.cli.progress import WatchedBag
 from pose_graph_ros.cli.results import collect_drive, with_refused, write_results
-from pose_graph_ros.cli.run.content import Run
 from pose_graph_ros.cli.run.document import document, write_document
-from pose_graph_ros.cli.run.recorder import Recorder, Update
+from pose_graph_ros.cli.run.recorder import Recorder, Run, Update
 from pose_graph_ros.core.backend import PoseGraphBackend
 from pose_graph_ros.core.batch.optimizer import Status
 from pose_graph_ros.core.estimate import Estimate, UpdateReport
