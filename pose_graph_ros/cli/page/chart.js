@@ -132,7 +132,7 @@ function drawRules({ctx, bbox, valToPos}, rules) {
     const right = of === 'x' && place > left + 0.6 * width;
     ctx.textAlign = right ? 'right' : 'left';
     ctx.fillText(name, begin[0] + (right ? -5 : 5) * ratio,
-      begin[1] + (of === 'x' ? 14 * (k + 1) : -5) * ratio);
+      begin[1] + (of === 'x' ? 14 * (k + 1) : (place < top + 20 * ratio ? 15 : -5)) * ratio);
   }
   ctx.restore();
 }

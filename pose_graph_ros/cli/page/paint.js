@@ -10,6 +10,7 @@ const Painted = L.Renderer.extend({
   _destroyContainer() {
     this._container.remove();
   },
+  /** Leaflet calls this when the map has come to rest. */
   _update() {
     if (this._map._animatingZoom && this._bounds) return;
     L.Renderer.prototype._update.call(this);
