@@ -44,9 +44,8 @@ from pose_graph_ros.cli.exports import (
 from pose_graph_ros.cli.graph_input import GRAPH_SUFFIXES, read_measurements
 from pose_graph_ros.cli.progress import WatchedBag
 from pose_graph_ros.cli.results import collect_drive, with_refused, write_results
-from pose_graph_ros.cli.run.content import Run
 from pose_graph_ros.cli.run.document import document, write_document
-from pose_graph_ros.cli.run.recorder import Recorder, Update
+from pose_graph_ros.cli.run.recorder import Recorder, Run, Update
 from pose_graph_ros.core.backend import PoseGraphBackend
 from pose_graph_ros.core.batch.optimizer import Status
 from pose_graph_ros.core.estimate import Estimate, UpdateReport

@@ -14,7 +14,7 @@ from pose_graph_ros.adapters.bags import BagError
 from pose_graph_ros.cli import options as shared, replay
 from pose_graph_ros.cli.arguments import Exports
 from pose_graph_ros.cli.page.render import render
-from pose_graph_ros.cli.run.reading import FILE, read_document
+from pose_graph_ros.cli.run.document import FILE, read_document
 from pose_graph_ros.core.exceptions import ConfigError, FileFormatError
 
 SUMMARY = ('title', 'subtitle', 'start', 'duration', 'facts', 'findings', 'error_table', 'sources',

@@ -17,15 +17,15 @@ from pose_graph_ros.adapters.sources import Kind
 from pose_graph_ros.cli.evaluation import Drive, evaluate, place_truth
 from pose_graph_ros.cli.replay import run_measurements
 from pose_graph_ros.cli.run import places
-from pose_graph_ros.cli.run.content import Run
 from pose_graph_ros.cli.run.document import document
-from pose_graph_ros.cli.run.lines import number, rounded, simplified
-from pose_graph_ros.cli.run.measurement_findings import silences
+from pose_graph_ros.cli.run.findings import silences
+from pose_graph_ros.cli.run.places import number, rounded, simplified
 from pose_graph_ros.cli.run.recorder import (
     Arrivals,
     MOST_SILENCES,
     MOST_UPDATES,
     Recorder,
+    Run,
     Update,
     UpdateLog,
 )

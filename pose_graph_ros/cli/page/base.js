@@ -1,7 +1,7 @@
 // Copyright 2026 The pose_graph_ros authors
 // SPDX-License-Identifier: Apache-2.0
-// What all parts of the page use: elements, numbers as people read them, ticks, colours, and the
-// one place that knows which time and which measurement the reader looks at.
+// What all parts of the page use: elements, colours, numbers as people read them, the looks of
+// states, and the one place that knows which time and which measurement the reader looks at.
 
 const DATA = JSON.parse(document.getElementById('data').textContent);
 const STATES = DATA.states ||
@@ -24,15 +24,10 @@ function fill(node, properties, children) {
   for (const [name, value] of Object.entries(properties || {})) {
     if (value === null || value === undefined || value === false) continue;
     if (name.startsWith('on')) node.addEventListener(name.slice(2), value);
-    else if (name === 'style') styleOf(node, value);
     else node.setAttribute(name, value === true ? '' : value);
   }
   node.append(...children.flat().filter((child) => child !== null && child !== undefined));
   return node;
-}
-
-function styleOf(node, values) {
-  for (const [name, value] of Object.entries(values)) node.style.setProperty(name, value);
 }
 
 /** Make a section of the page with a heading, and put it on the page. */
@@ -44,47 +39,34 @@ function section(id, title, lead) {
 }
 
 /** A line that says why there is nothing to see. */
-function nothing(why) {
-  return make('p', {class: 'nothing'}, why);
+const nothing = (why) => make('p', {class: 'nothing'}, why);
+
+/** A link to a place of the page, from which the keyboard goes on. */
+function linkTo(id, text) {
+  return make('a', {href: `#${encodeURIComponent(id)}`, onclick: (event) => {
+    event.preventDefault();
+    const node = document.getElementById(id);
+    if (node) bringIntoView(node, 'start');
+    if (node) node.focus({preventScroll: true});
+  }}, text);
 }
 
-/** Scroll to an element of the page and let the keyboard go on from there. */
-function goTo(node) {
-  if (!node) return;
-  node.scrollIntoView({behavior: CALM.matches ? 'auto' : 'smooth', block: 'start'});
-  node.focus({preventScroll: true});
+function bringIntoView(node, block) {
+  node.scrollIntoView({behavior: CALM.matches ? 'auto' : 'smooth', block});
 }
 
-/** An element for a canvas that follows its size and the resolution of the screen. */
-function canvasIn(host, properties, paint) {
-  const canvas = make('canvas', properties);
-  host.append(canvas);
-  const context = canvas.getContext('2d');
-  const surface = {canvas, context, width: 0, height: 0, due: false};
-  surface.paint = (ratio = window.devicePixelRatio || 1) => {
-    surface.due = false;
-    surface.width = canvas.clientWidth;
-    surface.height = canvas.clientHeight;
-    const [width, height] = [surface.width, surface.height].map((size) => Math.round(size * ratio));
-    if (width === 0 || height === 0) return;
-    if (canvas.width !== width || canvas.height !== height) Object.assign(canvas, {width, height});
-    context.setTransform(ratio, 0, 0, ratio, 0, 0);
-    context.clearRect(0, 0, surface.width, surface.height);
-    paint(surface);
-  };
-  surface.later = () => {
-    if (!surface.due) requestAnimationFrame(() => surface.paint());
-    surface.due = true;
-  };
-  new ResizeObserver(surface.later).observe(canvas);
-  surfaces.push(surface);
-  return surface;
+/** A table; the first cell of each row is its heading. */
+function table(look, heads, rows) {
+  return make('div', {class: `scrolls ${look}`}, make('table', {},
+    make('thead', {}, make('tr', {}, heads.map((text) => make('th', {scope: 'col'}, text)))),
+    make('tbody', {}, rows.map(([first, ...cells]) => make('tr', {},
+      make('th', {scope: 'row'}, first), cells.map((cell) => make('td', {}, cell)))))));
 }
-
-const surfaces = [];
 
 // --- colours ------------------------------------------------------------------------------------
 
+/** How to paint again what does not follow the colours and the size of the page by itself. */
+const repaints = [];
 let palette = {};
 
 /** The value of a colour of report.css in the scheme that is shown. */
@@ -99,10 +81,7 @@ function colour(name) {
 function setScheme(name) {
   document.documentElement.dataset.scheme = name;
   palette = {};
-  for (const surface of surfaces) {
-    if (surface.reset) surface.reset();
-    surface.paint();
-  }
+  for (const repaint of repaints) repaint();
 }
 
 // --- numbers ------------------------------------------------------------------------------------
@@ -122,7 +101,6 @@ function number(value, digits = 3) {
 
 /** A length in the unit in which it is easily read. */
 function length(metres, digits = 3) {
-  if (!known(metres)) return '–';
   const size = Math.abs(metres);
   if (size >= 1000) return `${number(metres / 1000, digits)} km`;
   if (size < 0.01 && size > 0) return `${number(metres * 1000, digits)} mm`;
@@ -130,19 +108,18 @@ function length(metres, digits = 3) {
   return `${number(metres, digits)} m`;
 }
 
-const degrees = (radians) => (radians * 180) / Math.PI;
+const degrees = (radians) => (known(radians) ? (radians * 180) / Math.PI : null);
 
 /** Seconds since the start, as `12.3 s` or `2:03.4` or `1:02:03`. */
 function clock(seconds, digits = 1) {
   if (!known(seconds)) return '–';
   if ((DATA.duration || 0) < 120) return `${seconds.toFixed(digits)} s`;
   const ticks = Math.round(Math.abs(seconds) * 10 ** digits);
-  const rest = (ticks / 10 ** digits) % 60;
+  const rest = ((ticks / 10 ** digits) % 60).toFixed(digits);
   const minutes = Math.floor(ticks / 10 ** digits / 60);
-  const tail = rest.toFixed(digits).padStart(digits > 0 ? digits + 3 : 2, '0');
   const head = minutes < 60 ? `${minutes}`
     : `${Math.floor(minutes / 60)}:${String(minutes % 60).padStart(2, '0')}`;
-  return `${seconds < 0 ? '-' : ''}${head}:${tail}`;
+  return `${seconds < 0 ? '-' : ''}${head}:${rest.padStart(digits > 0 ? digits + 3 : 2, '0')}`;
 }
 
 const clockUnit = () => ((DATA.duration || 0) < 120 ? 's'
@@ -158,51 +135,6 @@ function timeOfDay(seconds) {
 /** `1 closure`, `2 closures`. */
 const counted = (count, one, many = `${one}s`) => `${number(count, 6)} ${count === 1 ? one : many}`;
 
-// --- ticks --------------------------------------------------------------------------------------
-
-/** The step of 1, 2 or 5 times a power of ten that is at least this large. */
-function niceStep(step) {
-  const power = 10 ** Math.floor(Math.log10(step));
-  return [1, 2, 5, 10].map((each) => each * power).find((each) => each >= step * 0.9999);
-}
-
-/** Values for about `count` ticks on an axis from low to high. */
-function ticks(low, high, count) {
-  const step = niceStep((high - low) / Math.max(count, 1));
-  return multiples(step, low, high);
-}
-
-function multiples(step, low, high) {
-  const found = [];
-  for (let k = Math.ceil(low / step - 1e-9); k <= high / step + 1e-9; k += 1) {
-    found.push(Number((k * step).toPrecision(12)));
-  }
-  return found;
-}
-
-/** The same for seconds, in steps of minutes where these are many. */
-function timeTicks(low, high, count) {
-  const span = (high - low) / Math.max(count, 1);
-  const steps = [60, 120, 300, 600, 900, 1800, 3600, 7200, 18000, 36000, 86400];
-  if ((DATA.duration || 0) < 120 || span < 5) return ticks(low, high, count);
-  return multiples([5, 10, 20, 30, ...steps].find((each) => each >= span) || span, low, high);
-}
-
-/** The same for an axis that is logarithmic: powers of ten, and 2 and 5 of each if they are few. */
-function logTicks(low, high, count) {
-  const [first, last] = [Math.floor(Math.log10(low)), Math.ceil(Math.log10(high))];
-  const every = Math.max(1, Math.ceil((last - first) / Math.max(count, 1)));
-  const factors = last - first <= count / 2.5 ? [1, 2, 5] : [1];
-  const found = [];
-  for (let power = first; power <= last; power += every) {
-    for (const factor of factors) {
-      const value = Number((factor * 10 ** power).toPrecision(3));
-      if (value >= low * 0.999 && value <= high * 1.001) found.push(value);
-    }
-  }
-  return found;
-}
-
 /** The smallest and the largest of all known values. */
 function extent(...columns) {
   let [low, high] = [Infinity, -Infinity];
@@ -215,14 +147,32 @@ function extent(...columns) {
   return low <= high ? [low, high] : null;
 }
 
-/** The place in an ascending column of the value nearest to one. */
-function nearest(column, value) {
-  let [low, high] = [0, column.length - 1];
-  while (high - low > 1) {
-    const middle = (low + high) >> 1;
-    if (column[middle] <= value) low = middle; else high = middle;
-  }
-  return value - column[low] <= column[high] - value ? low : high;
+// --- looks --------------------------------------------------------------------------------------
+
+// States differ by colour, shape and dashes, so that no one needs the colours. Shapes are paths
+// of SVG around (0, 0), in pixels; `open` ones are not filled.
+const CIRCLE = 'M-3.6,0a3.6,3.6 0 1,0 7.2,0a3.6,3.6 0 1,0 -7.2,0Z';
+const LOOKS = [
+  {colour: 'believed', shape: CIRCLE, dash: []},
+  {colour: 'believed', shape: CIRCLE, open: true, dash: [9, 4]},
+  {colour: 'waiting', shape: 'M0,-4.6L4.3,3.2H-4.3Z', open: true, dash: [2, 4]},
+  {colour: 'doubted', shape: 'M-3.8,-3.8L3.8,3.8M-3.8,3.8L3.8,-3.8', open: true, dash: [7, 3, 2, 3]},
+  {colour: 'refused', shape: 'M-3.6,-3.6H3.6V3.6H-3.6Z', open: true, dash: [3, 3]},
+  {colour: 'held-out', shape: 'M0,-5L4.2,0L0,5L-4.2,0Z', dash: [12, 3]},
+];
+const [BELIEVED, WEAK, WAITING, DOUBTED, REFUSED, HELD_OUT] = LOOKS.keys();
+const lookOf = (state) => LOOKS[state] || LOOKS[0];
+
+/** A small picture of a mark or of a line, for lists. */
+function swatch({colour: name, shape, dash, width, area, open}) {
+  const stroke = `var(--${name})`;
+  return draw('svg', {class: 'swatch', viewBox: '-13 -7 26 14', 'aria-hidden': 'true'},
+    area ? draw('rect', {x: -11, y: -5, width: 22, height: 10, rx: 2, fill: stroke,
+      'fill-opacity': area}) : null,
+    dash ? draw('line', {x1: -12, x2: 12, y1: 0, y2: 0, stroke, 'stroke-width': width || 1.6,
+      'stroke-dasharray': dash.join(' ')}) : null,
+    shape ? draw('path', {d: shape, stroke, 'stroke-width': 1.7,
+      fill: open ? 'var(--surface)' : stroke}) : null);
 }
 
 // --- what the reader looks at -------------------------------------------------------------------
@@ -230,9 +180,9 @@ function nearest(column, value) {
 const focus = {time: null, item: null};
 const followers = {time: [], item: []};
 
-/** Let all charts and the map mark a time [s], or none. */
+/** Let all charts and the map mark a time [s]. */
 function lookAtTime(time) {
-  if (focus.time === time) return;
+  if (focus.time === time || !known(time)) return;
   focus.time = time;
   for (const follow of followers.time) follow(time);
 }

@@ -1,430 +1,412 @@
 // Copyright 2026 The pose_graph_ros authors
 // SPDX-License-Identifier: Apache-2.0
-// The section with the map: the picture, its controls, the layers, the time and the panel.
+// The map: Leaflet moves and zooms it, in metres (latitude is y, longitude is x). What is on it is
+// painted on two canvases: the layers, when the map has come to rest, and above them what follows
+// the reader. Measurements and springs are items: what a click finds and the panel shows.
 
-/** Put the map on the page; returns what other sections do with it. */
+/** Put the map on the page; returns how to choose an item. */
 function showMap() {
-  const lines = DATA.lines || {};
   const host = section('map', 'Map');
-  if (!lines.corrected || lines.corrected.x.length === 0) {
+  const path = (DATA.lines || {}).corrected;
+  if (!path || path.x.length === 0) {
     host.append(nothing('No path: the run made no hidden nodes.'));
-    return {choose: () => {}};
+    return () => {};
   }
-  const layers = makeLayers();
-  const stage = make('div', {class: 'stage'});
-  const side = make('div', {class: 'side'});
-  host.append(make('div', {class: 'map-grid'}, make('div', {class: 'map-main'}, stage), side));
-
-  const frame = {view: null, width: 0, height: 0, points: 0,
-    picture: {canvas: document.createElement('canvas'), seen: null, painted: 0,
-      oldest: OLDEST}};
-  const surface = canvasIn(stage, {
-    id: 'map-canvas', class: 'map', tabindex: '0', role: 'application',
+  const stage = make('div', {class: 'stage', id: 'stage', role: 'application',
     'aria-roledescription': 'map',
     'aria-label': 'Map of the drive. Arrow keys pan, plus and minus zoom, 0 shows all, Enter '
-      + 'chooses what is nearest to the middle, Escape chooses nothing.',
-  }, ({width, height}) => {
-    if (width !== frame.width || height !== frame.height) {
-      // as much is seen as before, and all if all was seen
-      const change = Math.min(width / frame.width, height / frame.height);
-      if (frame.width === 0 || view.fits(box, frame)) view.fit(box, false);
-      else view.set(view.x, view.y, view.scale * change);
-      Object.assign(frame, {width, height});
-    }
-    paintMap(layers, surface, frame);
-  });
-  surface.reset = () => { frame.picture.seen = null; };
-  const view = makeView(surface, () => {
-    surface.canvas.dataset.view = `${view.x} ${view.y} ${view.scale}`;
-    surface.later();
-  });
-  frame.view = view;
+      + 'chooses what is nearest to the middle, Escape chooses nothing.'});
+  const main = make('div', {}, stage);
+  const side = make('div', {class: 'side'});
+  host.append(make('div', {class: 'map-grid'}, main, side));
+  const layers = makeLayers();
+  const items = layers.flatMap((layer) => layer.items || []);
+  const map = L.map(stage, {crs: L.CRS.Simple, zoomSnap: 0, minZoom: -14, maxZoom: 8,
+    attributionControl: false, keyboardPanDelta: 60, bounceAtZoomLimits: false,
+    wheelPxPerZoomLevel: 120, inertia: !CALM.matches, zoomAnimation: !CALM.matches});
+  if (CALM.matches) {
+    map.panBy = (offset) => L.Map.prototype.panBy.call(map, offset, {animate: false});
+  }
   const box = boxOf(layers);
-  const fit = () => view.fit(box);
-
-  const choose = (item) => {
-    const layer = layers.find((each) => (item.spring ? each.id === 'springs'
-      : each.table === item.table));
-    if (layer) {
-      layer.shown = true;
-      if (layer.states) layer.states.add(item.state);
-    }
-    for (const update of updates) update();
-    surface.reset();
-    lookAtItem(item);
-    if (item.times.length > 0) lookAtTime(item.times[item.times.length - 1]);
-    centreOn(item, view, surface, box);
+  let fitted = null;
+  const fit = () => {
+    map.fitBounds(box, {padding: [30, 35], animate: false});
+    fitted = map.getZoom();
   };
-  const label = make('div', {class: 'readout', hidden: true});
-  stage.append(label);
-  addGestures(surface, view, {
-    onFit: fit,
-    onPick: (u, v, within) => {
-      const item = pick(layers, view, u, v, within);
-      lookAtItem(item);
-      if (!item) return;
-      lookAtTime(item.times[item.times.length - 1]);
-      bringIntoView(document.getElementById('panel'));
-    },
-    onHover: (u, v) => hover(layers, view, surface, lines.corrected, label, u, v),
+  fit();
+  const below = new Painted({padding: 0.25, paint: (...of) => {
+    paintLayers(layers, ...of);
+    // of two canvases the upper one hides the other on paper
+    if (document.documentElement.classList.contains('paper')) paintFocus(path, ...of);
+  }}).addTo(map);
+  const above = new Painted({padding: 0, paint: (...of) => paintFocus(path, ...of)}).addTo(map);
+  L.control.scale({imperial: false, position: 'bottomright'}).addTo(map);
+  const axes = DATA.axes || ['x', 'y'];
+  stage.append(make('p', {class: 'axes'}, `↑ ${axes[1]} [m] → ${axes[0]} [m]`));
+  stage.querySelector('.leaflet-control-zoom').append(make('a', {href: '#', role: 'button',
+    title: 'Show all', 'aria-label': 'Show all', onclick: (event) => {
+      event.preventDefault();
+      fit();
+    }}, 'all'));
+  const tell = () => {
+    const {lng, lat} = map.getCenter();
+    stage.dataset.view = `${lng} ${lat} ${2 ** map.getZoom()}`;
+    above.repaint();
+  };
+  map.on('move zoom', tell);
+  tell();
+  repaints.push(() => {
+    map.invalidateSize({animate: false});
+    below.repaint();
+    above.repaint();
   });
-  stage.append(mapButtons(view, fit));
-  const updates = showLayers(side, layers, surface);
-  makePanel(side, {onCentre: choose});
-  showTime(host.querySelector('.map-main'), lines.corrected);
-  for (const [kind, tables] of [['fixes', DATA.fixes || []], ['closures', DATA.closures || []]]) {
-    for (const {source, left_out: leftOut} of tables.filter((table) => table.left_out > 0)) {
-      host.append(make('p', {class: 'note'}, `${source}: ${number(leftOut, 9)} more ${
-        kind} are not shown, nearly all of which are believed.`));
+  // what was shown as a whole stays so; as long as a page is changed for paper, see `printWhole`
+  map.on('resize', ({newSize}) => {
+    const printed = document.documentElement.classList.contains('paper');
+    if (map.getZoom() === fitted && newSize.x > 100 && !printed) fit();
+  });
+
+  const tick = showLayers(side, layers, () => below.repaint());
+  const choose = (item) => {
+    const layer = layers.find((each) => (each.items || []).includes(item));
+    layer.shown = true;
+    if (layer.states) layer.states.add(item.shown);
+    tick();
+    below.repaint();
+    lookAtItem(item);
+    lookAtTime(item.times[item.times.length - 1]);
+    const [x, y] = middleOf(item.ends);
+    const apart = Math.max(...item.ends.map((end) => Math.hypot(end[0] - x, end[1] - y)));
+    const half = Math.max(1.4 * apart, Math.min(0.06 * (box.getEast() - box.getWest()), 60), 2);
+    const zoom = Math.log2(Math.min(stage.clientWidth, stage.clientHeight) / 2 / half);
+    map.setView([y, x], zoom, {animate: !CALM.matches});
+    bringIntoView(stage, 'nearest');
+  };
+  const shown = () => layers.filter((layer) => layer.shown);
+  const pick = ({lng, lat}, pixels) => {
+    const item = nearestItem(shown(), lng, lat, 2 ** map.getZoom(), pixels);
+    lookAtItem(item);
+    if (!item) return;
+    lookAtTime(item.times[item.times.length - 1]);
+    const panel = document.getElementById('panel');
+    if (panel.getBoundingClientRect().top > window.innerHeight - 120) bringIntoView(panel, 'nearest');
+  };
+  map.on('click', ({latlng, originalEvent: {pointerType}}) => pick(
+    latlng, pointerType === 'touch' || pointerType === 'pen' ? 18 : 9));
+  stage.addEventListener('keydown', (event) => {
+    const action = {0: fit, Escape: () => lookAtItem(null),
+      Enter: () => pick(map.getCenter(), Infinity)}[event.key];
+    if (action && event.target === stage) action();
+  });
+  const label = L.tooltip({direction: 'auto', offset: [12, 0]});
+  map.on('mousemove', ({latlng}) => {
+    const scale = 2 ** map.getZoom();
+    const item = nearestItem(shown(), latlng.lng, latlng.lat, scale, 9);
+    stage.classList.toggle('on-item', item !== null);
+    if (!item) label.remove();
+    else label.setLatLng(latlng).setContent(make('span', {}, make('b', {}, item.id || item.source),
+      make('br'), item.spring ? 'spring' : STATES[item.shown])).addTo(map);
+    lookAtTime(timeAt(path, latlng, 14 / scale));
+  });
+  map.on('mouseout', () => label.remove());
+  scrollBeforeZoom(map, stage);
+  printWhole(map);
+  followers.time.push(() => above.repaint());
+  followers.item.push(() => above.repaint());
+  showTime(main, path);
+  makePanel(side, choose);
+  const tables = [...(DATA.fixes || []), ...(DATA.closures || [])];
+  for (const {source, left_out: leftOut} of tables.filter((each) => each.left_out > 0)) {
+    host.append(make('p', {class: 'note'}, `${source}: ${number(leftOut, 9)} more measurements are `
+      + 'not shown, nearly all of which are believed.'));
+  }
+  host.append(make('div', {class: 'lists'}, listRejected('closure', items, choose),
+    listRejected('fix', items, choose)));
+  return choose;
+}
+
+/** The box that shows the path and the truth as a whole. */
+function boxOf(layers) {
+  const lines = layers.filter(({id}) => id === 'corrected' || id === 'truth').map(({line}) => line);
+  const [[left, right], [bottom, top]] = ['x', 'y'].map((name) => extent(...lines.map(
+    (line) => line[name])));
+  const room = Math.max(0.03 * Math.max(right - left, top - bottom), 0.5);
+  return L.latLngBounds([bottom - room, left - room], [top + room, right + room]);
+}
+
+/** The wheel zooms, unless it has begun to scroll the page before the map came under it. */
+function scrollBeforeZoom(map, stage) {
+  let waiting = null;
+  window.addEventListener('wheel', ({target}) => {
+    if (stage.contains(target) && waiting === null) return;
+    map.scrollWheelZoom.disable();
+    clearTimeout(waiting);
+    waiting = setTimeout(() => {
+      waiting = null;
+      map.scrollWheelZoom.enable();
+    }, 200);
+  }, {passive: true, capture: true});
+}
+
+/** On paper there is the same part of the map, whatever the size of the paper. */
+function printWhole(map) {
+  let seen = null;
+  window.addEventListener('beforeprint', () => {
+    seen = [map.getCenter(), map.getZoom()];
+    const bounds = map.getBounds();
+    document.documentElement.classList.add('paper');
+    map.invalidateSize({animate: false});
+    map.fitBounds(bounds, {animate: false});
+  });
+  window.addEventListener('afterprint', () => {
+    document.documentElement.classList.remove('paper');
+    map.invalidateSize({animate: false});
+    map.setView(...seen, {animate: false});
+  });
+}
+
+// --- items and layers ---------------------------------------------------------------------------
+
+/** A fix or a closure; `shown` is the state as which it is painted. */
+function itemOf(kind, source, k) {
+  const column = (name) => (source[name] ? source[name][k] : null);
+  const why = column('why');
+  const heldOut = Boolean(column('held_out'));
+  const item = {
+    kind, source: source.source, state: column('state'), id: column('id'), distance: column('d'),
+    reason: why === null || why < 0 ? null : DATA.texts[why], heldOut,
+    shown: heldOut ? HELD_OUT : column('state')};
+  if (kind === 'closure') {
+    return {...item, times: [column('t0'), column('t1')],
+      ends: [[column('x0'), column('y0')], [column('x1'), column('y1')]]};
+  }
+  const at = column('at');
+  const {x, y} = DATA.lines.corrected;
+  return {...item, times: [column('t')], ends: [[column('x'), column('y')]],
+    tie: known(at) && at >= 0 ? [x[at], y[at]] : null};
+}
+
+function springItem(spring) {
+  const ends = [spring.from, spring.to].filter((end) => end && known(end.x));
+  return {kind: 'spring', spring, source: spring.source, id: spring.name, reason: spring.text,
+    times: ends.map((end) => end.t), ends: ends.map((end) => [end.x, end.y])};
+}
+
+const springItems = (DATA.springs || []).map(springItem);
+
+/** All layers in the order in which they are painted; those without marks are left out. */
+function makeLayers() {
+  const lines = DATA.lines || {};
+  const looks = {
+    odometry: {name: 'odometry, aligned', colour: 'odometry', width: 1.5, dash: [6, 4]},
+    truth: {name: 'truth', colour: 'truth', width: 1.2, dash: [2, 3]},
+    corrected: {name: 'corrected path', colour: 'path', width: 2.2, dash: []}};
+  const ellipses = DATA.ellipses || {x: []};
+  const measurements = (kind, sources) => (sources || []).map((source) => {
+    const items = source.state.map((_, k) => itemOf(kind, source, k));
+    const counts = STATES.map((_, state) => items.filter((item) => item.shown === state).length);
+    return {id: `${kind}/${source.source}`, kind, items, counts, count: items.length,
+      name: `${kind === 'fix' ? 'fixes' : 'closures'}${sources.length > 1 ? ` ${source.source}` : ''}`,
+      states: new Set(STATES.keys()), swatch: {...LOOKS[BELIEVED], dash: kind === 'fix' ? null : []}};
+  });
+  const springs = springItems.filter((item) => item.ends.length > 0);
+  return [
+    {id: 'ellipses', name: 'covariances, 2 sigma', count: ellipses.x.length, ellipses, factor: 1,
+      swatch: {colour: 'path', area: 0.25}},
+    ...Object.entries(looks).filter(([id]) => lines[id]).map(([id, look]) => ({
+      id, name: look.name, count: lines[id].x.length, swatch: look, line: lines[id], look})),
+    ...measurements('closure', DATA.closures), ...measurements('fix', DATA.fixes),
+    {id: 'springs', kind: 'spring', name: 'springs under most tension', count: springs.length,
+      items: springs, swatch: {colour: 'spring', dash: [], width: 4}, shown: false},
+  ].filter((layer) => layer.count > 0).map((layer) => ({shown: true, ...layer}));
+}
+
+const middleOf = (ends) => [0, 1].map(
+  (axis) => ends.reduce((sum, end) => sum + end[axis], 0) / ends.length);
+
+/** The item nearest to a place, of the layers and states that are shown, within some pixels. */
+function nearestItem(layers, x, y, scale, pixels) {
+  let [best, found] = [pixels / scale, null];
+  for (const {items, states} of layers) {
+    for (const item of items || []) {
+      if (states && !states.has(item.shown)) continue;
+      // what is not believed is wanted more often, and there is less of it
+      const bonus = item.shown === BELIEVED || item.shown === HELD_OUT ? 0 : 3;
+      const apart = toSegment(x, y, item.ends[0], item.ends[item.ends.length - 1]) - bonus / scale;
+      if (apart < best) [best, found] = [apart, item];
     }
   }
-  const lists = make('div', {class: 'lists'});
-  host.append(lists);
-  listRejected(lists, 'closure', DATA.closures || [],
-    {title: 'Doubted and refused closures', onChoose: choose, open: true});
-  listRejected(lists, 'fix', DATA.fixes || [],
-    {title: 'Doubted and refused fixes', onChoose: choose, open: false});
-  followers.time.push(surface.later);
-  followers.item.push(surface.later);
-  return {choose};
+  return found;
 }
 
-/** The box that shows the path and the truth as a whole, and other marks if they are near. */
-function boxOf(layers) {
-  const near = layers.filter((layer) => layer.id === 'corrected' || layer.id === 'truth');
-  const others = layers.filter((layer) => layer.id === 'odometry' || layer.kind);
-  const columns = (of, name) => of.flatMap((layer) => [
-    (layer.line || layer.table)[name] || (layer.table || {})[`${name}0`]]);
-  const [[left, right], [bottom, top]] = ['x', 'y'].map(
-    (name) => extent(...columns(near, name)) || [0, 1]);
-  const room = 0.15 * Math.max(right - left, top - bottom, 10);
-  const clipTo = (name, low, high) => {
-    const [least, most] = extent(...columns(others, name)) || [low, high];
-    return [Math.max(Math.min(least, low), low - room), Math.min(Math.max(most, high), high + room)];
-  };
-  const [x, y] = [clipTo('x', left, right), clipTo('y', bottom, top)];
-  return {left: x[0], right: x[1], bottom: y[0], top: y[1]};
+/** Distance of a point from a line between two others. */
+function toSegment(x, y, [p, q], [r, s]) {
+  const length2 = (r - p) ** 2 + (s - q) ** 2;
+  const part = length2 === 0 ? 0 : ((x - p) * (r - p) + (y - q) * (s - q)) / length2;
+  const at = Math.min(1, Math.max(0, part));
+  return Math.hypot(x - p - at * (r - p), y - q - at * (s - q));
 }
 
-/** Show an item with what is around it. */
-function centreOn(item, view, surface, box) {
-  surface.canvas.scrollIntoView({
-    behavior: CALM.matches ? 'auto' : 'smooth', block: 'nearest'});
-  const [x, y] = middleOf(item.ends);
-  const apart = Math.max(...item.ends.map((end) => Math.hypot(end[0] - x, end[1] - y)), 0);
-  const whole = Math.max(box.right - box.left, box.top - box.bottom);
-  const half = Math.max(1.4 * apart, Math.min(0.06 * whole, 60), 2);
-  const size = Math.min(surface.canvas.clientWidth, surface.canvas.clientHeight);
-  view.flyTo(x, y, size / 2 / half);
-}
-
-/** Scroll as little as needed, if nearly nothing of an element can be seen. */
-function bringIntoView(node) {
-  if (node.getBoundingClientRect().top > window.innerHeight - 120) {
-    node.scrollIntoView({behavior: CALM.matches ? 'auto' : 'smooth', block: 'nearest'});
-  }
-}
-
-/** The pointer on the map marks the time at which the robot was there. */
-function hover(layers, view, surface, path, label, u, v) {
-  const item = u === null ? null : pick(layers, view, u, v, 9);
-  label.hidden = item === null;
-  if (u === null) return;
-  surface.canvas.style.cursor = item ? 'pointer' : 'grab';
-  if (item) {
-    label.replaceChildren(make('b', {}, item.id || item.source),
-      make('span', {}, item.spring ? 'spring' : STATES[item.state]));
-    const left = u > surface.canvas.clientWidth / 2;
-    Object.assign(label.style, {
-      left: left ? 'auto' : `${u + 14}px`,
-      right: left ? `${surface.canvas.clientWidth - u + 14}px` : 'auto', top: `${v + 12}px`});
-  }
-  const [x, y] = view.toMap(u, v);
-  let [best, found] = [14 / view.scale, null];
+/** When the robot was near a place, if it was. */
+function timeAt(path, {lng, lat}, within) {
+  let [best, found] = [within, null];
   for (let k = 0; k < path.x.length; k += 1) {
-    const apart = Math.abs(path.x[k] - x) + Math.abs(path.y[k] - y);
+    const apart = Math.hypot(path.x[k] - lng, path.y[k] - lat);
     if (apart < best) [best, found] = [apart, path.t[k]];
   }
-  if (found !== null) lookAtTime(found);
+  return found;
 }
 
 // --- controls -----------------------------------------------------------------------------------
 
-function mapButtons(view, fit) {
-  const button = (label, sign, onclick) => make(
-    'button', {type: 'button', 'aria-label': label, title: label, onclick}, sign);
-  return make('div', {class: 'map-buttons'},
-    button('Zoom in', '+', () => view.zoom(1.6)),
-    button('Zoom out', '−', () => view.zoom(1 / 1.6)),
-    button('Show all', draw('svg', {viewBox: '0 0 16 16', 'aria-hidden': 'true'},
-      draw('path', {d: 'M2,6V2H6M10,2H14V6M14,10V14H10M6,14H2V10', fill: 'none',
-        stroke: 'currentColor', 'stroke-width': 1.8})), fit));
-}
-
 /** A box to tick for each layer, and for each state of measurements; returns how to show them. */
-function showLayers(host, layers, surface) {
+function showLayers(host, layers, repaint) {
   const updates = [];
   const tick = (text, mark, count, read, write) => {
     const input = make('input', {type: 'checkbox', onchange: () => {
       write(input.checked);
-      surface.reset();
-      surface.later();
+      repaint();
     }});
     updates.push(() => { input.checked = read(); });
     return make('label', {}, input, swatch(mark), make('span', {class: 'label'}, text),
       make('span', {class: 'count'}, number(count, 6)));
   };
-  const list = make('ul', {class: 'layers', 'aria-label': 'Layers of the map'});
-  for (const layer of [...layers].reverse()) {
-    const row = make('li', {'data-layer': layer.id}, tick(layer.name, layer.swatch, layer.count,
-      () => layer.shown, (on) => { layer.shown = on; }));
-    if (layer.counts) {
-      row.append(make('ul', {class: 'states'}, layer.counts.flatMap((count, state) => (
-        count === 0 ? [] : [make('li', {'data-state': state}, tick(STATES[state],
-          {...lookOf(state), dash: layer.kind === 'fix' ? null : lookOf(state).dash}, count,
-          () => layer.states.has(state),
-          (on) => (on ? layer.states.add(state) : layer.states.delete(state))))]))));
-    }
-    if (layer.id === 'ellipses') row.append(sizeOfEllipses(layer, surface));
-    list.append(row);
-  }
-  host.append(make('details', {class: 'layer-box', open: true},
-    make('summary', {}, 'Layers'), list));
-  for (const update of updates) update();
-  return updates;
-}
-
-function sizeOfEllipses(layer, surface) {
-  const choice = make('select', {'aria-label': 'Size of the covariance ellipses',
-    onchange: () => {
-      layer.factor = Number(choice.value);
-      surface.reset();
-      surface.later();
+  const statesOf = ({kind, counts, states}) => make('ul', {class: 'states'}, [...counts.entries()]
+    .filter(([, count]) => count > 0).map(([state, count]) => make('li', {'data-state': state}, tick(
+      STATES[state], {...lookOf(state), dash: kind === 'fix' ? null : lookOf(state).dash}, count,
+      () => states.has(state), (on) => (on ? states.add(state) : states.delete(state))))));
+  const sizes = (layer) => make('select', {'aria-label': 'Size of the covariance ellipses',
+    onchange: (event) => {
+      layer.factor = Number(event.target.value);
+      repaint();
     }}, [1, 3, 10, 30, 100].map((factor) => make('option', {value: factor},
     factor === 1 ? 'true to scale' : `${factor} times as large`)));
-  return make('div', {class: 'choice'}, choice);
+  host.append(make('details', {class: 'layer-box card', open: true}, make('summary', {}, 'Layers'),
+    make('ul', {class: 'layers', 'aria-label': 'Layers of the map'}, [...layers].reverse().map(
+      (layer) => make('li', {'data-layer': layer.id}, tick(layer.name, layer.swatch, layer.count,
+        () => layer.shown, (on) => { layer.shown = on; }),
+      layer.counts ? statesOf(layer) : null, layer.ellipses ? sizes(layer) : null)))));
+  const update = () => updates.forEach((each) => each());
+  update();
+  return update;
 }
 
 /** The slider that tells where the robot was at a time. */
 function showTime(host, path) {
   const [first, last] = [path.t[0], path.t[path.t.length - 1]];
   const slider = make('input', {
-    type: 'range', id: 'time', min: first, max: last, step: 'any', value: first,
+    type: 'range', id: 'time', min: first, max: last, step: (last - first) / 200 || 1, value: first,
     'aria-label': 'Time of the drive', oninput: () => lookAtTime(Number(slider.value))});
-  slider.addEventListener('keydown', (event) => {
-    const step = {ArrowLeft: -0.005, ArrowRight: 0.005, PageDown: -0.05, PageUp: 0.05}[event.key];
-    if (step === undefined) return;
-    event.preventDefault();
-    lookAtTime(Math.min(last, Math.max(first, Number(slider.value) + step * (last - first))));
-  });
-  const text = make('output', {for: 'time', id: 'where'});
+  const text = make('output', {for: 'time', id: 'where'}, 'Move the slider, or point at the path '
+    + 'or at a chart, to see where the robot was.');
   host.append(make('div', {class: 'time'}, slider, text));
-  const say = (time) => {
-    if (time === null) {
-      text.textContent = 'Move the slider, or point at the path or at a chart, to see where the '
-        + 'robot was.';
-      return;
-    }
+  followers.time.push((time) => {
     slider.value = time;
-    const pose = poseAt(path, time);
-    const offset = DATA.offset || [0, 0];
-    const day = timeOfDay(time);
     slider.setAttribute('aria-valuetext', clock(time));
-    text.replaceChildren(make('b', {}, clock(time)), day ? ` · ${day}` : '',
-      ` · ${(pose.x + offset[0]).toFixed(2)}, ${(pose.y + offset[1]).toFixed(2)} m`,
-      known(pose.theta) ? ` · ${number(degrees(pose.theta))}°` : '');
-  };
-  followers.time.push(say);
-  say(null);
+    const {x, y, theta} = poseAt(path, time);
+    const words = [timeOfDay(time), placeText([x, y]), known(theta) ? `${number(degrees(theta))}°` : null];
+    text.replaceChildren(make('b', {}, clock(time)), ...words.map((word) => (word ? ` · ${word}` : '')));
+  });
+}
+
+function placeText([x, y]) {
+  const [right, up] = DATA.offset || [0, 0];
+  return `${(x + right).toFixed(2)}, ${(y + up).toFixed(2)} m`;
 }
 
 /** Where the robot was at a time, between two poses of the path. */
 function poseAt({t, x, y, theta}, time) {
-  const k = nearest(t, time);
-  const before = Math.max(0, t[k] <= time ? k : k - 1);
-  const after = Math.min(t.length - 1, before + 1);
-  const span = t[after] - t[before];
-  const part = span > 0 ? Math.min(1, Math.max(0, (time - t[before]) / span)) : 0;
-  const between = (column) => column[before] + part * (column[after] - column[before]);
-  return {x: between(x), y: between(y), theta: theta ? theta[part < 0.5 ? before : after] : null};
+  const after = t.findIndex((each) => each >= time);
+  const [k, m] = after < 0 ? [t.length - 1, t.length - 1] : [Math.max(after - 1, 0), after];
+  const part = t[m] > t[k] ? Math.max(0, (time - t[k]) / (t[m] - t[k])) : 0;
+  const between = (column) => column[k] + part * (column[m] - column[k]);
+  return {x: between(x), y: between(y), theta: theta ? theta[part < 0.5 ? k : m] : null};
 }
 
-// --- the picture --------------------------------------------------------------------------------
+// --- the panel and the lists --------------------------------------------------------------------
 
-/** Above so many points a picture of the layers is moved with the map, and seldom painted anew. */
-const HEAVY = 6000;
-/** How old it may become meanwhile: at least so much [ms], and so many times what it takes. */
-const [OLDEST, TIMES] = [250, 8];
+const KINDS = {fix: 'Fix', closure: 'Loop closure', spring: 'Spring'};
+const MOST_ENTRIES = 100;
 
-function paintMap(layers, surface, frame) {
-  const {context, canvas} = surface;
-  const {view, picture} = frame;
-  const now = performance.now();
-  const seen = [view.x, view.y, view.scale, canvas.width, canvas.height];
-  const same = picture.seen && seen.every((value, k) => value === picture.seen[k]);
-  const resized = !picture.seen || seen[3] !== picture.seen[3] || seen[4] !== picture.seen[4];
-  if (!same && (resized || frame.points < HEAVY || now - picture.painted >= picture.oldest)) {
-    paintLayers(layers, canvas, frame);
-    Object.assign(picture, {seen, painted: now});
-    requestAnimationFrame(() => {
-      picture.oldest = Math.max(OLDEST, TIMES * (performance.now() - now));
-    });
-  } else if (!same) {
-    clearTimeout(picture.again);
-    picture.again = setTimeout(() => {
-      picture.painted = -Infinity;
-      surface.later();
-    }, OLDEST);
+/** The panel beside the map; it shows the item that the reader has chosen. */
+function makePanel(host, centreOn) {
+  const panel = make('div', {class: 'panel card', id: 'panel', 'aria-live': 'polite'});
+  host.append(panel);
+  const tag = (state) => make('span', {class: 'state'}, swatch({...lookOf(state), dash: null}),
+    STATES[state] || 'unknown');
+  const show = (item) => panel.replaceChildren(...(!item ? [make('p', {class: 'hint'},
+    'Click or tap a fix, a closure or a spring on the map to see what is known of it.')] : [
+    make('div', {class: 'panel-head'},
+      make('h3', {}, KINDS[item.kind], ' ', make('span', {class: 'id'}, item.id || item.source)),
+      make('button', {type: 'button', class: 'plain', 'aria-label': 'Close',
+        onclick: () => lookAtItem(null)}, '×')),
+    make('p', {}, ...[...new Set([item.state, item.shown])].filter(known).map(tag)),
+    make('p', {class: 'reason'}, item.reason || ''),
+    make('dl', {}, factsOf(item).flatMap(
+      ([name, value]) => [make('dt', {}, name), make('dd', {}, value)])),
+    make('button', {type: 'button', onclick: () => centreOn(item)}, 'Centre the map on it')]));
+  followers.item.push(show);
+  show(null);
+}
+
+function factsOf({source, ends, times, tie, distance, spring}) {
+  const time = (t) => [clock(t), timeOfDay(t)].filter((text) => text).join(' · ');
+  const apart = ([x, y], [p, q]) => length(Math.hypot(x - p, y - q));
+  const rows = [['source', source]];
+  if (ends.length === 2) {
+    rows.push(['from', `${time(times[0])} at ${placeText(ends[0])}`],
+      ['to', `${time(times[1])} at ${placeText(ends[1])}`], ['apart', apart(...ends)]);
+  } else if (ends.length === 1) {
+    rows.push(['time', time(times[0])], ['place', placeText(ends[0])]);
   }
-  const [x, y, scale] = picture.seen;
-  const [left, top] = view.toScreen(x, y);
-  const [width, height] = [frame.width, frame.height].map((size) => (size * view.scale) / scale);
-  context.drawImage(picture.canvas, left - width / 2, top - height / 2, width, height);
-  if (focus.item) paintChosen(focus.item, context, frame);
-  if (focus.time !== null) paintRobot(DATA.lines.corrected, context, frame);
-  paintScaleBar(context, frame);
-  paintNorth(context, frame);
-}
-
-/** Paint the layers on a canvas of their own. */
-function paintLayers(layers, {width, height}, frame) {
-  const {canvas} = frame.picture;
-  if (canvas.width !== width || canvas.height !== height) Object.assign(canvas, {width, height});
-  const context = canvas.getContext('2d');
-  context.setTransform(width / frame.width, 0, 0, height / frame.height, 0, 0);
-  context.clearRect(0, 0, frame.width, frame.height);
-  frame.points = 0;
-  paintGrid(context, frame);
-  const shown = layers.filter((layer) => layer.shown);
-  const later = shown.filter((layer) => layer.id === 'corrected' || layer.id === 'springs');
-  for (const layer of shown) {
-    if (!later.includes(layer)) layer.paint(layer, context, frame, BELOW);
+  if (tie) rows.push(['off the path', apart(tie, ends[0])]);
+  if (known(distance)) rows.push(['distance', `${number(distance)} sigma`]);
+  if (!spring) return rows;
+  const {rank, kind, energy, expected, residual, sigma} = spring;
+  rows.push(['rank', `${rank} of ${DATA.springs.length}`], ['kind', kind],
+    ['energy', `${number(energy)}, where ${number(expected)} is expected`]);
+  const names = ['position', 'fix', 'global pose'].includes(kind) ? ['x', 'y', 'heading']
+    : ['along', 'across', 'heading'];
+  for (const [k, name] of names.entries()) {
+    // coordinates without a sigma say nothing
+    if (!residual || !sigma || !known(residual[k]) || !(sigma[k] > 0)) continue;
+    const value = name === 'heading' ? `${number(degrees(residual[k]))}°` : length(residual[k]);
+    rows.push([name, `${value}, ${number(residual[k] / sigma[k], 2)} sigma`]);
   }
-  for (const layer of later) layer.paint(layer, context, frame);
-  for (const layer of shown) if (layer.kind) layer.paint(layer, context, frame, ABOVE);
+  return rows;
 }
 
-/** Lines at round coordinates, with these at the left and at the lower border. */
-function paintGrid(context, {view, width, height}) {
-  const [left, top] = view.toMap(0, 0);
-  const [right, bottom] = view.toMap(width, height);
-  const step = niceStep(110 / view.scale);
-  const unit = step >= 1000 ? 1000 : 1;
-  const labels = [];
-  context.strokeStyle = colour('grid');
-  context.lineWidth = 1;
-  context.beginPath();
-  for (const x of multiples(step, left, right)) {
-    const u = Math.round(view.toScreen(x, 0)[0]) + 0.5;
-    context.moveTo(u, 0);
-    context.lineTo(u, height);
-    if (u > 70 && u < width - 20) labels.push([number(x / unit, 6), u, height - 6, 'center']);
-  }
-  for (const y of multiples(step, bottom, top)) {
-    const v = Math.round(view.toScreen(0, y)[1]) + 0.5;
-    context.moveTo(0, v);
-    context.lineTo(width, v);
-    if (v > 12 && v < height - 60) labels.push([number(y / unit, 6), 6, v - 3, 'left']);
-  }
-  context.stroke();
-  for (const [text, u, v, align] of labels) halo(context, text, u, v, align);
+/** A list of the measurements of a kind that are doubted or refused, the farthest off first. */
+function listRejected(kind, items, choose) {
+  const far = ({distance}) => (known(distance) ? distance : -1);
+  const found = items.filter((item) => item.kind === kind
+    && (item.state === DOUBTED || item.state === REFUSED));
+  found.sort((one, other) => one.state - other.state || far(other) - far(one));
+  if (!items.some((item) => item.kind === kind)) return null;
+  const list = make('ol', {class: 'entries'});
+  const show = (entries) => list.append(...entries.map((item) => entry(item, choose, [
+    swatch({...lookOf(item.state), dash: null}),
+    make('span', {class: 'entry-name'}, item.id || `${item.source} at ${clock(item.times[0])}`),
+    make('span', {class: 'entry-far'}, known(item.distance) ? `${number(item.distance)} σ` : ''),
+    make('span', {class: 'entry-why'}, make('span', {class: 'unseen'}, `${STATES[item.state]}: `),
+      item.reason || STATES[item.state])])));
+  show(found.slice(0, MOST_ENTRIES));
+  const more = make('button', {type: 'button', class: 'more', onclick: () => {
+    more.remove();
+    show(found.slice(MOST_ENTRIES));
+  }}, `Show the other ${found.length - MOST_ENTRIES}`);
+  return make('details', {class: 'rejected card', 'data-kind': kind,
+    open: kind === 'closure' && found.length > 0},
+  make('summary', {}, `Doubted and refused ${kind === 'fix' ? 'fixes' : 'closures'} `,
+    make('span', {class: 'count'}, found.length)),
+  found.length > 0 ? list : nothing('None: all were used.'),
+  found.length > MOST_ENTRIES ? more : null);
 }
 
-/** A text that can be read on whatever is below it. */
-function halo(context, text, u, v, align = 'left', name = 'muted') {
-  context.font = FONT;
-  context.textBaseline = 'alphabetic';
-  context.textAlign = align;
-  context.lineJoin = 'round';
-  context.strokeStyle = colour('surface');
-  context.lineWidth = 3;
-  context.strokeText(text, u, v);
-  context.fillStyle = colour(name);
-  context.fillText(text, u, v);
-}
-
-function paintScaleBar(context, {view, width, height}) {
-  const metres = niceStep(60 / view.scale);
-  const [long, right, v] = [metres * view.scale, width - 16, height - 30];
-  for (const [name, thick] of [['surface', 5], ['ink', 2]]) {
-    context.strokeStyle = colour(name);
-    context.lineWidth = thick;
-    context.beginPath();
-    context.moveTo(right - long, v - 5);
-    context.lineTo(right - long, v);
-    context.lineTo(right, v);
-    context.lineTo(right, v - 5);
-    context.stroke();
-  }
-  halo(context, length(metres), right - long / 2, v - 5, 'center', 'ink');
-}
-
-/** Where the axes of the map lead: north up, or x to the right and y up. */
-function paintNorth(context, {height}) {
-  const axes = DATA.axes || ['x', 'y'];
-  const [u, v, long] = [16, height - 26, 30];
-  context.strokeStyle = colour('ink');
-  context.lineWidth = 1.6;
-  context.beginPath();
-  context.moveTo(u, v - long);
-  context.lineTo(u, v);
-  context.lineTo(u + long, v);
-  context.moveTo(u - 4, v - long + 6);
-  context.lineTo(u, v - long);
-  context.lineTo(u + 4, v - long + 6);
-  context.moveTo(u + long - 6, v - 4);
-  context.lineTo(u + long, v);
-  context.lineTo(u + long - 6, v + 4);
-  context.stroke();
-  halo(context, `${axes[1]} [m]`, u + 8, v - long + 5, 'left', 'ink');
-  halo(context, `${axes[0]} [m]`, u + long + 5, v + 4, 'left', 'ink');
-}
-
-/** A frame around what is chosen, and a line from a fix to where the robot was. */
-function paintChosen(item, context, {view}) {
-  const places = item.ends.map((end) => view.toScreen(...end));
-  const line = (from, to, name, thick) => {
-    context.strokeStyle = colour(name);
-    context.lineWidth = thick;
-    context.beginPath();
-    context.moveTo(...from);
-    context.lineTo(...to);
-    context.stroke();
-  };
-  const name = item.spring ? 'spring' : lookOf(item.state).colour;
-  if (item.tie) line(places[0], view.toScreen(...item.tie), name, 1.5);
-  if (places.length === 2) {
-    line(...places, 'surface', 9);
-    line(...places, name, 4.5);
-  }
-  for (const [u, v] of places) {
-    for (const [ring, thick] of [['surface', 6], ['ink', 2.4]]) {
-      context.strokeStyle = colour(ring);
-      context.lineWidth = thick;
-      context.beginPath();
-      context.arc(u, v, 10, 0, 7);
-      context.stroke();
-    }
-  }
-  if (!item.spring) stamp(lookOf(item.state).shape, name, context, ...middleOf(places), 1.3);
-}
-
-/** The robot as an arrow where it was at the time that is looked at. */
-function paintRobot(path, context, {view}) {
-  const pose = poseAt(path, focus.time);
-  const [u, v] = view.toScreen(pose.x, pose.y);
-  context.save();
-  context.translate(u, v);
-  context.rotate(-(pose.theta || 0));
-  context.beginPath();
-  if (known(pose.theta)) context.moveTo(13, 0);
-  for (const [x, y] of [[-8, 7.5], [-4.5, 0], [-8, -7.5]]) context.lineTo(x, y);
-  context.closePath();
-  context.lineJoin = 'round';
-  context.strokeStyle = colour('surface');
-  context.lineWidth = 5;
-  context.stroke();
-  context.fillStyle = colour('ink');
-  context.fill();
-  context.restore();
+/** A row of a list that shows an item on the map. */
+function entry(item, choose, content) {
+  const button = make('button', {type: 'button', class: 'entry', disabled: item.ends.length === 0,
+    onclick: () => choose(item)}, ...content);
+  followers.item.push((chosen) => button.setAttribute('aria-current', chosen === item));
+  return make('li', {}, button);
 }

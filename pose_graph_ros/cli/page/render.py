@@ -5,8 +5,8 @@ Put the data of a report, its style and its script together to one HTML page.
 
 Titles, ids and reasons come from files and topics, so none of them is trusted: in the page they
 are JSON in which no tag can begin, and the script shows them as text only. The policy of the page
-(Content-Security-Policy) allows this one script and this one style by their hashes, and nothing
-from anywhere.
+(Content-Security-Policy) allows these scripts and this style by their hashes, and nothing from
+anywhere.
 """
 
 import base64
@@ -18,32 +18,31 @@ import json
 import re
 from typing import Any
 
-SCRIPTS = ('base', 'marks', 'chart', 'view', 'layers', 'panel', 'map', 'sources', 'sections',
-           'main')
+SCRIPTS = ('base', 'chart', 'paint', 'map', 'sections')
 """Parts of the script, in order; they share one scope."""
+LIBRARIES = {'uPlot': ('uPlot.iife.min.js', 'uPlot.min.css'),
+             'leaflet': ('leaflet.js', 'leaflet.css')}
+"""Script and style of the libraries of others in vendor/, with their licences beside them."""
+# Paper has more pixels than most screens; the libraries ask once, as they are loaded.
+SHARP = ("Object.defineProperty(window, 'devicePixelRatio', "
+         '{value: Math.max(2, devicePixelRatio), configurable: true});')
 ESCAPES = {ord(sign): f'\\u{ord(sign):04x}' for sign in '<>&'}
 """Signs that begin a tag, a comment or an entity, as JSON may spell them in texts."""
 
 
 def render(data: Mapping[str, Any]) -> str:
-    """
-    Return the page for the data of a report as HTML.
-
-    Raises
-    ------
-    ValueError
-        If a number is not finite.
-
-    """
-    script = "'use strict';\n" + '\n'.join(_asset(f'{name}.js') for name in SCRIPTS)
+    """Return the page for the data of a report as HTML; ValueError if a number is not finite."""
     parts = {
-        'script': f'\n{script}',
-        'style': f'\n{_asset("report.css")}',
+        'library': '\n'.join((SHARP, *(_vendored(name, 0) for name in LIBRARIES))),
+        'script': '\n'.join(("\n'use strict';", *(_asset(f'{name}.js') for name in SCRIPTS))),
+        'style': '\n'.join((*(_vendored(name, 1) for name in LIBRARIES), _asset('report.css'))),
         'data': json.dumps(data, allow_nan=False, separators=(',', ':')).translate(ESCAPES),
-        'title': _as_html(str(data.get('title') or 'report')),
+        # half a surrogate pair, which no file can hold, becomes a question mark
+        'title': html.escape(str(data.get('title') or 'report').encode(
+            'utf-8', 'replace').decode('utf-8')),
     }
     parts['policy'] = (
-        f"default-src 'none'; script-src {_hash(parts['script'])}; "
+        f"default-src 'none'; script-src {_hash(parts['library'])} {_hash(parts['script'])}; "
         f"style-src {_hash(parts['style'])}; img-src data:; base-uri 'none'; form-action 'none'")
     # one pass, so that what is put in is not looked at again
     return re.sub(r'{{(\w+)}}', lambda found: parts[found[1]], _asset('report.html'))
@@ -53,9 +52,12 @@ def _asset(name: str) -> str:
     return (files(__package__) / name).read_text(encoding='utf-8')
 
 
-def _as_html(text: str) -> str:
-    """Return a text as HTML; half a surrogate pair, which no file can hold, as a question mark."""
-    return html.escape(text.encode('utf-8', 'replace').decode('utf-8'))
+def _vendored(library: str, which: int) -> str:
+    """Return the script (0) or the style (1) of a library after its licence."""
+    text = _asset(f'vendor/{LIBRARIES[library][which]}')
+    # of the map of its source only the developer's tools of a browser would ask
+    text = text.partition('//# sourceMappingURL')[0]
+    return text if which == 1 else f'/*\n{_asset(f"vendor/LICENSE.{library}")}*/\n{text}'
 
 
 def _hash(text: str) -> str:

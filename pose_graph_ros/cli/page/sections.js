@@ -1,254 +1,319 @@
 // Copyright 2026 The pose_graph_ros authors
 // SPDX-License-Identifier: Apache-2.0
-// The other sections: the head, errors over time, springs, updates, and the matrices.
+// What is on the page, from top to bottom, but for the map.
 
-const LEVELS = {warning: 'Warning', notice: 'Notice', good: 'Good'};
-const LEVEL_SIGNS = {
-  warning: 'M8,1.5L15,14H1Z M8,6V10 M8,11.6V12.4', notice: 'M8,2a6,6 0 1,0 0.01,0Z M8,7V11.4 M8,4.6V5.4',
-  good: 'M8,2a6,6 0 1,0 0.01,0Z M5,8.2L7.2,10.4L11.2,5.8'};
+const LEVELS = {
+  warning: ['Warning', 'M8,1.5L15,14H1Z M8,6V10 M8,11.6V12.4'],
+  notice: ['Notice', 'M8,2a6,6 0 1,0 0.01,0Z M8,7V11.4 M8,4.6V5.4'],
+  good: ['Good', 'M8,2a6,6 0 1,0 0.01,0Z M5,8.2L7.2,10.4L11.2,5.8']};
+const timeAxis = (values) => ({label: `time [${clockUnit()}]`, values, time: true,
+  range: [0, DATA.duration || 1]});
+const charts = (host, layout) => host.appendChild(make('div', {class: `charts ${layout}`}));
 
 /** Title, facts and findings. */
 function showHead() {
-  const head = document.getElementById('head');
-  const when = DATA.start ? `${DATA.start.slice(0, 10)} ${DATA.start.slice(11, 19)} UTC` : null;
-  const toggle = make('button', {type: 'button', id: 'scheme', class: 'plain'});
-  const wide = matchMedia('(prefers-color-scheme: dark)');
-  const use = (dark) => {
-    setScheme(dark ? 'dark' : 'light');
-    toggle.textContent = dark ? 'Light' : 'Dark';
-    toggle.setAttribute('aria-label', `Show the page ${dark ? 'light' : 'dark'}`);
+  const root = document.documentElement;
+  const dark = matchMedia('(prefers-color-scheme: dark)');
+  const toggle = make('button', {type: 'button', id: 'scheme'});
+  const use = (name) => {
+    setScheme(name);
+    toggle.textContent = name === 'dark' ? 'Light' : 'Dark';
+    toggle.setAttribute('aria-label', `Show the page ${name === 'dark' ? 'light' : 'dark'}`);
   };
-  let chosen = false;
+  const follow = () => use(dark.matches ? 'dark' : 'light');
   toggle.addEventListener('click', () => {
-    chosen = true;
-    use(document.documentElement.dataset.scheme !== 'dark');
+    dark.removeEventListener('change', follow);
+    use(root.dataset.scheme === 'dark' ? 'light' : 'dark');
   });
-  wide.addEventListener('change', () => { if (!chosen) use(wide.matches); });
-  use(wide.matches);
-  head.append(
-    make('div', {class: 'title'}, make('p', {class: 'brand'}, 'pose-graph report'),
+  dark.addEventListener('change', follow);
+  follow();
+  const when = DATA.start ? `${DATA.start.slice(0, 10)} ${DATA.start.slice(11, 19)} UTC` : null;
+  document.getElementById('head').append(
+    make('div', {class: 'title'}, make('p', {class: 'subtitle'}, 'pose-graph report'),
       make('h1', {}, DATA.title || 'report'),
       make('p', {class: 'subtitle'}, [DATA.subtitle, when].filter((text) => text).join(' · '))),
     toggle);
-  const facts = DATA.facts || [];
-  // as many columns as leave the fewest places empty
-  const empty = (count) => (count - (facts.length % count)) % count;
-  const columns = [7, 6, 5, 4].reduce((one, other) => (empty(other) < empty(one) ? other : one));
-  document.getElementById('main').append(
-    make('dl', {class: 'facts', style: {'--columns': columns}}, facts.map(({label, value, note}) => make(
-      'div', {class: 'card'}, make('dt', {}, label), make('dd', {}, value),
-      note ? make('dd', {class: 'note'}, note) : null))));
+  document.getElementById('main').append(make('dl', {class: 'facts'}, (DATA.facts || []).map(
+    ({label, value, note}) => make('div', {class: 'card'}, make('dt', {}, label),
+      make('dd', {}, value), make('dd', {class: 'note'}, note || '')))));
   showFindings();
+  const names = {map: 'Map', errors: 'Errors', sources: 'Residuals', springs: 'Springs',
+    updates: 'Updates', sparsity: 'Matrices'};
+  document.getElementById('contents').append(make('ul', {}, Object.entries(names).map(
+    ([id, name]) => make('li', {}, linkTo(id, name)))));
 }
 
 /** What a person must know; what is as it should be is folded away, unless there is nothing else. */
 function showFindings() {
-  const all = DATA.findings || [];
-  const isGood = ({level}) => level === 'good';
-  const [good, others] = [all.filter(isGood), all.filter((each) => !isGood(each))];
-  const host = make('div', {id: 'findings', role: 'region', 'aria-label': 'Findings'});
-  if (others.length > 0) host.append(make('ul', {class: 'findings'}, others.map(findingOf)));
-  if (good.length > 0) {
-    host.append(make('details', {class: 'good', open: others.length === 0},
-      make('summary', {}, others.length > 0
-        ? `${counted(good.length, 'thing')} ${good.length === 1 ? 'is as it' : 'are as they'} should be`
-        : 'All that was checked is as it should be'),
-      make('ul', {class: 'findings'}, good.map(findingOf))));
-  }
-  if (all.length > 0) document.getElementById('main').append(host);
+  const [good, others] = [true, false].map((which) => (DATA.findings || []).filter(
+    ({level}) => (level === 'good') === which));
+  const list = (found) => make('ul', {class: 'findings'}, found.map(({level, text, anchor}) => {
+    const name = level in LEVELS ? level : 'notice';
+    return make('li', {'data-level': name},
+      draw('svg', {viewBox: '0 0 16 16', 'aria-hidden': 'true'}, draw('path', {d: LEVELS[name][1]})),
+      make('span', {}, make('b', {class: 'unseen'}, `${LEVELS[name][0]}: `), text),
+      anchor ? linkTo(anchor, 'Show') : null);
+  }));
+  const count = good.length === 1 ? '1 thing is as it should be'
+    : `${good.length} things are as they should be`;
+  document.getElementById('main').append(
+    make('div', {id: 'findings', role: 'region', 'aria-label': 'Findings'},
+      others.length > 0 ? list(others) : null,
+      good.length > 0 ? make('details', {class: 'good', open: others.length === 0},
+        make('summary', {}, others.length > 0 ? count : 'All that was checked is as it should be'),
+        list(good)) : null));
 }
 
-function findingOf({level, text, anchor}) {
-  const body = make('span', {}, make('b', {class: 'unseen'}, `${LEVELS[level] || 'Notice'}: `), text);
-  const sign = draw('svg', {viewBox: '0 0 16 16', 'aria-hidden': 'true'}, draw('path', {
-    d: LEVEL_SIGNS[level] || LEVEL_SIGNS.notice, fill: 'none', stroke: 'currentColor',
-    'stroke-width': 1.6, 'stroke-linejoin': 'round', 'stroke-linecap': 'round'}));
-  const link = anchor ? make('a', {href: `#${encodeURIComponent(anchor)}`, onclick: (event) => {
-    event.preventDefault();
-    goTo(document.getElementById(anchor));
-  }}, 'Show') : null;
-  return make('li', {'data-level': level in LEVELS ? level : 'notice'}, sign, body, link);
-}
-
-/** Links to the sections of the page. */
-function showContents() {
-  const names = {map: 'Map', errors: 'Errors', sources: 'Residuals', springs: 'Springs',
-    updates: 'Updates', sparsity: 'Matrices'};
-  document.getElementById('contents').append(make('ul', {}, Object.entries(names).map(
-    ([id, name]) => make('li', {}, make('a', {href: `#${id}`, onclick: (event) => {
-      event.preventDefault();
-      goTo(document.getElementById(id));
-    }}, name)))));
-}
-
-// --- errors -------------------------------------------------------------------------------------
-
-/** Position and heading errors over time with what was claimed of them. */
+/** Position and heading errors over time with what was claimed of them, and the table of errors. */
 function showErrors() {
   const {errors} = DATA;
-  const host = section('errors', 'Errors over time');
-  if (!errors || errors.t.length === 0) {
-    host.append(nothing('No errors over time: the run had no truth, and no fixes were held out '
-      + '(--truth, --hold-out).'), ...errorTable(DATA.error_table));
+  const host = section('errors', 'Errors over time', errors && errors.t.length > 0
+    ? `Distance to ${errors.against === 'truth' ? 'the truth' : errors.against}. The band is what `
+      + 'the covariances claim: 95 % of errors should be in it.' : null);
+  if (errors && errors.t.length > 0) showErrorCharts(charts(host, 'wide'), errors);
+  else host.append(nothing('No errors over time: the run had no truth, and no fixes were held out '
+    + '(--truth, --hold-out).'));
+  const rows = DATA.error_table || [];
+  const heads = Object.entries({median: 'median', rms: 'rms', p95: '95 %', maximum: 'largest',
+    count: 'of'}).filter(([name]) => rows.some((row) => known(row[name])));
+  const cell = (row, name) => (name === 'count' || !known(row[name]) ? number(row[name], 6)
+    : row[name].toFixed(2) + (row.unit === 'deg' ? '°' : ''));
+  if (rows.length > 0) {
+    host.append(table('errors card', ['distance [m]', ...heads.map(([, head]) => head)],
+      rows.map((row) => [row.name, ...heads.map(([name]) => cell(row, name))])));
+  }
+}
+
+function showErrorCharts(host, {t, position, odometry, sigma, heading}) {
+  const top = (column) => (extent(column) || [0, 0])[1];
+  const log = top(odometry) > 5 * top(position);
+  const floor = log ? Math.max(0.002, top(position) / 300) : 0;
+  const claimed = (sigma || []).map((each) => (known(each) ? 2 * each : null));
+  const series = [{name: 'corrected path', y: position, colour: 'path', width: 2}];
+  if (odometry) {
+    series.push({name: 'odometry, aligned', y: odometry, colour: 'odometry', dash: [6, 4]});
+  }
+  if (sigma) {
+    series.push({name: 'claimed, 2 sigma', y: claimed, colour: 'path', width: 0.5},
+      {y: claimed.map((each) => (each === null ? null : floor / 2)), colour: 'path', width: 0});
+  }
+  makeChart(host, {title: 'Position', x: timeAxis(t), series,
+    band: sigma ? [series.length - 1, series.length] : null,
+    y: {label: log ? 'error [m], logarithmic' : 'error [m]', log, floor}});
+  if ((heading || []).some(known)) {
+    makeChart(host, {title: 'Heading', x: timeAxis(t), y: {label: 'error [degrees]'},
+      series: [{name: 'corrected path', y: heading.map(degrees), colour: 'path'}]});
+  }
+}
+
+/** The residuals of each source: expected against found, and three charts. */
+function showSources() {
+  const host = section('sources', 'Residuals by source',
+    'A residual divided by the sigma that its source claims should be 1 on average, less what the '
+    + 'optimisation takes up. A ratio of 2 says that sigmas are half of what they should be; an '
+    + 'interval with 1 in it, that nothing is wrong with them.');
+  const sources = DATA.sources || [];
+  if (sources.length === 0) host.append(nothing('No residuals: nothing was measured.'));
+  sources.forEach((source) => showSource(host, source));
+}
+
+function showSource(host, source) {
+  const {name, kind, count, used, verdict, energy, scale, unused, independent, rows, series} = source;
+  const far = unused && unused.count > 0 && known(unused.median_distance)
+    ? ` (of the others half are more than ${number(unused.median_distance)} sigma off)` : '';
+  const numbers = [
+    `${counted(count, 'measurement')}, ${number(used, 6)} used${far}`,
+    known(independent) && counted(Math.round(independent), 'independent residual'),
+    known(scale) && Math.abs(scale - 1) > 0.005 && `sigmas multiplied by ${number(scale)} in the graph`,
+    energy && known(energy.found)
+      && `mean energy ${number(energy.found)}, expected ${number(energy.expected)}`,
+    energy && known(energy.quantile95_share)
+      && `${number(100 * energy.quantile95_share)} % within their 95 % bound`];
+  const card = make('article', {
+    class: 'card source', id: `source-${name}`, tabindex: '-1', 'aria-label': `Source ${name}`},
+  make('h3', {}, name, ' ', make('span', {class: 'kind'}, String(kind || '').replace(/_/g, ' '))),
+  make('p', {class: 'verdict'}, verdict || ''),
+  make('p', {class: 'numbers'}, numbers.filter((text) => text).join(' · ')));
+  host.append(card);
+  if (rows.length === 0) card.append(nothing('None of them is in the graph, so there are no residuals.'));
+  else card.append(table('ratios', ['component', 'expected', 'found', 'ratio', '95 % interval'],
+    rows.map((row) => [[row.name, make('small', {}, ` ${counted(row.count, 'residual')}`)],
+      number(row.expected), number(row.found), [make('b', {}, number(row.ratio)), ratioPicture(row)],
+      known(row.low) ? `${number(row.low, 2)} – ${number(row.high, 2)}` : '–'])));
+  if (!series || series.t.length === 0) return;
+  const row = charts(card, '');
+  showHistogram(row, source);
+  makeChart(row, {title: 'Over time', x: timeAxis(series.t), y: {label: 'residual / expected'},
+    rules: [-2, 2].map((at) => ({of: 'y', at, colour: 'muted', dash: [5, 4]})),
+    series: series.rows.map((y, k) => ({kind: 'dots', y, name: (rows[k] || {name: `component ${k}`}).name,
+      colour: ['path', 'odometry', 'held-out'][k % 3]})),
+    note: 'Dashed: 2 sigma, where 95 % should be within.'});
+  showAutocorrelation(row, source);
+}
+
+/** The ratio on a logarithmic axis from 1/5 to 5: a dot, its interval, and 1. */
+function ratioPicture({ratio, low, high}) {
+  const at = (value) => 4 + 112 * Math.min(1, Math.max(0, 0.5 + Math.log(value) / Math.log(25)));
+  const sign = !known(low) || (low <= 1 && high >= 1) ? 'believed' : (low > 1 ? 'doubted' : 'waiting');
+  return draw('svg', {class: 'ratio-picture', viewBox: '0 0 120 18', 'aria-hidden': 'true'},
+    draw('path', {d: 'M4,9H116M60,2V16', stroke: 'var(--muted)'}),
+    known(low) && low > 0 ? draw('rect', {x: at(low), width: Math.max(at(high) - at(low), 2), y: 4,
+      height: 10, rx: 2, fill: 'var(--believed)', 'fill-opacity': 0.4}) : null,
+    known(ratio) && ratio > 0
+      ? draw('circle', {cx: at(ratio), cy: 9, r: 5, fill: `var(--${sign})`}) : null);
+}
+
+function noChart(host, title, why) {
+  host.append(make('figure', {class: 'chart'}, make('figcaption', {}, title), nothing(why)));
+}
+
+function showHistogram(host, {histogram}) {
+  const title = 'How large they are';
+  if (!histogram || histogram.count.length === 0) {
+    noChart(host, title, 'The optimum follows this source wherever it leads, so that its residuals '
+      + 'say nothing.');
     return;
   }
-  host.append(make('p', {class: 'lead'}, `Distance to ${errors.against === 'truth' ? 'the truth'
-    : String(errors.against)}. The band is what the covariances claim: 95 % of errors should be `
-    + 'in it.'));
-  const marks = [];
-  if (errors.sigma) {
-    const high = errors.sigma.map((sigma) => (known(sigma) ? 2 * sigma : null));
-    marks.push({kind: 'band', x: errors.t, high, low: high.map((value) => known(value) ? 1e-9 : null),
-      colour: 'path', name: 'claimed, 2 sigma'});
-  }
-  if (errors.odometry) {
-    marks.push({kind: 'line', x: errors.t, y: errors.odometry, colour: 'odometry', dash: [6, 4],
-      name: 'odometry, aligned'});
-  }
-  marks.push({kind: 'line', x: errors.t, y: errors.position, colour: 'path', width: 1.9,
-    name: 'corrected path'});
-  const top = (column) => (extent(column || []) || [0, 0])[1];
-  const log = top(errors.odometry) > 5 * top(errors.position);
-  const time = {label: `time [${clockUnit()}]`, time: true, domain: [0, DATA.duration || 1]};
-  const charts = make('div', {class: 'charts wide'});
-  host.append(charts);
-  makeChart(charts, {title: 'Position', marks, x: time, height: 260,
-    y: {label: log ? 'error [m], logarithmic' : 'error [m]', log,
-      floor: Math.max(0.002, top(errors.position) / 300), readOut: (value) => length(value)}});
-  if (errors.heading && errors.heading.some(known)) {
-    makeChart(charts, {title: 'Heading', height: 260, x: time, y: {label: 'error [degrees]',
-      readOut: (value) => `${number(value)}°`}, marks: [{kind: 'line', x: errors.t, width: 1.6,
-      y: errors.heading.map((value) => (known(value) ? degrees(value) : null)), colour: 'path',
-      name: 'corrected path'}]});
-  }
-  host.append(...errorTable(DATA.error_table));
+  const {edges, count} = histogram;
+  const wide = edges[1] - edges[0];
+  const total = count.reduce((sum, value) => sum + value, 0);
+  const values = count.map((_, k) => edges[k] + wide / 2);
+  const normal = values.map((value) => (
+    total * wide * Math.exp(-0.5 * value * value)) / Math.sqrt(2 * Math.PI));
+  makeChart(host, {title, note: 'Larger ones are counted in the outermost bars.',
+    x: {label: 'residual / expected', values, range: [edges[0], edges[edges.length - 1]]},
+    y: {label: 'count'}, series: [{kind: 'bars', name: 'found', y: count, colour: 'path'},
+      {name: 'normal, as claimed', y: normal, colour: 'odometry'}]});
 }
 
-const ERROR_COLUMNS = {median: 'median', rms: 'rms', p95: '95 %', maximum: 'largest', count: 'of'};
-
-/** The table of distances between paths and what they are compared with, if there is one. */
-function errorTable(rows) {
-  if (!rows || rows.length === 0) return [];
-  const shown = Object.keys(ERROR_COLUMNS).filter((name) => rows.some((row) => known(row[name])));
-  const cell = (row, name) => {
-    if (name === 'count' || !known(row[name])) return number(row[name], 6);
-    return row[name].toFixed(2) + (row.unit === 'deg' ? '°' : '');
-  };
-  return [make('div', {class: 'card table scrolls'}, make('table', {class: 'errors'},
-    make('thead', {}, make('tr', {}, make('th', {scope: 'col'}, 'distance [m]'), shown.map(
-      (name) => make('th', {scope: 'col'}, ERROR_COLUMNS[name])))),
-    make('tbody', {}, rows.map((row) => make('tr', {}, make('th', {scope: 'row'}, row.name),
-      shown.map((name) => make('td', {}, cell(row, name))))))))];
+function showAutocorrelation(host, {autocorrelation}) {
+  const title = 'How long they keep their direction';
+  if (!autocorrelation || autocorrelation.lag.length === 0) {
+    noChart(host, title, 'There are too few residuals, or they say nothing.');
+    return;
+  }
+  const {lag, value, band, fitted, time, in_use: inUse} = autocorrelation;
+  const last = lag[lag.length - 1];
+  // lags that grow by a factor are told apart on an axis that does so as well
+  const log = lag[0] > 0 && last > 20 * lag[0];
+  const farthest = Math.max(last, Math.min(Math.max(time || 0, inUse || 0), 2 * last));
+  const series = [{kind: 'stems', name: 'found', y: value, colour: 'path'}];
+  if (fitted) series.push({name: 'fitted', y: fitted, colour: 'odometry', dash: [6, 3]});
+  if (known(band)) {
+    series.push({name: 'as of white noise, 95 %', y: lag.map(() => band), colour: 'muted', width: 0.5},
+      {y: lag.map(() => -band), colour: 'muted', width: 0.5});
+  }
+  const rules = [{at: time, name: `suggests ${number(time)} s`, colour: 'doubted'},
+    {at: inUse, name: `in use ${number(inUse)} s`, dash: [2, 3], colour: 'held-out'}]
+    .filter(({at}) => known(at) && at > 0).map((rule) => ({of: 'x', ...rule}));
+  makeChart(host, {title, series, rules, y: {label: 'autocorrelation'},
+    band: known(band) ? [series.length - 1, series.length] : null,
+    x: {label: log ? 'lag [s], logarithmic' : 'lag [s]', values: lag, log,
+      range: log ? null : [0, farthest]},
+    note: known(time) ? null : 'No correlation time is suggested: within the band, residuals say '
+      + 'nothing of each other.'});
 }
-
-// --- springs ------------------------------------------------------------------------------------
 
 /** The constraints under most tension; a click shows them on the map. */
-function showSprings(map) {
+function showSprings(choose) {
   const host = section('springs', 'Springs under most tension',
     'Constraints as springs between poses: the energy is what each adds to chi2, and the mark in '
     + 'its bar is what it adds on average if its covariance is right.');
-  const springs = DATA.springs || [];
-  if (springs.length === 0) {
+  if (springItems.length === 0) {
     host.append(nothing('None: the graph has no constraints with a residual.'));
     return;
   }
-  const most = Math.max(...springs.map(({energy, expected}) => Math.max(energy || 0, expected || 0)));
-  host.append(make('ol', {class: 'springs'}, springs.map((spring) => {
-    const {rank, name, kind, energy, expected, text} = spring;
-    const item = itemOfSpring(spring);
-    const bar = draw('svg', {class: 'bar', viewBox: '0 0 100 10', preserveAspectRatio: 'none',
-      'aria-hidden': 'true'},
-    draw('rect', {x: 0, y: 1, width: 100, height: 8, fill: 'var(--line)'}),
-    draw('rect', {x: 0, y: 1, width: 100 * ((energy || 0) / most), height: 8, fill: 'var(--spring)'}),
-    draw('rect', {x: 100 * ((expected || 0) / most) - 0.2, y: 0, width: 0.4, height: 10,
-      fill: 'var(--ink)'}));
-    const button = make('button', {type: 'button', class: 'entry', disabled: item.ends.length === 0,
-      onclick: () => map.choose(item)},
-    make('span', {class: 'rank'}, rank), make('span', {class: 'entry-name'}, name),
-    make('span', {class: 'kind'}, kind), bar,
-    make('span', {class: 'energy'}, make('b', {}, number(energy)), ` / ${number(expected)}`),
-    text && text !== name ? make('span', {class: 'entry-why'},
-      text.startsWith(name) ? text.slice(name.length).replace(/^[:,]? /, '') : text) : null);
-    followers.item.push((chosen) => button.classList.toggle('chosen', sameItem(chosen, item)));
-    return make('li', {}, button);
+  const [, most] = extent(...springItems.map(({spring}) => [spring.energy, spring.expected, 1e-9]));
+  host.append(make('ol', {class: 'springs card'}, springItems.map((item) => {
+    const {rank, name, kind, energy, expected, text} = item.spring;
+    const bar = (height, x, width, fillName) => draw('rect', {
+      x: `${(100 * x) / most}%`, width, height, y: (10 - height) / 2, fill: `var(--${fillName})`});
+    return entry(item, choose, [
+      make('span', {class: 'rank'}, rank), make('span', {class: 'entry-name'}, name),
+      make('span', {class: 'kind'}, kind),
+      draw('svg', {class: 'bar', 'aria-hidden': 'true'}, bar(8, 0, '100%', 'line'),
+        bar(8, 0, `${(100 * (energy || 0)) / most}%`, 'spring'), bar(10, expected || 0, 2, 'ink')),
+      make('span', {class: 'energy'}, make('b', {}, number(energy)), ` / ${number(expected)}`),
+      make('span', {class: 'entry-why'}, (text || '').replace(name, '').replace(/^[:,]? /, ''))]);
   })));
 }
-
-// --- updates ------------------------------------------------------------------------------------
 
 /** How long updates took, chi2 and the size of the graph over the drive. */
 function showUpdates() {
   const {updates} = DATA;
-  const host = section('updates', 'Updates');
+  const times = updates ? updates.ms.filter(known).sort((one, other) => one - other) : [];
+  const share = (part) => times[Math.min(times.length - 1, Math.floor(part * times.length))];
+  const host = section('updates', 'Updates', times.length > 0
+    ? `${counted(updates.count || updates.t.length, 'update')}: half took less than ${
+      number(share(0.5))} ms, 95 % less than ${number(share(0.95))} ms, the longest ${
+      number(share(1))} ms.` : null);
   if (!updates || updates.t.length === 0) {
     host.append(nothing('No updates were recorded in this run.'));
     return;
   }
-  const times = updates.ms.filter(known).sort((one, other) => one - other);
-  const share = (part) => times[Math.min(times.length - 1, Math.floor(part * times.length))];
-  if (times.length > 0) {
-    host.append(make('p', {class: 'lead'}, `${counted(updates.count || updates.t.length, 'update')}`
-      + `: half took less `
-      + `than ${number(share(0.5))} ms, 95 % less than ${number(share(0.95))} ms, the longest `
-      + `${number(share(1))} ms.`));
-  }
-  const charts = make('div', {class: 'charts wide'});
-  host.append(charts);
-  const x = {label: `time of the drive [${clockUnit()}]`, time: true, domain: [0, DATA.duration || 1]};
-  const wide = (column) => {
+  const axis = (label, column) => {
     const found = extent((column || []).filter((value) => value > 0));
-    return found !== null && found[1] > 20 * found[0];
+    const log = found !== null && found[1] > 20 * found[0];
+    return {label: log ? `${label}, logarithmic` : label, log};
   };
-  const period = known(updates.period) && updates.period < 20 * share(1)
-    ? [{kind: 'rule', of: 'y', at: updates.period, colour: 'doubted', dash: [6, 4],
-      name: `period of the node, ${number(updates.period)} ms`}] : [];
-  makeChart(charts, {title: 'Time of an update', x, marks: [...period,
-    {kind: 'dots', x: updates.t, y: updates.ms, colour: 'path', name: 'update',
-      format: (value) => `${number(value)} ms`}],
-  y: {label: wide(updates.ms) ? 'time [ms], logarithmic' : 'time [ms]', log: wide(updates.ms)}});
-  const log = wide(updates.chi2);
-  makeChart(charts, {title: 'chi2 of the graph', x, marks: [
-    {kind: 'line', x: updates.t, y: updates.chi2, colour: 'odometry', name: 'chi2'},
-    {kind: 'line', x: updates.t, y: updates.nodes, colour: 'path', dash: [6, 4],
-      name: 'hidden nodes', format: (value) => number(value, 6)}],
-  y: {label: log ? 'chi2, nodes, logarithmic' : 'chi2, nodes', log}});
+  const row = charts(host, 'wide');
+  makeChart(row, {title: 'Time of an update', x: timeAxis(updates.t), y: axis('time [ms]', updates.ms),
+    series: [{kind: 'dots', y: updates.ms, colour: 'path', name: 'update [ms]'}],
+    rules: known(updates.period) && updates.period < 20 * share(1) ? [{of: 'y', at: updates.period,
+      colour: 'doubted', dash: [6, 4], name: `period of the node, ${number(updates.period)} ms`}] : []});
+  makeChart(row, {title: 'chi2 of the graph', x: timeAxis(updates.t),
+    y: axis('chi2, nodes', updates.chi2), series: [
+      {y: updates.chi2, colour: 'odometry', name: 'chi2'},
+      {y: updates.nodes, colour: 'path', dash: [6, 4], name: 'hidden nodes',
+        format: (value) => number(value, 6)}]});
 }
 
-// --- matrices -----------------------------------------------------------------------------------
-
-/** Where H and its factor have blocks that are not zero. */
+/** Where H and its factor have blocks that are not zero, darker where there are many. */
 function showSparsity() {
   const host = section('sparsity', 'Sparsity of H and of its factor',
     'Each node is a row and a column. What the order of elimination leaves empty costs no time.');
   const matrices = DATA.sparsity || [];
-  if (matrices.length === 0) {
-    host.append(nothing('No matrices: the graph of this run is not there any more.'));
-    return;
+  if (matrices.length === 0) host.append(nothing('No matrices: the graph of this run is not there any more.'));
+  const row = charts(host, 'wide');
+  for (const {title, size, nonzeros, fill: filled, bins, cells} of matrices) {
+    const caption = [`${number(size, 6)} × ${number(size, 6)} blocks`,
+      `${number(nonzeros, 6)} not zero (${number((100 * nonzeros) / size ** 2, 2)} %)`,
+      ...(filled > 0 ? [`${number(filled, 6)} of them fill`] : [])].join(' · ');
+    const most = Math.max(...cells.map((cell) => cell[2]), 1);
+    const shade = ([, , count]) => Math.ceil((4 * Math.log1p(count)) / Math.log1p(most));
+    const square = Math.max(1, bins / 250);
+    row.append(make('figure', {class: 'chart'}, make('figcaption', {}, title),
+      draw('svg', {class: 'matrix', viewBox: `0 0 ${bins} ${bins}`, role: 'img',
+        'aria-label': `${title}: ${caption}`}, [1, 2, 3, 4].map((level) => draw('path', {
+        fill: 'var(--path)', 'fill-opacity': 0.4 + 0.15 * level, d: cells.filter(
+          (cell) => shade(cell) === level).map(([down, right]) => (
+          `M${right},${down}h${square}v${square}h-${square}Z`)).join('')}))),
+      make('p', {class: 'note'}, caption)));
   }
-  const row = make('div', {class: 'charts wide'});
-  host.append(row);
-  for (const matrix of matrices) showMatrix(row, matrix);
 }
 
-function showMatrix(host, {title, size, nonzeros, fill: filledIn, bins, cells}) {
-  const share = size > 0 ? `${number((100 * nonzeros) / size ** 2, 2)} %` : '–';
-  const text = [`${number(size, 6)} × ${number(size, 6)} blocks`, `${number(nonzeros, 6)} not zero `
-    + `(${share})`, known(filledIn) && filledIn > 0 ? `${number(filledIn, 6)} of them fill` : null];
-  const caption = text.filter((each) => each).join(' · ');
-  const plot = make('div', {class: 'matrix'});
-  host.append(make('figure', {class: 'chart'}, make('figcaption', {}, title), plot,
-    make('p', {class: 'note'}, caption)));
-  const most = Math.max(1, ...cells.map((cell) => cell[2]));
-  canvasIn(plot, {role: 'img', 'aria-label': `${title}: ${caption}`}, ({context, width}) => {
-    const side = width / bins;
-    context.fillStyle = colour('path');
-    for (const [down, right, count] of cells) {
-      context.globalAlpha = 0.4 + 0.6 * (Math.log1p(count) / Math.log1p(most));
-      const [left, top] = [Math.floor(right * side), Math.floor(down * side)];
-      context.fillRect(left, top, Math.max(Math.ceil((right + 1) * side) - left, 1.5),
-        Math.max(Math.ceil((down + 1) * side) - top, 1.5));
-    }
-    context.globalAlpha = 1;
-  });
-}
+// on paper the page is light and has all findings, whatever it is on the screen
+let onScreen = null;
+let folded = [];
+window.addEventListener('beforeprint', () => {
+  onScreen = document.documentElement.dataset.scheme;
+  folded = [...document.querySelectorAll('details.good:not([open])')];
+  for (const each of folded) each.open = true;
+  document.documentElement.classList.add('paper');
+  setScheme('light');
+});
+window.addEventListener('afterprint', () => {
+  document.documentElement.classList.remove('paper');
+  for (const each of folded) each.open = false;
+  setScheme(onScreen);
+});
+
+showHead();
+const choose = showMap();
+showErrors();
+showSources();
+showSprings(choose);
+showUpdates();
+showSparsity();
+document.getElementById('foot').append(make('p', {},
+  'Made by pose-graph report. This file holds all its data, and loads nothing.'));

@@ -19,8 +19,7 @@ from pose_graph_ros.adapters.bags import open_bag
 from pose_graph_ros.adapters.conversions import stamp_ns
 from pose_graph_ros.adapters.sources import backend_config, ODOMETRY_KINDS
 from pose_graph_ros.cli.evaluation import Drive, evaluate
-from pose_graph_ros.cli.run.content import Run
-from pose_graph_ros.cli.run.recorder import Recorder, Update
+from pose_graph_ros.cli.run.recorder import Recorder, Run, Update
 from pose_graph_ros.core.backend import PoseGraphBackend
 from pose_graph_ros.core.batch.optimizer import Status
 from pose_graph_ros.core.estimate import UpdateReport

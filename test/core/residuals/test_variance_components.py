@@ -9,7 +9,7 @@ import pytest
 
 from pose_graph_ros.cli.main import main
 from pose_graph_ros.cli.replay import CLOSURES
-from pose_graph_ros.cli.run.reading import read_document
+from pose_graph_ros.cli.run.document import read_document
 from pose_graph_ros.core.graph.constraints import EdgeKind, Edges
 from pose_graph_ros.core.graph.graph import Graph, GraphUpdate
 from pose_graph_ros.core.residuals import variance_components as vc

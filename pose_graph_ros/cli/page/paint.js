@@ -1,0 +1,245 @@
+// Copyright 2026 The pose_graph_ros authors
+// SPDX-License-Identifier: Apache-2.0
+// What is painted on the map. A frame tells where a place [m] is on the canvas, and what is in it.
+
+/** A canvas on the map that is painted anew when the map has come to rest. */
+const Painted = L.Renderer.extend({
+  _initContainer() {
+    this._container = make('canvas', {'aria-hidden': 'true'});
+  },
+  _destroyContainer() {
+    this._container.remove();
+  },
+  /** Leaflet calls this when the map has come to rest. */
+  _update() {
+    if (this._map._animatingZoom && this._bounds) return;
+    L.Renderer.prototype._update.call(this);
+    const {min, max} = this._bounds;
+    const size = this._bounds.getSize();
+    const ratio = window.devicePixelRatio;
+    L.DomUtil.setPosition(this._container, min);
+    Object.assign(this._container, {width: size.x * ratio, height: size.y * ratio});
+    Object.assign(this._container.style, {width: `${size.x}px`, height: `${size.y}px`});
+    const context = this._container.getContext('2d');
+    context.setTransform(ratio, 0, 0, ratio, -ratio * min.x, -ratio * min.y);
+    context.font = '12px system-ui, sans-serif';
+    const scale = 2 ** this._map.getZoom();
+    const origin = this._map.getPixelOrigin();
+    const corner = this._map.containerPointToLayerPoint([0, 0]);
+    const visible = [corner, corner.add(this._map.getSize())];
+    this.options.paint(context, {
+      scale, min, max, visible, place: (x, y) => [x * scale - origin.x, -y * scale - origin.y],
+      back: ({x, y}) => [(x + origin.x) / scale, -(y + origin.y) / scale]});
+  },
+  repaint() {
+    this._update();
+  },
+});
+
+/** On which sides a place is out of a frame, as bits. */
+const sideOf = ({min, max}, u, v) => (u < min.x - 9 ? 1 : u > max.x + 9 ? 2 : 0)
+  | (v < min.y - 9 ? 4 : v > max.y + 9 ? 8 : 0);
+
+/** Paint the layers: what is believed below the corrected path, the worst above all. */
+function paintLayers(layers, context, frame) {
+  paintGrid(context, frame, false);
+  const shown = layers.filter((layer) => layer.shown);
+  const measured = (order) => shown.filter(({counts}) => counts).forEach((layer) => order
+    .filter((state) => layer.states.has(state) && layer.counts[state] > 0)
+    .forEach((state) => (layer.kind === 'fix' ? paintFixes : paintClosures)(
+      layer.items.filter((item) => item.shown === state), state, context, frame)));
+  for (const layer of shown) {
+    if (layer.ellipses) paintEllipses(layer, context, frame);
+    if (layer.line && layer.id !== 'corrected') paintPath(layer, context, frame);
+  }
+  measured([HELD_OUT, BELIEVED, WEAK]);
+  for (const layer of shown) {
+    if (layer.id === 'corrected') paintPath(layer, context, frame);
+    if (layer.kind === 'spring') paintSprings(layer, context, frame);
+  }
+  measured([WAITING, REFUSED, DOUBTED]);
+}
+
+/** Lines at round coordinates, or these as texts at the left and at the lower border. */
+function paintGrid(context, frame, asTexts) {
+  const {scale, place, back} = frame;
+  const [min, max] = asTexts ? frame.visible : [frame.min, frame.max];
+  const [[left, top], [right, bottom]] = [back(min), back(max)];
+  const least = 110 / scale;
+  const power = 10 ** Math.floor(Math.log10(least));
+  const step = [1, 2, 5, 10].map((each) => each * power).find((each) => each >= least);
+  context.strokeStyle = colour('grid');
+  context.lineWidth = 1;
+  context.beginPath();
+  for (let k = Math.ceil(left / step); k <= right / step; k += 1) {
+    const u = Math.round(place(k * step, 0)[0]) + 0.5;
+    context.moveTo(u, min.y);
+    context.lineTo(u, max.y);
+    if (asTexts && u > min.x + 130) halo(context, number(k * step, 6), u + 3, max.y - 5);
+  }
+  for (let k = Math.ceil(bottom / step); k <= top / step; k += 1) {
+    const v = Math.round(place(0, k * step)[1]) + 0.5;
+    context.moveTo(min.x, v);
+    context.lineTo(max.x, v);
+    if (asTexts && v < max.y - 30) halo(context, number(k * step, 6), min.x + 6, v - 3);
+  }
+  if (!asTexts) context.stroke();
+}
+
+/** A text that can be read on whatever is below it. */
+function halo(context, text, u, v) {
+  context.lineJoin = 'round';
+  context.strokeStyle = colour('surface');
+  context.lineWidth = 3;
+  context.strokeText(text, u, v);
+  context.fillStyle = colour('muted');
+  context.fillText(text, u, v);
+}
+
+function stroke(context, name, width, places) {
+  context.strokeStyle = colour(name);
+  context.lineWidth = width;
+  context.beginPath();
+  for (const [k, [u, v]] of places.entries()) context[k === 0 ? 'moveTo' : 'lineTo'](u, v);
+  context.stroke();
+}
+
+/** Paint a path, without the points that do not show and the parts that are out of sight. */
+function paintPath({line: {x, y}, look}, context, frame) {
+  context.strokeStyle = colour(look.colour);
+  context.lineWidth = look.width;
+  context.lineJoin = 'round';
+  context.setLineDash(look.dash);
+  context.beginPath();
+  let [p, q, before] = [Infinity, Infinity, 0];
+  for (let k = 0; k < x.length; k += 1) {
+    const [u, v] = frame.place(x[k], y[k]);
+    if (Math.abs(u - p) + Math.abs(v - q) < 1.5 && k < x.length - 1) continue;
+    const side = sideOf(frame, u, v);
+    context[k === 0 || (side & before) !== 0 ? 'moveTo' : 'lineTo'](u, v);
+    [p, q, before] = [u, v, side];
+  }
+  context.stroke();
+  context.setLineDash([]);
+}
+
+/** Paint ellipses, but none whose middle is in one that is painted: they would be one blot. */
+function paintEllipses({ellipses: e, factor}, context, frame) {
+  context.strokeStyle = context.fillStyle = colour('path');
+  context.lineWidth = 1;
+  const painted = [];
+  for (let k = 0; k < e.x.length; k += 1) {
+    if (!known(e.xx[k])) continue;
+    const [u, v] = frame.place(e.x[k], e.y[k]);
+    const [mean, half] = [(e.xx[k] + e.yy[k]) / 2, Math.hypot((e.xx[k] - e.yy[k]) / 2, e.xy[k])];
+    const [long, short] = [mean + half, mean - half].map(
+      (variance) => 2 * factor * frame.scale * Math.sqrt(Math.max(variance, 0)));
+    if (long < 1.5) continue;
+    if (painted.some(([x, y, radius]) => Math.hypot(u - x, v - y) < Math.max(radius, long))) continue;
+    painted.push([u, v, long]);
+    context.beginPath();
+    context.ellipse(u, v, long, Math.max(short, 0.3),
+      -0.5 * Math.atan2(2 * e.xy[k], e.xx[k] - e.yy[k]), 0, 7);
+    context.globalAlpha = 0.1;
+    context.fill();
+    context.globalAlpha = 0.4;
+    context.stroke();
+  }
+  context.globalAlpha = 1;
+}
+
+/** Paint the mark of a state with a border, which lets it show on lines of any colour. */
+function stamp(state, context, [u, v], size) {
+  const {colour: name, shape, open} = lookOf(state);
+  const path = new Path2D(shape);
+  context.save();
+  context.translate(u, v);
+  context.scale(size, size);
+  context.strokeStyle = colour('surface');
+  context.lineWidth = 3.6;
+  context.stroke(path);
+  context.strokeStyle = context.fillStyle = colour(name);
+  context.lineWidth = 1.7;
+  context[open ? 'stroke' : 'fill'](path);
+  context.restore();
+}
+
+/** Paint fixes, of those that hide one another one; many are dots. */
+function paintFixes(items, state, context, frame) {
+  const places = new Map();
+  for (const {ends: [[x, y]]} of items) {
+    const [u, v] = frame.place(x, y);
+    if (sideOf(frame, u, v) === 0) places.set(Math.round(u / 3) * 1e5 + Math.round(v / 3), [u, v]);
+  }
+  context.fillStyle = colour(lookOf(state).colour);
+  for (const [u, v] of places.values()) {
+    if (places.size > 400) context.fillRect(u - 1.25, v - 1.25, 2.5, 2.5);
+    else stamp(state, context, [u, v], state === BELIEVED ? 0.75 : 1);
+  }
+}
+
+function paintClosures(items, state, context, frame) {
+  const {colour: name, dash} = lookOf(state);
+  const believed = state === BELIEVED;
+  const lines = items.map(({ends}) => ends.map((end) => frame.place(...end))).filter(
+    ([one, other]) => (sideOf(frame, ...one) & sideOf(frame, ...other)) === 0);
+  context.setLineDash(dash);
+  context.globalAlpha = believed ? 0.75 : 1;
+  for (const line of lines) stroke(context, name, believed ? 1.3 : 1.6, line);
+  context.setLineDash([]);
+  context.globalAlpha = 1;
+  if (lines.length > (believed || state === REFUSED ? 150 : 600)) return;
+  for (const line of lines) stamp(state, context, middleOf(line), believed ? 0.7 : 1.1);
+}
+
+function paintSprings({items}, context, frame) {
+  context.textAlign = 'center';
+  context.textBaseline = 'middle';
+  for (const {ends, spring} of [...items].reverse()) {
+    const places = ends.map((end) => frame.place(...end));
+    const [u, v] = middleOf(places);
+    stroke(context, 'spring', 4, places);
+    context.fillStyle = colour('spring');
+    context.beginPath();
+    context.arc(u, v, 8.5, 0, 7);
+    context.fill();
+    context.fillStyle = colour('surface');
+    context.fillText(String(spring.rank), u, v + 0.5);
+  }
+}
+
+/** What the reader looks at: the chosen item, and the robot at the time; and coordinates. */
+function paintFocus(path, context, frame) {
+  paintGrid(context, frame, true);
+  if (focus.item) paintChosen(focus.item, context, frame);
+  if (focus.time === null) return;
+  const {x, y, theta} = poseAt(path, focus.time);
+  context.translate(...frame.place(x, y));
+  context.rotate(-(theta || 0));
+  const shape = new Path2D('M13,0L-8,7.5L-4.5,0L-8,-7.5Z');
+  context.lineJoin = 'round';
+  context.strokeStyle = colour('surface');
+  context.lineWidth = 5;
+  context.stroke(shape);
+  context.fillStyle = colour('ink');
+  context.fill(shape);
+}
+
+/** A frame around what is chosen, and a line from a fix to where the robot was. */
+function paintChosen(item, context, frame) {
+  const places = item.ends.map((end) => frame.place(...end));
+  const name = item.spring ? 'spring' : lookOf(item.shown).colour;
+  if (item.tie) stroke(context, name, 1.5, [places[0], frame.place(...item.tie)]);
+  stroke(context, 'surface', 9, places);
+  stroke(context, name, 4.5, places);
+  for (const [u, v] of places) {
+    for (const [ring, width] of [['surface', 6], ['ink', 2.4]]) {
+      context.strokeStyle = colour(ring);
+      context.lineWidth = width;
+      context.beginPath();
+      context.arc(u, v, 10, 0, 7);
+      context.stroke();
+    }
+  }
+  if (!item.spring) stamp(item.shown, context, middleOf(places), 1.3);
+}
