@@ -11,8 +11,7 @@ import numpy as np
 import pytest
 from sensor_msgs.msg import Imu
 
-pytestmark = [pytest.mark.untraced,
-              pytest.mark.skipif(TFMessage is None, reason='there is no tf2_msgs')]
+pytestmark = pytest.mark.skipif(TFMessage is None, reason='there is no tf2_msgs')
 SPEED, RATE, DRIFT, BIAS = 2.0, 0.1, 0.02, -0.008
 """Of the circle [m/s, rad/s], of the heading by the wheels, and of the gyroscope [rad/s]."""
 REST, END_OF_FIXES, END = 4.0, 25.0, 45.0

@@ -12,8 +12,6 @@ from lifecycle_msgs.msg import State, Transition
 from lifecycle_msgs.srv import ChangeState, GetState
 import pytest
 
-pytestmark = pytest.mark.untraced
-
 
 class Manager:
     """Asks for states and transitions, as a lifecycle manager does."""

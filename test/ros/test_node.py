@@ -42,8 +42,6 @@ from rclpy.serialization import serialize_message
 
 from pose_graph_ros.core.geometry import se2
 
-pytestmark = pytest.mark.untraced
-
 
 def test_every_message_of_a_drive_is_sound(client: Client) -> None:
     drive(client, 30.0, paced=True)

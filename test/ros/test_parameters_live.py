@@ -19,8 +19,6 @@ import yaml
 from pose_graph_ros.adapters.parameter_texts import constraints
 from pose_graph_ros.adapters.parameters import all_parameters, Change
 
-pytestmark = pytest.mark.untraced
-
 
 def test_every_parameter_is_described(client: Client) -> None:
     names = client.call(client.node.create_client(

@@ -16,8 +16,6 @@ from visualization_msgs.msg import Marker, MarkerArray
 
 from pose_graph_ros.core.geometry import se2
 
-pytestmark = pytest.mark.untraced
-
 
 def newest(client: Client) -> np.ndarray:
     """Return the pose that the node publishes with the newest odometry."""

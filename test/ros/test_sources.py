@@ -31,7 +31,6 @@ import yaml
 
 from pose_graph_ros.core.geometry import se2
 
-pytestmark = pytest.mark.untraced
 # Exact measurements: what is left is the rounding of latitude and longitude [m].
 EXACT = 1e-3
 REAR = (-0.5, 0.25)

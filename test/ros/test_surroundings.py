@@ -15,7 +15,6 @@ from sensor_msgs.msg import Imu, NavSatFix
 
 from pose_graph_ros.adapters.parameter_files import without_effect
 
-pytestmark = pytest.mark.untraced
 EKF = '/odometry/filtered'
 
 

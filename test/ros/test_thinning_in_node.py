@@ -7,8 +7,6 @@ from harness import Client, stamp_ns
 import numpy as np
 import pytest
 
-pytestmark = pytest.mark.untraced
-
 
 @pytest.mark.parametrize(
     'node', [('-p', 'thinning.cell:=6.0', '-p', 'thinning.newest:=10.0')], indirect=True)

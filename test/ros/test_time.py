@@ -12,7 +12,6 @@ import numpy as np
 import pytest
 from rosgraph_msgs.msg import Clock
 
-pytestmark = pytest.mark.untraced
 LOOPS = 5
 DATUM = ('-p', 'datum:=[48.1, 11.6]')
 

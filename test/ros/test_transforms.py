@@ -22,8 +22,8 @@ import pytest
 
 from pose_graph_ros.core.geometry import se2
 
-pytestmark = [pytest.mark.untraced, pytest.mark.skipif(
-    TFMessage is None, reason='tf2_msgs is not built: no /tf')]
+pytestmark = pytest.mark.skipif(
+    TFMessage is None, reason='tf2_msgs is not built: no /tf')
 
 
 def broadcast(parent: str, child: str, seconds: float) -> object:

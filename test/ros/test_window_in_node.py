@@ -7,7 +7,6 @@ from harness import Client, pose, stamp_ns
 import numpy as np
 import pytest
 
-pytestmark = pytest.mark.untraced
 WINDOW = 24
 
 

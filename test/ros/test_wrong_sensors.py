@@ -13,7 +13,6 @@ import numpy as np
 import pytest
 from sensor_msgs.msg import Imu
 
-pytestmark = pytest.mark.untraced
 GYRO = ('-p', 'sources:=[odom, fix, gyro]', '-p', 'gyro.mounting:=up')
 HEADING = ('-p', 'sources:=[odom, fix, imu]')
 
