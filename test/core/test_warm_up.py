@@ -17,7 +17,6 @@ import pytest
 
 from pose_graph_ros import core
 from pose_graph_ros.core.compiled import jit
-from pose_graph_ros.core.warm_up import warm_up
 
 
 def run_alone(code: str, **environment: str) -> str:
@@ -75,32 +74,6 @@ def called_from_python() -> set[str]:
     return {names[id(kernel)] for module in modules_of_core()
             for function in functions_of(module, module.__name__)
             for kernel in kernels_in(function)}
-
-
-def test_the_kernels_that_python_calls_are_those_that_declare_their_signature() -> None:
-    found = called_from_python()
-    assert len(found) > 20
-    assert found == {name for name in jit.declared() if '.core.' in name}
-
-
-def test_the_warm_up_imports_all_modules_of_the_engine_with_kernels() -> None:
-    modules_of_core()
-    names = run_alone('from pose_graph_ros.core import warm_up\n'
-                      'print(*warm_up.jit.declared())').split()
-    assert sorted(names) == sorted(name for name in jit.declared() if '.core.' in name)
-
-
-def test_every_declared_kernel_is_ready_after_it() -> None:
-    warm_up()
-    for name in jit.declared():
-        assert jit._signatures[name] in jit._registered[name].overloads, name
-
-
-def test_a_call_with_other_types_is_an_error_not_a_compilation() -> None:
-    for _ in range(2):      # at the first call, and once it is compiled
-        with pytest.raises(TypeError):
-            jit._registered['pose_graph_ros.core.smoother.step.run']('text', 1, 2)
-        warm_up()
 
 
 # --- what the engine does ------------------------------------------------------------------------

@@ -251,14 +251,6 @@ def test_a_node_may_turn_by_many_turns(step: float) -> None:
         assert smoother.chi2() < 1e-9
 
 
-def test_a_heading_at_the_jump_stays_where_it_is() -> None:
-    smoother = IncrementalSmoother(EXACT)
-    smoother.update(GraphUpdate(
-        hidden=[[0.0, 0.0, -np.pi + 1e-3]], observed=ObservedNodes.joined([
-            seen(0, [0.0, 0.0, np.pi - 1e-3]), seen(0, [0.0, 0.0, -np.pi + 3e-3])])))
-    assert se2.wrap(smoother.poses[0, 2] - (np.pi + 1e-3)) == pytest.approx(0.0, abs=1e-6)
-
-
 # --- failure ------------------------------------------------------------------------------------
 
 def street(n: int, seed: int = 1) -> tuple[IncrementalSmoother, SlowGraph]:
@@ -396,38 +388,6 @@ def test_a_bad_update_does_not_forget_what_was_left_over() -> None:
     assert poses[:3] == poses[3:]
 
 
-def test_a_bad_update_does_not_forget_new_poses() -> None:
-    smoother, slow = street(10)
-    smoother.graph.set_poses(smoother.poses + 0.01)
-    assert smoother.update(GraphUpdate(free=[0])).status is Status.FAILED
-    smoother.update(GraphUpdate())
-    assert np.max(np.abs(slow.at(smoother.poses).step())) < 1e-3
-    assert smoother.covariances().shape == (10, 3, 3)
-
-
-def test_an_update_that_does_not_fit_leaves_no_trace() -> None:
-    smoother, _ = street(10)
-    before = state(smoother.graph)
-    with pytest.raises(ValueError, match=r'expected a hidden node in 0\.\.10'):
-        smoother.update(GraphUpdate(hidden=np.zeros((1, 3)), edges=link(0, 11, np.zeros(3))))
-    assert differences(before, state(smoother.graph)) == []
-
-
-def test_stamps_begin_anew_unnoticed() -> None:
-    smoother, slow = street(30)
-    spared, _ = street(30)
-    for k, counter in enumerate((tb.FRONT_SERIAL, tb.UPDATE)):
-        smoother.graph.memory.head[counter] = tb.LAST_STAMP + 1
-        for update in (GraphUpdate(edges=link(3 + k, 20, slow.poses[20])),
-                       GraphUpdate(free=[0]), GraphUpdate(weigh_edges={5: 0.1 + 0.1 * k})):
-            assert smoother.update(update)[:5] == spared.update(update)[:5]
-            assert smoother.poses.tobytes() == spared.poses.tobytes()
-    assert smoother.graph.memory.head[tb.UPDATE] < 100
-    smoother.graph.memory.head[tb.UPDATE] = tb.LAST_STAMP + 1
-    smoother.extend(np.ones(3), POSE_INFORMATION)
-    assert smoother.graph.memory.head[tb.UPDATE] < 100
-
-
 # --- default settings ---------------------------------------------------------------------------
 
 def closing_loops(seed: int, n: int) -> list[tuple[GraphUpdate, FloatArray]]:
@@ -563,14 +523,6 @@ def test_a_chain_made_with_another_weight_follows_what_pulls_at_it(weight: float
         smoother.update(GraphUpdate(observed=seen(
             59, smoother.poses[59] + np.array([3.0, 3.0, 0.0]))))
     np.testing.assert_allclose(extended.poses, updated.poses, rtol=0.0, atol=1e-3)
-
-
-def test_extending_takes_any_numbers() -> None:
-    smoother = IncrementalSmoother(EXACT)
-    smoother.update(GraphUpdate(hidden=np.zeros((1, 3)), fix=[0]))
-    smoother.extend([1, 0, 0], np.eye(3, dtype=int))
-    smoother.extend((1.0, 0.0, 0.0), 2.0 * np.eye(3, order='F')[::-1, ::-1])
-    np.testing.assert_allclose(smoother.poses[1:], [[1.0, 0.0, 0.0], [2.0, 0.0, 0.0]], atol=1e-12)
 
 
 @pytest.mark.parametrize('fixed', [False, True])

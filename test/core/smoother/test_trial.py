@@ -81,17 +81,6 @@ def test_it_is_adopted_with_all_that_was_added_meanwhile(seed: int) -> None:
     assert smoother.update(here.new_nodes(1)).status is Status.CONVERGED
 
 
-def test_a_trial_that_is_dropped_leaves_no_trace() -> None:
-    here = world(5)
-    smoother = driven(here)
-    before = state(smoother.graph)
-    trial = smoother.trial(GraphUpdate(weigh_edges={7: 0.0}))
-    assert smoother.adopt(trial).status is Status.FAILED    # not done
-    assert finished(trial) > 4
-    assert status(trial) is Status.CONVERGED
-    assert differences(before, state(smoother.graph)) == []
-
-
 def test_without_a_result_or_with_other_poses_nothing_is_adopted() -> None:
     here = world(6)
     smoother = driven(here, 3)

@@ -11,7 +11,6 @@ from pose_graph_ros.core.batch.optimizer import to_the_end
 from pose_graph_ros.core.geometry import se2
 from pose_graph_ros.core.graph.constraints import EdgeKind, Edges, ObservedKind, ObservedNodes
 from pose_graph_ros.core.graph.graph import Graph, GraphUpdate
-from pose_graph_ros.core.sources import error_estimate
 from pose_graph_ros.core.sources.error_estimate import measured_path, search
 from pose_graph_ros.core.sources.error_likelihood import (
     chain_motions,
@@ -168,30 +167,6 @@ def test_correlated_errors_are_found_among_wrong_positions() -> None:
         assert 8.0 < found.tau < 50.0
 
 
-def test_too_few_positions_show_nothing() -> None:
-    drive = a_drive(0, n=error_estimate.LEAST_POSITIONS - 1, tau=30.0)
-    assert to_the_end(search(drive)) == error_estimate.NOTHING
-
-
-def test_a_step_of_a_search_is_bounded(monkeypatch: pytest.MonkeyPatch) -> None:
-    done = []
-
-    def counting(*arguments: object) -> tuple[float, int]:
-        done.append(len(arguments[0]))  # type: ignore[arg-type]
-        return filtered(*arguments)
-
-    monkeypatch.setattr(error_estimate, 'filtered', counting)
-    steps, found = search(a_drive(1, n=300, tau=20.0)), None
-    while found is None:
-        before = len(done)
-        try:
-            next(steps)
-        except StopIteration as end:
-            found = end.value
-        assert sum(done[before:]) <= error_estimate.PER_STEP + 300
-    assert found == to_the_end(search(a_drive(1, n=300, tau=20.0)))
-
-
 @pytest.mark.parametrize(('drift', 'tau', 'n'), [
     (1.0, 0.0, 200), (1.0, 60.0, 400), (0.3, 60.0, 400), (2.0, 0.0, 600), (3.0, 0.0, 400),
     (3.0, 60.0, 600)])
@@ -273,22 +248,3 @@ def test_chained_motions_are_those_of_an_oracle() -> None:
         assert se2.wrap(got[k, 2] - pose[2]) == pytest.approx(0.0, abs=1e-12)
         np.testing.assert_allclose(spread[k], cov, rtol=1e-10, atol=1e-10)
         np.testing.assert_allclose(ways[k], way[[0, 0, 1], [0, 1, 1]], rtol=1e-10, atol=1e-10)
-
-
-def test_a_long_path_is_joined_in_steps(monkeypatch: pytest.MonkeyPatch) -> None:
-    arguments = line(40), SECOND * np.arange(40), np.arange(40)
-    at_once = to_the_end(measured_path(*arguments))
-    monkeypatch.setattr(error_estimate, 'NODES_PER_STEP', 7)
-    assert len(list(measured_path(*arguments))) >= 40 // 7
-    for one, other in zip(to_the_end(measured_path(*arguments)), at_once, strict=True):
-        np.testing.assert_array_equal(one, other)
-
-
-def test_of_many_positions_the_newest_and_a_sample_of_the_others_are_used(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    monkeypatch.setattr(error_estimate, 'NEWEST', 10)
-    monkeypatch.setattr(error_estimate, 'OLDER', 5)
-    found = to_the_end(measured_path(line(40), SECOND * np.arange(40), np.arange(40)))
-    assert len(found.seconds) == 15
-    np.testing.assert_allclose(found.seconds[-10:], np.arange(30, 40))
