@@ -27,7 +27,6 @@ from benchmark import (
     kept_sections,
     report,
     robust_fixes,
-    robust_jumps,
     robust_peers,
     robust_picture,
     robust_timing,
@@ -318,7 +317,7 @@ SECTIONS: dict[str, Callable[[Options], Section]] = {
     'timing': lambda options: robust_timing.timing(quick=options.quick),
     'fixes': lambda options: robust_fixes.section(
         options.data, quick=options.quick, robust=options.fix_robust, cases=options.cases),
-    'jumps': lambda options: robust_jumps.section(quick=options.quick), 'peers': peers}
+    'peers': peers}
 
 
 LIMITS = Section(
