@@ -17,7 +17,6 @@ from pose_graph_ros.core.batch import levenberg_marquardt, optimizer
 from pose_graph_ros.core.batch.optimizer import BatchResult, Status
 from pose_graph_ros.core.config import (
     BackendConfig,
-    CovariancePolicy,
     MeasurementSource,
     OdometrySource,
     POSITIONS,
@@ -357,12 +356,6 @@ class Flaky(IncrementalSmoother):
         return UpdateResult(Status.FAILED, 'broken on purpose', 0, 0, 0, 0)
 
 
-FAR = {'GlobalPose': MeasurementSource(covariance=CovariancePolicy(position_ceiling=1e6))}
-# It tells the angle to the map, but is too uncertain of the place to hold the graph anywhere.
-NOWHERE = GlobalPose(
-    DRIVE.odometry[3].stamp_ns + 7, DRIVE.global_poses[0].pose, np.diag([1e10, 1e10, 1e-6]))
-
-
 @pytest.mark.parametrize('known', [20, 100])
 def test_a_failing_update_leaves_the_graph_bit_equal_and_the_engine_recovers(known: int) -> None:
     smoother = Flaky()
@@ -395,80 +388,6 @@ def test_a_failing_update_leaves_the_graph_bit_equal_and_the_engine_recovers(kno
     assert backend.optimize().status is Status.CONVERGED
     assert backend.n_quarantined == 0    # ... but at the end
     assert_same_path(backend, REFERENCE_PATH)
-
-
-def test_an_alignment_whose_update_fails_is_undone() -> None:
-    smoother = Flaky()
-    backend = PoseGraphBackend(prompt(), smoother=smoother)
-    events = in_order(DRIVE.odometry, DRIVE.positions)
-    for event in events[:6]:
-        feed(backend, event)
-    backend.update()
-    assert backend.estimate().alignment is AlignmentState.UNALIGNED
-    for event in events[6:]:
-        feed(backend, event)
-    before, estimate = snapshot(backend.graph), backend.estimate()
-    smoother.broken = True
-    assert backend.update().status is Status.FAILED
-    assert snapshot(backend.graph) == before
-    # still where the first position says, and no more certain than before
-    np.testing.assert_array_equal(backend.estimate().path.poses, estimate.path.poses)
-    np.testing.assert_array_equal(backend.estimate().covariance, estimate.covariance)
-    smoother.broken = False
-    assert backend.optimize().status is Status.CONVERGED
-    assert backend.estimate().alignment is AlignmentState.ALIGNED
-    assert_same_path(backend, path(run(events)))
-
-
-def test_an_update_that_raises_is_undone_and_set_aside(monkeypatch: pytest.MonkeyPatch) -> None:
-    backend = PoseGraphBackend(prompt())
-    for event in in_order(DRIVE.odometry, DRIVE.global_poses):
-        feed(backend, event)
-    before = backend.graph.poses.copy()
-
-    def no_memory(*_: object, **__: object) -> None:
-        raise MemoryError('no memory')
-
-    with monkeypatch.context() as patch:
-        patch.setattr(IncrementalSmoother, '_step', no_memory)
-        report = backend.update()
-    assert (report.status, report.reason) == (Status.FAILED, 'MemoryError: no memory')
-    np.testing.assert_array_equal(backend.graph.poses, before)
-    assert backend.graph.n_observed == 0
-    assert backend.estimate().alignment is not AlignmentState.ALIGNED
-    assert backend.n_quarantined == len(DRIVE.global_poses)
-    assert backend.optimize().status is Status.CONVERGED
-    assert backend.graph.n_observed == len(DRIVE.global_poses)
-    assert_same_path(backend, path(run(in_order(DRIVE.odometry, DRIVE.global_poses))))
-
-
-def test_a_constraint_that_cannot_be_solved_for_is_set_aside_and_the_engine_goes_on() -> None:
-    backend = PoseGraphBackend(prompt(measurements=FAR))
-    events = in_order(DRIVE.odometry, DRIVE.global_poses, DRIVE.positions[1:], DRIVE.closures)
-    for event in events:
-        if event is DRIVE.odometry[5]:
-            feed(backend, NOWHERE)
-            before = snapshot(backend.graph)
-            report = backend.update()
-            assert report.status is Status.FAILED
-            assert 'not determined' in report.reason
-            assert snapshot(backend.graph) == before
-            # and once more, before anything has been solved for again
-            feed(backend, replace(NOWHERE, stamp_ns=NOWHERE.stamp_ns + 1))
-            assert backend.update().status is Status.FAILED
-            assert snapshot(backend.graph) == before
-            assert backend.estimate().alignment is AlignmentState.LOCAL
-        feed(backend, event)
-        assert backend.update().status is not Status.FAILED
-    assert backend.n_quarantined == 2
-    estimate = backend.estimate()
-    assert estimate.alignment is AlignmentState.ALIGNED
-    expected = path(run(events))
-    np.testing.assert_allclose(estimate.path.poses[:, :2], expected[:, :2], atol=0.05)
-    # with all that holds the graph at the end they do no harm
-    assert backend.optimize().status is Status.CONVERGED
-    assert backend.n_quarantined == 0
-    assert backend.graph.n_observed == len(DRIVE.positions) - 1 + len(DRIVE.global_poses) + 2
 
 
 # --- Updates ---------------------------------------------------------------------------------
@@ -742,17 +661,6 @@ def test_a_heading_that_drifts_far_in_a_long_outage_is_wound_the_right_way(
     backend.graph.set_poses(truth)
     from_truth = optimizer.optimize(backend.graph, BackendConfig().final_optimization)
     assert found <= from_truth.chi2 * (1.0 + 1e-9)
-
-
-@pytest.mark.parametrize(('drift', 'seed', 'update_every'), [(-3.0, 2, 1), (5.0, 3, 10)])
-def test_updates_alone_wind_a_heading_that_has_drifted_far_the_right_way(
-    drift: float, seed: int, update_every: int,
-) -> None:
-    backend = PoseGraphBackend(prompt())
-    drive_with_outage(backend, drift, seed, update_every)
-    found = backend.graph.energies().chi2
-    backend.optimize()
-    assert found <= 1.01 * backend.graph.energies().chi2 + 1.0
 
 
 def test_a_loop_closure_that_came_too_early_can_be_sent_again() -> None:

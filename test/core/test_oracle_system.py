@@ -69,69 +69,6 @@ def test_a_graph_of_fixed_nodes_has_no_unknowns() -> None:
     assert b.shape == (0,)
 
 
-# --- Figure 3.10: what measurements do to the pattern of H -----------------------------------
-
-class Figure:
-    """The example of the source, growing."""
-
-    def __init__(self) -> None:
-        self.rng = np.random.default_rng(310)
-        self.graph = Graph()
-
-    def hidden(self, n: int) -> None:
-        self.graph.apply(GraphUpdate(hidden=random_poses(self.rng, n)))
-
-    def observe(self, node: int) -> None:
-        # full poses alone: a block that they touch has no zero
-        pair = random_observed(self.rng, [node, node], offset=False)
-        self.graph.apply(GraphUpdate(observed=pair.rows(slice(1, 2))))
-
-    def edge(self, i: int, j: int) -> None:
-        self.graph.apply(GraphUpdate(edges=random_edges(self.rng, [i], [j])))
-
-    def state(self) -> tuple[npt.NDArray[np.bool_], FloatArray]:
-        system = LinearSystem(self.graph)
-        H = system.assemble(self.graph.poses)[0].toarray()
-        np.testing.assert_array_equal(system.pattern(), blocks_that_are_not_zero(H))
-        np.testing.assert_allclose(H, H.T, atol=ROUNDING)
-        return system.pattern(), H
-
-
-def test_figure_3_10_the_states_of_a_growing_graph() -> None:
-    figure = Figure()
-    figure.hidden(1)
-    figure.observe(0)
-    a_pattern, a_H = figure.state()
-    np.testing.assert_array_equal(a_pattern, [[True]])          # x0 with xw0: one block
-
-    figure.observe(0)
-    b_pattern, b_H = figure.state()
-    np.testing.assert_array_equal(b_pattern, a_pattern)         # xw1 on x0: same pattern,
-    assert np.all(np.linalg.eigvalsh(b_H - a_H) > 0.0)          # more information
-
-    figure.hidden(1)
-    figure.edge(0, 1)
-    c_pattern, c_H = figure.state()
-    np.testing.assert_array_equal(c_pattern, np.ones((2, 2)))   # an edge: 2x2 blocks
-    np.testing.assert_array_equal(b_pattern, c_pattern[:1, :1])
-    assert np.any(c_H[:3, :3] != b_H)
-
-    figure.observe(1)
-    d_pattern, d_H = figure.state()
-    np.testing.assert_array_equal(d_pattern, c_pattern)         # xw2 on x1: same pattern,
-    changed = ~np.isclose(d_H, c_H, rtol=0.0, atol=ROUNDING)
-    np.testing.assert_array_equal(                              # one diagonal block changes
-        blocks_that_are_not_zero(changed.astype(float)), [[False, False], [False, True]])
-
-    figure.hidden(3)
-    for i in range(1, 4):
-        figure.edge(i, i + 1)
-    figure.observe(3)                                           # xw3
-    e_pattern, _ = figure.state()
-    distance = np.abs(np.subtract.outer(np.arange(5), np.arange(5)))
-    np.testing.assert_array_equal(e_pattern, distance <= 1)     # a chain: block-tridiagonal
-
-
 # --- The null space of a graph that floats ---------------------------------------------------
 
 def rigid_motion(poses: FloatArray) -> FloatArray:

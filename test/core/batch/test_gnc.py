@@ -156,10 +156,3 @@ def test_a_retest_takes_in_what_was_left_out_and_throws_out_what_is_wrong() -> N
     better = problem.improved(bent)
     assert better.cost < bent.cost
     assert not better.believed[-1]
-
-
-def test_a_graph_whose_factorisation_is_nearly_dense_is_left_alone(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    monkeypatch.setattr(gnc, 'MOST_NUMBERS', 100)
-    assert gnc.select(small(0), Surrogate.TRUNCATED) is None

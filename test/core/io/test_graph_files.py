@@ -8,7 +8,6 @@ from dataclasses import replace
 import functools
 import hashlib
 import json
-import os
 from pathlib import Path
 import tempfile
 from typing import Any
@@ -33,7 +32,6 @@ from pose_graph_ros.core.exceptions import FileFormatError, FileWriteError
 from pose_graph_ros.core.geometry.geodesy import MapOrigin
 from pose_graph_ros.core.graph.constraints import EdgeKind, Edges, ObservedKind, ObservedNodes
 from pose_graph_ros.core.graph.graph import Graph, GraphUpdate, NextIds
-from pose_graph_ros.core.io import atomic_files
 from pose_graph_ros.core.io.g2o import read_g2o
 from pose_graph_ros.core.io.graph_files import graph_paths, read_datum, read_graph, write_graph
 from pose_graph_ros.core.io.saved_graph import SavedGraph
@@ -90,25 +88,6 @@ def test_other_programs_read_the_graph_and_the_path(tmp_path: Path) -> None:
 
 
 # --- places -------------------------------------------------------------------------------------
-
-def test_the_file_with_the_checksums_is_renamed_last_after_all_are_on_the_disk(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    done: list[str] = []
-    replace_, fsync = os.replace, os.fsync
-
-    def replacing(source: Path, target: Path) -> None:
-        done.append(Path(target).suffix)
-        replace_(source, target)
-
-    def syncing(handle: int) -> None:
-        done.append('sync')
-        fsync(handle)
-
-    monkeypatch.setattr(atomic_files.os, 'replace', replacing)
-    monkeypatch.setattr(atomic_files.os, 'fsync', syncing)
-    write_graph(small_graph(), tmp_path / 'map')
-    assert done == ['sync', 'sync', 'sync', '.g2o', '.tum', '.json', 'sync']
 
 
 def make_folder(path: Path) -> Path:

@@ -229,22 +229,6 @@ def test_what_a_robot_can_do_is_no_jump(name: str, rate: int) -> None:
     assert jumps(drive(np.arange(8 * rate) / rate, *QUICK[name])) == 0
 
 
-def test_after_many_resets_the_motion_is_that_without_but_for_the_resets() -> None:
-    rng = np.random.default_rng(5)
-    samples = drive(np.arange(1200) * 0.1, steady(1.5), lambda t: 0.2 * np.sin(0.1 * t))
-    broken = samples
-    for at in (100, 300, 320, 700):
-        broken = reset(broken, at)
-    stream = settled(broken)
-    assert stream.n_jumps == 4
-    for _ in range(50):
-        a, b = np.sort(rng.integers(320, 699, 2))
-        motion = stream.timeline.motion(samples[a].stamp_ns, samples[b].stamp_ns)
-        np.testing.assert_allclose(
-            motion.increment, se2.between(samples[a].pose, samples[b].pose), atol=1e-9)
-        assert np.all(motion.variance == 0.0)
-
-
 # --- Noise -----------------------------------------------------------------------------------
 
 TWIST = {'noise_from': NoiseFrom.TWIST}

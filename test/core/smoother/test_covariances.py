@@ -5,11 +5,10 @@
 from hypothesis import given, settings, strategies as st
 import numpy as np
 import pytest
-from slow_smoother import cliques, EXACT, frame_turn, SlowGraph, world
+from slow_smoother import EXACT, SlowGraph, world
 
 from pose_graph_ros.core.batch.optimizer import Status
 from pose_graph_ros.core.geometry import se2
-from pose_graph_ros.core.graph import tables as tb
 from pose_graph_ros.core.graph.constraints import EdgeKind, Edges, ObservedKind, ObservedNodes
 from pose_graph_ros.core.graph.graph import GraphUpdate
 from pose_graph_ros.core.smoother import covariances
@@ -136,56 +135,6 @@ def test_nodes_in_different_parts_are_not_correlated() -> None:
     joint = smoother.joint_covariance(2, 5)
     np.testing.assert_array_equal(joint[:3, 3:], np.zeros((3, 3)))
     np.testing.assert_allclose(joint[3:, 3:], 2.0 * np.linalg.inv(pose_information()), rtol=1e-12)
-
-
-@given(seeds, st.integers(1, 25))
-@settings(max_examples=20)
-def test_covariances_do_not_depend_on_the_frames_of_cliques(seed: int, steps: int) -> None:
-    smoother = driven(seed, steps)
-    graph = smoother.graph
-    pair = graph.n_nodes // 2, graph.n_nodes - 1
-    expected, expected_joint = smoother.covariances(), smoother.joint_covariance(*pair)
-    memory, rng = graph.memory, np.random.default_rng(seed)
-    for c, clique in cliques(graph).items():
-        if np.any(graph.fixed[clique.frontal]) or clique.parent < 0:
-            continue  # anchored to the map
-        angle = rng.uniform(-3.0, 3.0)
-        turned = clique.R.copy()
-        for k in range(0, clique.R.shape[1], 3):
-            turned[:, k:k + 2] = clique.R[:, k:k + 2] @ se2.rotation(angle)
-        triangle = np.linalg.qr(turned, mode='r')
-        triangle *= np.sign(np.diag(triangle))[:, None]
-        n = len(triangle)
-        triangle[np.diag_indices(n)] = 1.0 / triangle[np.diag_indices(n)]
-        values = memory['pool_f'][memory['clique_i'][c, tb.VALUES]:]
-        places = np.triu_indices(n, m=clique.R.shape[1] + 1)
-        values[:len(places[0])] = np.column_stack((triangle, clique.rhs))[places]
-        memory['clique_i'][c, tb.ANCHORED] = 0
-        memory['clique_f'][c, tb.TURN_ZERO] += frame_turn(graph, c) - angle
-    np.testing.assert_allclose(smoother.covariances(), expected, rtol=1e-8, atol=1e-13)
-    np.testing.assert_allclose(
-        smoother.joint_covariance(*pair), expected_joint, rtol=1e-8, atol=1e-13)
-
-
-def test_asking_changes_nothing() -> None:
-    smoother, other = driven(5, 20), driven(5, 20)
-    smoother.covariances()
-    smoother.covariance(3)
-    smoother.joint_covariance(0, 4)
-    smoother.newest_covariance()
-    for each in (smoother, other):
-        each.update(GraphUpdate(weigh_edges={2: 0.3}))
-    assert smoother.poses.tobytes() == other.poses.tobytes()
-
-
-@pytest.mark.parametrize('node', [4, -1, 1.5, None])
-def test_a_node_that_is_not_there_is_refused(node: object) -> None:
-    smoother = IncrementalSmoother(EXACT)
-    smoother.update(chain(4))
-    for ask in (lambda: smoother.covariance(node), lambda: smoother.joint_covariance(0, node),
-                lambda: smoother.joint_covariance(node, 0)):
-        with pytest.raises(ValueError, match=rf'a hidden node in 0\.\.3, got {node}'):
-            ask()
 
 
 def test_covariances_require_that_edits_are_solved_for() -> None:

@@ -7,7 +7,7 @@ from dataclasses import replace
 from hypothesis import given, settings, strategies as st
 import numpy as np
 import pytest
-from slow_smoother import cliques, differences, EXACT, SlowGraph, state, World, world
+from slow_smoother import differences, EXACT, SlowGraph, state, World, world
 
 from pose_graph_ros.core.batch import optimizer
 from pose_graph_ros.core.batch.optimizer import Status
@@ -151,27 +151,6 @@ def test_the_tree_has_the_result_of_the_pure_function(seed: int) -> None:
     gone = np.isin(edges.i, leaving) | np.isin(edges.j, leaving)
     assert len(forgotten.edges) == np.sum(gone)
     assert len(forgotten.observed) == np.sum(np.isin(observed.node, leaving))
-
-
-@given(seeds)
-@settings(max_examples=20)
-def test_whole_subtrees_leave_the_rest_untouched_bit_for_bit(seed: int) -> None:
-    smoother, here = driven(seed)
-    graph = smoother.graph
-    tree = cliques(graph)
-    c = int(here.rng.choice([c for c, clique in tree.items() if clique.parent >= 0]))
-    below, rest = [c], []
-    for each in below:
-        below += [child for child in tree[each].children if child in tree]
-        rest += tree[each].frontal
-    if graph.newest_pose in rest:
-        return
-    kept = np.setdiff1d(graph.node_ids, rest)
-    poses = graph.poses_of(kept).tobytes()
-    values = {k: clique.R.tobytes() for k, clique in tree.items() if k not in below}
-    smoother.forget(rest)
-    assert graph.poses_of(kept).tobytes() == poses
-    assert {k: clique.R.tobytes() for k, clique in cliques(graph).items()} == values
 
 
 @given(seeds, flags)

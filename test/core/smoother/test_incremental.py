@@ -17,7 +17,6 @@ from pose_graph_ros.core.config import SmootherConfig
 from pose_graph_ros.core.exceptions import GraphUpdateError
 from pose_graph_ros.core.geometry import se2
 from pose_graph_ros.core.geometry.se2 import FloatArray
-from pose_graph_ros.core.graph import tables as tb
 from pose_graph_ros.core.graph.constraints import EdgeKind, Edges, ObservedKind, ObservedNodes
 from pose_graph_ros.core.graph.graph import Graph, GraphUpdate
 from pose_graph_ros.core.smoother import step, tree_update
@@ -448,28 +447,6 @@ def test_what_is_left_over_is_done_in_the_next_updates() -> None:
     assert (result.status, result.iterations) == (Status.CONVERGED, 0)
 
 
-def test_removing_and_adding_again_takes_no_memory() -> None:
-    smoother, here = IncrementalSmoother(), world(2)
-    smoother.update(GraphUpdate(hidden=np.array(here.truth), fix=[0]))
-    smoother.update(here.new_nodes(60))
-    n_first = smoother.graph.n_edges
-    smoother.update(GraphUpdate(edges=here.edges(here.pairs(60))))
-    extra = np.arange(n_first, smoother.graph.n_edges)
-    rng, ends = np.random.default_rng(1), []
-    for _ in range(1000):
-        chosen = rng.choice(extra, 3, replace=False)
-        assert smoother.update(GraphUpdate(weigh_edges={
-            int(e): float(rng.choice([0.0, 1.0, 0.5])) for e in chosen})).reason == ''
-        ends.append(smoother.graph.memory.head[[tb.POOL_F_END, tb.POOL_I_END, tb.N_CLIQUES]])
-    assert np.all(ends[-1] <= 1.3 * np.array(ends[200]))
-    assert smoother.graph.memory.head[tb.N_CLIQUES] <= 2 * smoother.graph.n_nodes
-    # and nothing has gone wrong on the way
-    smoother.update(GraphUpdate(weigh_edges={int(e): 1.0 for e in extra}))
-    assert np.max(np.abs(SlowGraph(
-        smoother.poses.copy(), smoother.graph.fixed, smoother.graph.edges,
-        smoother.graph.observed).step())) < 1e-2
-
-
 # --- along a chain ------------------------------------------------------------------------------
 
 @pytest.mark.parametrize('config', [SmootherConfig(), EXACT], ids=['default', 'exact'])
@@ -523,19 +500,3 @@ def test_a_chain_made_with_another_weight_follows_what_pulls_at_it(weight: float
         smoother.update(GraphUpdate(observed=seen(
             59, smoother.poses[59] + np.array([3.0, 3.0, 0.0]))))
     np.testing.assert_allclose(extended.poses, updated.poses, rtol=0.0, atol=1e-3)
-
-
-@pytest.mark.parametrize('fixed', [False, True])
-def test_extending_from_a_node_that_was_fixed_or_freed(fixed: bool) -> None:
-    smoother, slow = IncrementalSmoother(EXACT), SlowGraph()
-    first = GraphUpdate(hidden=np.zeros((2, 3)), edges=link(0, 1, [1.0, 0.0, 0.1]),
-                        observed=seen(0, np.zeros(3)), fix=[1] if fixed else [0])
-    smoother.update(first)
-    smoother.extend(np.array([1.0, 0.0, 0.1]), POSE_INFORMATION)
-    smoother.update(GraphUpdate(observed=seen(2, [2.2, 0.1, 0.3])))
-    slow = slow.edited(first).edited(GraphUpdate(
-        hidden=smoother.poses[2:], edges=link(1, 2, [1.0, 0.0, 0.1]),
-        observed=seen(2, [2.2, 0.1, 0.3])))
-    slow = slow.at(smoother.poses)
-    assert np.max(np.abs(slow.step())) < CLOSE
-    np.testing.assert_array_equal(smoother.poses[1 if fixed else 0], np.zeros(3))

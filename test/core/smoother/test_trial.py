@@ -99,21 +99,6 @@ def test_without_a_result_or_with_other_poses_nothing_is_adopted() -> None:
     assert smoother.adopt(trial).status is Status.FAILED
 
 
-def test_what_cannot_be_solved_with_it_is_not_adopted() -> None:
-    here = world(7)
-    smoother = driven(here, 4)
-    smoother.update(here.new_nodes(1))
-    edge = smoother.graph.n_edges - 1
-    n = smoother.graph.n_nodes
-    smoother.update(GraphUpdate(edges=here.edges([(0, n - 1)])))
-    trial = smoother.trial(GraphUpdate(weigh_edges={edge: 0.0}))
-    finished(trial)
-    smoother.update(GraphUpdate(weigh_edges={edge + 1: 0.0}))   # only the first one is left
-    before = state(smoother.graph)
-    assert smoother.adopt(trial).status is Status.FAILED
-    assert differences(before, state(smoother.graph)) == []
-
-
 def test_an_update_that_diverges_can_be_left_to_a_trial() -> None:
     # a chain that closes by a heading that is off by more than a linear model stands
     smoother, here = IncrementalSmoother(), world(2)
