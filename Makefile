@@ -6,6 +6,9 @@ BENCH_ARGS ?=
 # Modules are byte-compiled when they are first imported, and not in each process anew.
 unexport PYTHONDONTWRITEBYTECODE
 
+RESOLVE = $(VENV)/bin/uv pip compile --quiet --upgrade --no-annotate --python-version 3.11 \
+	--custom-compile-command 'make lock'
+
 # make variable -> option of `pose-graph demo`; only those that are given
 option = $(if $($(1)),--$(2) '$($(1))')
 DEMO_ARGS = $(call option,BAG,bag) $(call option,ODOM,odom) $(call option,FIX,fix) \
@@ -13,13 +16,14 @@ DEMO_ARGS = $(call option,BAG,bag) $(call option,ODOM,odom) $(call option,FIX,fi
 	$(call option,TRUTH,truth) $(call option,HOLD_OUT,hold-out) $(call option,RATE,rate) \
 	$(call option,OUT,out)
 
-.PHONY: help setup setup-demo setup-test demo test bench lint types fmt lock clean
+.PHONY: help setup setup-demo setup-test demo test coverage bench lint types fmt lock clean
 
 help:
 	@echo 'make demo    set up, then simulate a drive, replay it through the node and judge the result'
 	@echo '             own bag: BAG=folder|file.mcap|file.db3 ODOM=/topic FIX=/topic [GLOBAL_POSE=/topic]'
 	@echo '             [LOOP_CLOSURE=/topic] [TRUTH=/topic] [HOLD_OUT=5] [RATE=factor] [OUT=demo]'
 	@echo 'make test    set up, then run the checks (ruff, mypy) and all tests; PYTEST_ARGS="-k word"'
+	@echo 'make coverage    which lines of the engine its own tests run'
 	@echo 'make bench   measure the engine against GTSAM; BENCH_ARGS="--quick --gate", or --help'
 	@echo 'make lint    ruff alone;  make types: mypy alone;  make fmt: let ruff mend what it can'
 	@echo 'make setup   set up alone: $(VENV), from wheels, or on top of ROS where one is sourced;'
@@ -43,6 +47,13 @@ demo: setup-demo
 test: setup-test
 	@dev/test.sh $(VENV) $(PYTEST_ARGS)
 
+# of the engine by its own tests: to trace those of the node and the tools takes as long as they do
+coverage: setup-test
+	$(VENV)/bin/python -m coverage erase
+	$(VENV)/bin/python -m coverage run -m pytest -q -n 3 --dist loadfile test/core
+	$(VENV)/bin/python -m coverage combine --quiet
+	$(VENV)/bin/python -m coverage report --skip-covered --sort=cover --include='pose_graph_ros/core/*'
+
 bench: setup
 	@$(VENV)/bin/python -m pip install --quiet --disable-pip-version-check --no-deps \
 		-r benchmark/requirements.txt
@@ -57,10 +68,15 @@ types: setup-test
 fmt: setup-test
 	$(VENV)/bin/ruff check --fix
 
+# for the oldest supported Python: what is the newest for 3.11 also exists for 3.12
 lock: setup
-	$(VENV)/bin/python dev/lock.py
+	$(RESOLVE) dev/requirements.in -o requirements.lock
+	$(RESOLVE) dev/requirements.in dev/requirements-test.in -c requirements.lock \
+		| grep -vxF -f requirements.lock \
+		| sed '1i # What tests and checks need beside requirements.lock; made by `make lock`.' \
+		>requirements-test.lock
 
 clean:
 	rm -rf .venv .venv-ros build install log *.egg-info .coverage htmlcov
 	rm -rf .hypothesis .mypy_cache .pytest_cache .ruff_cache
-	find pose_graph_ros test dev launch -name __pycache__ -prune -exec rm -rf {} +
+	find pose_graph_ros test launch -name __pycache__ -prune -exec rm -rf {} +

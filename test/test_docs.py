@@ -4,12 +4,15 @@
 
 import ast
 import functools
+import importlib
+import inspect
 from pathlib import Path
 import re
 
 import pytest
 
 import pose_graph_ros
+from pose_graph_ros import core
 
 PACKAGE = Path(pose_graph_ros.__file__).parent
 ROOT = Path(__file__).resolve().parents[1]
@@ -99,3 +102,22 @@ def test_the_container_copies_what_the_package_is_made_of() -> None:
               'setup.cfg', 'LICENSE'}
     assert not needed & set(ignored)
     assert all((ROOT / name).exists() for name in needed)
+
+
+def test_what_users_call_has_a_docstring() -> None:
+    named = []
+    for item in re.findall(r'^- (`.*?):', inspect.getdoc(core) or '', re.M):
+        module = ''
+        for name in re.findall(r'`([^`]+)`', item):
+            # the module of the first name of an item is that of the others, too
+            module = name.rpartition('.')[0] or module
+            found = importlib.import_module(f'pose_graph_ros.core.{module}')
+            named.append(getattr(found, name.rpartition('.')[2]))
+    for path in sorted((PACKAGE / 'cli').glob('*.py')):
+        tool = importlib.import_module(f'pose_graph_ros.cli.{path.stem}')
+        named += [getattr(tool, door) for door in ('add_arguments', 'execute')
+                  if hasattr(tool, door)]
+    assert len(named) > 40
+    # (a dataclass that has none gets its signature)
+    assert not [one for one in named
+                if not one.__doc__ or one.__doc__.startswith(f'{one.__name__}(')]

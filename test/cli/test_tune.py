@@ -167,7 +167,6 @@ def facts_of(capsys: pytest.CaptureFixture[str], *args: str) -> dict[str, Any]:
 
 
 @pytest.mark.skipif(not HUSKY.exists(), reason=f'no recording at {HUSKY}')
-@pytest.mark.untraced
 @pytest.mark.timeout(400)
 def test_husky_is_better_at_fixes_held_out(
     tmp_path: Path, capsys: pytest.CaptureFixture[str],
@@ -185,7 +184,6 @@ def test_husky_is_better_at_fixes_held_out(
 
 
 @pytest.mark.skipif(not PLAZA.exists(), reason=f'no recording at {PLAZA}')
-@pytest.mark.untraced
 @pytest.mark.timeout(400)
 def test_plaza_is_nearer_to_the_truth(
     tmp_path: Path, capsys: pytest.CaptureFixture[str],

@@ -139,20 +139,6 @@ def test_the_final_path_does_not_depend_on_the_order_of_arrival(seed: int) -> No
     assert backends[0].graph.n_edges == n_edges
 
 
-def test_the_final_errors_are_those_of_all_measurements_whatever_was_in_use() -> None:
-    """White errors of a receiver that a first, wrong estimate took for correlated ones."""
-    events = drive(3, 1e-3)
-    backend, white = fed(events), fed(events, replace(SOURCE, correlation_time=0.0))
-    backend._tuner._begin('fix', CorrelatedErrors(50.0, 1.0, 0.1))
-    backend._tuner.finish_change()
-    assert in_use(backend) is not None
-    for each in (backend, white):
-        assert each.optimize().status is Status.CONVERGED
-    assert in_use(backend) is None
-    assert_each_held_once(backend)
-    np.testing.assert_allclose(path(backend), path(white), atol=1e-9)
-
-
 def test_what_is_saved_goes_on_as_if_it_had_not_been() -> None:
     events = drive(4, TAU)
     backend = fed(events[:240])
@@ -260,20 +246,3 @@ def test_the_noise_of_odometry_stays_if_the_solver_fails_with_another_one(
     assert backend._tuner.is_idle
     assert backend.estimate().odometry_errors == AS_CLAIMED
     np.testing.assert_array_equal(path(backend), before)
-
-
-def test_a_step_moves_a_bounded_number_of_fixes(monkeypatch: pytest.MonkeyPatch) -> None:
-    """So that the past of a long drive changes its model in many updates, not in one."""
-    monkeypatch.setattr(error_tuner, 'PART', 7)
-    backend = fed(drive(5, TAU, n=60), replace(SOURCE, correlation_time=0.0))
-    backend._tuner._begin('fix', CorrelatedErrors(TAU, 1.0, 0.05))
-    held, graph, n_steps = backend._factors.constraints('fix').edges, backend.graph, 0
-    while not backend._tuner.is_idle:
-        moved, size = int(np.sum(held.values >= 0)), graph.n_nodes + graph.n_edges
-        backend._tuner.step()
-        n_steps += 1
-        assert np.sum(held.values >= 0) - moved <= 7
-        # an edge to the bias for each; at most a state for each, with the edges on both sides
-        assert graph.n_nodes + graph.n_edges - size <= 4 * 7
-    assert np.all(held.values >= 0)
-    assert n_steps == -(-len(held) // 7)

@@ -16,7 +16,7 @@ import numba
 import pytest
 
 from pose_graph_ros.core import warm_up
-from pose_graph_ros.core.compiled import jit, kernel_cache
+from pose_graph_ros.core.compiled import jit
 from pose_graph_ros.core.helper_process import HelperProcess
 
 PACKAGE = 'helped_kernels_of_a_test'
@@ -190,27 +190,3 @@ def test_a_helper_ends_with_a_process_that_is_killed(folder: Path) -> None:
     while is_alive(helper):
         assert time.monotonic() < deadline
         time.sleep(0.01)
-
-
-def test_one_helper_on_one_processor(
-    warm: Callable[..., ModuleType], started: list[str], monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    monkeypatch.setattr(os, 'sched_getaffinity', lambda process: {0})
-    assert warm('along', 'along').twice.signatures
-    assert started == ['along']
-
-
-def test_no_helper_without_a_folder_to_meet_at(
-    warm: Callable[..., ModuleType], started: list[str], monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    monkeypatch.setattr(kernel_cache, '_candidates', lambda source: iter(()))
-    assert warm('along').twice.signatures
-    assert started == []
-
-
-@pytest.mark.parametrize('executable', ['', None, '/nowhere/python'])
-def test_no_helper_where_there_is_no_interpreter_to_start(
-    warm: Callable[..., ModuleType], monkeypatch: pytest.MonkeyPatch, executable: str | None,
-) -> None:
-    monkeypatch.setattr(sys, 'executable', executable)
-    assert warm('along').twice.signatures

@@ -17,7 +17,6 @@ from random_graphs import (
     random_observed,
     random_poses,
 )
-import scipy.sparse
 from sparse_system import Factorization, LinearSystem
 
 from pose_graph_ros.core.exceptions import LinearSolveError
@@ -53,19 +52,6 @@ def test_h_and_b_are_those_of_dense_loops(  # noqa: PLR0917
     np.testing.assert_array_equal(system.pattern(), blocks_that_are_not_zero(H_dense))
 
 
-def test_a_system_is_filled_again_at_other_poses() -> None:
-    graph = random_graph(seed=1, fix=(2,))
-    system = LinearSystem(graph)
-    first, _ = system.assemble(graph.poses)
-    first = first.toarray()
-    graph.set_poses(random_poses(np.random.default_rng(2), graph.n_nodes))
-    H, b = system.assemble(graph.poses)
-    H_dense, b_dense = free_part(graph, *dense_system(graph))
-    assert not np.allclose(first, H_dense)
-    np.testing.assert_allclose(H.toarray(), H_dense, atol=ROUNDING)
-    np.testing.assert_allclose(b, b_dense, atol=ROUNDING)
-
-
 def test_a_step_moves_the_free_nodes_alone() -> None:
     graph = random_graph(seed=3, n_nodes=4, fix=(1,))
     step = np.arange(9.0)
@@ -81,81 +67,6 @@ def test_a_graph_of_fixed_nodes_has_no_unknowns() -> None:
     assert system.size == 0
     assert H.shape == (0, 0)
     assert b.shape == (0,)
-
-
-# --- Figure 3.10: what measurements do to the pattern of H -----------------------------------
-
-class Figure:
-    """The example of the source, growing."""
-
-    def __init__(self) -> None:
-        self.rng = np.random.default_rng(310)
-        self.graph = Graph()
-
-    def hidden(self, n: int) -> None:
-        self.graph.apply(GraphUpdate(hidden=random_poses(self.rng, n)))
-
-    def observe(self, node: int) -> None:
-        # full poses alone: a block that they touch has no zero
-        pair = random_observed(self.rng, [node, node], offset=False)
-        self.graph.apply(GraphUpdate(observed=pair.rows(slice(1, 2))))
-
-    def edge(self, i: int, j: int) -> None:
-        self.graph.apply(GraphUpdate(edges=random_edges(self.rng, [i], [j])))
-
-    def state(self) -> tuple[npt.NDArray[np.bool_], FloatArray]:
-        system = LinearSystem(self.graph)
-        H = system.assemble(self.graph.poses)[0].toarray()
-        np.testing.assert_array_equal(system.pattern(), blocks_that_are_not_zero(H))
-        np.testing.assert_allclose(H, H.T, atol=ROUNDING)
-        return system.pattern(), H
-
-
-def test_figure_3_10_the_states_of_a_growing_graph() -> None:
-    figure = Figure()
-    figure.hidden(1)
-    figure.observe(0)
-    a_pattern, a_H = figure.state()
-    np.testing.assert_array_equal(a_pattern, [[True]])          # x0 with xw0: one block
-
-    figure.observe(0)
-    b_pattern, b_H = figure.state()
-    np.testing.assert_array_equal(b_pattern, a_pattern)         # xw1 on x0: same pattern,
-    assert np.all(np.linalg.eigvalsh(b_H - a_H) > 0.0)          # more information
-
-    figure.hidden(1)
-    figure.edge(0, 1)
-    c_pattern, c_H = figure.state()
-    np.testing.assert_array_equal(c_pattern, np.ones((2, 2)))   # an edge: 2x2 blocks
-    np.testing.assert_array_equal(b_pattern, c_pattern[:1, :1])
-    assert np.any(c_H[:3, :3] != b_H)
-
-    figure.observe(1)
-    d_pattern, d_H = figure.state()
-    np.testing.assert_array_equal(d_pattern, c_pattern)         # xw2 on x1: same pattern,
-    changed = ~np.isclose(d_H, c_H, rtol=0.0, atol=ROUNDING)
-    np.testing.assert_array_equal(                              # one diagonal block changes
-        blocks_that_are_not_zero(changed.astype(float)), [[False, False], [False, True]])
-
-    figure.hidden(3)
-    for i in range(1, 4):
-        figure.edge(i, i + 1)
-    figure.observe(3)                                           # xw3
-    e_pattern, _ = figure.state()
-    distance = np.abs(np.subtract.outer(np.arange(5), np.arange(5)))
-    np.testing.assert_array_equal(e_pattern, distance <= 1)     # a chain: block-tridiagonal
-
-
-def test_a_loop_closure_adds_its_two_blocks_beside_the_band() -> None:
-    figure = Figure()
-    figure.hidden(5)
-    figure.observe(0)
-    for i in range(4):
-        figure.edge(i, i + 1)
-    chain, _ = figure.state()
-    figure.edge(4, 1)
-    closed, _ = figure.state()
-    assert [tuple(at) for at in np.argwhere(closed & ~chain).tolist()] == [(1, 4), (4, 1)]
 
 
 # --- The null space of a graph that floats ---------------------------------------------------
@@ -208,10 +119,6 @@ def test_a_loose_part_of_the_graph_is_named() -> None:
     assert LinearSystem(graph).size == 15
 
 
-def test_an_empty_graph_is_an_empty_system() -> None:
-    assert LinearSystem(Graph()).size == 0
-
-
 # --- Factorization ---------------------------------------------------------------------------
 
 @given(seeds)
@@ -230,24 +137,6 @@ def test_the_factorization_solves_and_gives_every_covariance(seed: int) -> None:
         np.testing.assert_allclose(
             covariance, inverse[part, part], rtol=0.0, atol=INVERSE_ROUNDING * scale)
         np.testing.assert_array_equal(covariance, covariance.T)
-
-
-def test_several_right_hand_sides_are_solved_at_once() -> None:
-    graph = random_graph(seed=7, fix=(0,))
-    H, _ = LinearSystem(graph).assemble(graph.poses)
-    right = np.random.default_rng(7).standard_normal((H.shape[0], 4))
-    np.testing.assert_allclose(H @ Factorization(H).solve(right), right, atol=1e-9)
-
-
-@pytest.mark.parametrize('value', [np.nan, np.inf])
-def test_numbers_that_are_not_finite_are_refused(value: float) -> None:
-    with pytest.raises(LinearSolveError, match='finite'):
-        Factorization(scipy.sparse.csc_array(np.diag([1.0, value, 1.0])))
-
-
-def test_a_singular_matrix_is_refused() -> None:
-    with pytest.raises(LinearSolveError, match='singular'):
-        Factorization(scipy.sparse.csc_array(np.ones((3, 3)))).solve(np.ones(3))
 
 
 def test_a_heading_that_nothing_determines_is_refused_or_has_no_certainty() -> None:

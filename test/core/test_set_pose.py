@@ -91,19 +91,6 @@ def test_measurements_count_on_their_side_of_it() -> None:
     assert backend.estimate().chi2 < 1e-6
 
 
-def test_it_can_be_set_again_and_again_without_odometry_in_between() -> None:
-    backend = PoseGraphBackend()
-    drive(backend, 0, 50, np.zeros(3))
-    for k in range(3):
-        pose = np.array([100.0 * k, 7.0, 0.1])
-        backend.set_pose(GlobalPose(2**62, pose, SIGMA), 'set_pose')
-        backend.update()
-        np.testing.assert_allclose(backend.estimate().T_map_base, pose, atol=1e-6)
-    assert np.all(np.diff(backend.estimate().path.stamps_ns) > 0)
-    drive(backend, 50, 60, None)
-    assert backend.optimize().status is Status.CONVERGED
-
-
 def test_without_odometry_it_is_refused() -> None:
     backend = PoseGraphBackend()
     answer = backend.set_pose(GlobalPose(1, np.zeros(3), SIGMA), 'set_pose')

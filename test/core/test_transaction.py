@@ -3,29 +3,19 @@
 """A failed update leaves everything as it was, wherever it fails."""
 
 from collections.abc import Callable
-import contextlib
 from typing import Any
 
 import numpy as np
 import pytest
-from random_graphs import random_graph, snapshot
+from random_graphs import snapshot
 from saved_graphs import assert_same_value
 
-from pose_graph_ros.core.alignment.monitor import AlignmentMonitor
 from pose_graph_ros.core.backend import PoseGraphBackend
 from pose_graph_ros.core.batch.optimizer import Status
 from pose_graph_ros.core.config import BackendConfig, Loss, MeasurementSource, OdometrySource
-from pose_graph_ros.core.geometry import se2
 from pose_graph_ros.core.graph.graph import GraphUpdate
-from pose_graph_ros.core.graph.reweighting import Reweighting
-from pose_graph_ros.core.judgement.judge import Judge
 from pose_graph_ros.core.measurements import LoopClosure, OdometrySample, Position
-from pose_graph_ros.core.odometry.hidden_nodes import HiddenNodes
-from pose_graph_ros.core.smoother.incremental import IncrementalSmoother
 from pose_graph_ros.core.smoother.results import UpdateResult
-from pose_graph_ros.core.sources.constraint_queue import Queue, QueuedEdge
-from pose_graph_ros.core.sources.factor_builder import FactorBuilder
-from pose_graph_ros.core.transaction import Transaction
 
 SECOND = 1_000_000_000
 CONFIG = BackendConfig(
@@ -158,35 +148,3 @@ def test_an_interrupt_is_rolled_back_and_goes_through(monkeypatch: pytest.Monkey
             backend.update()
     assert_same_value(state(backend), before)
     assert snapshot(backend.graph) == graph
-
-
-@pytest.mark.parametrize('error', [None, ValueError('broken on purpose'), KeyboardInterrupt()])
-def test_a_transaction_moves_the_graph_or_says_why_not(
-    error: BaseException | None,
-) -> None:
-    graph = random_graph(1)
-    queue = Queue([QueuedEdge('scan', graph.edges.rows(slice(0, 1)))], [])
-    poses, T_map_graph = graph.poses.copy(), np.array([3.0, -2.0, 0.5])
-    reweighting = Reweighting()
-    nodes = HiddenNodes(CONFIG, lambda *_: 0)
-    nodes.table.restore(np.arange(4), np.arange(4), np.zeros((2, 3)), poses[:2], 0.0)
-    transaction = Transaction(
-        graph, nodes, AlignmentMonitor(CONFIG), FactorBuilder(CONFIG, reweighting),
-        Judge(IncrementalSmoother(), reweighting, CONFIG, nodes))
-    passed = contextlib.suppress(KeyboardInterrupt)     # the only one that goes through
-    with passed, transaction:
-        transaction.add(queue)
-        transaction.move_graph(T_map_graph)
-        if error is not None:
-            raise error
-        transaction.solved(UpdateResult(Status.CONVERGED, '', 1, 0, 0, 0))
-    if error is None:
-        np.testing.assert_allclose(graph.poses, se2.compose(T_map_graph, poses), atol=1e-12)
-        np.testing.assert_array_equal(nodes.table.frozen, graph.poses[:2])
-        assert transaction.failure == ''
-        return
-    np.testing.assert_array_equal(nodes.table.frozen, poses[:2])
-    np.testing.assert_array_equal(graph.poses, poses)
-    assert transaction.moved_back
-    assert transaction.queue is queue
-    assert ('broken on purpose' in transaction.failure) is isinstance(error, ValueError)

@@ -2,22 +2,11 @@
 # SPDX-License-Identifier: Apache-2.0
 """After the warm-up nothing is left to be compiled, whatever the engine does."""
 
-from collections.abc import Iterator
-import importlib
-import inspect
-import itertools
 import os
-import pkgutil
 import subprocess
 import sys
-from types import CodeType, FunctionType, ModuleType
 
-from numba.core.dispatcher import Dispatcher
 import pytest
-
-from pose_graph_ros import core
-from pose_graph_ros.core.compiled import jit
-from pose_graph_ros.core.warm_up import warm_up
 
 
 def run_alone(code: str, **environment: str) -> str:
@@ -28,79 +17,6 @@ def run_alone(code: str, **environment: str) -> str:
         env={**os.environ, 'PYTHONPATH': path, **environment})
     assert done.returncode == 0, f'exit code {done.returncode}: {done.stderr[-3000:]}'
     return done.stdout
-
-
-# --- what must be covered: all kernels that functions of Python call -----------------------------
-
-def modules_of_core() -> list[ModuleType]:
-    return [importlib.import_module(found.name)
-            for found in pkgutil.walk_packages(core.__path__, 'pose_graph_ros.core.')]
-
-
-def functions_of(owner: ModuleType | type, module: str) -> Iterator[FunctionType]:
-    """Yield the functions of a module or class that Python runs."""
-    for each in vars(owner).values():
-        if isinstance(each, Dispatcher):
-            continue
-        member = getattr(each, 'fget', None) or inspect.unwrap(getattr(each, '__func__', each))
-        if getattr(member, '__module__', None) != module:
-            continue
-        if isinstance(member, FunctionType):
-            yield member
-        elif isinstance(member, type):
-            yield from functions_of(member, module)
-
-
-def codes(code: CodeType) -> Iterator[CodeType]:
-    yield code
-    for constant in code.co_consts:
-        if isinstance(constant, CodeType):
-            yield from codes(constant)
-
-
-def kernels_in(function: FunctionType) -> Iterator[Dispatcher]:
-    """Yield the kernels whose names occur in a function, as globals or after modules."""
-    for code in codes(function.__code__):
-        known = [function.__globals__.get(name) for name in code.co_names]
-        spaces = [vars(value) for value in known if isinstance(value, ModuleType)]
-        in_modules = itertools.chain.from_iterable(
-            map(space.get, code.co_names) for space in spaces)
-        for value in itertools.chain(known, in_modules):
-            if isinstance(value, Dispatcher):
-                yield value
-
-
-def called_from_python() -> set[str]:
-    names = {id(kernel): name for name, kernel in jit._registered.items()}
-    return {names[id(kernel)] for module in modules_of_core()
-            for function in functions_of(module, module.__name__)
-            for kernel in kernels_in(function)}
-
-
-def test_the_kernels_that_python_calls_are_those_that_declare_their_signature() -> None:
-    found = called_from_python()
-    assert len(found) > 20
-    assert found == {name for name in jit.declared() if '.core.' in name}
-
-
-def test_the_warm_up_imports_all_modules_of_the_engine_with_kernels() -> None:
-    modules_of_core()
-    names = run_alone('from pose_graph_ros.core import warm_up\n'
-                      'print(*warm_up.jit.declared())').split()
-    assert sorted(names) == sorted(name for name in jit.declared() if '.core.' in name)
-
-
-def test_every_declared_kernel_is_ready_after_it() -> None:
-    warm_up()
-    for name in jit.declared():
-        assert jit._signatures[name] in jit._registered[name].overloads, name
-
-
-def test_a_call_with_other_types_is_an_error_not_a_compilation() -> None:
-    for _ in range(2):      # at the first call, and once it is compiled
-        with pytest.raises(TypeError):
-            jit._registered['pose_graph_ros.core.smoother.step.run']('text', 1, 2)
-        warm_up()
 
 
 # --- what the engine does ------------------------------------------------------------------------

@@ -19,7 +19,6 @@ from sensor_msgs.msg import Imu
 
 from pose_graph_ros.core.geometry import se2
 
-pytestmark = pytest.mark.untraced
 COUNT = 210
 """Number of messages on each topic."""
 BEFORE = 60.0

@@ -45,7 +45,6 @@ from visualization_msgs.msg import Marker, MarkerArray
 
 from pose_graph_ros.core.geometry import se2
 
-pytestmark = pytest.mark.untraced
 WITHOUT = '''
 import sys
 sys.modules['rclpy.experimental'] = sys.modules['tf2_msgs'] = None

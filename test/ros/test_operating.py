@@ -23,8 +23,6 @@ from pose_graph_ros.adapters import launch_arguments
 from pose_graph_ros.adapters.parameter_texts import constraints
 from pose_graph_ros.adapters.parameters import all_parameters, Change
 
-pytestmark = pytest.mark.untraced
-
 
 class Manager:
     """Asks for states and transitions, as a lifecycle manager does."""

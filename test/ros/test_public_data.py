@@ -22,8 +22,6 @@ from pose_graph_ros.core.geometry.geodesy import TangentPlane
 from pose_graph_ros.core.geometry.trajectory import Trajectory
 
 pytest.importorskip('rclpy', reason='ROS 2 is not there: no rclpy')
-pytestmark = pytest.mark.untraced
-
 DATA = Path(os.environ.get(
     'POSE_GRAPH_DATA', Path(__file__).resolve().parents[3] / 'shared' / 'data')) / 'robot'
 HUSKY = DATA / 'husky_test1_ros2'

@@ -55,7 +55,6 @@ def short_bag(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
-@pytest.mark.untraced
 @pytest.mark.timeout(180)
 def test_the_same_bag_gives_the_same_path(bag: Path, tmp_path: Path) -> None:
     topics = ['--odom', '/odom', '--fix', '/gps/fix', '--loop-closure', '/loop_closure',

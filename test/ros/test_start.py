@@ -12,8 +12,6 @@ from circle import fix_at, odometry_at, path_error
 from harness import AS_A_USER, Client, copy_kernels, NodeProcess, PATIENCE, PREPARE_PATIENCE
 import pytest
 
-pytestmark = pytest.mark.untraced
-
 
 @pytest.mark.timeout(PREPARE_PATIENCE)
 def test_nothing_is_lost_while_kernels_are_compiled(

@@ -18,7 +18,6 @@ from pose_graph_ros.adapters.verdict_messages import states_in
 from pose_graph_ros.core.geometry import se2
 from pose_graph_ros.core.judgement.verdicts import State
 
-pytestmark = pytest.mark.untraced
 LAP = 20.0 * math.pi
 """Duration of a round of the circle [s]."""
 VARIANCES = (0.01, 0.01, 0.0025)

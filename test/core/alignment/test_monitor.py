@@ -8,7 +8,6 @@ import numpy as np
 import pytest
 from saved_graphs import assert_same_value
 
-from pose_graph_ros.core.alignment import monitor
 from pose_graph_ros.core.alignment.monitor import AlignmentMonitor, AlignmentState
 from pose_graph_ros.core.config import BackendConfig, NoiseFrom, OdometryNoise, OdometrySource
 from pose_graph_ros.core.geometry import se2
@@ -140,13 +139,6 @@ def test_biases_in_the_graph_are_no_way_of_the_robot() -> None:
     assert some.sigma == pytest.approx(alone.sigma)
 
 
-def test_headings_alone_leave_the_map_local() -> None:
-    some = AlignmentMonitor(CONFIG)
-    compass = [attached(HeadingOnly(SECOND, T_MAP_ODOM[2], 1e-4), 0)]
-    assert some.find(GRAPH, compass, NODES) is None
-    assert some.state is AlignmentState.LOCAL
-
-
 @pytest.mark.parametrize('node', [0, 3])
 def test_a_certain_heading_and_one_position_are_enough(node: int) -> None:
     some = AlignmentMonitor(CONFIG)
@@ -159,35 +151,12 @@ def test_a_certain_heading_and_one_position_are_enough(node: int) -> None:
     assert some.sigma == pytest.approx(0.01)    # of the better one
 
 
-def test_an_uncertain_heading_does_not_align() -> None:
-    some = AlignmentMonitor(CONFIG)
-    compass = attached(HeadingOnly(SECOND, T_MAP_ODOM[2], 4.0), 0, 'compass')
-    assert some.find(GRAPH, [compass, *fixes(range(1))], NODES) is None
-    assert some.state is AlignmentState.UNALIGNED
-
-
 def test_a_global_pose_aligns_alone() -> None:
     some = AlignmentMonitor(CONFIG)
     pose = GlobalPose(SECOND, T_MAP_ODOM, np.diag([0.01, 0.01, 1e-4]))
     T_map_graph = some.find(GRAPH, [attached(pose, 0)], NODES)
     assert T_map_graph is not None
     np.testing.assert_allclose(T_map_graph, T_MAP_ODOM, atol=1e-9)
-
-
-def test_the_angle_is_checked_at_eight_measurements_and_whenever_they_have_doubled() -> None:
-    some = aligned_with(fixes(range(5)))
-    turned = se2.compose(T_MAP_ODOM + np.array([0.0, 0.0, 1.0]), NODES.odometry)
-    checked = []
-    for k in range(5, 70):
-        before = some.saved().next_verdict
-        # the solution is right: whatever is found, it is no reason to turn
-        assert some.recheck(graph_at(se2.compose(T_MAP_ODOM, NODES.odometry)), NODES) is None
-        if some.saved().next_verdict != before:
-            checked.append(k)
-        some.add(fixes(range(k, k + 1)))
-    assert checked == [8, 16, 32, 64]
-    # after a check a wrong angle stays unnoticed until the evidence has doubled again
-    assert some.recheck(graph_at(turned), NODES) is None
 
 
 def test_a_wrong_first_angle_is_corrected_and_its_sigma_too() -> None:
@@ -202,12 +171,6 @@ def test_a_wrong_first_angle_is_corrected_and_its_sigma_too() -> None:
     assert some.is_aligned
 
 
-def test_headings_are_no_evidence_for_the_angle() -> None:
-    some = aligned_with(fixes(range(5)))
-    some.add([attached(HeadingOnly(SECOND, 0.0, 1e-4), 0)] * 20)
-    assert len(some.saved().node) == 5
-
-
 def test_checks_end_when_the_path_is_not_that_of_odometry_any_more() -> None:
     wrong = se2.compose(T_MAP_ODOM, np.array([0.0, 0.0, 1.5]))
     some = aligned_with(fixes(range(5), wrong))
@@ -215,37 +178,6 @@ def test_checks_end_when_the_path_is_not_that_of_odometry_any_more() -> None:
     some.add(fixes(range(5, 65)))
     assert len(some.saved().node) == 0
     assert some.recheck(graph_at(se2.compose(wrong, NODES.odometry)), NODES) is None
-
-
-def test_after_the_last_check_no_evidence_is_kept(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(monitor, 'LAST_RECHECK', 20)
-    some = aligned_with(fixes(range(5)))
-    solved = se2.compose(T_MAP_ODOM, NODES.odometry)
-    for k in range(5, 60):
-        some.add(fixes(range(k, k + 1)))
-        some.recheck(graph_at(solved), NODES)
-    assert len(some.saved().node) == 0
-
-
-def test_before_the_alignment_nothing_is_checked() -> None:
-    some = AlignmentMonitor(CONFIG)
-    some.find(GRAPH, fixes(range(1)), NODES)
-    some.add(fixes(range(60)))
-    assert some.recheck(GRAPH, NODES) is None
-    assert some.saved().next_verdict == monitor.FIRST_RECHECK
-
-
-def test_what_find_has_done_is_undone_by_the_copy_from_before() -> None:
-    some = AlignmentMonitor(CONFIG)
-    some.find(GRAPH, fixes(range(1)), NODES)
-    before = some.copy()
-    first = some.find(GRAPH, fixes(range(12)), NODES)
-    assert some.is_aligned
-    some.restore(before)
-    assert some.copy() == before
-    assert some.state is AlignmentState.UNALIGNED
-    # the next attempt finds the same
-    np.testing.assert_array_equal(some.find(GRAPH, fixes(range(12)), NODES), first)
 
 
 @pytest.mark.parametrize('n', [0, 1, 20])

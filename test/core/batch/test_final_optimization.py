@@ -11,7 +11,7 @@ from random_graphs import snapshot
 from scipy.optimize import minimize
 
 from pose_graph_ros.core.backend import PoseGraphBackend
-from pose_graph_ros.core.batch import final_optimization, optimizer
+from pose_graph_ros.core.batch import optimizer
 from pose_graph_ros.core.batch.optimizer import BatchResult, Status
 from pose_graph_ros.core.config import BackendConfig, Loss, MeasurementSource, OdometrySource
 from pose_graph_ros.core.geometry import se2
@@ -178,23 +178,6 @@ def test_fixes_with_small_weights_regain_them_when_more_fixes_agree() -> None:
 
 
 @pytest.mark.parametrize('loss', ROBUST)
-def test_updates_alone_lead_near_the_minimum_and_settle(loss: Loss) -> None:
-    odometry, measurements, truth = drive(7, outliers=range(5, N, 6))
-    backend = fed(PoseGraphBackend(config(loss)), odometry, measurements)
-    reports = [backend.update() for _ in range(20)]
-    assert reports[-1].iterations == 0
-    online = backend.graph.poses.copy()
-    backend.optimize()
-    off = np.hypot(*(online - backend.graph.poses)[:, :2].T)
-    assert np.max(off) < 3e-3
-    # a second optimisation changes nothing
-    before = backend.graph.poses.copy()
-    backend.optimize()
-    np.testing.assert_allclose(backend.graph.poses, before, atol=1e-9)
-    assert rms(backend, truth) < 0.8
-
-
-@pytest.mark.parametrize('loss', ROBUST)
 def test_a_wrong_loop_closure_gets_a_small_weight(loss: Loss) -> None:
     odometry, measurements, truth = drive(8, n=130)
     scans = [LoopClosure(
@@ -252,25 +235,6 @@ def test_a_failed_optimisation_leaves_weights_and_poses_to_the_bit(
     np.testing.assert_array_equal(backend.estimate().path.poses, estimate.path.poses)
     solve.left = 10**9
     assert backend.optimize().status is Status.CONVERGED
-
-
-def test_one_start_that_fails_does_not_affect_the_other() -> None:
-    odometry, measurements, truth = drive(9, outliers=(5, 20, 40))
-
-    class Flaky(Failing):
-        def __call__(self, graph: Graph, settings: SolverConfig) -> BatchResult:
-            result = super().__call__(graph, settings)
-            if result.status is Status.FAILED:
-                self.left = 10**9     # once
-            return result
-
-    backend = fed(PoseGraphBackend(config(Loss.CAUCHY), solve=Flaky(2, raises=False)),
-                  odometry, measurements)
-    assert backend.optimize().status is Status.CONVERGED
-    other = fed(PoseGraphBackend(config(Loss.CAUCHY)), odometry, measurements)
-    other.optimize()
-    np.testing.assert_allclose(backend.graph.poses, other.graph.poses, atol=1e-9)
-    assert rms(backend, truth) < 0.4
 
 
 @pytest.mark.parametrize('loss', ENDING)
@@ -348,14 +312,3 @@ def test_a_structure_prior_leaves_positions_that_are_known_alone() -> None:
     # the positions move as far as the fixes let them
     off = backend.graph.poses[:, :2] - plain.graph.poses[:, :2]
     assert np.max(np.hypot(*off.T)) < 0.3
-
-
-def test_weights_that_have_not_settled_are_not_called_converged(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    odometry, measurements, _ = drive(9, outliers=(5, 20, 40))
-    backend = fed(PoseGraphBackend(config(Loss.CAUCHY)), odometry, measurements, updates=False)
-    with monkeypatch.context() as patch:
-        patch.setattr(final_optimization, 'REWEIGHTINGS', 1)
-        assert backend.optimize().status is Status.MAX_ITERATIONS
-    assert backend.optimize().status is Status.CONVERGED

@@ -15,8 +15,6 @@ from pose_graph_ros.core.batch import gnc
 from pose_graph_ros.core.batch.gnc import Surrogate
 from pose_graph_ros.core.batch.truncated import LIMITS, TruncatedProblem
 from pose_graph_ros.core.geometry.se2 import FloatArray
-from pose_graph_ros.core.graph.constraints import Edges
-from pose_graph_ros.core.graph.graph import Graph, GraphUpdate
 
 
 def problem_of(drive: Drive) -> TruncatedProblem:
@@ -44,14 +42,6 @@ def test_the_surrogates_end_at_the_truncated_cost_and_at_that_of_geman_mcclure()
     assert Surrogate.TRUNCATED.weights(share, 1e6).round().tolist() == [1, 1, 1, 0, 0, 0]
     np.testing.assert_allclose(
         Surrogate.GEMAN_MCCLURE.weights(share, 1.0), 1.0 / (1.0 + share) ** 2)
-
-
-@pytest.mark.parametrize('surrogate', Surrogate)
-def test_all_weights_count_at_first(surrogate: Surrogate) -> None:
-    for largest in (1.5, 100.0, 1e5):
-        weights = surrogate.weights(np.linspace(0.0, largest, 9), surrogate.first(largest))
-        assert np.all(weights > 0.0)
-        assert np.all(np.diff(weights) <= 0.0)
 
 
 # --- Against a dense solver, one constraint at a time ----------------------------------------
@@ -166,19 +156,3 @@ def test_a_retest_takes_in_what_was_left_out_and_throws_out_what_is_wrong() -> N
     better = problem.improved(bent)
     assert better.cost < bent.cost
     assert not better.believed[-1]
-
-
-def test_what_leaves_a_node_undetermined_is_no_set() -> None:
-    graph, eye = Graph(), np.eye(3)
-    graph.apply(GraphUpdate(hidden=np.zeros((3, 3)), fix=(0,), edges=Edges(
-        [0, 1], [1, 2], np.zeros((2, 3)), [eye, eye], [0, 1])))
-    problem = TruncatedProblem(graph, np.array([1]))
-    assert problem.choice(np.array([False])) is None
-    assert problem.choice(np.array([True])).cost == pytest.approx(0.0, abs=1e-12)
-
-
-def test_a_graph_whose_factorisation_is_nearly_dense_is_left_alone(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    monkeypatch.setattr(gnc, 'MOST_NUMBERS', 100)
-    assert gnc.select(small(0), Surrogate.TRUNCATED) is None

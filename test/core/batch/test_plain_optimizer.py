@@ -15,7 +15,7 @@ from pose_graph_ros.core.batch.plain_graph import errors, linearized, PlainGraph
 from pose_graph_ros.core.batch.plain_optimizer import PlainOptimizer
 from pose_graph_ros.core.geometry import se2
 from pose_graph_ros.core.geometry.se2 import FloatArray
-from pose_graph_ros.core.graph.constraints import EdgeKind, Edges, ObservedNodes
+from pose_graph_ros.core.graph.constraints import EdgeKind, Edges
 from pose_graph_ros.core.graph.graph import Graph, GraphUpdate
 from pose_graph_ros.core.solver_config import SolverConfig
 
@@ -62,13 +62,6 @@ def test_the_optimum_is_that_of_the_compiled_optimiser(seed: int) -> None:
     np.testing.assert_array_equal(plain.poses[graph.fixed], graph.rows().poses[graph.fixed])
 
 
-def test_nearly_all_of_these_are_simple() -> None:
-    # those with one fixed node: two at wrong poses contradict the rest
-    graphs = [PlainGraph(noisy_graph(seed, noise=0.03).rows()) for seed in range(0, 40, 2)]
-    found = [PlainOptimizer(graph, CONFIG).from_chordal_start() for graph in graphs]
-    assert sum(each is not None for each in found) >= 18
-
-
 @settings(max_examples=40, deadline=None)
 @given(seed=st.integers(0, 2**32 - 1))
 def test_errors_and_jacobians(seed: int) -> None:
@@ -99,17 +92,6 @@ def test_a_hard_graph_is_left_to_the_other_optimiser() -> None:
     before: FloatArray = plain.poses.copy()
     assert PlainOptimizer(plain, CONFIG).from_chordal_start() is None
     np.testing.assert_array_equal(plain.poses, before)
-
-
-def test_what_is_covered() -> None:
-    graph = noisy_graph(0)
-    assert PlainGraph.is_covered(graph.rows())
-    for update in (
-            GraphUpdate(observed=ObservedNodes([0], None, np.zeros((1, 3)), np.eye(3)[None], [0])),
-            GraphUpdate(landmarks=np.zeros((1, 2))), GraphUpdate(remove_edges=[4])):
-        other = noisy_graph(0)
-        other.apply(update)
-        assert not PlainGraph.is_covered(other.rows())
 
 
 @pytest.mark.parametrize('seed', range(5))
@@ -146,12 +128,3 @@ def test_what_overflows_is_no_result_and_no_warning(start: str) -> None:
             np.testing.assert_array_equal(plain.poses, before)
         assert np.all(np.isfinite(plain.poses))
     assert refused > 0
-
-
-def test_parts_are_held_as_nodes_are_numbered() -> None:
-    graph = noisy_graph(0, n=6)
-    rows = graph.rows()
-    keep = np.flatnonzero((rows.edges.i // 2) == (rows.edges.j // 2))
-    plain = PlainGraph(rows.with_edges(rows.edges.rows(keep)))
-    assert plain.hold_parts() == [2, 4]
-    assert plain.hold_parts() == []

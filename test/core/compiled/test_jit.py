@@ -14,7 +14,6 @@ from types import ModuleType
 
 from helpers.all_kernels import call_all_kernels
 import numba
-from numba.core.caching import FunctionCache, NullCache
 from numba.core.dispatcher import Dispatcher
 from numba.core.runtime import _nrt_python, rtsys
 import numpy as np
@@ -103,37 +102,6 @@ def files(folder: Path, pattern: str) -> list[Path]:
 
 # --- kernels ------------------------------------------------------------------------------------
 
-def test_registry_knows_every_kernel_and_its_signatures(folder: Path) -> None:
-    total = start().total
-    assert jit._registered.keys() == {f'{PACKAGE}.inner.scaled', f'{PACKAGE}.outer.total'}
-    assert jit._registered[f'{PACKAGE}.outer.total'] is total
-    assert total.signatures == []
-    total(ONES)
-    total(2.0 * ONES)
-    assert len(total.signatures) == 1
-    total(np.ones(3, dtype=np.float32))
-    assert len(total.signatures) == 2
-
-
-def test_kernel_divides_as_numpy_does_and_passes_options_on() -> None:
-    @jit.kernel(fastmath={'contract'})
-    def ratio(x, y):
-        return x / y
-
-    assert ratio(1.0, 0.0) == np.inf
-    assert ratio.targetoptions['nogil']
-    assert ratio.targetoptions['fastmath'] == {'contract'}
-
-
-def test_other_users_of_numba_keep_their_cache(folder: Path) -> None:
-    environment = dict(os.environ)
-    start()
-    # a function of a file, as Numba finds no place for others
-    own = numba.njit(cache=True)(kernel_cache._top)
-    assert type(own._cache) is FunctionCache
-    assert numba.config.CACHE_DIR == ''
-    assert dict(os.environ) == environment
-
 
 def test_declared_signature_is_the_only_one() -> None:
     @jit.kernel(signature=(jit.NUMBER, jit.NUMBERS))
@@ -194,14 +162,6 @@ def test_change_in_what_a_kernel_calls_is_noticed(
     again = start()
     assert again.total(ONES) == 15.0
     assert loaded(again.total)
-
-
-def test_change_of_the_options_is_noticed(folder: Path) -> None:
-    assert start().total(ONES) == 6.0
-    (folder / 'inner.py').write_text(INNER.replace('nsz', 'nnan'))
-    changed = start()
-    changed.total(ONES)
-    assert not loaded(changed.total)
 
 
 def test_files_do_not_pile_up(folder: Path) -> None:
@@ -355,17 +315,6 @@ def test_private_folder_that_others_can_write_to_is_refused(
         places.private.rename(places.temporary / f'pose_graph_ros-{uid}')
         monkeypatch.setattr(os, 'getuid', lambda: uid)
     assert places.find() is None
-
-
-def test_kernel_without_a_folder_works(
-    folder: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture,
-) -> None:
-    monkeypatch.setattr(kernel_cache, '_candidates', lambda source: iter(()))
-    module = start()
-    assert module.total(ONES) == 6.0
-    assert isinstance(module.total._cache, NullCache)
-    assert not jit.is_cached(TOTAL)
-    assert 'compiles them again' in caplog.text
 
 
 # --- whole processes ----------------------------------------------------------------------------

@@ -110,15 +110,3 @@ def test_merged_cliques_hold_all_blocks_and_few_zeros(
         size = len(together)
         zeros = size * (size - 1) // 2 + size * len(separators[target]) - blocks
         assert zeros <= most_zeros
-
-
-def test_without_zeros_only_what_fits_exactly_is_merged() -> None:
-    """Of four cliques in a chain the second fits into the third, the first misses a block."""
-    counts, nothing = np.ones(4, np.int32), 0
-    # cliques {0|1 2}, {1|2 3}, {2|3}, {3}: 1 into 2 is exact, 0 into 1 misses block 3
-    offset = np.array([0, 3, 6, 8, 9], np.int32)
-    parent = np.array([1, 2, 3, -1], np.int32)
-    into, frontal = amalgamate(4, counts, offset, parent, 0, nothing, 10)
-    assert into.tolist() == [0, 2, 2, 3]
-    assert frontal[2] == 2
-    assert amalgamate(4, counts, offset, parent, 0, 1, 1)[0].tolist() == [0, 1, 2, 3]

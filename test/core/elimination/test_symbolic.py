@@ -4,8 +4,7 @@
 
 from hypothesis import given, strategies as st
 import numpy as np
-import pytest
-from random_graphs import random_edges, random_graph, random_observed, random_poses
+from random_graphs import random_edges, random_observed, random_poses
 import scipy.sparse.csgraph
 
 from pose_graph_ros.core.elimination import symbolic
@@ -47,14 +46,6 @@ def test_cliques_cover_the_graph_in_postorder(seed: int, n_nodes: int, extra: in
     for i, j in zip(graph.edges.i, graph.edges.j, strict=True):
         first = min(clique_of[i], clique_of[j])
         assert {i, j} <= set(lists[first])
-
-
-@pytest.mark.parametrize('n_biases', [0, 5])
-def test_the_newest_pose_is_alone_in_its_clique(n_biases: int) -> None:
-    graph = random_graph(seed=1, n_nodes=30, n_edges=60, n_biases=n_biases)
-    cliques = symbolic.analyse(graph.memory.head).cliques
-    assert cliques.nodes[-1] == graph.newest_pose == 29
-    assert cliques.n_frontal[-1] == 1
 
 
 @given(seeds)

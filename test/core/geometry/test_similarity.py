@@ -73,9 +73,3 @@ def test_the_similarity_is_umeyamas(mirrored: bool) -> None:
     assert found.scale == pytest.approx(scale, rel=1e-12)
     moved = found.apply(np.column_stack((source, np.zeros(50))))
     np.testing.assert_allclose(moved[:, :2], scale * source @ R.T + t, atol=1e-12)
-
-
-def test_a_single_point_has_no_scale() -> None:
-    found = fit_similarity(np.ones((3, 2)), np.ones((3, 2)) * 5.0, with_scale=True)
-    assert found.scale == 1.0
-    np.testing.assert_allclose(found.pose, [4.0, 4.0, 0.0])

@@ -36,15 +36,6 @@ def test_interpolation_is_that_of_a_slow_search(stamps: list[int], data: st.Data
         assert abs(se2.wrap(pose[2] - expected[2])) < ROUNDING
 
 
-@pytest.mark.parametrize('shape', [(), (1,), (2, 3), (0,)])
-def test_stamps_may_have_any_shape(shape: tuple[int, ...]) -> None:
-    for n in (1, 5):
-        stamps = EPOCH + np.arange(n)
-        trajectory = Trajectory(stamps, random_poses(np.random.default_rng(2), n))
-        assert trajectory.at(np.full(shape, EPOCH)).shape == (*shape, 3)
-        assert trajectory.covers(np.full(shape, EPOCH)).shape == shape
-
-
 def test_nothing_is_extrapolated() -> None:
     trajectory = Trajectory([10, 20], np.zeros((2, 3)))
     np.testing.assert_array_equal(
@@ -83,12 +74,3 @@ def test_a_trajectory_is_frozen_and_its_own() -> None:
         trajectory.poses = poses
     trajectory.at([1])[0] = 5.0     # what is interpolated belongs to the caller
     Trajectory([1], np.zeros((1, 3))).at([1])[0] = 5.0
-
-
-def test_a_trajectory_continues_only_later() -> None:
-    begin = Trajectory(np.array([1, 3]), np.zeros((2, 3)))
-    longer = begin.continued(4, np.array([1.0, 2.0, 0.5]))
-    assert longer.stamps_ns.tolist() == [1, 3, 4]
-    assert longer.poses[-1].tolist() == [1.0, 2.0, 0.5]
-    assert begin.continued(3, np.ones(3)) is begin
-    assert len(Trajectory(np.empty(0), np.empty((0, 3))).continued(1, np.ones(3))) == 1

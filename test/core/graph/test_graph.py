@@ -9,14 +9,11 @@ from hypothesis import given, strategies as st
 import numpy as np
 import pytest
 from random_graphs import (
-    dense_system,
     random_edges,
     random_edges_to_biases,
     random_graph,
     random_observed,
     random_poses,
-    slow_edge,
-    slow_observed,
     snapshot,
 )
 
@@ -148,16 +145,6 @@ def test_no_part_of_an_update_is_applied_where_another_is_bad(name: str) -> None
     assert snapshot(graph) == before
 
 
-def test_the_rows_that_were_refused_are_gone_from_later_updates_too() -> None:
-    graph = random_graph(seed=3, n_nodes=N_NODES)
-    with pytest.raises(GraphUpdateError):
-        graph.apply(edge(j=[99]))
-    n_edges = len(graph.edges)
-    graph.apply(edge(j=[2]))
-    assert len(graph.edges) == n_edges + 1
-    assert graph.edges.j[-1] == 2
-
-
 def test_new_constraints_may_lead_to_the_new_hidden_nodes() -> None:
     rng = np.random.default_rng(4)
     graph = Graph()
@@ -169,12 +156,6 @@ def test_new_constraints_may_lead_to_the_new_hidden_nodes() -> None:
     np.testing.assert_array_equal(graph.fixed, [False, True, False])
     graph.apply(GraphUpdate(free=(1,), fix=(0,)))
     np.testing.assert_array_equal(graph.fixed, [True, False, False])
-
-
-def test_headings_are_wrapped_when_they_come_in() -> None:
-    graph = Graph()
-    graph.apply(GraphUpdate(hidden=[[1.0, 2.0, np.pi], [1.0, 2.0, 7.0]]))
-    np.testing.assert_allclose(graph.poses[:, 2], [-np.pi, 7.0 - 2.0 * np.pi], atol=1e-15)
 
 
 def strided(array: np.ndarray) -> np.ndarray:
@@ -204,26 +185,6 @@ def test_whatever_the_arrays_are_like_the_rows_are_the_same(
         observed=ObservedNodes(*map(odd, observed.columns))))
     assert snapshot(other) == snapshot(usual)
     assert len(editing.add_rows.signatures) == signatures
-
-
-def test_tables_of_empty_lists_add_nothing() -> None:
-    graph = random_graph(seed=11)
-    before = snapshot(graph)
-    graph.apply(GraphUpdate(
-        edges=Edges([], [], [], [], []), observed=ObservedNodes([], None, [], [], [])))
-    assert snapshot(graph) == before
-    with pytest.raises(GraphUpdateError, match=r'\(N, 3\).*\(0,\)'):
-        graph.apply(GraphUpdate(hidden=[]))
-
-
-def test_rows_that_only_the_full_validation_accepts_are_added() -> None:
-    graph, far = random_graph(seed=12, n_nodes=N_NODES), [[1e301, 0.0, 0.0]]
-    information = [np.eye(3) + 5e-6 * np.eye(3)[::-1] * [0.0, 0.0, 1.0]]  # files print few digits
-    for _ in range(40):     # more than the first tables hold
-        graph.apply(edge(information=information))
-    graph.apply(GraphUpdate(hidden=far))
-    assert graph.n_nodes == N_NODES + 1
-    assert graph.poses[-1, 0] == far[0][0]
 
 
 @pytest.mark.parametrize('poses', [
@@ -281,61 +242,6 @@ def test_rollback_reverts_every_edit_bit_for_bit(
     grow(graph, np.random.default_rng(seed), 5)
     grow(other, np.random.default_rng(seed), 5)
     assert snapshot(graph) == snapshot(other)
-
-
-def test_rollback_returns_to_the_last_begin_and_no_further() -> None:
-    rng = np.random.default_rng(7)
-    graph = random_graph(seed=7)
-    graph.begin()
-    grow(graph, rng, 3)
-    before = snapshot(graph)
-    graph.begin()
-    grow(graph, rng, 4)
-    graph.rollback()
-    assert snapshot(graph) == before
-
-
-@given(seeds)
-def test_chi2_is_the_sum_of_all_energies(seed: int) -> None:
-    graph = random_graph(seed)
-    energies = graph.energies()
-    edges, unary = graph.edges, graph.observed
-    for k in range(len(edges)):
-        error, _, _ = slow_edge(graph.poses[edges.i[k]], graph.poses[edges.j[k]], edges.mean[k])
-        assert energies.edges[k] == pytest.approx(error @ edges.information[k] @ error, rel=1e-9)
-    for k in range(len(unary)):
-        error, _ = slow_observed(graph.poses[unary.node[k]], unary.offset[k], unary.mean[k])
-        assert energies.observed[k] == pytest.approx(
-            error @ unary.information[k] @ error, rel=1e-9, abs=1e-12)
-    assert energies.chi2 == pytest.approx(
-        np.sum(energies.edges) + np.sum(energies.observed), rel=1e-12)
-
-
-def test_the_gradient_of_chi2_is_twice_b() -> None:
-    graph = random_graph(seed=8)
-    _, b = dense_system(graph)
-    step = 1e-6
-
-    def chi2(shift: np.ndarray) -> float:
-        return graph.energies(graph.poses + shift.reshape(-1, 3)).chi2
-
-    numeric = [(chi2(step * axis) - chi2(-step * axis)) / (2.0 * step)
-               for axis in np.eye(3 * graph.n_nodes)]
-    np.testing.assert_allclose(numeric, 2.0 * b, rtol=1e-6, atol=1e-4)
-
-
-def test_adding_one_by_one_equals_adding_at_once() -> None:
-    at_once = random_graph(seed=9)
-    edges, unary = at_once.edges, at_once.observed
-    one_by_one = Graph()
-    append: Callable[[GraphUpdate], None] = one_by_one.apply
-    for pose in at_once.poses:
-        append(GraphUpdate(hidden=pose[None]))
-    for k in range(len(edges)):
-        append(GraphUpdate(edges=edges.rows(slice(k, k + 1))))
-    for k in range(len(unary)):
-        append(GraphUpdate(observed=unary.rows(slice(k, k + 1))))
-    assert snapshot(one_by_one) == snapshot(at_once)
 
 
 @pytest.mark.parametrize('make', [

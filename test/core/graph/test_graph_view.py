@@ -2,26 +2,18 @@
 # SPDX-License-Identifier: Apache-2.0
 """The view of a graph against a slow evaluation of each row."""
 
-import time
 
 from hypothesis import given, strategies as st
 import numpy as np
 import pytest
 from random_graphs import matrix, random_graph
 
-from pose_graph_ros.core.backend import PoseGraphBackend
 from pose_graph_ros.core.geometry.se2 import FloatArray
-from pose_graph_ros.core.graph import factors, graph_view
+from pose_graph_ros.core.graph import graph_view
 from pose_graph_ros.core.graph.constraints import EdgeKind, Edges
 from pose_graph_ros.core.graph.graph import Graph, GraphUpdate
 from pose_graph_ros.core.graph.graph_view import DrawnRows, GraphView, Lines
-from pose_graph_ros.core.measurements import (
-    GlobalPose,
-    HeadingOnly,
-    OdometrySample,
-)
 
-SECOND = 1_000_000_000
 seeds = st.integers(0, 2**32 - 1)
 biases = st.integers(0, 4)
 # Energies by the kernel and by NumPy differ by rounding.
@@ -36,22 +28,6 @@ def weighted(seed: int, n_biases: int) -> Graph:
                     [EdgeKind.ODOMETRY] * 2),
         weigh_edges={0: 0.25, 1: 0.0}, remove_observed=(2,), weigh_observed={1: 0.5}))
     return graph
-
-
-@given(seeds, biases)
-def test_energies_are_those_of_the_errors(seed: int, n_biases: int) -> None:
-    graph = weighted(seed, n_biases)
-    edges, observed = np.empty(graph.n_edges), np.empty(graph.n_observed)
-    factors.energies(graph.memory.head, edges, observed)
-    expected, (weights, observed_weights) = graph.energies(), graph.weights
-    np.testing.assert_allclose(edges * weights, expected.edges, **SAME)
-    np.testing.assert_allclose(observed * observed_weights, expected.observed, **SAME)
-    full = weighted(seed, n_biases)
-    full.apply(GraphUpdate(
-        weigh_edges=dict.fromkeys(range(graph.n_edges), 1.0),
-        weigh_observed=dict.fromkeys(range(graph.n_observed), 1.0)))
-    np.testing.assert_allclose(edges, full.energies().edges, **SAME)
-    np.testing.assert_allclose(observed, full.energies().observed, **SAME)
 
 
 def slow_view(graph: Graph) -> dict[str, list[list[float]]]:
@@ -107,20 +83,6 @@ def test_the_view_shows_each_row_once_and_no_bias(seed: int, n_biases: int) -> N
             in_any_order(np.array(wanted).reshape(-1, 5)), **SAME)
 
 
-def test_a_heading_is_not_in_the_view() -> None:
-    backend = PoseGraphBackend()
-    assert backend.view() is None
-    for k in range(1, 20):
-        backend.add_odometry(OdometrySample(k * SECOND, np.array((float(k), 0.0, 0.0))))
-    backend.add_measurement(GlobalPose(3 * SECOND, np.array((3.0, 0.0, 0.1)), np.eye(3)), 'pose')
-    backend.add_measurement(HeadingOnly(4 * SECOND, 0.0, 0.01), 'imu')
-    backend.optimize()
-    view = backend.view()
-    assert view is not None
-    assert len(view.observed.ends) == 1
-    np.testing.assert_array_equal(view.observed.ends[0, 1], [3.0, 0.0])
-
-
 def test_a_view_does_not_follow_the_graph_and_cannot_be_written() -> None:
     graph = weighted(0, 2)
     view = graph_view.view(graph)
@@ -136,20 +98,6 @@ def test_a_view_does_not_follow_the_graph_and_cannot_be_written() -> None:
 def arrays(view: GraphView) -> list[FloatArray]:
     lines = (view.odometry, view.loop_closures, view.observed)
     return [view.nodes, *(array for line in lines for array in (line.ends, line.sigmas))]
-
-
-def test_the_view_of_a_large_graph_is_fast() -> None:
-    n = 50_000
-    graph, ahead = Graph(), np.arange(n - 1)
-    graph.apply(GraphUpdate(
-        hidden=np.zeros((n, 3)), edges=Edges(
-            ahead, ahead + 1, np.ones((n - 1, 3)), np.tile(np.eye(3), (n - 1, 1, 1)),
-            np.zeros(n - 1, dtype=int))))
-    graph_view.view(graph)
-    start = time.process_time()
-    graph_view.view(graph)
-    # a hundred times the usual duration [s]
-    assert time.process_time() - start < 1.0
 
 
 def test_what_is_not_simply_believed_is_drawn_apart_though_its_weight_is_0() -> None:

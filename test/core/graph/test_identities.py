@@ -10,20 +10,6 @@ from pose_graph_ros.core.graph.error_functions import edge_errors, observed_erro
 from pose_graph_ros.core.graph.graph import GraphUpdate
 
 
-def test_in_a_graph_that_nothing_has_left_ids_are_rows() -> None:
-    graph = random_graph(seed=1, n_biases=2)
-    assert graph.node_ids.tolist() == list(range(graph.n_nodes))
-    assert graph.edge_ids.tolist() == list(range(graph.n_edges))
-    assert graph.observed_ids.tolist() == list(range(graph.n_observed))
-    assert graph.next_ids == (graph.n_nodes, graph.n_edges, graph.n_observed)
-    assert graph.newest_pose == 6
-    for rows, size in ((graph.node_rows, graph.n_nodes), (graph.edge_rows, graph.n_edges),
-                       (graph.observed_rows, graph.n_observed)):
-        assert rows([2, 0, size - 1]).tolist() == [2, 0, size - 1]
-        assert rows([-1, size]).tolist() == [-1, -1]
-        assert rows(1).tolist() == 1
-
-
 def test_ids_that_somebody_holds_stay_what_they_are() -> None:
     graph = random_graph(seed=2)
     held = graph.node_ids, graph.edge_ids, graph.observed_ids

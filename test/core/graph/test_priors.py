@@ -18,7 +18,7 @@ from pose_graph_ros.core.exceptions import GraphUpdateError
 from pose_graph_ros.core.geometry import se2
 from pose_graph_ros.core.geometry.se2 import FloatArray
 from pose_graph_ros.core.graph.graph import Graph, GraphUpdate
-from pose_graph_ros.core.graph.priors import model, packed, unpacked
+from pose_graph_ros.core.graph.priors import model, packed
 from pose_graph_ros.core.smoother.incremental import IncrementalSmoother
 from pose_graph_ros.core.solver_config import SolverConfig
 
@@ -186,12 +186,6 @@ def test_a_prior_alone_holds_its_nodes() -> None:
     loose = IncrementalSmoother(EXACT)
     assert loose.update(GraphUpdate(hidden=poses, priors=[
         random_prior(rng, [0, 1, 2], poses, anchored=False)])).status is Status.FAILED
-
-
-def test_a_packed_prior_is_unpacked_to_the_bit() -> None:
-    prior = random_prior(np.random.default_rng(3), [4, 2], np.ones((2, 3)), anchored=False)
-    again = unpacked(prior.nodes, packed(prior), anchored=False)
-    assert packed(again).tobytes() == packed(prior).tobytes()
 
 
 @pytest.mark.parametrize(('change', 'message'), [

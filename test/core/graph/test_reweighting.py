@@ -79,44 +79,6 @@ def test_with_the_cost_chi2_is_the_sum_of_the_robust_costs(
     assert graph.energies().chi2 + some.cost(graph) == pytest.approx(expected)
 
 
-def test_constraints_without_a_loss_are_not_counted_and_cost_nothing() -> None:
-    graph, some = random_graph(3), Reweighting()
-    for row in range(5):
-        some.add(row, Loss.NONE, 3.0, edge=True)
-        some.add(row, Loss.NONE, 3.0, edge=False)
-        some.set_base_weight(row, 0.5)
-    assert len(some) == 0
-    assert some.cost(graph) == 0.0
-    assert some.changes(graph) == ({}, {})
-    assert some.all_alike(0.5) == ({}, {})
-
-
-def test_alike_are_the_base_weights_times_a_weight() -> None:
-    some = Reweighting()
-    for row in (2, 5, 9):
-        some.add(row, Loss.HUBER, 3.0, edge=True)
-        some.add(row, Loss.HUBER, 3.0, edge=False)
-    some.set_base_weight(5, 0.25)
-    some.set_base_weight(6, 0.1)    # has no loss
-    some.set_base_weight(10, 0.1)
-    assert some.all_alike(1e-2) == (
-        {2: 0.01, 5: 0.01, 9: 0.01}, {2: 0.01, 5: 0.0025, 9: 0.01})
-    assert len(some) == 6
-
-
-@pytest.mark.parametrize(('weight', 'changes'), [(0.999, False), (0.99, True), (1.01, True)])
-def test_an_update_ignores_changes_of_less_than_half_a_percent(
-    weight: float, changes: bool,
-) -> None:
-    graph, some = random_graph(1), Reweighting()
-    some.add(4, Loss.CAUCHY, 2.0, edge=True)
-    target = float(some.all_changes(graph)[0][4])
-    graph.apply(GraphUpdate(weigh_edges={4: weight * target}))
-    found, _ = some.changes(graph)
-    assert found == ({4: target} if changes else {})
-    assert some.all_changes(graph)[0] == {4: target}
-
-
 def robust_edges(graph: Graph) -> Reweighting:
     some = Reweighting()
     for row in range(graph.n_edges):

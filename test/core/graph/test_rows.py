@@ -4,7 +4,6 @@
 
 from hypothesis import given, strategies as st
 import numpy as np
-import pytest
 
 from pose_graph_ros.core.exceptions import GraphUpdateError
 from pose_graph_ros.core.graph import rows, tables as tb
@@ -48,31 +47,3 @@ def test_semidefinite_matrices_in_any_units_are_accepted_as_they_are(
     valid, kept = packed(matrix)
     assert valid
     np.testing.assert_array_equal(kept, matrix)
-
-
-@pytest.mark.parametrize('correlation', [1.001, -1.001, 3.0, 1e200])
-@pytest.mark.parametrize('pair', [(0, 1), (0, 2), (1, 2)])
-def test_correlations_beyond_one_are_left_to_the_full_validation(
-    pair: tuple[int, int], correlation: float,
-) -> None:
-    matrix = np.diag([1.0, 4.0, 100.0])
-    i, j = pair
-    matrix[i, j] = matrix[j, i] = correlation * np.sqrt(matrix[i, i] * matrix[j, j])
-    assert not packed(matrix)[0]
-    assert not is_valid(matrix)
-
-
-def test_a_matrix_of_three_correlations_that_cannot_be_together_is_refused() -> None:
-    matrix = np.array([[1.0, 0.9, 0.9], [0.9, 1.0, -0.9], [0.9, -0.9, 1.0]])
-    assert not packed(matrix)[0]
-    assert not is_valid(matrix)
-
-
-def test_a_matrix_of_zeros_is_refused() -> None:
-    assert not packed(np.zeros((3, 3)))[0]
-
-
-@pytest.mark.parametrize(('number', 'finite'), [
-    (0.0, True), (-1e300, True), (np.inf, False), (-np.inf, False), (np.nan, False)])
-def test_what_is_finite(number: float, finite: bool) -> None:
-    assert rows._is_finite(number) is finite

@@ -95,19 +95,3 @@ def test_edits_without_a_step_are_rolled_back_bit_for_bit(
         del simulation.truth[len(slow.poses):]
         assert differences(state(reference.graph), state(smoother.graph)) in ([], ['cliques'])
         assert reference.poses.tobytes() == smoother.poses.tobytes()
-
-
-def test_many_rollbacks_take_no_memory() -> None:
-    simulation, smoother, slow = begun(7)
-    for _ in range(10):
-        smoother.update(simulation.new_nodes(3))
-    ends = []
-    for _ in range(50):
-        # an edge between distant nodes, and a node that is not determined
-        update = simulation.joined(simulation.new_part('none'), edges=simulation.edges([(1, 25)]))
-        del simulation.truth[-1:]
-        assert smoother.update(update).status is Status.FAILED
-        assert_pools_are_whole(smoother.graph)
-        ends.append(smoother.graph.memory.head[[tb.POOL_F_END, tb.POOL_I_END, tb.N_CLIQUES]])
-    assert np.all(ends[-1] == ends[1])
-    del slow

@@ -52,12 +52,6 @@ def test_the_order_is_found_out(order: str, correlation: float, tag: str, tmp_pa
         guess.file.graph.edges.information, read_g2o(path, order).graph.edges.information)
 
 
-def test_nothing_is_guessed_without_need(tmp_path: Path) -> None:
-    path = tmp_path / 'graph.g2o'
-    path.write_text('EDGE_SE2 0 1 1 0 0 1 0 0 1 0 1\n', encoding='ascii')
-    assert read_guessed(path)[1:] == (None, '')
-
-
 def test_a_file_that_neither_order_can_be_is_refused_with_its_line(tmp_path: Path) -> None:
     path = tmp_path / 'graph.graph'
     path.write_text('EDGE2 0 1 1 0 0 1 0 0 1 0 1\nEDGE2 1 2 1 0 0 1 0\n', encoding='ascii')

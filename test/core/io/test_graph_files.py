@@ -8,7 +8,6 @@ from dataclasses import replace
 import functools
 import hashlib
 import json
-import os
 from pathlib import Path
 import tempfile
 from typing import Any
@@ -33,7 +32,6 @@ from pose_graph_ros.core.exceptions import FileFormatError, FileWriteError
 from pose_graph_ros.core.geometry.geodesy import MapOrigin
 from pose_graph_ros.core.graph.constraints import EdgeKind, Edges, ObservedKind, ObservedNodes
 from pose_graph_ros.core.graph.graph import Graph, GraphUpdate, NextIds
-from pose_graph_ros.core.io import atomic_files, old_versions
 from pose_graph_ros.core.io.g2o import read_g2o
 from pose_graph_ros.core.io.graph_files import graph_paths, read_datum, read_graph, write_graph
 from pose_graph_ros.core.io.saved_graph import SavedGraph
@@ -70,11 +68,6 @@ def test_any_of_the_suffixes_or_none_names_all_three_files(tmp_path: Path, name:
     assert_same_value(read_graph(folder / name), small_graph())
 
 
-def test_another_dot_belongs_to_the_name(tmp_path: Path) -> None:
-    write_graph(small_graph(), tmp_path / 'map.v2')
-    assert sorted(contents(tmp_path)) == ['map.v2.g2o', 'map.v2.json', 'map.v2.tum']
-
-
 def test_other_programs_read_the_graph_and_the_path(tmp_path: Path) -> None:
     saved = saved_drive()
     g2o, side, tum = write_graph(saved, tmp_path / 'map')
@@ -95,25 +88,6 @@ def test_other_programs_read_the_graph_and_the_path(tmp_path: Path) -> None:
 
 
 # --- places -------------------------------------------------------------------------------------
-
-def test_the_file_with_the_checksums_is_renamed_last_after_all_are_on_the_disk(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    done: list[str] = []
-    replace_, fsync = os.replace, os.fsync
-
-    def replacing(source: Path, target: Path) -> None:
-        done.append(Path(target).suffix)
-        replace_(source, target)
-
-    def syncing(handle: int) -> None:
-        done.append('sync')
-        fsync(handle)
-
-    monkeypatch.setattr(atomic_files.os, 'replace', replacing)
-    monkeypatch.setattr(atomic_files.os, 'fsync', syncing)
-    write_graph(small_graph(), tmp_path / 'map')
-    assert done == ['sync', 'sync', 'sync', '.g2o', '.tum', '.json', 'sync']
 
 
 def make_folder(path: Path) -> Path:
@@ -246,19 +220,6 @@ def test_a_file_of_version_1_is_read() -> None:
     assert backend.estimate().chi2 == pytest.approx(27.1463, abs=1e-3)
 
 
-def number_as_version_1_does(members: dict[str, Any]) -> None:
-    members['version'] = 1
-    for (member, field), names in old_versions.NUMBERED.items():
-        chosen = members[member][field]
-        members[member][field] = [names.index(chosen['names'][k]) for k in chosen['of']]
-
-
-def test_versions_1_and_2_of_a_graph_are_read_alike(tmp_path: Path) -> None:
-    _, side, _ = write_graph(saved_drive(), tmp_path / 'map')
-    rewrite(side, number_as_version_1_does)
-    assert_same_value(read_graph(side), saved_drive())
-
-
 def test_odometry_that_closures_have_doubted_in_version_4_keeps_its_weight(tmp_path: Path) -> None:
     _, side, _ = write_graph(saved_drive(), tmp_path / 'map')
 
@@ -272,63 +233,6 @@ def test_odometry_that_closures_have_doubted_in_version_4_keeps_its_weight(tmp_p
     saved = read_graph(side)
     assert saved.rows.edges.weight[0] == 0.01
     assert_same_value(saved.judgement, saved_drive().judgement)
-
-
-def test_losses_and_kinds_are_saved_by_their_names(tmp_path: Path) -> None:
-    _, side, _ = write_graph(saved_drive(), tmp_path / 'map')
-    members = json.loads(side.read_text(encoding='ascii'))
-    assert members['edge_losses']['losses']['names'] == ['huber']
-    assert members['graph']['edge_kind']['names'] == ['odometry', 'loop_closure', 'bias']
-    assert members['graph']['observed_kind']['names'] == ['global_pose', 'position', 'heading']
-    # another order of the names is the same graph
-
-    def turn(members: dict[str, Any]) -> None:
-        kind = members['graph']['edge_kind']
-        kind['names'] = kind['names'][::-1]
-        kind['of'] = [2 - k for k in kind['of']]
-
-    rewrite(side, turn)
-    assert_same_value(read_graph(side), saved_drive())
-
-
-@pytest.mark.parametrize(('place', 'value', 'expected'), [
-    (('graph', 'fixed'), [-1], r'graph\.fixed: expected hidden nodes'),
-    (('graph', 'biases'), [10**6], r'graph\.biases: expected hidden nodes'),
-    (('graph', 'biases'), [0], 'no biases as vertices'),
-    (('graph', 'observed_on_bias'), [-1], r'graph\.observed_on_bias: expected numbers in 0'),
-    (('graph', 'observed_on_bias'), [], r'expected \d+ observed nodes, got \d+'),
-    (('graph', 'edge_kind'), [0], r"edge_kind: expected the fields \['names', 'of'\]"),
-    (('graph', 'edge_kind'), {'names': ['odometry'], 'of': [1]}, 'positions among 1 names'),
-    (('edge_losses', 'losses'), {'names': ['l1'], 'of': [0]}, 'one of none, huber, cauchy.*l1'),
-    (('graph', 'edge_weight'), [1.0], r'expected \d+ weights, got 1'),
-    (('graph', 'bias_edge_bias'), [], r'expected \d+ edges to biases, got 0')])
-def test_rows_that_do_not_fit_together_are_refused_with_what_was_expected(
-    tmp_path: Path, place: tuple[str, str], value: list[Any], expected: str,
-) -> None:
-    _, side, _ = write_graph(saved_drive(), tmp_path / 'map')
-
-    def change(members: dict[str, Any]) -> None:
-        members[place[0]][place[1]] = value
-
-    rewrite(side, change)
-    with pytest.raises(FileFormatError, match=expected):
-        read_graph(side)
-
-
-def test_each_vertex_has_all_of_its_numbers(tmp_path: Path) -> None:
-    g2o, side, _ = write_graph(small_graph(), tmp_path / 'map')
-    text = g2o.read_text(encoding='ascii')
-    for broken in (text.replace('VERTEX_SE2 1 ', 'VERTEX_SE2 ', 1),
-                   text.replace('VERTEX_SE2 1 ', 'VERTEX_SE2 nan ', 1)):
-        write_graph(small_graph(), tmp_path / 'map')
-        g2o.write_text(broken, encoding='ascii')
-
-        def checksum(members: dict[str, Any], content: bytes = broken.encode()) -> None:
-            members['g2o_sha256'] = hashlib.sha256(content).hexdigest()
-
-        rewrite(side, checksum)
-        with pytest.raises(FileFormatError, match='finite numbers after each VERTEX_SE2'):
-            read_graph(side)
 
 
 @pytest.mark.parametrize('body', [b'', b'"format": ', b'}}', b'"a": ' + b'[' * 10**5])

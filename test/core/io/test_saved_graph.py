@@ -19,7 +19,7 @@ from saved_graphs import (
     SECOND,
     straight_line,
 )
-from test_delay_invariance import DRIVES, Event, feed, PLAIN, ROBUST, SAME_PATH
+from test_delay_invariance import DRIVES, Event, PLAIN, ROBUST, SAME_PATH
 
 from pose_graph_ros.core.alignment.monitor import AlignmentState
 from pose_graph_ros.core.backend import PoseGraphBackend
@@ -30,11 +30,10 @@ from pose_graph_ros.core.config import (
     OdometrySource,
 )
 from pose_graph_ros.core.estimate import Estimate
-from pose_graph_ros.core.exceptions import NothingToSaveError
 from pose_graph_ros.core.geometry import covariance, se2
 from pose_graph_ros.core.geometry.geodesy import MapOrigin, TangentPlane
 from pose_graph_ros.core.io.graph_files import read_graph, write_graph
-from pose_graph_ros.core.io.saved_graph import SavedGraph, site_refusal, STATES
+from pose_graph_ros.core.io.saved_graph import SavedGraph, site_refusal
 from pose_graph_ros.core.measurements import (
     AnswerStatus,
     GlobalPose,
@@ -137,17 +136,6 @@ def test_a_graph_comes_back_to_the_bit_and_grows_on_as_without_saving(kind: str,
     assert_same_estimate(closed(after), uninterrupted(kind), SAME_PATH)
 
 
-def test_the_first_update_after_a_load_eliminates_everything() -> None:
-    backend = PoseGraphBackend(PLAIN)
-    feed_all(backend, events('plain')[:500])
-    restored = PoseGraphBackend.restored(PLAIN, backend.saved())
-    report = restored.update()
-    assert (report.status, report.eliminated) == (Status.CONVERGED, restored.graph.n_nodes)
-    np.testing.assert_allclose(report.chi2, backend.estimate().chi2, rtol=1e-5)
-    assert_same_estimate(restored.estimate(), of_the_graph(backend), 3e-3)
-    assert restored.update().eliminated == 0
-
-
 def test_a_robot_that_was_put_elsewhere_stays_there() -> None:
     elsewhere = np.array([500.0, 300.0, 1.0])
     # (closures would connect the nodes before and after)
@@ -169,17 +157,6 @@ def test_a_robot_that_was_put_elsewhere_stays_there() -> None:
     for backend in (whole, parted):
         feed_all(backend, odometry)
     assert_same_estimate(closed(parted), closed(whole), SAME_PATH)
-
-
-def test_saving_changes_nothing() -> None:
-    backend = PoseGraphBackend(ROBUST)
-    for k, event in enumerate(events('robust')):
-        feed(backend, event)
-        if k % 20 == 0:
-            backend.update()
-        if k % 100 == 99:
-            backend.saved()
-    assert_same_estimate(closed(backend), uninterrupted('robust'), SAME_PATH)
 
 
 def test_what_was_seen_is_refused_again_and_what_was_left_out_is_not() -> None:
@@ -210,11 +187,6 @@ def test_edges_that_wait_and_those_set_aside_are_saved() -> None:
             [queued.source for queued in restored._quarantine.edges]) == (['waits'], ['failed'])
     assert_same_estimate(closed(restored), closed(backend), SAME_PATH)
     assert restored.graph.n_edges == backend.graph.n_edges == len(backend.node_stamps_ns) - 1 + 2
-
-
-def test_without_any_node_there_is_nothing_to_save() -> None:
-    with pytest.raises(NothingToSaveError):
-        PoseGraphBackend().saved()
 
 
 def test_positions_that_wait_for_the_alignment_are_left_out_and_counted() -> None:
@@ -307,15 +279,6 @@ def test_odometry_that_was_restarted_makes_a_loose_edge_to_where_the_robot_was(
     assert old.reason == 'out_of_order'
 
 
-def test_only_the_first_step_after_a_load_may_be_loose() -> None:
-    restored = PoseGraphBackend.restored(LINE_ODOMETRY, straight_line().saved())
-    for time in (3600.0, 3601.0, 3630.0, 3631.0):   # the gap of 29 s is an ordinary one
-        restored.add_odometry(line_sample(time, at=time - 3600.0), 'odom')
-    restored.finish()
-    assert restored.counts['odom', 'jump'] == 1
-    assert np.sqrt(last_edge(restored)[1][0, 0]) < 0.5
-
-
 def test_another_odometry_may_be_primary_after_a_load_with_one_loose_edge() -> None:
     config = BackendConfig(odometry={'odom': OdometrySource(), 'visual': OdometrySource()})
     saved = straight_line(config).saved()
@@ -391,21 +354,6 @@ def test_a_closure_may_refer_to_a_saved_node_or_an_instant_between_saved_nodes()
     assert 1e-4 < farthest < 0.1
 
 
-def test_measurements_after_a_load_are_added_as_usual() -> None:
-    restored = PoseGraphBackend.restored(LINE_ODOMETRY, through_files(straight_line().saved()))
-    goal = np.array([50.0, 20.0, 1.5])
-    for k in range(30):
-        time = 100.0 + 0.2 * k
-        restored.add_odometry(line_sample(time, at=0.2 * k), 'odom')
-        restored.add_measurement(GlobalPose(
-            round(time * SECOND), se2.compose(goal, np.array([0.2 * k, 0.0, 0.0])),
-            np.diag([1e-4, 1e-4, 1e-4])), 'global_pose')
-    estimate = closed(restored)
-    assert estimate.alignment is AlignmentState.ALIGNED
-    np.testing.assert_allclose(
-        estimate.T_map_base, se2.compose(goal, np.array([5.8, 0.0, 0.0])), atol=0.05)
-
-
 # --- the site ------------------------------------------------------------------------------------
 
 HERE = MapOrigin(48.1, 11.6, 500.0, 0.1)
@@ -444,13 +392,6 @@ def test_a_datum_that_was_set_must_be_that_of_the_graph(datum: MapOrigin, same: 
         assert str(datum) in refusal
 
 
-def test_the_refusal_names_the_distance() -> None:
-    refusal = site_refusal(saved_here(), datum=north_of(HERE, 1234.5))
-    assert '1234.5' in str(refusal)
-    refusal = site_refusal(saved_here(), fix=north_of(HERE, 12_345.0))
-    assert ' 12.3 km' in str(refusal)
-
-
 def test_a_first_fix_must_be_near_a_node() -> None:
     saved = saved_here()
     plane = TangentPlane(*HERE)
@@ -463,7 +404,3 @@ def test_a_first_fix_must_be_near_a_node() -> None:
     latitude, longitude, _ = plane.to_geodetic(np.array([end + 9_900.0, 0.0])).tolist()
     assert site_refusal(unaligned, fix=MapOrigin(latitude, longitude)) is not None
     assert site_refusal(unaligned, fix=north_of(HERE, 9_990.0)) is None
-
-
-def test_the_states_of_the_alignment_in_files_are_those_of_the_format() -> None:
-    assert STATES == ('local', 'unaligned', 'aligned')

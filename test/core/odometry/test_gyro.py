@@ -2,7 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Yaw rates by stamp, and their integral against a fine numerical one."""
 
-from itertools import pairwise
 import math
 
 from hypothesis import given, settings, strategies as st
@@ -82,28 +81,6 @@ def test_the_noise_is_that_of_independent_samples_or_of_the_model() -> None:
         assert integral.between(*ends).variance == pytest.approx(source.sigma_rate**2 * 1.497)
 
 
-def test_the_parts_of_an_integral_add_up() -> None:
-    times = np.arange(0.0, 3.0, 0.013)
-    integral = filled(samples(times, np.cos(times))).integral(EPOCH + 1, EPOCH + 2 * SECOND)
-    assert integral is not None
-    cuts = [EPOCH + 1, EPOCH + 123_456_789, EPOCH + SECOND, EPOCH + 2 * SECOND]
-    parts = [integral.between(*pair) for pair in pairwise(cuts)]
-    assert np.sum(parts, axis=0) == pytest.approx(integral.between(cuts[0], cuts[-1]), rel=1e-12)
-    rest = integral.between(cuts[0], cuts[-1]).without(parts[1])
-    assert rest == pytest.approx(np.sum([parts[0], parts[2]], axis=0), rel=1e-9)
-
-
-def test_the_order_of_arrival_within_the_window_does_not_matter() -> None:
-    times = np.arange(0.0, 4.0, 0.01)
-    given_ = samples(times, np.sin(times))
-    generator = np.random.default_rng(5)
-    shuffled = [given_[k] for k in np.argsort(times + generator.uniform(0.0, 0.24, len(times)))]
-    one, other = filled(given_), filled(shuffled)
-    ends = EPOCH + 5_000_000, EPOCH + 3_500_000_000
-    assert one.integral(*ends).between(*ends) == other.integral(*ends).between(*ends)
-    assert one.n_sorted == 0 < other.n_sorted
-
-
 def test_a_gap_breaks_the_integral() -> None:
     times = np.concatenate((np.arange(0.0, 1.0, 0.01), np.arange(1.3, 2.0, 0.01)))
     stream = filled(samples(times, 0.0 * times))
@@ -151,11 +128,3 @@ def test_a_saved_stream_continues_bit_for_bit() -> None:
         second.add(sample)
     ends = EPOCH + 5_000_000, EPOCH + 2_700_000_000
     assert second.integral(*ends).between(*ends) == whole.integral(*ends).between(*ends)
-
-
-def test_what_lies_before_a_stamp_is_forgotten() -> None:
-    stream = filled(samples(np.arange(0.0, 3.0, 0.01), np.ones(300)))
-    stream.forget_before(EPOCH + 2 * SECOND + 1)
-    assert stream.first_ns == EPOCH + 2 * SECOND
-    ends = EPOCH + 2 * SECOND + 1, EPOCH + 2 * SECOND + SECOND // 2
-    assert stream.integral(*ends).between(*ends).angle == pytest.approx(0.5)

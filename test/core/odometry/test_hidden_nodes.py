@@ -18,7 +18,6 @@ from pose_graph_ros.core.geometry.se2 import FloatArray
 from pose_graph_ros.core.graph.constraints import Edges
 from pose_graph_ros.core.measurements import GlobalPose, OdometrySample, Position
 from pose_graph_ros.core.odometry.hidden_nodes import HiddenNodes
-from pose_graph_ros.core.odometry.timeline import LARGEST_GAP_NS
 
 SECOND = 1_000_000_000
 EPOCH = 1_767_225_600 * SECOND
@@ -162,16 +161,6 @@ def test_nodes_are_where_a_slow_walk_puts_them(seed: int) -> None:
             se2.wrapped(made.poses), se2.wrapped(np.array(poses)[at]), atol=ROUNDING)
 
 
-@pytest.mark.parametrize('rate', [1, 10])
-def test_a_long_rest_leaves_the_heartbeat(rate: int) -> None:
-    nodes, made, _ = grown([
-        ('wheel', OdometrySample(EPOCH + k * SECOND // rate, np.ones(3)))
-        for k in range(1200 * rate)])
-    assert len(nodes) == 120
-    assert len(nodes.streams['wheel'].timeline) <= 2 if rate > 1 else 1200
-    np.testing.assert_array_equal(np.array(made.means[1:]), 0.0)
-
-
 def test_a_node_that_cannot_be_made_is_made_at_the_next_sample() -> None:
     arrivals = by_stamp({'wheel': np.arange(0.0, 20.0, 0.1)})
     whole, _, _ = grown(arrivals)
@@ -208,30 +197,6 @@ def test_another_source_adds_edges_between_the_nodes_that_it_covers(
         assert np.all(np.abs(off) < sigma + 1e-4)
 
 
-def test_the_edge_of_a_source_spans_the_nodes_in_its_gap() -> None:
-    gap = 3.0
-    other = np.concatenate((np.arange(0.02, 8.0, 0.1), np.arange(8.0 + gap, 20.0, 0.1)))
-    nodes, _, edges = grown(by_stamp({'wheel': np.arange(0.0, 20.0, 0.1), 'visual': other}))
-    times = (nodes.stamps_ns - EPOCH) * 1e-9
-    inside = np.flatnonzero((times > 7.9) & (times < 8.0 + gap))
-    assert len(inside) >= 4
-    assert gap * SECOND > LARGEST_GAP_NS
-    ends = {int(k) for _, edge in edges for k in (edge.i[0], edge.j[0])}
-    assert ends == set(range(1, len(nodes))) - set(inside.tolist())
-    across = next(edge for _, edge in edges if edge.i[0] == inside[0] - 1)
-    assert across.j[0] == inside[-1] + 1
-
-
-def test_a_source_at_rest_adds_edges_between_the_nodes_of_the_heartbeat() -> None:
-    arrivals = [(name, OdometrySample(EPOCH + k * SECOND // 10 + phase, np.ones(3)))
-                for k in range(1000) for name, phase in (('wheel', 0), ('visual', 33_000_000))]
-    nodes, _, edges = grown(arrivals)
-    assert len(nodes) == 10
-    assert [(int(edge.i[0]), int(edge.j[0])) for _, edge in edges] == [
-        (k, k + 1) for k in range(1, 9)]     # (before the first node it has not begun)
-    assert len(nodes.streams['visual'].timeline) <= 3
-
-
 # --- The primary source ----------------------------------------------------------------------
 
 WHEEL = np.arange(0.0, 30.0, 0.1)
@@ -258,13 +223,6 @@ def test_a_silent_primary_source_is_replaced(silence: float) -> None:
     # the first edge of the source after its silence spans that
     across = [edge for source, edge in edges if edge.j[0] - edge.i[0] > 1]
     assert len(across) == (1 if silence < 20.0 else 0)
-
-
-def test_silence_shorter_than_the_patience_is_waited_for() -> None:
-    wheel = without(WHEEL, 10.0, 11.8)
-    nodes, made, _ = grown(by_stamp({'wheel': wheel, 'visual': VISUAL}))
-    assert set(made.sources) == {'wheel'}
-    assert_true(nodes, made)
 
 
 def test_the_first_source_is_primary_again_when_the_other_is_silent() -> None:
@@ -329,26 +287,6 @@ def test_the_preferred_source_is_not_waited_for_longer(late: float) -> None:
     assert_true(nodes, made)
     covered = np.count_nonzero(nodes.stamps_ns >= stamp_of(late))
     assert len(edges) in ((covered - 1, covered - 2) if late < 30.0 else (0,))
-
-
-def test_a_short_stream_has_its_nodes_in_the_end() -> None:
-    nodes, made, _ = grown(by_stamp({'visual': VISUAL[:20]}), finish=False)
-    assert len(nodes) == 0
-    nodes, made, _ = grown(by_stamp({'visual': VISUAL[:20]}))
-    assert len(nodes) == 3
-    nodes, made, _ = grown(by_stamp({'wheel': WHEEL[4:10], 'visual': VISUAL[:20]}))
-    assert set(made.sources) == {'wheel'}
-
-
-def test_no_samples_or_a_single_one() -> None:
-    nodes, _, edges = grown([])
-    assert (len(nodes), edges, nodes.primary) == (0, [], '')
-    assert nodes.covered_ns == nodes.newest_ns == -1
-    nodes, _, _ = grown(by_stamp({'wheel': [1.0]}))
-    assert len(nodes) == 1
-    motion, noise, _ = nodes.newest()
-    np.testing.assert_array_equal(motion, 0.0)
-    np.testing.assert_array_equal(noise, 0.0)
 
 
 # --- Order of arrival ------------------------------------------------------------------------

@@ -93,31 +93,9 @@ def test_a_stated_speed_that_is_not_finite_is_ignored(stated: float) -> None:
                 == is_jump(before, (length, 0.0), 0.1, 0.0, LIMIT))
 
 
-def test_after_standing_still_a_metre_in_a_tenth_of_a_second_is_a_jump() -> None:
-    still = Speeds((0.0, 0.0, 0.0), (0.0, 0.0), (0.0, 0.0))
-    assert is_jump(still, (1.0, 0.0), 0.1, 0.0, LIMIT)
-    assert is_jump(still, (0.0, 1.5), 0.1, 0.0, LIMIT)
-    assert not is_jump(still, (1.0, 0.0), 0.1, 8.0, LIMIT)      # the twist states the speed
-    assert not is_jump(UNKNOWN, (1.0, 0.0), 0.1, 0.0, LIMIT)
-
-
 # --- Speeds ----------------------------------------------------------------------------------
 
 ORIGIN = (0.0, 0.0, 0.0)
-
-
-def test_speeds_are_taken_over_no_less_than_the_least_time() -> None:
-    window = SpeedWindow(UNKNOWN, SECOND, ORIGIN)
-    early = SECOND + round(LEAST_TIME * 0.4e9)
-    window = window.moved(early, (0.2, 0.0, 0.0), (0.2, 0.0))
-    assert window == SpeedWindow(UNKNOWN, SECOND, ORIGIN, (0.2, 0.0))
-    late = SECOND + round(LEAST_TIME * 2e9)
-    pose = (0.1, 0.0, 0.0)     # a step back
-    window = window.moved(late, pose, (0.1, 0.0))
-    assert window.speeds.velocity == pytest.approx((0.1 / (2.0 * LEAST_TIME), 0.0, 0.0))
-    assert window.speeds.recent == pytest.approx((0.3 / (2.0 * LEAST_TIME), 0.0))
-    assert window.speeds.greatest == window.speeds.recent
-    assert window[1:] == (late, pose, (0.0, 0.0))
 
 
 @given(st.lists(rates, min_size=1, max_size=30))

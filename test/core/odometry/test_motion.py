@@ -6,15 +6,12 @@ from dataclasses import replace
 
 from hypothesis import given, strategies as st
 import numpy as np
-import pytest
 
 from pose_graph_ros.core.config import OdometryNoise
 from pose_graph_ros.core.geometry import se2
 from pose_graph_ros.core.geometry.covariance import UNKNOWN_HEADING_VARIANCE
 from pose_graph_ros.core.odometry.motion import (
     Motion,
-    NO_MOTION,
-    NO_VARIANCE,
     odometry_covariance,
 )
 
@@ -69,17 +66,3 @@ def test_turning_the_motion_leaves_the_covariance_in_the_frame_at_its_end() -> N
         turned = np.array([*(se2.rotation(theta) @ chord), theta])
         np.testing.assert_allclose(
             odometry_covariance(NOISE, Motion(turned, 4.0, 2.0)), expected, atol=1e-12)
-
-
-def test_each_increment_has_the_floors_once_and_variances_of_its_own() -> None:
-    floors = np.diag([NOISE.sigma_floor_position**2] * 2 + [NOISE.sigma_floor_heading**2])
-    np.testing.assert_allclose(odometry_covariance(NOISE, NO_MOTION), floors, rtol=1e-12)
-    np.testing.assert_array_equal(odometry_covariance(NOISE, NO_MOTION, floor=False), 0.0)
-    more = Motion(np.zeros(3), 0.0, 0.0, np.array([0.1, 0.2, 0.3]))
-    np.testing.assert_allclose(
-        odometry_covariance(NOISE, more, floor=False), np.diag([0.1, 0.2, 0.3]))
-
-
-def test_the_defaults_cannot_be_changed_by_accident() -> None:
-    with pytest.raises(ValueError, match='read-only'):
-        NO_VARIANCE[0] = 1.0

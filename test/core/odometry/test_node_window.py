@@ -11,7 +11,6 @@ from pose_graph_ros.core.config import BackendConfig, NodePolicy, OdometrySource
 from pose_graph_ros.core.geometry import se2
 from pose_graph_ros.core.measurements import Answer, LoopClosure, OdometrySample
 from pose_graph_ros.core.odometry.hidden_nodes import HiddenNodes
-from pose_graph_ros.core.odometry.node_table import NodeTable
 from pose_graph_ros.core.sources.measurement_constraints import attach, attach_reference
 
 SECOND = 1_000_000_000
@@ -161,14 +160,3 @@ def test_saved_and_restored_nodes_continue_as_they_would_have(
         assert_same_value(*edges)
     assert made_too == made
     assert other.n_frozen == one.n_frozen
-
-
-def test_a_node_that_has_left_takes_at_most_64_bytes() -> None:
-    table, n = NodeTable(), 5000
-    for k in range(n):
-        table.append(k, k, np.array([float(k), 0.0, 0.0]))
-        if len(table) - table.n_frozen > 50:
-            table.freeze(np.zeros((10, 3)))
-    taken = sum(column._data.nbytes if len(column) < 100 else len(column) * column._data[0].nbytes
-                for column in vars(table).values() if column is not table.thinned)
-    assert taken < 64 * n

@@ -8,11 +8,9 @@ import numpy as np
 import pytest
 
 from pose_graph_ros.core.config import OdometrySource
-from pose_graph_ros.core.geometry import covariance
 from pose_graph_ros.core.measurements import OdometrySample
 from pose_graph_ros.core.odometry.secondary_edges import SecondaryEdges
 from pose_graph_ros.core.odometry.stream import OdometryStream
-from pose_graph_ros.core.odometry.timeline import LARGEST_GAP_NS
 
 SECOND = 1_000_000_000
 NODES = np.arange(1, 11) * SECOND
@@ -31,31 +29,9 @@ def stream(times: Iterable[float]) -> OdometryStream:
     return one
 
 
-def added(one: OdometryStream) -> SecondaryEdges:
-    edges = SecondaryEdges()
-    edges.skip_to('visual', 0, reached=False)
-    edges.extend('visual', one, NODES, ROWS)
-    return edges
-
-
 def ends(edges: SecondaryEdges) -> list[tuple[int, int]]:
     """Return the numbers of the hidden nodes that the edges connect."""
     return [(int(edge.i[0]) // 2, int(edge.j[0]) // 2) for _, edge in edges.new]
-
-
-def test_consecutive_nodes_that_are_covered_get_an_edge() -> None:
-    visual = stream(np.arange(2.55, 7.5, 0.1))
-    edges = added(visual)
-    assert ends(edges) == [(2, 3), (3, 4), (4, 5), (5, 6)]
-    assert edges.progress == {'visual': (6, 7)}
-    for k, (source, edge) in enumerate(edges.new, 2):
-        motion = visual.timeline.motion(int(NODES[k]), int(NODES[k + 1]))
-        assert source == 'visual'
-        assert (edge.i[0], edge.j[0]) == (ROWS[k], ROWS[k + 1])
-        np.testing.assert_array_equal(edge.mean[0], motion.increment)
-        np.testing.assert_allclose(edge.mean[0], [1.0, 0.05, 0.1], atol=2e-3)
-        np.testing.assert_array_equal(
-            edge.information[0], covariance.information(visual.covariance(motion)))
 
 
 def test_the_edges_do_not_depend_on_how_often_they_are_extended() -> None:
@@ -72,26 +48,6 @@ def test_the_edges_do_not_depend_on_how_often_they_are_extended() -> None:
     assert len(edges.new) == 9
 
 
-def test_an_edge_spans_a_gap_of_the_source() -> None:
-    gap = (LARGEST_GAP_NS + 2 * SECOND) * 1e-9
-    times = np.concatenate((np.arange(0.55, 4.5, 0.1), np.arange(4.5 + gap, 10.5, 0.1)))
-    assert ends(added(stream(times))) == [
-        (0, 1), (1, 2), (2, 3), (3, 7), (7, 8), (8, 9)]
-
-
-def test_a_node_after_the_newest_settled_sample_waits() -> None:
-    visual = stream(np.arange(0.55, 3.5, 0.1))
-    edges = added(visual)
-    assert ends(edges) == [(0, 1), (1, 2)]
-    for t in np.arange(3.55, 5.5, 0.1):
-        visual.add(OdometrySample(round(t * 1e9), np.array([t, 0.0, 0.0])))
-    edges.extend('visual', visual, NODES, ROWS)
-    assert ends(edges) == [(0, 1), (1, 2)]     # nothing is settled
-    visual.settle_all(visual.newest_ns)
-    edges.extend('visual', visual, NODES, ROWS)
-    assert ends(edges)[2:] == [(2, 3), (3, 4)]
-
-
 @pytest.mark.parametrize('reached', [True, False])
 def test_no_edge_spans_a_skip(*, reached: bool) -> None:
     visual = stream(np.arange(0.55, 10.5, 0.1))
@@ -101,14 +57,6 @@ def test_no_edge_spans_a_skip(*, reached: bool) -> None:
     edges.skip_to('visual', 5, reached=reached)
     edges.extend('visual', visual, NODES, ROWS)
     assert ends(edges) == [(0, 1), (1, 2), (5, 6), (6, 7), (7, 8), (8, 9)]
-
-
-def test_a_node_that_is_not_reached_must_be_covered_first() -> None:
-    late = stream(np.arange(6.55, 10.5, 0.1))
-    edges = SecondaryEdges()
-    edges.skip_to('visual', 3, reached=False)
-    edges.extend('visual', late, NODES, ROWS)
-    assert ends(edges) == [(6, 7), (7, 8), (8, 9)]
 
 
 def test_no_edge_spans_a_restart_after_a_graph_was_loaded() -> None:

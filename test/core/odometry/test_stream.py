@@ -3,9 +3,7 @@
 """One source of odometry: samples sorted by stamp, jumps removed, noise."""
 
 from collections.abc import Callable
-from itertools import pairwise
 import math
-import sys
 
 from hypothesis import given, settings, strategies as st
 import numpy as np
@@ -93,36 +91,11 @@ def test_samples_shuffled_within_the_window_give_the_same_bits(data: st.DataObje
     assert contents(stream) == contents(in_order)
 
 
-def test_a_sample_waits_for_the_window_and_no_longer() -> None:
-    stream = OdometryStream(OdometrySource(reorder_window=0.2))
-    for k in range(10):
-        stream.add(OdometrySample(EPOCH + k * SECOND // 10, np.array([0.1 * k, 0.0, 0.0])))
-        assert [stamp for stamp, _ in stream.settle()] == (
-            [EPOCH + (k - 2) * SECOND // 10] if k >= 2 else [])
-
-
-def test_samples_that_are_sorted_in_are_counted() -> None:
-    stream = OdometryStream(OdometrySource(reorder_window=0.5))
-    for k in (0, 1, 3, 2, 5, 4, 6):
-        stream.add(OdometrySample(EPOCH + k * SECOND // 10, np.array([0.1 * k, 0.0, 0.0])))
-    assert stream.n_sorted == 2
-
-
 def test_late_samples_and_duplicates_have_different_reasons() -> None:
     stream = settled(WIGGLE)
     assert stream.add(WIGGLE[7]).reason == 'duplicate_stamp'
     assert stream.add(OdometrySample(WIGGLE[7].stamp_ns + 1, np.zeros(3))).reason == 'out_of_order'
     assert stream.add(OdometrySample(EPOCH - 1, np.zeros(3))).reason == 'out_of_order'
-
-
-def test_a_sample_may_be_changed_by_its_owner_afterwards() -> None:
-    pose = np.array([1.0, 2.0, 0.5])
-    stream = OdometryStream(OdometrySource())
-    stream.add(OdometrySample(EPOCH, pose))
-    pose[:] = 99.0
-    for _ in stream.settle(EPOCH):
-        pass
-    np.testing.assert_array_equal(stream.timeline.poses, [[1.0, 2.0, 0.5]])
 
 
 def test_a_stamp_far_ahead_does_not_stop_the_source() -> None:
@@ -217,13 +190,6 @@ def test_a_reset_in_mid_drive_is_a_jump(rate: int, speed: float) -> None:
 
 
 @pytest.mark.parametrize('rate', RATES)
-def test_a_heading_that_is_set_to_zero_is_a_jump(rate: int) -> None:
-    samples = drive(np.arange(20 * rate) / rate, steady(1.0), lambda t: 0.3 * (t < 8.0))
-    assert abs(samples[12 * rate].pose[2]) > 2.0
-    assert jumps(reset(samples, 12 * rate, yaw=True)) == 1
-
-
-@pytest.mark.parametrize('rate', RATES)
 def test_a_single_sample_that_is_off_leaves_no_trace_but_noise(rate: int) -> None:
     samples = drive(np.arange(10 * rate) / rate, steady(2.0))
     off = list(samples)
@@ -240,14 +206,6 @@ def test_a_single_sample_that_is_off_leaves_no_trace_but_noise(rate: int) -> Non
 def test_a_gap_is_no_jump(rate: int, gap: float, speed: float) -> None:
     times = np.concatenate((np.arange(5 * rate) / rate, 5.0 + gap + np.arange(5 * rate) / rate))
     assert jumps(drive(times, steady(speed), steady(0.3 if speed < 5.0 else 0.05))) == 0
-
-
-@pytest.mark.parametrize('rate', RATES)
-@pytest.mark.parametrize('gap', [1.0, 5.0])
-@pytest.mark.parametrize('speed', [1.0, 30.0])
-def test_a_reset_in_a_gap_is_a_jump(rate: int, gap: float, speed: float) -> None:
-    times = np.concatenate((np.arange(90 * rate) / rate, 90.0 + gap + np.arange(rate) / rate))
-    assert jumps(reset(drive(times, steady(speed)), 90 * rate)) == 1
 
 
 QUICK = {
@@ -269,44 +227,6 @@ QUICK = {
 @pytest.mark.parametrize('name', QUICK)
 def test_what_a_robot_can_do_is_no_jump(name: str, rate: int) -> None:
     assert jumps(drive(np.arange(8 * rate) / rate, *QUICK[name])) == 0
-
-
-@pytest.mark.parametrize('rate', RATES)
-@pytest.mark.parametrize('name', QUICK)
-@pytest.mark.parametrize('seed', range(3))
-def test_unevenly_spaced_stamps_make_no_jumps(name: str, rate: int, seed: int) -> None:
-    rng = np.random.default_rng(seed)
-    true = np.arange(8 * rate) / rate
-    samples = drive(true, *QUICK[name])
-    # held back for up to 40 ms here and there, then all at once
-    stamped = np.maximum.accumulate(true + 0.04 * (rng.random(len(true)) < 0.2))
-    stamped += 1e-4 * np.arange(len(true)) / len(true)
-    uneven = [OdometrySample(EPOCH + round(t * 1e9), one.pose)
-              for t, one in zip(stamped, samples, strict=True)]
-    uneven = [b for a, b in pairwise(uneven) if b.stamp_ns > a.stamp_ns]
-    assert jumps(uneven) == 0
-
-
-@pytest.mark.parametrize('speed', [np.nan, np.inf, -np.inf, 1e300])
-def test_a_stated_speed_that_is_not_finite_is_tolerated(speed: float) -> None:
-    samples = [OdometrySample(one.stamp_ns, one.pose, speed) for one in WIGGLE]
-    assert settled(samples).n_jumps <= 1
-
-
-def test_after_many_resets_the_motion_is_that_without_but_for_the_resets() -> None:
-    rng = np.random.default_rng(5)
-    samples = drive(np.arange(1200) * 0.1, steady(1.5), lambda t: 0.2 * np.sin(0.1 * t))
-    broken = samples
-    for at in (100, 300, 320, 700):
-        broken = reset(broken, at)
-    stream = settled(broken)
-    assert stream.n_jumps == 4
-    for _ in range(50):
-        a, b = np.sort(rng.integers(320, 699, 2))
-        motion = stream.timeline.motion(samples[a].stamp_ns, samples[b].stamp_ns)
-        np.testing.assert_allclose(
-            motion.increment, se2.between(samples[a].pose, samples[b].pose), atol=1e-9)
-        assert np.all(motion.variance == 0.0)
 
 
 # --- Noise -----------------------------------------------------------------------------------
@@ -367,33 +287,7 @@ def test_an_invalid_variance_of_a_twist_is_replaced_by_the_model(broken: float) 
         motion.variance, [0.01 * 4.9, 0.07**2 * motion.distance, 0.02 * 4.9], rtol=1e-6)
 
 
-def test_without_a_variance_the_noise_is_that_of_the_model() -> None:
-    samples = drive(np.arange(50) * 0.1, steady(2.0), steady(0.3))
-    start, end = samples[0].stamp_ns, samples[-1].stamp_ns
-    noise = OdometryNoise()
-    motion = settled(samples, noise=noise, **TWIST).timeline.motion(start, end)
-    np.testing.assert_allclose(motion.variance, [
-        noise.sigma_distance**2 * motion.distance, noise.sigma_lateral**2 * motion.distance,
-        noise.sigma_heading_distance**2 * motion.distance
-        + noise.sigma_heading_turn**2 * motion.turn], rtol=1e-6)
-
-
 # --- Memory ----------------------------------------------------------------------------------
-
-def test_standing_still_leaves_nothing() -> None:
-    stream = OdometryStream(OdometrySource(noise_from=NoiseFrom.TWIST))
-    pose, variance = np.array([1.0, 2.0, 0.3]), np.array([0.1, 0.1, 0.1])
-    for k in range(0, 60_000):
-        stream.add(OdometrySample(EPOCH + k * SECOND // 50, pose, 0.0, variance))
-        for _ in stream.settle():
-            pass
-    assert len(stream.timeline) == 2
-    assert len(stream._waiting) <= 14
-    assert sys.getsizeof(stream._waiting) < 1000
-    motion = stream.timeline.motion(EPOCH, stream.settled_ns)
-    np.testing.assert_array_equal(motion.increment, 0.0)
-    # every instant of it is covered closely
-    assert stream.timeline.covers(EPOCH + 1134 * SECOND + 77, closely=True)
 
 
 @settings(max_examples=20)
@@ -418,11 +312,6 @@ def test_leaving_out_samples_at_rest_changes_nothing(data: st.DataObject) -> Non
         assert motion.distance == pytest.approx(
             np.sum(np.hypot(*np.diff(walk[:, :2], axis=0).T)), abs=ROUNDING)
         np.testing.assert_array_equal(motion.variance, 0.0)
-
-
-def test_without_any_sample_there_is_no_newest_one() -> None:
-    with pytest.raises(ValueError, match='there is no odometry'):
-        OdometryStream(OdometrySource()).newest(0)
 
 
 def by_twist(times: FloatArray, twist: tuple[float, float, float]) -> list[OdometrySample]:
@@ -456,16 +345,6 @@ def test_twists_between_messages_are_integrated_to_the_second_order() -> None:
         pose = stream.timeline.poses[-1]
         assert math.hypot(*(pose - truth[-1].pose)[:2]) < bound
         assert stream.n_jumps == 0
-
-
-def test_the_path_by_twists_does_not_depend_on_the_order() -> None:
-    times = np.arange(0.0, 3.0, 0.02)
-    samples = [OdometrySample(EPOCH + round(t * 1e9), np.zeros(3), twist=(
-        1.0, 0.0, math.sin(t))) for t in times.tolist()]
-    order = np.argsort(times + np.random.default_rng(1).uniform(0.0, 0.2, len(times)))
-    one = settled(samples, integrate=Integrate.TWIST)
-    other = settled([samples[k] for k in order], integrate=Integrate.TWIST)
-    assert contents(one) == contents(other)
 
 
 def test_a_gap_between_twists_is_an_uncertain_motion() -> None:

@@ -58,14 +58,3 @@ def at_the_end(
     end[:2, :2] = se2.rotation(se2.compose(mean, step)[2])
     in_anchor = propagated(mean, axes @ C @ axes.T, step, noise)
     return end.T @ in_anchor @ end
-
-
-def test_the_oldest_ones_are_dropped() -> None:
-    rng, nodes = np.random.default_rng(1), ThinnedNodes()
-    nodes.add(np.array([7, 3, 5]), np.array([8, 8, 8]), random_poses(rng, 3),
-              random_information(rng, 3))
-    nodes.drop_before(5)
-    assert nodes.places().numbers.tolist() == [5, 7]
-    assert len(nodes) == 2
-    assert nodes.place(3) is None
-    assert nodes.place(9) is None

@@ -87,11 +87,6 @@ def test_a_large_threshold_lets_no_stamp_of_the_future_pass() -> None:
     assert one.goes_on()
 
 
-def test_slow_odometry_is_of_the_present() -> None:
-    one = Given(began=False)
-    assert one.answers(*np.arange(EPOCH, EPOCH + 4000.0, 20.0)) == {'used'}
-
-
 @pytest.mark.parametrize('away', [-3600.0, 3600.0])
 def test_another_odometry_with_another_clock_is_refused_whatever_the_first_does(
     away: float,
@@ -166,15 +161,6 @@ def test_a_gyroscope_of_another_time_is_refused_and_has_no_say() -> None:
     # it goes on while odometry is silent
     assert one.answers(*np.arange(NOW + 10.0, NOW + 200.0, 0.1), source='gyro') == {'used'}
     assert one.goes_on()
-
-
-def test_a_refusal_says_which_stamps_and_what_to_do() -> None:
-    one = Given('odom', 'visual')
-    judged = one.keeper.judge(
-        'visual', OdometrySample(round((NOW + 3600.0) * SECOND), np.zeros(3)))
-    assert judged.refusal is not None
-    assert '3600.1 s ahead of the stamps of odom' in judged.refusal.detail
-    assert 'visual.time_offset' in judged.refusal.detail
 
 
 @given(st.integers(-10**6, 10**6))

@@ -11,7 +11,6 @@ import pytest
 from random_graphs import matrix, random_poses, vector
 
 from pose_graph_ros.core.geometry import se2
-from pose_graph_ros.core.geometry.scalar_se2 import between_one, compose_one, wrap_one
 from pose_graph_ros.core.geometry.se2 import FloatArray
 from pose_graph_ros.core.odometry.timeline import next_row, OdometryTimeline
 
@@ -89,25 +88,6 @@ def test_motions_compose_and_travel_adds_up(data: st.DataObject) -> None:
     assert first.turn + second.turn == pytest.approx(whole.turn, abs=ROUNDING)
 
 
-def test_a_sample_is_given_back_bit_for_bit() -> None:
-    stamps = [EPOCH + 10 * k for k in range(40)]
-    poses = random_poses(np.random.default_rng(4), 40)
-    timeline = filled(stamps, poses)
-    for stamp, pose in zip(stamps, poses, strict=True):
-        np.testing.assert_array_equal(timeline.pose(stamp), pose)
-    np.testing.assert_array_equal(timeline.stamps_ns, stamps)
-    np.testing.assert_array_equal(timeline.poses, poses)
-    motion = timeline.motion(stamps[3], stamps[3])
-    np.testing.assert_array_equal(motion.increment, 0.0)
-    assert motion.distance == motion.turn == 0.0
-
-
-def test_single_nanoseconds_count() -> None:
-    timeline = filled([EPOCH, EPOCH + 4], np.array([[0.0, 0.0, 0.0], [4.0, 0.0, 0.0]]))
-    for k in range(5):
-        assert timeline.pose(EPOCH + k)[0] == k
-
-
 def test_headings_are_interpolated_across_half_a_turn() -> None:
     timeline = filled([0, 10], np.array([[0.0, 0.0, np.pi - 0.1], [0.0, 0.0, -np.pi + 0.1]]))
     assert abs(timeline.pose(5)[2]) == pytest.approx(np.pi)
@@ -128,15 +108,6 @@ def test_instants_that_are_not_covered_are_rejected() -> None:
         timeline.motion(20, 10)
 
 
-@pytest.mark.parametrize('stamp', [20, 15])
-def test_a_stamp_that_is_not_newer_is_refused_and_nothing_changes(stamp: int) -> None:
-    timeline = filled([10, 20], np.zeros((2, 3)))
-    with pytest.raises(ValueError, match=f'after 20, got {stamp}'):
-        append(timeline, stamp, np.ones(3))
-    assert len(timeline) == 2
-    assert timeline.motion(10, 20).distance == 0.0
-
-
 def test_jitter_at_rest_is_no_path() -> None:
     rng = np.random.default_rng(1)
     n = 30_000     # ten minutes at 50 Hz, 2 mm and 2 mrad
@@ -145,13 +116,6 @@ def test_jitter_at_rest_is_no_path() -> None:
     motion = timeline.motion(20_000_000, 20_000_000 * n)
     assert motion.distance < 0.02
     assert motion.turn < 0.02
-
-
-def test_slow_motion_is_counted_whole() -> None:
-    n = 1001     # a millimetre a sample
-    poses = np.column_stack((np.arange(n) * 0.001, np.zeros(n), np.zeros(n)))
-    timeline = filled([k + 1 for k in range(n)], poses)
-    assert timeline.motion(1, n).distance == pytest.approx(1.0, abs=0.011)
 
 
 # --- Variances, gaps and rest ----------------------------------------------------------------
@@ -228,15 +192,6 @@ def test_leaving_out_rest_changes_no_motion(moves: list[int], seed: int) -> None
         assert motion.turn == pytest.approx(turn, abs=ROUNDING)
 
 
-@given(st.floats(-1e4, 1e4), st.floats(-10.0, 10.0), st.floats(-10.0, 10.0))
-def test_one_pose_at_a_time_is_the_same_as_arrays(x: float, a: float, b: float) -> None:
-    first, second = se2.wrapped(np.array([x, a, b])), se2.wrapped(np.array([b, x, a]))
-    assert wrap_one(a) == se2.wrap(a)
-    one, two = tuple(first.tolist()), tuple(second.tolist())
-    np.testing.assert_allclose(compose_one(one, two), se2.compose(first, second), atol=1e-11)
-    np.testing.assert_allclose(between_one(one, two), se2.between(first, second), atol=1e-11)
-
-
 @given(st.lists(st.tuples(st.integers(1, 2_000_000_000), st.sampled_from((0, 0, 1))),
                 min_size=1, max_size=40), st.data())
 def test_thinning_changes_nothing_at_the_instants_that_matter_and_after(
@@ -272,16 +227,6 @@ def test_thinning_changes_nothing_at_the_instants_that_matter_and_after(
                         thinned.motion(start, end), whole.motion(start, end), strict=True):
                     np.testing.assert_array_equal(one, other)
     np.testing.assert_array_equal(thinned.poses[0], whole.poses[0])
-
-
-def test_thinning_leaves_out_the_samples_between() -> None:
-    stamps = [EPOCH + k * SECOND // 10 for k in range(1000)]
-    timeline = filled(stamps, np.column_stack((0.1 * np.arange(1000), np.zeros((1000, 2)))))
-    kept, rows, dense = timeline.thinned(
-        np.array([stamps[50], stamps[100] + 1]), stamps[990])
-    np.testing.assert_array_equal(kept, [stamps[k] for k in (0, 50, 100, 101, *range(990, 1000))])
-    assert rows.shape == (14, 8)
-    assert not np.any(dense)
 
 
 def test_thinning_does_not_take_what_is_left_out_for_rest() -> None:

@@ -11,7 +11,7 @@ import pytest
 from pose_graph_ros.adapters.parameters import checked
 from pose_graph_ros.cli.replay import run_measurements
 from pose_graph_ros.core.residuals.components import Analysis
-from pose_graph_ros.core.residuals.scale import fit, squared_correlations
+from pose_graph_ros.core.residuals.scale import fit
 from pose_graph_ros.core.residuals.source_residuals import SourceResiduals
 from pose_graph_ros.core.residuals.whiteness import whiteness
 from pose_graph_ros.core.sources.gauss_markov import CorrelatedErrors
@@ -78,13 +78,6 @@ def test_what_determines_the_poses_alone_says_nothing() -> None:
     assert all(math.isnan(row.ratio) for row in found.rows)
     assert fit(made(errors[:3], 1.0)).says_nothing
     assert fit(made(np.empty((0, 2)), 1.0)).says_nothing
-
-
-@pytest.mark.parametrize('phi', [0.0, 0.5, 0.9])
-def test_the_sum_of_squared_correlations_is_that_of_the_process(phi: float) -> None:
-    found = np.mean([squared_correlations(autoregressive(4000, phi, seed)[:, 0])
-                     for seed in range(10)])
-    assert found == pytest.approx(phi**2 / (1.0 - phi**2), rel=0.15, abs=0.02)
 
 
 def test_whiteness_tells_the_correlation_time_of_correlated_errors_alone() -> None:

@@ -12,7 +12,6 @@ from pose_graph_ros.core.backend import PoseGraphBackend
 from pose_graph_ros.core.geometry import se2
 from pose_graph_ros.core.geometry.se2 import FloatArray
 from pose_graph_ros.core.graph.graph import Graph
-from pose_graph_ros.core.residuals.source_residuals import spread
 
 STEP = 1e-6
 
@@ -125,10 +124,3 @@ def test_unused_constraints_have_their_distance_from_the_estimate_without_them()
             backend.graph.edges_at([number]).information) for number in unused.ids]
     np.testing.assert_allclose(unused.distances**2, np.ravel(expected), rtol=1e-9)
     assert np.all(unused.distances > 10.0)
-
-
-def test_numbers_are_spread_evenly() -> None:
-    assert spread(5, 10).tolist() == [0, 1, 2, 3, 4]
-    some = spread(1000, 11)
-    assert (len(some), some[0], some[-1]) == (11, 0, 999)
-    assert np.ptp(np.diff(some)) <= 1

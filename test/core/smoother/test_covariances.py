@@ -5,11 +5,10 @@
 from hypothesis import given, settings, strategies as st
 import numpy as np
 import pytest
-from slow_smoother import cliques, EXACT, frame_turn, SlowGraph, world
+from slow_smoother import EXACT, SlowGraph, world
 
 from pose_graph_ros.core.batch.optimizer import Status
 from pose_graph_ros.core.geometry import se2
-from pose_graph_ros.core.graph import tables as tb
 from pose_graph_ros.core.graph.constraints import EdgeKind, Edges, ObservedKind, ObservedNodes
 from pose_graph_ros.core.graph.graph import GraphUpdate
 from pose_graph_ros.core.smoother import covariances
@@ -136,116 +135,6 @@ def test_nodes_in_different_parts_are_not_correlated() -> None:
     joint = smoother.joint_covariance(2, 5)
     np.testing.assert_array_equal(joint[:3, 3:], np.zeros((3, 3)))
     np.testing.assert_allclose(joint[3:, 3:], 2.0 * np.linalg.inv(pose_information()), rtol=1e-12)
-
-
-def test_a_node_with_itself_is_fully_correlated() -> None:
-    smoother = IncrementalSmoother(EXACT)
-    smoother.update(chain(5))
-    np.testing.assert_array_equal(
-        smoother.joint_covariance(2, 2), np.tile(smoother.covariance(2), (2, 2)))
-
-
-def test_many_rays_have_many_blocks_at_once() -> None:
-    smoother, n = IncrementalSmoother(EXACT), 200
-    smoother.update(GraphUpdate(
-        hidden=np.zeros((n + 1, 3)),
-        edges=Edges([0] * n, range(1, n + 1), np.zeros((n, 3)), [pose_information()] * n,
-                    [EdgeKind.ODOMETRY] * n),
-        observed=ObservedNodes([0], None, np.zeros((1, 3)), [pose_information()],
-                               [ObservedKind.GLOBAL_POSE])))
-    one = np.linalg.inv(pose_information())
-    np.testing.assert_allclose(smoother.covariances()[1:], np.tile(2.0 * one, (n, 1, 1)),
-                               rtol=1e-9)
-
-
-def test_a_dense_graph_is_one_large_clique() -> None:
-    rng, n = np.random.default_rng(1), 25
-    i, j = np.triu_indices(n, 1)
-    poses = rng.normal(size=(n, 3))
-    smoother = IncrementalSmoother(EXACT)
-    smoother.update(GraphUpdate(
-        hidden=poses, fix=[3], edges=Edges(
-            i, j, se2.between(poses[i], poses[j]), [pose_information()] * len(i),
-            [EdgeKind.LOOP_CLOSURE] * len(i))))
-    expected, actual = dense(smoother), smoother.covariances()
-    for node in range(n):
-        assert off(actual[node], expected[np.ix_(rows(node), rows(node))]) < RELATIVE
-
-
-@given(seeds, st.integers(1, 25))
-@settings(max_examples=20)
-def test_covariances_do_not_depend_on_the_frames_of_cliques(seed: int, steps: int) -> None:
-    smoother = driven(seed, steps)
-    graph = smoother.graph
-    pair = graph.n_nodes // 2, graph.n_nodes - 1
-    expected, expected_joint = smoother.covariances(), smoother.joint_covariance(*pair)
-    memory, rng = graph.memory, np.random.default_rng(seed)
-    for c, clique in cliques(graph).items():
-        if np.any(graph.fixed[clique.frontal]) or clique.parent < 0:
-            continue  # anchored to the map
-        angle = rng.uniform(-3.0, 3.0)
-        turned = clique.R.copy()
-        for k in range(0, clique.R.shape[1], 3):
-            turned[:, k:k + 2] = clique.R[:, k:k + 2] @ se2.rotation(angle)
-        triangle = np.linalg.qr(turned, mode='r')
-        triangle *= np.sign(np.diag(triangle))[:, None]
-        n = len(triangle)
-        triangle[np.diag_indices(n)] = 1.0 / triangle[np.diag_indices(n)]
-        values = memory['pool_f'][memory['clique_i'][c, tb.VALUES]:]
-        places = np.triu_indices(n, m=clique.R.shape[1] + 1)
-        values[:len(places[0])] = np.column_stack((triangle, clique.rhs))[places]
-        memory['clique_i'][c, tb.ANCHORED] = 0
-        memory['clique_f'][c, tb.TURN_ZERO] += frame_turn(graph, c) - angle
-    np.testing.assert_allclose(smoother.covariances(), expected, rtol=1e-8, atol=1e-13)
-    np.testing.assert_allclose(
-        smoother.joint_covariance(*pair), expected_joint, rtol=1e-8, atol=1e-13)
-
-
-def test_the_newest_node_alone_in_a_root_is_read_off() -> None:
-    smoother = IncrementalSmoother(EXACT)
-    smoother.update(chain(40))
-    clique = cliques(smoother.graph)[int(smoother.graph.memory['node_i'][39, tb.CLIQUE])]
-    assert (clique.frontal, clique.parent) == ([39], -1)
-    assert off(smoother.newest_covariance(), smoother.covariance(39)) < 1e-12
-
-
-@pytest.mark.parametrize('fix_newest', [False, True])
-def test_the_newest_node_may_be_anywhere(fix_newest: bool) -> None:
-    smoother = IncrementalSmoother(EXACT)
-    smoother.update(chain(12))
-    smoother.update(GraphUpdate(fix=[11] if fix_newest else [4]))
-    np.testing.assert_allclose(
-        smoother.newest_covariance(), smoother.covariance(11), rtol=1e-12, atol=1e-18)
-
-
-def test_asking_changes_nothing() -> None:
-    smoother, other = driven(5, 20), driven(5, 20)
-    smoother.covariances()
-    smoother.covariance(3)
-    smoother.joint_covariance(0, 4)
-    smoother.newest_covariance()
-    for each in (smoother, other):
-        each.update(GraphUpdate(weigh_edges={2: 0.3}))
-    assert smoother.poses.tobytes() == other.poses.tobytes()
-
-
-def test_an_empty_graph_has_no_covariances() -> None:
-    smoother = IncrementalSmoother()
-    assert smoother.covariances().shape == (0, 3, 3)
-    with pytest.raises(ValueError, match='a graph with nodes, got -1'):
-        smoother.newest_covariance()
-    with pytest.raises(ValueError, match='a graph with nodes, got 0'):
-        smoother.covariance(0)
-
-
-@pytest.mark.parametrize('node', [4, -1, 1.5, None])
-def test_a_node_that_is_not_there_is_refused(node: object) -> None:
-    smoother = IncrementalSmoother(EXACT)
-    smoother.update(chain(4))
-    for ask in (lambda: smoother.covariance(node), lambda: smoother.joint_covariance(0, node),
-                lambda: smoother.joint_covariance(node, 0)):
-        with pytest.raises(ValueError, match=rf'a hidden node in 0\.\.3, got {node}'):
-            ask()
 
 
 def test_covariances_require_that_edits_are_solved_for() -> None:

@@ -17,7 +17,6 @@ from pose_graph_ros.core.config import SmootherConfig
 from pose_graph_ros.core.exceptions import GraphUpdateError
 from pose_graph_ros.core.geometry import se2
 from pose_graph_ros.core.geometry.se2 import FloatArray
-from pose_graph_ros.core.graph import tables as tb
 from pose_graph_ros.core.graph.constraints import EdgeKind, Edges, ObservedKind, ObservedNodes
 from pose_graph_ros.core.graph.graph import Graph, GraphUpdate
 from pose_graph_ros.core.smoother import step, tree_update
@@ -251,14 +250,6 @@ def test_a_node_may_turn_by_many_turns(step: float) -> None:
         assert smoother.chi2() < 1e-9
 
 
-def test_a_heading_at_the_jump_stays_where_it_is() -> None:
-    smoother = IncrementalSmoother(EXACT)
-    smoother.update(GraphUpdate(
-        hidden=[[0.0, 0.0, -np.pi + 1e-3]], observed=ObservedNodes.joined([
-            seen(0, [0.0, 0.0, np.pi - 1e-3]), seen(0, [0.0, 0.0, -np.pi + 3e-3])])))
-    assert se2.wrap(smoother.poses[0, 2] - (np.pi + 1e-3)) == pytest.approx(0.0, abs=1e-6)
-
-
 # --- failure ------------------------------------------------------------------------------------
 
 def street(n: int, seed: int = 1) -> tuple[IncrementalSmoother, SlowGraph]:
@@ -396,38 +387,6 @@ def test_a_bad_update_does_not_forget_what_was_left_over() -> None:
     assert poses[:3] == poses[3:]
 
 
-def test_a_bad_update_does_not_forget_new_poses() -> None:
-    smoother, slow = street(10)
-    smoother.graph.set_poses(smoother.poses + 0.01)
-    assert smoother.update(GraphUpdate(free=[0])).status is Status.FAILED
-    smoother.update(GraphUpdate())
-    assert np.max(np.abs(slow.at(smoother.poses).step())) < 1e-3
-    assert smoother.covariances().shape == (10, 3, 3)
-
-
-def test_an_update_that_does_not_fit_leaves_no_trace() -> None:
-    smoother, _ = street(10)
-    before = state(smoother.graph)
-    with pytest.raises(ValueError, match=r'expected a hidden node in 0\.\.10'):
-        smoother.update(GraphUpdate(hidden=np.zeros((1, 3)), edges=link(0, 11, np.zeros(3))))
-    assert differences(before, state(smoother.graph)) == []
-
-
-def test_stamps_begin_anew_unnoticed() -> None:
-    smoother, slow = street(30)
-    spared, _ = street(30)
-    for k, counter in enumerate((tb.FRONT_SERIAL, tb.UPDATE)):
-        smoother.graph.memory.head[counter] = tb.LAST_STAMP + 1
-        for update in (GraphUpdate(edges=link(3 + k, 20, slow.poses[20])),
-                       GraphUpdate(free=[0]), GraphUpdate(weigh_edges={5: 0.1 + 0.1 * k})):
-            assert smoother.update(update)[:5] == spared.update(update)[:5]
-            assert smoother.poses.tobytes() == spared.poses.tobytes()
-    assert smoother.graph.memory.head[tb.UPDATE] < 100
-    smoother.graph.memory.head[tb.UPDATE] = tb.LAST_STAMP + 1
-    smoother.extend(np.ones(3), POSE_INFORMATION)
-    assert smoother.graph.memory.head[tb.UPDATE] < 100
-
-
 # --- default settings ---------------------------------------------------------------------------
 
 def closing_loops(seed: int, n: int) -> list[tuple[GraphUpdate, FloatArray]]:
@@ -488,28 +447,6 @@ def test_what_is_left_over_is_done_in_the_next_updates() -> None:
     assert (result.status, result.iterations) == (Status.CONVERGED, 0)
 
 
-def test_removing_and_adding_again_takes_no_memory() -> None:
-    smoother, here = IncrementalSmoother(), world(2)
-    smoother.update(GraphUpdate(hidden=np.array(here.truth), fix=[0]))
-    smoother.update(here.new_nodes(60))
-    n_first = smoother.graph.n_edges
-    smoother.update(GraphUpdate(edges=here.edges(here.pairs(60))))
-    extra = np.arange(n_first, smoother.graph.n_edges)
-    rng, ends = np.random.default_rng(1), []
-    for _ in range(1000):
-        chosen = rng.choice(extra, 3, replace=False)
-        assert smoother.update(GraphUpdate(weigh_edges={
-            int(e): float(rng.choice([0.0, 1.0, 0.5])) for e in chosen})).reason == ''
-        ends.append(smoother.graph.memory.head[[tb.POOL_F_END, tb.POOL_I_END, tb.N_CLIQUES]])
-    assert np.all(ends[-1] <= 1.3 * np.array(ends[200]))
-    assert smoother.graph.memory.head[tb.N_CLIQUES] <= 2 * smoother.graph.n_nodes
-    # and nothing has gone wrong on the way
-    smoother.update(GraphUpdate(weigh_edges={int(e): 1.0 for e in extra}))
-    assert np.max(np.abs(SlowGraph(
-        smoother.poses.copy(), smoother.graph.fixed, smoother.graph.edges,
-        smoother.graph.observed).step())) < 1e-2
-
-
 # --- along a chain ------------------------------------------------------------------------------
 
 @pytest.mark.parametrize('config', [SmootherConfig(), EXACT], ids=['default', 'exact'])
@@ -563,27 +500,3 @@ def test_a_chain_made_with_another_weight_follows_what_pulls_at_it(weight: float
         smoother.update(GraphUpdate(observed=seen(
             59, smoother.poses[59] + np.array([3.0, 3.0, 0.0]))))
     np.testing.assert_allclose(extended.poses, updated.poses, rtol=0.0, atol=1e-3)
-
-
-def test_extending_takes_any_numbers() -> None:
-    smoother = IncrementalSmoother(EXACT)
-    smoother.update(GraphUpdate(hidden=np.zeros((1, 3)), fix=[0]))
-    smoother.extend([1, 0, 0], np.eye(3, dtype=int))
-    smoother.extend((1.0, 0.0, 0.0), 2.0 * np.eye(3, order='F')[::-1, ::-1])
-    np.testing.assert_allclose(smoother.poses[1:], [[1.0, 0.0, 0.0], [2.0, 0.0, 0.0]], atol=1e-12)
-
-
-@pytest.mark.parametrize('fixed', [False, True])
-def test_extending_from_a_node_that_was_fixed_or_freed(fixed: bool) -> None:
-    smoother, slow = IncrementalSmoother(EXACT), SlowGraph()
-    first = GraphUpdate(hidden=np.zeros((2, 3)), edges=link(0, 1, [1.0, 0.0, 0.1]),
-                        observed=seen(0, np.zeros(3)), fix=[1] if fixed else [0])
-    smoother.update(first)
-    smoother.extend(np.array([1.0, 0.0, 0.1]), POSE_INFORMATION)
-    smoother.update(GraphUpdate(observed=seen(2, [2.2, 0.1, 0.3])))
-    slow = slow.edited(first).edited(GraphUpdate(
-        hidden=smoother.poses[2:], edges=link(1, 2, [1.0, 0.0, 0.1]),
-        observed=seen(2, [2.2, 0.1, 0.3])))
-    slow = slow.at(smoother.poses)
-    assert np.max(np.abs(slow.step())) < CLOSE
-    np.testing.assert_array_equal(smoother.poses[1 if fixed else 0], np.zeros(3))

@@ -5,11 +5,9 @@
 from hypothesis import given, settings, strategies as st
 import jacobians
 import numpy as np
-import pytest
-from slow_smoother import EXACT, SlowGraph, world
+from slow_smoother import EXACT, world
 from test_covariances import chain, dense, driven, off, RELATIVE, seeds
 
-from pose_graph_ros.core.geometry import se2
 from pose_graph_ros.core.graph import error_functions
 from pose_graph_ros.core.graph.constraints import EdgeKind, Edges
 from pose_graph_ros.core.graph.graph import GraphUpdate
@@ -89,52 +87,3 @@ def test_neighbours_far_from_what_fixes_them_have_an_exact_relative_covariance()
     edges = smoother.graph.edges_at(np.array([1990]))
     covariance = smoother.edge_innovations(edges).covariances[0]
     np.testing.assert_allclose(covariance, np.linalg.inv(edges.information[0]), rtol=1e-12)
-
-
-def test_parts_of_the_graph_that_are_not_connected_are_independent() -> None:
-    smoother, here = IncrementalSmoother(EXACT), world(1)
-    smoother.update(GraphUpdate(hidden=np.array(here.truth), fix=[0]))
-    smoother.update(here.new_nodes(4))
-    smoother.update(here.new_part('pose'))
-    n = smoother.graph.n_nodes
-    edge = Edges([2], [n - 1], [[0.0, 0.0, 0.0]], [np.eye(3)], [EdgeKind.LOOP_CLOSURE])
-    _, covariance = smoother.edge_innovations(edge)
-    linear = jacobians.linearize_edges(smoother.poses, edge)
-    parts = [J[0] @ smoother.covariance(node) @ J[0].T for J, node in (
-        (linear.jacobian_i, 2), (linear.jacobian_j, n - 1))]
-    np.testing.assert_allclose(covariance[0], sum(parts), rtol=1e-12)
-
-
-def test_between_fixed_nodes_nothing_is_uncertain() -> None:
-    smoother = IncrementalSmoother(EXACT)
-    smoother.update(chain(6))
-    smoother.update(GraphUpdate(fix=[3]))
-    edges = Edges([0, 3], [3, 5], np.zeros((2, 3)), [np.eye(3)] * 2, [EdgeKind.LOOP_CLOSURE] * 2)
-    covariances = smoother.edge_innovations(edges).covariances
-    np.testing.assert_array_equal(covariances[0], np.zeros((3, 3)))
-    assert np.all(np.diag(covariances[1]) > 0.0)
-    slow = SlowGraph(smoother.poses, smoother.graph.fixed, smoother.graph.edges).covariance()
-    J = jacobians.linearize_edges(smoother.poses, edges).jacobian_j[1]
-    np.testing.assert_allclose(covariances[1], J @ slow[15:, 15:] @ J.T, rtol=1e-9)
-
-
-def test_a_closure_moves_nodes_by_less_than_its_innovation() -> None:
-    # the law of the Kalman filter: the error that is left is R S^-1 e
-    smoother = IncrementalSmoother(EXACT)
-    smoother.update(chain(40))
-    mean = se2.between(smoother.poses[3], smoother.poses[30]) + np.array([1e-4, -2e-4, 1e-5])
-    edge = Edges([3], [30], [mean], [np.diag([50.0, 60.0, 900.0])], [EdgeKind.LOOP_CLOSURE])
-    before, S = smoother.edge_innovations(edge)
-    R = np.linalg.inv(edge.information[0])
-    smoother.update(GraphUpdate(edges=edge))
-    after, left = smoother.edge_innovations(edge)
-    np.testing.assert_allclose(after[0], R @ np.linalg.solve(S[0] + R, before[0]), rtol=1e-2)
-    np.testing.assert_allclose(left[0], S[0] - S[0] @ np.linalg.solve(S[0] + R, S[0]), rtol=1e-3)
-
-
-def test_a_node_that_is_not_there_is_refused() -> None:
-    smoother = IncrementalSmoother(EXACT)
-    smoother.update(chain(3))
-    edge = Edges([0], [3], np.zeros((1, 3)), [np.eye(3)], [EdgeKind.LOOP_CLOSURE])
-    with pytest.raises(ValueError, match=r'expected a hidden node in 0\.\.2, got 3'):
-        smoother.edge_innovations(edge)

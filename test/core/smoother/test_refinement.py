@@ -133,39 +133,3 @@ def test_an_interruption_leaves_no_trace_and_the_next_call_goes_on() -> None:
     smoother.refine()
     refined(smoother)
     assert abs(off(smoother)[0]) < 1e-6
-
-
-def test_an_interruption_does_not_stop_an_update() -> None:
-    smoother, spared = streets(200), streets(200)
-    mean = se2.between(smoother.poses[20], smoother.poses[199]) + 0.1
-    smoother.interrupt()
-    assert smoother.update(closure(20, 199, mean)) == spared.update(closure(20, 199, mean))
-    assert smoother.poses.tobytes() == spared.poses.tobytes()
-
-
-def test_a_refinement_goes_on_after_the_memory_has_grown() -> None:
-    smoother = streets(300)
-    smoother.refine()
-    while not (result := smoother.refine()).finished:
-        rng = np.random.default_rng(7)
-        for _ in range(1500):   # more than there is room for
-            smoother.extend(np.array([1.0, 0.0, 0.0]) + SIGMA * rng.normal(size=3), INFORMATION)
-    assert result.finished
-    assert abs(off(smoother)[0]) < 1e-6
-
-
-def test_after_a_batch_optimisation_there_is_nothing_to_refine() -> None:
-    smoother = streets(200)
-    optimizer.optimize(smoother.graph, SolverConfig(max_iterations=50, step_tolerance=1e-9))
-    assert smoother.refine().finished
-    assert smoother.refine().moved < 1e-7
-
-
-def test_edits_that_wait_for_an_update_cannot_be_refined() -> None:
-    smoother = streets(20)
-    assert IncrementalSmoother().refine() == (True, 0.0)
-    smoother.graph.set_poses(smoother.poses.copy())
-    with pytest.raises(ValueError, match='wait for the solver'):
-        smoother.refine()
-    smoother.update(GraphUpdate())
-    refined(smoother)

@@ -104,19 +104,6 @@ def test_a_trial_is_adopted_although_nodes_have_left_meanwhile(seed: int) -> Non
     assert_at_minimum(smoother)
 
 
-def test_a_trial_whose_poses_have_all_left_is_outdated() -> None:
-    smoother = IncrementalSmoother(EXACT)
-    smoother.update(GraphUpdate(hidden=np.zeros((1, 3)), fix=[0]))
-    smoother.extend(MOTION, INFORMATION)
-    trial = smoother.trial(GraphUpdate(weigh_edges={0: 0.5}))
-    while trial.work():
-        pass
-    smoother.extend(MOTION, INFORMATION)
-    smoother.update(GraphUpdate(remove_nodes=[0, 1], fix=[2]))
-    assert trial.is_outdated
-    assert smoother.adopt(trial).status is Status.FAILED
-
-
 def test_the_batch_fallback_lets_nodes_leave_as_well() -> None:
     # a chain that closes by a heading that is off by more than a linear model stands
     smoother, here = IncrementalSmoother(), world(2)
@@ -136,19 +123,6 @@ def test_the_batch_fallback_lets_nodes_leave_as_well() -> None:
     anew.fill(smoother.graph.rows())
     result = optimizer.optimize_from_linear_start(anew, SolverConfig())
     assert smoother.chi2() == pytest.approx(result.chi2, rel=1e-3)
-
-
-def test_what_waits_to_be_linearized_leaves_with_its_nodes() -> None:
-    smoother, here = driven(3)
-    for _ in range(12):
-        smoother.update(GraphUpdate(edges=here.edges(here.pairs(2))))
-        smoother.refine()
-        nodes = iter(here.rng.permutation(smoother.graph.node_ids[1:]).tolist())
-        while not let_leave(smoother, here, [next(nodes)]):
-            pass
-        waiting = smoother.graph.memory['waiting'][:smoother.graph.memory.head[tb.N_WAITING]]
-        assert np.all(waiting < smoother.graph.n_edges)
-        assert_at_minimum(smoother)
 
 
 def test_a_node_that_holds_others_cannot_leave() -> None:

@@ -9,8 +9,6 @@ from slow_smoother import differences, state, World, world
 
 from pose_graph_ros.core.batch import optimizer
 from pose_graph_ros.core.batch.optimizer import chi2_of
-from pose_graph_ros.core.exceptions import GraphUpdateError
-from pose_graph_ros.core.graph import tables as tb
 from pose_graph_ros.core.graph.constraints import Edges, ObservedNodes
 from pose_graph_ros.core.graph.graph import GraphUpdate
 from pose_graph_ros.core.smoother.incremental import IncrementalSmoother
@@ -143,37 +141,3 @@ def test_adding_them_solves_nothing_and_a_rollback_restores_every_bit() -> None:
     graph.apply(GraphUpdate(remove_edges=twins.edges[2:9], remove_observed=range(3)))
     graph.rollback()
     assert differences(after, state(graph)) == []
-
-
-def test_they_are_appended_without_a_step_but_nothing_that_needs_one_is() -> None:
-    twins = Twins(3)
-    twins.drive(15)
-    graph = twins.full.graph
-    edges, observed = twins.here.edges([(0, 9), (4, 12)]), twins.here.observed([7, 7])
-    observed.weight[:] = 0.0
-    before = state(graph)
-    assert not twins.full.append(GraphUpdate(edges=edges, observed=observed))
-    assert not twins.full.append(GraphUpdate(observed=observed, free=(0,)))
-    with pytest.raises(GraphUpdateError):
-        twins.full.append(GraphUpdate(observed=observed, weigh_edges={graph.n_edges: 1.0}))
-    assert differences(before, state(graph)) == []
-    edges.weight[:] = 0.0
-    twins.idle_edges += range(graph.n_edges, graph.n_edges + 2)
-    twins.idle_observed += range(graph.n_observed, graph.n_observed + 2)
-    assert twins.full.append(GraphUpdate(edges=edges, observed=observed))
-    assert set(differences(before, state(graph))) == {
-        'edge_f', 'edge_i', 'edge_id', 'observed_f', 'observed_i', 'observed_id', 'next'}
-    twins.drive(5)
-    twins.check()
-
-
-def test_no_frame_turns_and_nothing_waits_for_them() -> None:
-    # a row with weight 0 has no linearization error, however far its ends have moved
-    twins = Twins(8)
-    twins.drive(10)
-    graph = twins.full.graph
-    graph.set_poses(graph.poses * np.array([40.0, -40.0, 1.0]))
-    optimizer.optimize(graph, SolverConfig())
-    waiting = graph.memory['waiting'][:graph.memory.head[tb.N_WAITING]]
-    assert not set(waiting.tolist()) & set(twins.idle_edges)
-    assert not np.any(graph.memory['edge_f'][twins.idle_edges, tb.ERROR2])

@@ -45,15 +45,6 @@ def test_white_errors_are_not_called_correlated(seed: int, n: int, period: float
     assert not estimate(stamps(n, period), residuals).significant
 
 
-def test_gaps_in_time_are_no_lags() -> None:
-    rng = np.random.default_rng(3)
-    period, n = 0.5, 4000
-    residuals, when = errors(rng, n, period, 5.0, 0.0), stamps(n, period)
-    kept = rng.random(n) < 0.4
-    found = estimate(when[kept], residuals[kept])
-    assert found.tau == pytest.approx(5.0, rel=0.4)
-
-
 @pytest.mark.parametrize('residuals', [
     np.zeros((100, 2)), np.ones((100, 2)), np.ones((LEAST_RESIDUALS - 1, 2)), np.zeros((0, 2))])
 def test_degenerate_residuals_give_finite_numbers(residuals: np.ndarray) -> None:
@@ -61,19 +52,3 @@ def test_degenerate_residuals_give_finite_numbers(residuals: np.ndarray) -> None
     assert np.all(np.isfinite(found))
     same = estimate(np.full(len(residuals), SECOND), residuals)
     assert np.all(np.isfinite(same))
-
-
-def test_errors_that_are_forgotten_after_one_lag_have_its_time_constant() -> None:
-    """A mean of two white errors: a correlation of one half at the first lag, then none."""
-    white = np.random.default_rng(4).standard_normal((3001, 2))
-    found = estimate(stamps(3000, 0.5), white[1:] + white[:-1])
-    assert found.significant
-    assert found.tau == pytest.approx(0.5 / np.log(2.0), rel=0.1)
-
-
-def test_bursts_without_a_period_are_called_white() -> None:
-    # two and two 0.1 s apart, with 10 s in between: no pair is a median of the periods apart
-    when = np.array([round((10.1 * (k // 2) + 0.1 * (k % 2)) * SECOND) for k in range(601)])
-    found = estimate(when, errors(np.random.default_rng(1), 601, 1.0, 50.0, 0.0))
-    assert not found.significant
-    assert np.all(np.isfinite(found))

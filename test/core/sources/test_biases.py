@@ -15,10 +15,9 @@ from random_graphs import (
     random_graph,
     random_information,
     random_poses,
-    slow_to_bias,
 )
 from scipy.optimize import least_squares
-from slow_smoother import cliques, differences, EXACT, SlowGraph, state, world
+from slow_smoother import cliques, differences, EXACT, state, world
 
 from pose_graph_ros.core.batch import optimizer
 from pose_graph_ros.core.batch.joint_start import joint
@@ -60,27 +59,6 @@ def fix(node: int, bias: int, where: FloatArray, offset: FloatArray, sigmas: Flo
 
 
 # --- the error ----------------------------------------------------------------------------------
-
-def test_errors_and_jacobians_are_the_slow_ones_and_central_differences() -> None:
-    rng, n, step = np.random.default_rng(1), 40, 1e-5
-    poses = random_poses(rng, 2 * n)
-    edges = random_edges_to_biases(rng, np.arange(n), np.arange(n, 2 * n))
-    error, jacobian_i, jacobian_j = jacobians.linearize_edges(poses, edges)
-    np.testing.assert_array_equal(error, error_functions.edge_errors(poses, edges))
-    for k in range(n):
-        slow = slow_to_bias(poses[k], poses[n + k], edges.mean[k], edges.bias[k])
-        for actual, expected in zip((error, jacobian_i, jacobian_j), slow, strict=True):
-            np.testing.assert_allclose(actual[k], expected, atol=1e-13)
-    for first, jacobian in ((0, jacobian_i), (n, jacobian_j)):
-        for axis in range(3):
-            moved = []
-            for sign in (1.0, -1.0):
-                there = poses.copy()
-                there[first:first + n, axis] += sign * step
-                moved.append(error_functions.edge_errors(there, edges))
-            difference = moved[0] - moved[1]
-            difference[:, 2] = se2.wrap(difference[:, 2])
-            np.testing.assert_allclose(jacobian[:, :, axis], difference / (2.0 * step), atol=1e-8)
 
 
 @given(seeds)
@@ -251,21 +229,6 @@ def test_the_estimate_is_good_all_along_a_drive_with_default_settings() -> None:
 
 # --- rows of biases in the graph ----------------------------------------------------------------
 
-def test_biases_are_numbered_behind_the_poses_of_their_update_and_are_no_poses() -> None:
-    graph = Graph()
-    assert graph.newest_pose == -1
-    graph.apply(GraphUpdate(biases=np.full((1, 3), 0.5)))
-    assert graph.newest_pose == -1
-    graph.apply(GraphUpdate(hidden=np.ones((2, 3)), biases=np.zeros((2, 3))))
-    assert graph.is_bias.tolist() == [True, False, False, True, True]
-    assert (graph.newest_pose, graph.n_nodes) == (2, 5)
-    np.testing.assert_array_equal(graph.poses[:, 0], [0.5, 1.0, 1.0, 0.0, 0.0])
-    graph.begin()
-    graph.apply(GraphUpdate(hidden=np.ones((1, 3))))
-    assert (graph.newest_pose, graph.is_bias[-1]) == (5, False)
-    graph.rollback()
-    assert graph.newest_pose == 2
-
 
 def with_biases(config: SmootherConfig = EXACT) -> IncrementalSmoother:
     """Return a chain of 12 poses and a chain of 4 biases, which are the last nodes."""
@@ -283,46 +246,6 @@ def with_biases(config: SmootherConfig = EXACT) -> IncrementalSmoother:
     return smoother
 
 
-def test_a_chain_is_extended_behind_biases_in_constant_time() -> None:
-    smoother = with_biases()
-    root = cliques(smoother.graph)[int(smoother.graph.memory['node_i'][11, tb.CLIQUE])]
-    assert (root.frontal, root.separator) == ([11], [])
-    before = smoother.poses.copy()
-    result = smoother.extend(np.array([1.0, 0.0, 0.1]), ODOMETRY)
-    assert (result.eliminated, result.visited, result.iterations) == (1, 1, 1)
-    assert smoother.graph.newest_pose == 16
-    assert (smoother.graph.edges.i[-1], smoother.graph.edges.j[-1]) == (11, 16)
-    np.testing.assert_array_equal(smoother.poses[:16], before)
-    np.testing.assert_allclose(
-        smoother.poses[16], se2.compose(before[11], np.array([1.0, 0.0, 0.1])))
-    smoother.extend(np.array([1.0, 0.0, 0.1]), ODOMETRY)
-    smoother.update(GraphUpdate(observed=ObservedNodes(
-        [17], None, smoother.poses[16:17] + 0.5, ODOMETRY[None], [ObservedKind.GLOBAL_POSE])))
-    graph = smoother.graph
-    slow = SlowGraph(graph.poses.copy(), graph.fixed, graph.edges, graph.observed)
-    assert np.max(np.abs(slow.step())) < 1e-6
-    np.testing.assert_allclose(
-        smoother.newest_covariance(), slow.covariance()[51:54, 51:54], rtol=1e-6, atol=1e-12)
-
-
-def test_without_a_chain_too_the_next_node_is_connected_to_the_newest_pose() -> None:
-    smoother = with_biases()
-    smoother.graph.set_poses(smoother.poses.copy())     # no chain any more
-    smoother.extend(np.array([1.0, 0.0, 0.1]), ODOMETRY)
-    assert (smoother.graph.edges.i[-1], smoother.graph.edges.j[-1]) == (11, 16)
-    np.testing.assert_allclose(
-        smoother.poses[16], se2.compose(smoother.poses[11], np.array([1.0, 0.0, 0.1])), atol=1e-9)
-
-
-def test_a_graph_without_poses_cannot_be_extended() -> None:
-    smoother = IncrementalSmoother(EXACT)
-    smoother.update(GraphUpdate(biases=np.zeros((1, 3)), observed=prior(0)))
-    with pytest.raises(ValueError, match='expected a graph with a hidden node'):
-        smoother.extend(np.zeros(3), ODOMETRY)
-    with pytest.raises(ValueError, match='got -1'):
-        smoother.newest_covariance()
-
-
 def test_an_update_with_an_undetermined_bias_is_rolled_back() -> None:
     smoother = with_biases()
     before = state(smoother.graph)
@@ -335,19 +258,6 @@ def test_an_update_with_an_undetermined_bias_is_rolled_back() -> None:
         Status.FAILED, 'hidden node 17 is not determined')
     assert differences(before, state(smoother.graph)) == []
     assert smoother.graph.newest_pose == 11
-
-
-def test_weights_and_removals_of_edges_to_biases_count() -> None:
-    smoother = with_biases()
-    n = smoother.graph.n_edges
-    for update in (GraphUpdate(weigh_edges={n - 1: 0.1, n - 3: 3.0}),
-                   GraphUpdate(remove_edges=[n - 1]), GraphUpdate(weigh_observed={0: 0.2}),
-                   GraphUpdate(weigh_edges={n - 1: 1.0, n - 2: 0.5})):
-        smoother.update(update)
-        graph = smoother.graph
-        slow = SlowGraph(graph.poses.copy(), graph.fixed, graph.edges, graph.observed)
-        assert np.max(np.abs(slow.step())) < 1e-6
-        assert smoother.chi2() == pytest.approx(slow.chi2(), rel=1e-9)
 
 
 # --- batch, starts, files -----------------------------------------------------------------------
@@ -428,28 +338,6 @@ def test_the_joint_start_weighs_positions_by_both_variances() -> None:
     start = joint(graph)
     np.testing.assert_allclose(start[1, :2], 0.8 * np.array([2.0, 0.0]) + 0.2 * bad, atol=1e-4)
     np.testing.assert_array_equal(start[2:], [[0.0, 0.0, 0.0], [5.0, 5.0, 0.1]])
-
-
-def test_a_part_connected_to_a_bias_with_a_prior_is_determined() -> None:
-    graph, _ = positions_with_biases(1)
-    assert optimizer.optimize(graph, SolverConfig()).status is Status.CONVERGED
-    graph.apply(GraphUpdate(remove_observed=[0]))
-    result = optimizer.optimize(graph, SolverConfig())
-    assert result.status is Status.FAILED
-    assert 'hidden node 0 and 9 others are connected to no' in result.reason
-
-
-def test_a_rescued_graph_has_its_biases() -> None:
-    smoother, other = with_biases(), IncrementalSmoother(EXACT)
-    smoother.extend(np.array([1.0, 0.0, 0.1]), ODOMETRY)
-    smoother.graph.begin()
-    assert batch_fallback.optimize_copy(smoother.graph, other.graph)
-    assert other.graph.is_bias.tolist() == smoother.graph.is_bias.tolist()
-    assert other.graph.newest_pose == smoother.graph.newest_pose == 16
-    for name in Edges.__dataclass_fields__:
-        np.testing.assert_array_equal(
-            getattr(other.graph.edges, name), getattr(smoother.graph.edges, name))
-    np.testing.assert_allclose(other.poses, smoother.poses, atol=1e-5)
 
 
 def test_a_closure_that_contradicts_all_is_solved_for_on_a_copy(

@@ -109,28 +109,6 @@ def test_every_constraint_has_the_name_of_its_source_and_of_its_ends() -> None:
         assert any(0.0 <= k - 0.25 - float(began[1]) < width + 1e-3 for k in expected['wander'])
 
 
-def test_energies_are_given_with_the_weight_and_without() -> None:
-    backend = driven()
-    found = backend.largest_energies(10_000)
-    robust = [each for each in found if each.source == 'robust']
-    for each in robust:
-        assert each.freedom == 2
-        # Huber with a threshold of 1: the weight is 1 / sigmas beyond it
-        assert each.energy == pytest.approx(min(each.unweighted, each.unweighted**0.5))
-    assert any(each.unweighted > 2.0 * each.energy for each in robust)
-    freedom = {each.kind: each.freedom for each in found}
-    assert freedom == {'odometry': 3, 'loop_closure': 3, 'global_pose': 3, 'position': 2,
-                       'heading': 1, 'bias': 3}
-
-
-def test_the_largest_are_the_first_of_all() -> None:
-    backend = driven()
-    every = backend.largest_energies(10_000)
-    assert backend.largest_energies(5) == every[:5]
-    assert backend.largest_energies(0) == []
-    assert PoseGraphBackend().largest_energies(5) == []
-
-
 def test_edges_of_a_new_primary_odometry_have_its_name() -> None:
     backend = PoseGraphBackend(BackendConfig(odometry={
         name: OdometrySource(reorder_window=0.0) for name in ('wheels', 'visual')}))
@@ -148,20 +126,3 @@ def test_edges_of_a_new_primary_odometry_have_its_name() -> None:
     assert f'visual x{last - 1} - x{last}' in names
     assert f'wheels x{last - 1} - x{last}' not in names
     assert {'wheels x3 - x4', 'visual x3 - x4'} <= names
-
-
-def test_where_the_source_is_not_known_the_kind_is_the_name() -> None:
-    backend = driven()
-    before = backend.largest_energies(10_000)
-    # as after loading a graph with other settings
-    for known in ('_constraints', '_pose_edges', '_error_models'):
-        getattr(backend._factors, known).clear()
-    for old, new in zip(before, backend.largest_energies(10_000), strict=True):
-        assert (new.energy, new.kind, new.freedom) == (old.energy, old.kind, old.freedom)
-        if old.kind == 'bias':
-            assert new.name == 'bias'
-        elif old.kind == 'odometry':
-            assert new.name.partition(' ')[2] == old.name.partition(' ')[2]
-        else:
-            ends = old.name[old.name.index('near' if 'near' in old.name else 'x'):]
-            assert (new.source, new.name) == ('', f'{old.kind} {ends}')

@@ -182,30 +182,6 @@ def test_correlated_errors_are_found_among_wrong_positions() -> None:
         assert 8.0 < found.tau < 50.0
 
 
-def test_too_few_positions_show_nothing() -> None:
-    drive = a_drive(0, n=error_estimate.LEAST_POSITIONS - 1, tau=30.0)
-    assert to_the_end(search(drive)) == error_estimate.NOTHING
-
-
-def test_a_step_of_a_search_is_bounded(monkeypatch: pytest.MonkeyPatch) -> None:
-    done = []
-
-    def counting(*arguments: object) -> tuple[float, int]:
-        done.append(len(arguments[0]))  # type: ignore[arg-type]
-        return filtered(*arguments)
-
-    monkeypatch.setattr(error_estimate, 'filtered', counting)
-    steps, found = search(a_drive(1, n=300, tau=20.0)), None
-    while found is None:
-        before = len(done)
-        try:
-            next(steps)
-        except StopIteration as end:
-            found = end.value
-        assert sum(done[before:]) <= error_estimate.PER_STEP + 300
-    assert found == to_the_end(search(a_drive(1, n=300, tau=20.0)))
-
-
 @pytest.mark.parametrize(('drift', 'tau', 'n'), [
     (1.0, 0.0, 200), (1.0, 60.0, 400), (0.3, 60.0, 400), (2.0, 0.0, 600), (3.0, 0.0, 400),
     (3.0, 60.0, 600)])

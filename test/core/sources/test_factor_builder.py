@@ -81,18 +81,6 @@ def test_an_update_adds_each_constraint_once() -> None:
     assert len(reweighting) == 6    # white and inflated
 
 
-def test_the_order_in_a_queue_does_not_matter() -> None:
-    saved, tables = [], []
-    for order in (range(20), reversed(range(20))):
-        graph, (factors, reweighting) = line(), builder()
-        queue = Queue([], [fix('biased', k) for k in order])
-        committed(factors, graph, queue)
-        saved.append({'factors': factors.saved(), 'losses': reweighting.saved()})
-        tables.append(graph.rows())
-    assert_same_value(*saved)
-    assert_same_value(*({'rows': tuple(rows)[:3], 'edges': rows.edges} for rows in tables))
-
-
 def test_every_row_knows_the_source_and_the_stamp_that_it_came_from() -> None:
     graph, (factors, _) = line(), builder()
     committed(factors, graph, some([3, 4, 20]), some([1, 10, 30]))
@@ -119,16 +107,6 @@ def test_every_row_knows_the_source_and_the_stamp_that_it_came_from() -> None:
         ('white', 'biased', 'other'), seconds)
     assert factors.origin(graph.n_edges, edge=True) is None
     assert factors.origin(graph.n_observed, edge=False) is None
-
-
-def test_a_bias_knows_its_source_and_when_its_bin_begins() -> None:
-    graph, (factors, _) = line(), builder()
-    committed(factors, graph, some([3, 4, 20]))
-    origins = [factors.bias_origin(row) for row in np.flatnonzero(graph.is_bias).tolist()]
-    # bins of 64 s / 64
-    assert sorted(origin.stamp_ns for origin in origins) == [k * SECOND for k in (3, 4, 20)]
-    assert {origin.source for origin in origins} == {'biased'}
-    assert factors.bias_origin(0) is None
 
 
 def test_an_update_that_is_rolled_back_is_built_again_as_it_was() -> None:
@@ -161,18 +139,6 @@ def restored(factors: FactorBuilder, config: BackendConfig) -> FactorBuilder:
     return other
 
 
-def test_a_restored_builder_builds_what_the_first_one_would_have() -> None:
-    graph, (factors, _) = line(), builder()
-    committed(factors, graph, some([3, 4, 20]), some([8, 12]))
-    other = restored(factors, CONFIG)
-    assert_same_value(other.saved(), factors.saved())
-    assert other.n_measurements == factors.n_measurements
-    updates = [each.build(some([1, 10, 30]), graph) for each in (factors, other)]
-    assert_same_value(updates[0].edges, updates[1].edges)
-    assert_same_value(updates[0].observed, updates[1].observed)
-    assert updates[0].weigh_observed == pytest.approx(updates[1].weigh_observed)
-
-
 def test_with_another_error_model_saved_constraints_stay_and_are_counted() -> None:
     graph, (factors, _) = line(), builder()
     committed(factors, graph, some([3, 4, 20]))
@@ -183,11 +149,3 @@ def test_with_another_error_model_saved_constraints_stay_and_are_counted() -> No
     assert other.saved()['biased'].n_otherwise == 3
     update = other.build(Queue([], [fix('biased', 7)]), graph)
     assert (len(update.biases), len(update.edges), len(update.observed)) == (0, 0, 1)
-
-
-def test_queues_are_joined_in_their_order() -> None:
-    one, other = some([1]), some([2, 3])
-    one.extend(other)
-    assert len(one) == 1 + 3 + 1 + 6
-    assert [int(each.observed.node[0]) for each in one.observed] == [1] * 3 + [2] * 3 + [3] * 3
-    assert [int(queued.edge.i[0]) for queued in one.edges] == [1, 2]

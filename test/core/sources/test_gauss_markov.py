@@ -18,9 +18,7 @@ from pose_graph_ros.core.config import (
     OdometryNoise,
     OdometrySource,
 )
-from pose_graph_ros.core.exceptions import ConfigError
-from pose_graph_ros.core.geometry import se2
-from pose_graph_ros.core.graph.constraints import EdgeKind, ObservedNodes
+from pose_graph_ros.core.graph.constraints import ObservedNodes
 from pose_graph_ros.core.graph.graph import NextIds
 from pose_graph_ros.core.measurements import (
     GlobalPose,
@@ -211,23 +209,6 @@ def test_shuffled_measurements_give_the_same_path(
     np.testing.assert_allclose(*paths, atol=1e-9)
 
 
-def test_biases_are_no_part_of_the_path_and_odometry_extends_poses() -> None:
-    backend = run(drive(1)[:20], MeasurementSource(correlation_time=5.0), seconds=20)
-    backend.update()
-    assert backend.graph.n_nodes > len(backend.node_stamps_ns)
-    assert EdgeKind.BIAS in backend.graph.edges.kind
-    for second in range(21, 41):
-        backend.add_odometry(OdometrySample(second * SECOND, np.array((second - 1.0, 0.0, 0.0))))
-    backend.optimize()
-    estimate = backend.estimate()
-    assert estimate is not None
-    assert estimate.n_hidden == len(estimate.path) == 40
-    assert (estimate.n_edges, estimate.n_observed) == (39, 21)
-    assert estimate.n_biases == backend.graph.n_nodes - 40 > 0
-    steps = se2.between(estimate.path.poses[:-1], estimate.path.poses[1:])
-    np.testing.assert_allclose(steps, np.tile((1.0, 0.0, 0.0), (39, 1)), atol=0.3)
-
-
 def test_reports_of_correlated_and_of_white_errors() -> None:
     rng, phi = np.random.default_rng(5), np.exp(-1.0 / 20.0)
     error = rng.standard_normal((300, 2))
@@ -242,8 +223,3 @@ def test_reports_of_correlated_and_of_white_errors() -> None:
         assert report.errors.significant
         assert 5.0 < report.errors.tau < 60.0
         assert 0.3 < report.energy < 1.7
-
-
-def test_a_time_constant_that_cannot_be_is_refused() -> None:
-    with pytest.raises(ConfigError, match='correlation_time'):
-        MeasurementSource(correlation_time=-0.5)

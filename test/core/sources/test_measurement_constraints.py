@@ -90,14 +90,6 @@ def test_a_stamp_is_seen_from_the_last_hidden_node_before_it(stamp: int) -> None
     assert np.min(np.linalg.eigvalsh(attachment.noise)) > -ROUNDING
 
 
-def test_at_a_hidden_node_there_is_no_motion_and_no_noise() -> None:
-    for node, stamp in enumerate(NODE_STAMPS.tolist()):
-        attachment = anchored(stamp)
-        assert attachment.node == node
-        np.testing.assert_array_equal(attachment.motion, 0.0)
-        np.testing.assert_array_equal(attachment.noise, 0.0)
-
-
 # --- no bias ---------------------------------------------------------------------------------
 
 @given(covered)
@@ -186,14 +178,6 @@ def test_the_noise_of_a_position_is_at_least_that_of_samples() -> None:
     assert np.max(ratios) == pytest.approx(1.0, abs=SAMPLING)
 
 
-def test_the_noise_of_a_position_at_a_node_is_its_own() -> None:
-    constraint = measurement_constraints.absolute_constraint(
-        Position(int(NODE_STAMPS[2]), np.zeros(2), MAP_COVARIANCE[:2, :2], np.zeros(2)),
-        anchored(int(NODE_STAMPS[2])))
-    np.testing.assert_allclose(
-        np.linalg.inv(constraint.information[0, :2, :2]), MAP_COVARIANCE[:2, :2], rtol=1e-9)
-
-
 @pytest.mark.parametrize(('stamp', 'other'), [(OTHER, STAMP), (STAMP, OTHER)])
 def test_the_noise_of_a_loop_closure_is_that_of_samples(stamp: int, other: int) -> None:
     rng = np.random.default_rng(3)
@@ -208,7 +192,6 @@ def test_the_noise_of_a_loop_closure_is_that_of_samples(stamp: int, other: int) 
         LoopClosure(stamp, z, MAP_COVARIANCE, reference_ns=other), reference, attachment)
     assert (constraint.i[0], constraint.j[0]) == (reference.node, attachment.node)
     assert_agree(np.cov(errors.T), covariance_of(constraint))
-
 
 
 def test_the_noise_of_a_heading_is_that_of_samples() -> None:

@@ -8,7 +8,6 @@ import pytest
 from pose_graph_ros.core.geometry import se2
 from pose_graph_ros.core.graph.constraints import EdgeKind, Edges, ObservedKind, ObservedNodes
 from pose_graph_ros.core.graph.graph import Graph, GraphUpdate
-from pose_graph_ros.core.sources import source_report
 from pose_graph_ros.core.sources.gauss_markov import CorrelatedErrors
 from pose_graph_ros.core.sources.source_report import report
 
@@ -53,25 +52,6 @@ def test_the_energy_is_the_mean_square_of_a_coordinate_in_sigmas(turn: float) ->
     assert not found.wrongly_white
 
 
-def test_residuals_are_in_map_axes_however_the_measured_pose_is_turned() -> None:
-    found = [report(observed(gauss_markov(600, 20.0) * (1.0, 3.0), 0.5, turn=turn), in_time(600),
-                    biased=False, in_use=None) for turn in (0.0, 1.0)]
-    assert found[1].errors == pytest.approx(found[0].errors)
-    assert found[1].energy == pytest.approx(found[0].energy)
-
-
-def test_headings_have_a_squared_residual_and_no_correlation_of_positions() -> None:
-    errors = 0.1 * np.random.default_rng(1).standard_normal(200)
-    graph, information = Graph(), np.zeros((200, 3, 3))
-    information[:, 2, 2] = 0.05**-2
-    graph.apply(GraphUpdate(
-        hidden=np.column_stack((gauss_markov(200, 20.0), errors)), observed=ObservedNodes(
-            np.arange(200), None, np.zeros((200, 3)), information, [ObservedKind.HEADING] * 200)))
-    found = report(graph, in_time(200), biased=False, in_use=None)
-    assert found.energy == pytest.approx(np.mean(errors**2) / 0.05**2)
-    assert not found.errors.significant
-
-
 def test_what_is_known_of_the_errors_counts_for_whether_they_fit_badly() -> None:
     graph = observed(4.0 * gauss_markov(100, 1.0), 1.0)
     unknown, known = (report(graph, in_time(100), biased=False, in_use=in_use) for in_use in (
@@ -95,12 +75,6 @@ def test_errors_that_are_treated_as_white_but_are_not_are_noticed(
     assert found.wrongly_white is wrong
 
 
-def test_there_is_nothing_to_report_of_what_is_not_used() -> None:
-    found = report(observed(np.ones((5, 2)), 0.5), in_time(5)[:0], biased=False, in_use=None)
-    assert (found.n, found.energy) == (0, 0.0)
-    assert not found.wrongly_white
-
-
 def test_neither_the_order_of_arrival_nor_repeated_stamps_change_the_residuals() -> None:
     graph, rows = observed(gauss_markov(300, 20.0), 1.0), in_time(300)
     expected = report(graph, rows, biased=False, in_use=None)
@@ -111,15 +85,6 @@ def test_neither_the_order_of_arrival_nor_repeated_stamps_change_the_residuals()
     found = report(graph, twice, biased=False, in_use=None)
     assert found.n == 600
     np.testing.assert_allclose(found.errors, expected.errors)
-
-
-def test_only_the_newest_residuals_are_evaluated(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(source_report, 'MOST_RESIDUALS', 100)
-    residuals = np.ones((300, 2))
-    residuals[:200] = 50.0
-    found = report(observed(residuals, 1.0), in_time(300), biased=False, in_use=None)
-    assert found.n == 300
-    assert found.energy == pytest.approx(1.0)
 
 
 def test_of_a_biased_source_the_whole_error_counts_not_the_white_rest() -> None:

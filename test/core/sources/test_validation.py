@@ -3,7 +3,6 @@
 """Validation: every covariance is made usable or rejected with a reason."""
 
 from dataclasses import dataclass, replace
-import itertools
 
 from hypothesis import given, strategies as st
 from hypothesis.extra.numpy import arrays
@@ -201,18 +200,6 @@ def assert_answered(measurement: Measurement, policy: CovariancePolicy) -> None:
         assert answer.reason.startswith('covariance_') or answer.reason == 'no_information'
 
 
-@pytest.mark.parametrize('policy', POLICIES)
-def test_one_or_two_bad_entries_anywhere_end_usable_or_refused(policy: CovariancePolicy) -> None:
-    places = [(i, j) for i in range(3) for j in range(i, 3)]
-    for (i, j), value in itertools.product(places, BAD):
-        for cov in (put((i, j, value)), both(i, j, value)):
-            for kind in KINDS:
-                assert_answered(kind(cov), policy)
-    for (a, b), x, y in itertools.product(itertools.combinations(range(3), 2), BAD, BAD):
-        for kind in KINDS:
-            assert_answered(kind(put((a, a, x), (b, b, y))), policy)
-
-
 @given(arrays(np.float64, (3, 3), elements=st.one_of(
     st.floats(), st.sampled_from(BAD), st.floats(-2.0, 2.0))), st.sampled_from(POLICIES))
 def test_any_numbers_end_usable_or_refused(cov: FloatArray, policy: CovariancePolicy) -> None:
@@ -242,48 +229,7 @@ def test_a_sound_covariance_passes_bit_for_bit(seed: int) -> None:
         np.testing.assert_allclose(raised, expected, rtol=ROUNDING)
 
 
-def test_a_repair_keeps_what_is_sound() -> None:
-    # only x loses its variance and correlations
-    left = validate(closure(put((0, 0, NAN))), REPAIR).measurement.covariance
-    np.testing.assert_allclose(left[1:, 1:], GOOD[1:, 1:], rtol=1e-9)
-    np.testing.assert_allclose(left[0], [25.0, 0.0, 0.0], atol=1e-12)
-    # where the triangles differ their mean is taken; where one is broken, the other
-    left = validate(closure(put((0, 1, 0.03))), REPAIR).measurement.covariance
-    np.testing.assert_allclose(left, both(0, 1, 0.02), rtol=1e-9)
-    left = validate(closure(put((0, 1, NAN))), REPAIR).measurement.covariance
-    np.testing.assert_allclose(left, GOOD, rtol=1e-9)
-    # a correlation beyond one becomes nearly one; the variances stay
-    left = validate(position(both(0, 1, 5.0)), REPAIR).measurement.covariance
-    np.testing.assert_allclose(np.diagonal(left), [0.04, 0.09], rtol=1e-9)
-    assert 0.999 < left[0, 1] / 0.06 < 1.0
-
-
-def test_infinite_variances_end_at_the_ceiling() -> None:
-    policy = CovariancePolicy(position_ceiling=300.0)
-    left = validate(position(np.diag([INF, INF, 1.0])), policy).measurement.covariance
-    np.testing.assert_allclose(left, 9e4 * np.eye(2))
-    left = validate(position(np.diag([4.0, LARGEST, 1.0])), policy).measurement.covariance
-    np.testing.assert_allclose(left, np.diag([4.0, 9e4]))
-    # a finite variance above the ceiling is no defect
-    answer = validate(position(1e10 * np.array([[1.0, 0.5], [0.5, 1.0]])), policy)
-    assert answer.repairs == ()
-    np.testing.assert_allclose(
-        answer.measurement.covariance, 9e4 * np.array([[1.0, 0.5], [0.5, 1.0]]))
-
-
 # --- Overrides -------------------------------------------------------------------------------
-
-def test_an_override_takes_the_place_of_any_covariance() -> None:
-    one, two = CovariancePolicy(override=(0.5,)), CovariancePolicy(override=(0.5, 0.1))
-    for cov in (GOOD, np.zeros((3, 3)), np.full((3, 3), NAN), put((0, 0, -1.0))):
-        left = validate(position(cov), one)
-        np.testing.assert_allclose(left.measurement.covariance, 0.25 * np.eye(2))
-        assert left.repairs == ()
-        for kind in (pose, closure):
-            left = validate(kind(cov), two)
-            np.testing.assert_allclose(
-                left.measurement.covariance, np.diag([0.25, 0.25, 0.01]))
-            assert left.repairs == ()
 
 
 def test_an_override_of_the_position_alone_leaves_the_heading_to_the_message() -> None:
@@ -339,14 +285,6 @@ def test_when_the_heading_of_a_pose_is_used(
         assert isinstance(answer.measurement, GlobalPose)
         np.testing.assert_allclose(
             answer.measurement.covariance, np.diag([0.04, 0.09, left]))
-
-
-def test_without_any_covariance_the_heading_is_dropped_unless_it_is_always_used() -> None:
-    assert isinstance(validate(pose(np.zeros((3, 3))), REPAIR).measurement, Position)
-    always = CovariancePolicy(heading=Heading.ALWAYS, default_heading=0.2)
-    left = validate(pose(np.zeros((3, 3))), always)
-    np.testing.assert_allclose(left.measurement.covariance, np.diag([25.0, 25.0, 0.04]))
-    assert left.repairs == ('default_covariance',)
 
 
 def test_a_pose_without_information_on_the_position_is_a_heading() -> None:

@@ -44,10 +44,6 @@ def test_those_beyond_the_smallest_limit_leave_in_groups(config: WindowConfig) -
         assert n_leaving(config, table_of(n)) == slow(config, n)
 
 
-def test_without_a_limit_none_leaves() -> None:
-    assert n_leaving(WindowConfig(), table_of(1000)) == 0
-
-
 @settings(max_examples=50, deadline=None)
 @given(asked=st.lists(st.booleans(), min_size=150, max_size=150),
        config=st.sampled_from([WindowConfig(nodes=17), WindowConfig(seconds=20.0),
@@ -61,17 +57,6 @@ def test_the_nodes_that_are_left_do_not_depend_on_how_often_it_is_asked(
         if ask:
             table.freeze(np.zeros((n_leaving(config, table), 3)))
     assert table.n_frozen == slow(config, len(table))
-
-
-def test_most_of_the_time_nothing_is_due() -> None:
-    table, groups = NodeTable(), []
-    for k in range(1000):
-        table.append((7 + 2 * k) * SECOND, k, np.array([3.0 * k, 0.0, 0.0]))
-        n = n_leaving(WindowConfig(nodes=80), table)
-        table.freeze(np.zeros((n, 3)))
-        groups += [n] * (n > 0)
-        assert len(table) - table.n_frozen <= 80 + 10
-    assert set(groups) == {10}
 
 
 def test_what_is_needed_stays_but_not_for_ever() -> None:

@@ -6,11 +6,9 @@ import math
 
 from hypothesis import given, settings, strategies as st
 import numpy as np
-import pytest
 from random_graphs import random_poses
 
 from pose_graph_ros.core.config import ThinningConfig
-from pose_graph_ros.core.exceptions import ConfigError
 from pose_graph_ros.core.graph.constraints import EdgeKind, Edges, ObservedKind, ObservedNodes
 from pose_graph_ros.core.graph.graph import Graph, GraphUpdate
 from pose_graph_ros.core.smoother.incremental import IncrementalSmoother
@@ -79,12 +77,6 @@ def test_the_newest_nodes_and_the_fixed_one_stay_and_then_the_oldest() -> None:
     assert dict(zip(*map(np.ndarray.tolist, found), strict=True))[40] == 0
 
 
-def test_nothing_leaves_a_graph_of_the_newest_nodes_alone() -> None:
-    config = ThinningConfig(cell=1000.0, angle=7.0, newest=60)
-    assert len(thinning.crowd(laps(60, 20), config).leaving) == 0
-    assert len(thinning.crowd(laps(60, 20), ThinningConfig(cell=1.0, newest=61)).leaving) == 0
-
-
 def test_a_group_is_connected_and_has_few_neighbours() -> None:
     chain = np.column_stack((np.arange(29), np.arange(1, 30)))
     assert thinning.group(np.array([3, 4, 5, 9]), chain).tolist() == [3, 4, 5]
@@ -92,12 +84,6 @@ def test_a_group_is_connected_and_has_few_neighbours() -> None:
     # a hub with many neighbours leaves alone
     star = np.column_stack((np.zeros(20, dtype=int), np.arange(1, 21)))
     assert thinning.group(np.array([0, 1, 2]), star).tolist() == [0]
-
-
-def test_wrong_settings_are_refused() -> None:
-    for settings_ in ({'cell': -1.0}, {'angle': 0.0}, {'poses': 0}, {'newest': 0}):
-        with pytest.raises(ConfigError):
-            ThinningConfig(**settings_)
 
 
 def test_ten_new_nodes_are_waited_for_and_biases_are_none() -> None:
