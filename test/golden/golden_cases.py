@@ -221,7 +221,11 @@ DRIVES = {
     'plaza1': Drive('robot/plaza1', large=True),
 }
 
-LOADED = {name: Loaded(name) for name in ('version_1',)}
+LOADED = {
+    'version_1': Loaded('version_1'),
+    # with a window, thinning, judged closures, slow errors of fixes and of a gyroscope
+    'version_4': Loaded('version_4', {**GYRO, **THIN, 'window.nodes': 45.0}),
+}
 
 TOOLS = {
     'simulate': Tool('simulate city --duration 40 --gyro --json --tum', ('city_truth.tum',)),
