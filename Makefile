@@ -2,6 +2,7 @@
 
 VENV := $(if $(ROS_DISTRO),.venv-ros,.venv)
 PYTEST_ARGS ?=
+GOLDEN_ARGS ?=
 BENCH_ARGS ?=
 # Modules are byte-compiled when they are first imported, and not in each process anew.
 unexport PYTHONDONTWRITEBYTECODE
@@ -16,7 +17,8 @@ DEMO_ARGS = $(call option,BAG,bag) $(call option,ODOM,odom) $(call option,FIX,fi
 	$(call option,TRUTH,truth) $(call option,HOLD_OUT,hold-out) $(call option,RATE,rate) \
 	$(call option,OUT,out)
 
-.PHONY: help setup setup-demo setup-test demo test coverage bench lint types fmt lock clean
+.PHONY: help setup setup-demo setup-test demo test golden coverage bench lint types fmt lock \
+	clean
 
 help:
 	@echo 'make demo    set up, then simulate a drive, replay it through the node and judge the result'
@@ -24,6 +26,7 @@ help:
 	@echo '             [LOOP_CLOSURE=/topic] [TRUTH=/topic] [HOLD_OUT=5] [RATE=factor] [OUT=demo]'
 	@echo 'make test    set up, then run the checks (ruff, mypy) and all tests; PYTEST_ARGS="-k word"'
 	@echo 'make coverage    which lines of the engine its own tests run'
+	@echo 'make golden  make the figures of test/golden anew; GOLDEN_ARGS="--check --exact" compares'
 	@echo 'make bench   measure the engine against GTSAM; BENCH_ARGS="--quick --gate", or --help'
 	@echo 'make lint    ruff alone;  make types: mypy alone;  make fmt: let ruff mend what it can'
 	@echo 'make setup   set up alone: $(VENV), from wheels, or on top of ROS where one is sourced;'
@@ -53,6 +56,9 @@ coverage: setup-test
 	$(VENV)/bin/python -m coverage run -m pytest -q -n 3 --dist loadfile test/core
 	$(VENV)/bin/python -m coverage combine --quiet
 	$(VENV)/bin/python -m coverage report --skip-covered --sort=cover --include='pose_graph_ros/core/*'
+
+golden: setup-test
+	@$(VENV)/bin/python test/golden $(GOLDEN_ARGS)
 
 bench: setup
 	@$(VENV)/bin/python -m pip install --quiet --disable-pip-version-check --no-deps \

@@ -6,6 +6,7 @@ Worlds from graph files: recordings and the public sets, put into the order of a
 Node k comes with all edges whose later end is k. `EDGE2` is read in TORO's order.
 """
 
+import os
 from pathlib import Path
 
 import numpy as np
@@ -16,7 +17,10 @@ from pose_graph_ros.core.graph.constraints import EdgeKind, Edges
 from pose_graph_ros.core.graph.graph import Graph
 from pose_graph_ros.core.io.g2o import read_g2o
 
-DEFAULT_FOLDER = Path(__file__).resolve().parents[2] / 'shared' / 'data' / 'graphs'
+DATA = Path(os.environ.get('POSE_GRAPH_DATA') or (
+    Path(__file__).resolve().parents[2] / 'shared' / 'data'))
+"""Where the public data are."""
+DEFAULT_FOLDER = DATA / 'graphs'
 SUFFIXES = ('.g2o', '.graph')
 TRUTH_MARKS = ('_gt', 'groundtruth')
 """What the names of ground-truth files hold; those are passed over."""

@@ -19,6 +19,7 @@ import numpy as np
 
 from benchmark import drives, inputs_gyro, kept_sections, report
 from benchmark.drives import Kind
+from benchmark.files import DATA
 from benchmark.metrics import Metric
 from benchmark.section import say, Section, Table
 from pose_graph_ros.core.alignment.monitor import AlignmentState
@@ -47,7 +48,6 @@ NEES = 0.8, 1.3
 WEAK = 1.5
 """The upper bound with 30 fixes, which show little of their errors."""
 UPDATE_EVERY = 0.5
-DATA = Path(__file__).resolve().parents[2] / 'shared' / 'data'
 PLAZA = Path('robot', 'plaza1')
 
 MOWER = Kind('mower, 1 m/s, fixes of 1 m at 1 Hz')

@@ -32,6 +32,7 @@ from benchmark import (
     robust_timing,
     streets,
 )
+from benchmark.files import DATA
 from benchmark.metrics import Metric
 from benchmark.robust_closures import (
     FAR,
@@ -59,7 +60,6 @@ from benchmark.section import say, Section, Table
 from pose_graph_ros.core.config import Robust
 from pose_graph_ros.core.geometry.trajectory import Trajectory
 
-DATA = Path(__file__).resolve().parents[2] / 'shared' / 'data'
 PLACES = ('false_loops/B25b_0.150.g2o', 'false_loops/Bicocca25b_GT_GPS.g2o',
           'false_loops/B25b_timestamps.txt')
 M3500 = 'graphs/input_M3500_g2o.g2o', 'graphs/manhattanOlson3500_groundtruth.txt'

@@ -10,13 +10,14 @@ import time
 
 from circle_bag import fixes, odometry
 import numpy as np
+from public_data import needs, PUBLIC
 import pytest
 from run_schema import problems
 
 from pose_graph_ros.cli.bag_messages import write_bag
 from pose_graph_ros.cli.main import main
 
-FALSE_LOOPS = Path(__file__).parents[3] / 'shared' / 'data' / 'false_loops'
+FALSE_LOOPS = PUBLIC / 'false_loops'
 
 
 def run(*words: object) -> int:
@@ -123,7 +124,7 @@ def test_a_gyroscope_that_is_mounted_wrongly_is_a_finding(
     assert all('the other way' in each['text'] for each in blamed)
 
 
-@pytest.mark.skipif(not FALSE_LOOPS.is_dir(), reason=f'no {FALSE_LOOPS}')
+@needs('false_loops')
 def test_wrong_closures_of_a_recording_are_told(
     tmp_path: Path, capsys: pytest.CaptureFixture[str],
 ) -> None:

@@ -3,18 +3,16 @@
 """The certificate and the starts of `pose-graph solve`, and its JSON output."""
 
 import json
-import os
 from pathlib import Path
 import re
 from typing import Any
 
 import numpy as np
+from public_data import needs, PUBLIC
 import pytest
 
 from pose_graph_ros.cli.main import main
 
-SHARED = Path(os.environ.get(
-    'POSE_GRAPH_DATA', Path(__file__).resolve().parents[3] / 'shared' / 'data')) / 'graphs'
 DATA = Path(__file__).resolve().parents[1] / 'data'
 GOLDEN = json.loads((DATA / 'golden.json').read_text(encoding='utf-8'))
 NAMES = [name for name in GOLDEN if name.endswith('.g2o')]
@@ -111,12 +109,12 @@ def test_the_reason_is_said_where_there_is_none(
 
 
 
-@pytest.mark.skipif(not SHARED.exists(), reason='public graphs are not present')
+@needs('graphs')
 @pytest.mark.parametrize(('name', 'chi2', 'bounded'), OPTIMA)
 def test_the_optimum_of_a_public_graph_is_reached_and_certified(
     name: str, chi2: float, bounded: bool, capsys: pytest.CaptureFixture[str],
 ) -> None:
-    values = solved(capsys, SHARED / name)
+    values = solved(capsys, PUBLIC / 'graphs' / name)
     assert values['chi2'] == pytest.approx(chi2, rel=1e-6)
     found = values['certificate']
     assert found['verdict'] == 'certified'

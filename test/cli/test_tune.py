@@ -5,13 +5,13 @@
 import contextlib
 import io
 import json
-import os
 from pathlib import Path
 import re
 from typing import Any
 
 from helpers.noisy_drive import made, write
 import numpy as np
+from public_data import needs, PUBLIC
 import pytest
 import yaml
 
@@ -155,9 +155,7 @@ def test_a_truth_at_other_times_is_null_in_json(
     assert facts['to_truth'] == {'before': None, 'after': None}
 
 
-DATA = Path(os.environ.get(
-    'POSE_GRAPH_DATA', Path(__file__).resolve().parents[3] / 'shared' / 'data')) / 'robot'
-HUSKY, PLAZA = DATA / 'husky_test1_ros2', DATA / 'plaza1'
+HUSKY, PLAZA = PUBLIC / 'robot/husky_test1_ros2', PUBLIC / 'robot/plaza1'
 
 
 def facts_of(capsys: pytest.CaptureFixture[str], *args: str) -> dict[str, Any]:
@@ -166,7 +164,7 @@ def facts_of(capsys: pytest.CaptureFixture[str], *args: str) -> dict[str, Any]:
     return dict(json.loads(capsys.readouterr().out))
 
 
-@pytest.mark.skipif(not HUSKY.exists(), reason=f'no recording at {HUSKY}')
+@needs('robot/husky_test1_ros2')
 @pytest.mark.timeout(400)
 def test_husky_is_better_at_fixes_held_out(
     tmp_path: Path, capsys: pytest.CaptureFixture[str],
@@ -183,7 +181,7 @@ def test_husky_is_better_at_fixes_held_out(
     assert rms[1] < 0.9 * rms[0]
 
 
-@pytest.mark.skipif(not PLAZA.exists(), reason=f'no recording at {PLAZA}')
+@needs('robot/plaza1')
 @pytest.mark.timeout(400)
 def test_plaza_is_nearer_to_the_truth(
     tmp_path: Path, capsys: pytest.CaptureFixture[str],

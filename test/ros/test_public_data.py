@@ -4,15 +4,14 @@
 Accuracy on recordings of real robots, where they are there.
 
 One goes through the node and one through replay; that both give the same path is tested elsewhere.
-The recordings are not part of the project: POSE_GRAPH_DATA names their folder, else it is looked
-for in shared/data beside the project's folder.
+The recordings are not part of the project; see `public_data`.
 """
 
 import json
-import os
 from pathlib import Path
 
 import numpy as np
+from public_data import needs, PUBLIC
 import pytest
 from tum_files import read_tum
 
@@ -22,15 +21,13 @@ from pose_graph_ros.core.geometry.geodesy import TangentPlane
 from pose_graph_ros.core.geometry.trajectory import Trajectory
 
 pytest.importorskip('rclpy', reason='ROS 2 is not there: no rclpy')
-DATA = Path(os.environ.get(
-    'POSE_GRAPH_DATA', Path(__file__).resolve().parents[3] / 'shared' / 'data')) / 'robot'
-HUSKY = DATA / 'husky_test1_ros2'
-PLAZA = DATA / 'plaza1'
+
+HUSKY, PLAZA = PUBLIC / 'robot/husky_test1_ros2', PUBLIC / 'robot/plaza1'
 DATUM = (40.44, -79.94)
 """Where the fixes of plaza1 are placed; anywhere would do."""
 
 
-@pytest.mark.skipif(not HUSKY.exists(), reason=f'no recording at {HUSKY}')
+@needs('robot/husky_test1_ros2')
 @pytest.mark.timeout(180)
 def test_husky_ends_near_the_fixes_that_it_got_and_those_that_it_did_not(tmp_path: Path) -> None:
     assert main(['demo', '--rate', '0', '--bag', str(HUSKY), '--odom',
@@ -43,7 +40,7 @@ def test_husky_ends_near_the_fixes_that_it_got_and_those_that_it_did_not(tmp_pat
     assert rows['corrected path to fixes held out']['count'] >= 190
 
 
-@pytest.mark.skipif(not HUSKY.exists(), reason=f'no recording at {HUSKY}')
+@needs('robot/husky_test1_ros2')
 @pytest.mark.parametrize(('settings', 'source', 'words'), [
     (('sources:=[odom, fix, gyro]', 'gyro.mounting:=up'), 'gyro', 'does not turn'),
     (('sources:=[odom, fix, imu]',), 'imu', 'contradicts the other sources')])
@@ -78,7 +75,7 @@ def plaza(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Trajectory]:
         np.column_stack((truth[:, 1:3], np.zeros(len(truth)))))
 
 
-@pytest.mark.skipif(not PLAZA.exists(), reason=f'no recording at {PLAZA}')
+@needs('robot/plaza1')
 @pytest.mark.timeout(180)
 def test_plaza_is_within_35_cm_of_the_truth(
     plaza: tuple[Path, Trajectory], tmp_path: Path,

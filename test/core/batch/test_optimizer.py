@@ -4,10 +4,10 @@
 
 import hashlib
 import json
-import os
 from pathlib import Path
 
 import numpy as np
+from public_data import missing, PUBLIC
 import pytest
 from random_graphs import (
     chordal,
@@ -51,8 +51,6 @@ GOLDEN = {name: entry for name, entry in
           json.loads((DATA / 'golden.json').read_text(encoding='ascii')).items()
           if name != 'about'}
 
-PUBLIC = Path(os.environ.get(
-    'POSE_GRAPH_DATA', Path(__file__).parents[4] / 'shared' / 'data' / 'graphs'))
 # chi2 at the optima of public graphs, by the literature and other solvers; relative error 1e-5.
 PUBLIC_OPTIMA = {
     'ring.g2o': (11.163, None),
@@ -342,9 +340,9 @@ def test_small_graphs_reach_their_stored_optima(name: str, *, from_chordal: bool
 @pytest.mark.parametrize('from_nothing', [False, True])
 @pytest.mark.parametrize('name', PUBLIC_OPTIMA)
 def test_public_graphs_reach_their_known_optima(name: str, *, from_nothing: bool) -> None:
-    path = PUBLIC / name
-    if not path.is_file():
-        pytest.skip(f'{path} is not there; POSE_GRAPH_DATA may name the folder of {name}')
+    path = PUBLIC / 'graphs' / name
+    if missing(f'graphs/{name}'):
+        pytest.skip(missing(f'graphs/{name}'))
     chi2, edge2_order = PUBLIC_OPTIMA[name]
     graph = read_g2o(path, edge2_order).graph
     if from_nothing:

@@ -2,10 +2,9 @@
 # SPDX-License-Identifier: Apache-2.0
 """Which fixes are believed in a drive of a real robot, where the recording is there."""
 
-import os
-from pathlib import Path
 
 import numpy as np
+from public_data import needs, PUBLIC
 import pytest
 
 from pose_graph_ros.core.backend import PoseGraphBackend
@@ -14,8 +13,7 @@ from pose_graph_ros.core.judgement.verdicts import State
 from pose_graph_ros.core.measurements import OdometrySample, Position
 
 SECOND = 1_000_000_000
-PLAZA = Path(os.environ.get(
-    'POSE_GRAPH_DATA', Path(__file__).resolve().parents[4] / 'shared' / 'data')) / 'robot/plaza2'
+PLAZA = PUBLIC / 'robot/plaza2'
 
 
 def read(name: str) -> Trajectory:
@@ -25,7 +23,7 @@ def read(name: str) -> Trajectory:
     return Trajectory(stamps[new], rows[new, 1:4])
 
 
-@pytest.mark.skipif(not PLAZA.exists(), reason=f'no recording at {PLAZA}')
+@needs('robot/plaza2')
 @pytest.mark.parametrize('seed', [25, 47, 50, 1])
 def test_a_mower_doubts_all_fixes_aside_after_an_outage_and_no_others(seed: int) -> None:
     odometry, truth = read('odom.csv'), read('gt.csv')
