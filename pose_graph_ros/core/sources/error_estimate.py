@@ -54,7 +54,8 @@ SIGNIFICANT = 20.0
 # The same for each time that the filter was lost: then odometry was wrong, or many positions.
 PER_LOST = 100.0
 # The same of the errors of odometry. The constant ones are states with a prior, which by itself
-# keeps them from being believed where little shows them.
+# keeps them from being believed where little shows them. Beside correlated errors, which may be
+# taken for those of odometry, it is `SIGNIFICANT`.
 SIGNIFICANT_ODOMETRY = 6.0
 # The same of one factor on the noise of odometry; and how much less likely larger ones may be.
 SIGNIFICANT_SCALE = 4.0
@@ -323,7 +324,7 @@ def _odometry_errors(
     *errors, way, turn, white = best
     claimed = yield from _descend(evaluate, [(*errors, 0.0, white)], fixed=ODOMETRY)
     least = yield from evaluate.value(best)
-    if claimed.value - least > SIGNIFICANT_ODOMETRY:
+    if claimed.value - least > (SIGNIFICANT if len(errors) > 0 else SIGNIFICANT_ODOMETRY):
         for axis in (-3, ODOMETRY):
             while best[axis] < 0.0:
                 more = (*best[:axis], best[axis] + FINEST, *best[axis + 1:])
