@@ -147,6 +147,14 @@ def test_variances_are_those_of_a_slow_walk(data: st.DataObject) -> None:
         assert np.all(part <= np.array([way.distance, way.distance, way.turn])**2 + ROUNDING)
 
 
+def test_at_rest_nothing_is_known_of_the_usual_noise() -> None:
+    timeline, row = OdometryTimeline(), None
+    for stamp_ns in (1, 2, 3):
+        row = next_row(row, stamp_ns, (1.0, 2.0, 0.5))
+        timeline.append(row)
+    np.testing.assert_array_equal(timeline.usual_variances(), 0.0)
+
+
 def test_the_noise_contains_the_effect_of_an_acceleration_between_samples() -> None:
     for rate in (1, 5, 20):
         times = np.arange(0.0, 4.0, 1.0 / rate)
