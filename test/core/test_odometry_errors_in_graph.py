@@ -98,7 +98,7 @@ def test_constant_errors_are_taken_out_and_fixes_aside_after_an_outage_are_refus
 
 
 def test_neither_the_order_of_arrival_nor_a_file_in_between_changes_the_path() -> None:
-    events, truth = drive(3)
+    events, _ = drive(3)
     events = [event for event in events if event.stamp_ns < OUTAGE * SECOND]
     random = np.random.default_rng(0)
     late = [event.stamp_ns + (30 * SECOND * random.random() if isinstance(event, Position) else 0)
