@@ -112,10 +112,7 @@ class ErrorTuner:
         """
         Do a bounded part of the work that is due; return how far a node has moved [m].
 
-        Parameters
-        ----------
-        most_edges : float, of a graph in which all odometry may be changed
-
+        In a graph of more than `most_edges` the odometry is not changed.
         """
         graph = self._smoother.graph
         if graph.has_touched:
@@ -224,14 +221,7 @@ class ErrorTuner:
         return [past.node for past in every if past is not None]
 
     def forget(self, nodes: IntArray, edges: IntArray, observed: IntArray) -> None:
-        """
-        Forget what has left the graph after `leave`.
-
-        Parameters
-        ----------
-        nodes, edges, observed : ndarray of int, ids
-
-        """
+        """Forget what has left the graph after `leave`, by ids."""
         kept, change = self._factors.forget(nodes, edges, observed), self._change
         self._factors.n_bias_edges -= self._n_bias_edges
         for source, past in self._past.items():
@@ -251,11 +241,7 @@ class ErrorTuner:
         """
         Follow the graph, which was loaded.
 
-        Parameters
-        ----------
-        knows_errors : bool
-            False for files of older versions, in which weights stand for the noise of odometry.
-
+        In files of older versions (not `knows_errors`) weights stand for the noise of odometry.
         """
         graph, rows = self._smoother.graph, self._primary_rows()
         # what a loss or the judge has changed has less weight

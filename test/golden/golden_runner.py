@@ -21,12 +21,11 @@ from typing import Any
 
 from golden_cases import CASES, Drive, Loaded, SECOND, Tool
 import numpy as np
-from pose_graph_ros.adapters.bag_sequence import open_bags
 from public_data import PUBLIC
 from tum_files import read_tum
 
 from pose_graph_ros.adapters.bag_inputs import choose_inputs, reader_of
-from pose_graph_ros.adapters.bags import Bag
+from pose_graph_ros.adapters.bags import Bag, open_bags
 from pose_graph_ros.adapters.parameters import checked
 from pose_graph_ros.adapters.sources import backend_config, source_list
 from pose_graph_ros.cli.bag_messages import fix_messages, odometry_messages, write_bag

@@ -148,14 +148,7 @@ class HiddenNodes:
         return in_order_of_preference(self.streams, self._config.odometry)
 
     def add_sample(self, sample: OdometrySample, source: str) -> Answer:
-        """
-        Return the answer to an odometry sample, after making the nodes and edges that are due.
-
-        Parameters
-        ----------
-        source : str, name of the odometry source
-
-        """
+        """Return the answer to a sample of a source, after making what is due."""
         stream = self.streams.get(source) or self._make_stream(source)
         answer = stream.add(sample)
         self._process(source, stream.settle())
@@ -246,14 +239,9 @@ class HiddenNodes:
         """
         Make a node 1 ns after the newest odometry, for a robot that was moved by hand.
 
-        All odometry must be settled. The motion by odometry since the newest node is not used.
-        Returns the id of the new node in the graph, or -1 if it could not be made.
-
-        Parameters
-        ----------
-        mean : ndarray, shape (3,), pose of the robot in the newest node [m, m, rad]
-        noise : ndarray, shape (3, 3), covariance of that pose, in the frame at its end
-
+        All odometry must be settled. The motion by odometry since the newest node is not used, but
+        the pose of the robot in it, with its covariance in the frame at the end. Returns the id of
+        the new node in the graph, or -1 if it could not be made.
         """
         timeline = self.streams[self.primary].timeline
         moved = self._motion_since_node(self.streams[self.primary], self.covered_ns)[0]
@@ -376,14 +364,7 @@ class HiddenNodes:
             motion.increment, stream.covariance(motion, floor=False)))
 
     def _between_nodes(self, node: int, stamp_ns: int) -> Motion:
-        """
-        Return the motion from a node to an instant before the next one, without the samples there.
-
-        Parameters
-        ----------
-        node : int, its number
-
-        """
+        """Return the motion from a node to before the next one, without the samples there."""
         ends, row = OdometryTimeline(), None
         for number in (node, node + 1):
             row = next_row(row, int(self.stamps_ns[number]),

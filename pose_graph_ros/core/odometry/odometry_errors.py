@@ -78,6 +78,11 @@ class OdometryErrors(NamedTuple):
         """What undoes the factors of the noise, without constant errors."""
         return OdometryErrors(1.0 / self.way, 1.0 / self.turn)
 
+    @property
+    def mean_sigma(self) -> float:
+        """Factor on the sigmas of an edge, in the geometric mean."""
+        return float((self.way**2 * self.turn)**(1.0 / 6.0))
+
     def is_close(self, other: 'OdometryErrors') -> bool:
         """Tell whether the numbers are those of others, but for rounding."""
         return all(math.isclose(a, b, rel_tol=1e-9, abs_tol=1e-12)

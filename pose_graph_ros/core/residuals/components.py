@@ -70,6 +70,11 @@ def analyse(
 
     """
     residuals = collect(smoother, nodes, factors, scales_in_use(smoother.graph, reweighting))
+    if nodes.primary in residuals:
+        # its edges have the noise that was found, and a ratio is one to what is claimed
+        of_odometry = residuals[nodes.primary]
+        residuals[nodes.primary] = of_odometry._replace(
+            scale=of_odometry.scale * nodes.errors.mean_sigma)
     at_estimate = {source: fit(each, factors.errors_in_use(source))
                    for source, each in residuals.items()}
     white = {source: each for source, each in residuals.items()
@@ -114,8 +119,10 @@ def _together(
     found = vc.restricted_likelihood(data, np.array(list(components.values())), fixed)
     if found is None:
         return {source: at_estimate[source].unknown for source in sources}
-    return {source: _with_factors(at_estimate[source], own[at], found, {
-        kind: k for k, (name, kind) in enumerate(components) if name == source})
+    return {source: _with_factors(
+        at_estimate[source], own[at], found,
+        {kind: k for k, (name, kind) in enumerate(components) if name == source},
+        in_use=nodes.errors.mean_sigma if source == nodes.primary else 1.0)
         for source, at in rows.items() if len(at) > 0}
 
 
@@ -135,7 +142,8 @@ def _motions(
 
 
 def _with_factors(
-    present: ScaleFit, claimed: FloatArray, found: vc.Found, parts: Mapping[int, int],
+    present: ScaleFit, claimed: FloatArray, found: vc.Found, parts: Mapping[int, int], *,
+    in_use: float,
 ) -> ScaleFit:
     """
     Return a fit with other factors.
@@ -144,6 +152,7 @@ def _with_factors(
     ----------
     claimed : ndarray, shape (M, 3, 3), covariances of the constraints
     parts : mapping, numbers of the components of the source, by 0 for the way and 1 for the turn
+    in_use : float, factor on the sigmas that the covariances have already
 
     """
     sigmas = np.sqrt(np.mean(np.diagonal(claimed, axis1=1, axis2=2), axis=0)).tolist()
@@ -155,4 +164,5 @@ def _with_factors(
             sigma=sigmas[row.coordinate], ratio=ratio, low=low, high=high))
     ratio, low, high, independent = found.of(list(parts.values()))
     return present._replace(
-        rows=tuple(rows), ratio=ratio, low=low, high=high, independent=independent)
+        rows=tuple(rows), ratio=in_use * ratio, low=in_use * low, high=in_use * high,
+        independent=independent)

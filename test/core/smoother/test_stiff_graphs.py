@@ -20,8 +20,8 @@ DECADES = (0.0, 6.0, 10.0, 11.5)
 SAME_CHI2 = 1e-6
 # Largest chi2 of the smoother above its minimum, after each step.
 EXCESS = 0.02
-# Largest error of a covariance, in products of the sigmas.
-COVARIANCE = 0.02
+# Largest error of a covariance, in products of the sigmas; processors round differently.
+COVARIANCE = 0.05
 
 seeds = st.integers(0, 2**32 - 1)
 

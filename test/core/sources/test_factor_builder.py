@@ -3,7 +3,6 @@
 """From queues to updates: the order of arrival is forgotten, and each row knows its source."""
 
 import numpy as np
-import pytest
 from saved_graphs import assert_same_value
 
 from pose_graph_ros.core.config import BackendConfig, Loss, MeasurementSource
@@ -78,7 +77,7 @@ def test_an_update_adds_each_constraint_once() -> None:
     factors.commit()
     assert factors.n_measurements == 9
     assert factors.n_bias_edges == np.sum(graph.edges.kind == EdgeKind.BIAS) == 5
-    assert len(reweighting) == 6    # white and inflated
+    assert len(reweighting) == 6    # white and other
 
 
 def test_every_row_knows_the_source_and_the_stamp_that_it_came_from() -> None:
@@ -121,15 +120,6 @@ def test_an_update_that_is_rolled_back_is_built_again_as_it_was() -> None:
     assert_same_value(second.observed, first.observed)
     assert (second.remove_edges, second.remove_observed, second.weigh_observed) == (
         first.remove_edges, first.remove_observed, first.weigh_observed)
-
-
-def test_what_a_loss_has_taken_off_stays_off_when_a_weight_is_renewed() -> None:
-    graph, (factors, _) = line(), builder()
-    committed(factors, graph, Queue([], [fix('other', k) for k in (3, 4)]))
-    assert graph.observed.weight.tolist() == [0.5, 0.5]
-    graph.apply(GraphUpdate(weigh_observed={0: 0.05}))
-    committed(factors, graph, Queue([], [fix('other', 5)]))
-    assert graph.observed.weight == pytest.approx([0.1 / 3, 1 / 3, 1 / 3])
 
 
 def restored(factors: FactorBuilder, config: BackendConfig) -> FactorBuilder:
