@@ -155,9 +155,8 @@ HALL = '--world hall --duration 45'
 LOOPS = '--world grid --seed 101 --duration 100 --closures 1'
 FALSE = f'{LOOPS} --false-rate 0.3 --false-groups 2:4'
 GYRO = {'sources': ['odom', 'fix', 'gyro'], 'gyro.mounting': 'up'}
-VISUAL = {'sources': ['odom', 'visual', 'fix'], 'visual.type': 'odometry',
-          'odometry_patience': 1.0}
-THIN = {'thinning.cell': 2.0, 'thinning.newest': 20.0}
+VISUAL = {'sources': ['odom', 'visual', 'fix'], 'visual.type': 'odometry'}
+THIN = {'thinning.cell': 2.0}
 
 DRIVES = {
     'fixes': Drive(CITY),
@@ -177,7 +176,7 @@ DRIVES = {
     'fixes_late_and_shuffled': Drive(f'{CITY} --delay /gps/fix:2:6 --duplicate /gps/fix:0.2'),
     'clock_ahead': Drive(
         f'{CITY} --clock-offset /gps/fix:0.3', {'fix.time_offset': -0.3}, large=True),
-    'datum': Drive(CITY, {'datum': [50.7, 7.1, 0.4], 'fix.minimum_period': 1.5}),
+    'datum': Drive(CITY, {'datum': [50.7, 7.1, 0.4]}),
     'receivers': Drive(CITY, {'sources': ['odom', 'fix', 'rear'], 'rear.type': 'fix',
                               'fix.lever_arm': [1.0, 0.0]}, two_receivers),
     'odometry_jumps': Drive(f'{CITY} --jump /odom:15:3,1,0.5 --jump /odom:30:reset'),

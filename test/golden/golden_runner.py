@@ -192,7 +192,7 @@ def state_of(
         'nodes': estimate.n_hidden, 'frozen': estimate.n_frozen, 'thinned': estimate.n_thinned,
         'edges': estimate.n_edges, 'observed': estimate.n_observed, 'biases': estimate.n_biases,
         'priors': estimate.n_priors, 'set aside': backend.n_quarantined,
-        'chi2': estimate.chi2, 'odometry scale': estimate.odometry_scale,
+        'chi2': estimate.chi2, 'odometry errors': list(estimate.odometry_errors),
         'believed': {source: states_text([each.state.value for each in verdicts
                                           if each.source == source])
                      for source in sorted({each.source for each in verdicts})},
