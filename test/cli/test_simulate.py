@@ -39,7 +39,7 @@ def test_the_drive_is_the_one_of_the_first_version() -> None:
     np.testing.assert_array_equal(drive.rate_stamps_ns[::500], old['rate_stamps_ns'])
     np.testing.assert_allclose(drive.rates[::500], old['rates'], rtol=0.0, atol=1e-9)
     np.testing.assert_allclose(drive.fixes[:, :2], old['fixes'][:, :2], rtol=0.0, atol=1e-12)
-    # PROJ's heights differ from version to version by the rounding of geocentric coordinates
+    # heights may differ by the rounding of geocentric coordinates, as from one PROJ to another
     np.testing.assert_allclose(drive.fixes[:, 2], old['fixes'][:, 2], rtol=0.0, atol=1e-8)
     np.testing.assert_allclose(drive.loop_poses, old['loop_poses'], rtol=0.0, atol=1e-9)
 
