@@ -88,7 +88,7 @@ setup(
     ],
     extras_require={
         'test': ['pytest>=7.4', 'pytest-timeout>=2.2', 'pytest-xdist>=3.4', 'coverage>=7.4',
-                 'hypothesis>=6.98', 'playwright>=1.40'],
+                 'hypothesis>=6.98', 'evo>=1.38', 'playwright>=1.40'],
         'dev': ['ruff', 'mypy', 'scipy-stubs'],
     },
 )
