@@ -308,6 +308,8 @@ class ErrorTuner:
         primary = graph.memory['edge_i'][:graph.n_edges, tb.EDGE_KIND] == EdgeKind.ODOMETRY
         others = np.concatenate([[], *self._factors.pose_edges().values()]).astype(np.int64)
         primary[graph.edge_rows(others)] = False
+        ends = graph.node_ids[graph.memory['edge_i'][:graph.n_edges, tb.END_J]]
+        primary &= ~np.isin(ends, self._nodes.relocated_ids)
         return np.flatnonzero(primary)
 
     def _next_search(self) -> _Search | None:

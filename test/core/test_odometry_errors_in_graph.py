@@ -11,7 +11,13 @@ from pose_graph_ros.core.backend import PoseGraphBackend
 from pose_graph_ros.core.config import BackendConfig, POSITIONS, WindowConfig
 from pose_graph_ros.core.geometry import se2
 from pose_graph_ros.core.judgement.verdicts import State
-from pose_graph_ros.core.measurements import OdometrySample, Position
+from pose_graph_ros.core.measurements import (
+    AnswerStatus,
+    GlobalPose,
+    OdometrySample,
+    Position,
+)
+from pose_graph_ros.core.odometry.odometry_errors import OdometryErrors
 
 SECOND = 1_000_000_000
 RATE, LONGER = 0.006, 0.01
@@ -128,3 +134,20 @@ def test_errors_of_odometry_are_found_in_a_window() -> None:
     assert backend.estimate().odometry_errors.rate == pytest.approx(RATE, abs=1e-3)
     error = newest[-60:, 1:] - truth[np.round(newest[-60:, 0] * 5 / SECOND).astype(int), :2]
     assert np.sqrt(np.mean(np.sum(error**2, axis=1))) < 1.0
+
+
+def test_where_a_person_has_put_the_robot_is_not_changed_by_errors_of_odometry() -> None:
+    events, truth = drive(5)
+    half = next(k for k, event in enumerate(events) if event.stamp_ns > 150 * SECOND)
+    backend = fed(events[:half])[0]
+    assert backend.estimate().odometry_errors.turn < 1.0
+    placed = GlobalPose(150 * SECOND, truth[750] + (5.0, 0.0, 0.0), np.diag((0.25, 0.25, 0.01)))
+    assert backend.set_pose(placed, 'initialpose').status is AnswerStatus.ACCEPTED
+    edge, before = backend.graph.edges.rows(slice(-1, None)), backend.estimate().odometry_errors
+    again = PoseGraphBackend.restored(None, backend.saved())
+    for each in (backend, again):
+        each._tuner._correct_odometry(OdometryErrors(2.0, 3.0, 0.001, 0.01))
+        assert each.estimate().odometry_errors != before
+        last = each.graph.edges.rows(slice(-1, None))
+        np.testing.assert_array_equal(last.information, edge.information)
+        np.testing.assert_array_equal(last.mean, edge.mean)

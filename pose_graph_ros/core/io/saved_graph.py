@@ -139,6 +139,8 @@ class SavedGraph:
                  f'{n_frozen} and {len(nodes.odometry)} for {n} nodes')
         _require(_are_odometry_errors(nodes.errors),
                  'nodes.errors: expected two positive numbers and two others')
+        _require(np.all((nodes.relocated > 0) & (nodes.relocated < n)),
+                 f'nodes.relocated: expected numbers in 1..{n - 1}')
         _increasing('nodes.stamps_ns', nodes.stamps_ns)
         _increasing('nodes.ids', nodes.ids)
         _same_length('nodes.thinned', thinned, 'numbers', 'anchors', 'relative', 'noise')

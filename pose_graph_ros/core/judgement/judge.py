@@ -347,8 +347,10 @@ class Judge:
     def correct_odometry(self, before: OdometryErrors, after: OdometryErrors) -> None:
         """Follow the edges of odometry, which know of other errors of it now."""
         for chain in (self._fixes.chain, self._closures.chain):
-            chain.correct(before, after, self._nodes.stamps_ns[
-                np.searchsorted(self._nodes.ids, chain.nodes)])
+            chain.correct(
+                before, after, self._nodes.stamps_ns[
+                    np.searchsorted(self._nodes.ids, chain.nodes)],
+                ~np.isin(chain.nodes[1:], self._nodes.relocated_ids))
 
     def moved(self, before: Held, after: Held) -> None:
         """

@@ -16,7 +16,7 @@ from pose_graph_ros.core.compiled.growing_array import GrowingArray
 from pose_graph_ros.core.compiled.jit import FLAG, INTEGER, INTEGERS, kernel, NUMBERS, ROWS
 from pose_graph_ros.core.config import OdometryNoise
 from pose_graph_ros.core.geometry import se2
-from pose_graph_ros.core.geometry.se2 import FloatArray, IntArray
+from pose_graph_ros.core.geometry.se2 import BoolArray, FloatArray, IntArray
 from pose_graph_ros.core.graph import factors, tables as tb
 from pose_graph_ros.core.graph.constraints import EdgeKind, full, upper
 from pose_graph_ros.core.graph.graph import Graph
@@ -129,6 +129,7 @@ class OdometryChain:
 
     def correct(
         self, before: OdometryErrors, after: OdometryErrors, stamps_ns: IntArray,
+        by_odometry: BoolArray,
     ) -> None:
         """
         Follow the edges, which know of other errors of odometry now.
@@ -137,17 +138,20 @@ class OdometryChain:
         ----------
         before, after : OdometryErrors
         stamps_ns : ndarray of int, shape (M,), of the nodes of the chain
+        by_odometry : ndarray of bool, shape (M - 1,), which steps have such edges
 
         """
         if len(self) < 2:
             return
         poses, sums = self._poses.values, full(self._sums.values)
         seconds = np.asarray(np.diff(stamps_ns) * 1e-9, dtype=np.float64)
-        motions = after.motions(before.as_odometry_says(
-            se2.between(poses[:-1], poses[1:]), seconds), seconds)
+        motions = se2.between(poses[:-1], poses[1:])
         back = se2.adjoint(se2.inverse(poses[1:]))
-        noises = after.covariances(before.inverse_noise.covariances(
-            back @ np.diff(sums, axis=0) @ np.swapaxes(back, 1, 2)))
+        noises = back @ np.diff(sums, axis=0) @ np.swapaxes(back, 1, 2)
+        motions = np.where(by_odometry[:, None], after.motions(
+            before.as_odometry_says(motions, seconds), seconds), motions)
+        noises = np.where(by_odometry[:, None, None], after.covariances(
+            before.inverse_noise.covariances(noises)), noises)
         moved = se2.compose(poses[:1], integrated(motions))
         forth = se2.adjoint(moved[1:])
         steps = forth @ noises @ np.swapaxes(forth, 1, 2)

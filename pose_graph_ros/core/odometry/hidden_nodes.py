@@ -86,6 +86,11 @@ class HiddenNodes:
         return len(self.table)
 
     @property
+    def relocated_ids(self) -> IntArray:
+        """Ids of the nodes at which the robot was put by hand; no odometry leads to them."""
+        return self.ids[np.array(sorted(self.relocated), dtype=np.int64)]
+
+    @property
     def stamps_ns(self) -> IntArray:
         """Stamps of all hidden nodes [ns], shape (N,), a read-only view."""
         return self.table.stamps_ns
@@ -389,11 +394,7 @@ class HiddenNodes:
         self._samples_since_ns = since_ns
 
     def forget(self, poses: FloatArray) -> None:
-        """
-        Freeze the oldest nodes in the graph at the given poses, shape (M, 3), as they have left.
-
-        The samples and the primary sources before them are dropped.
-        """
+        """Freeze the oldest nodes at poses, shape (M, 3), as they have left; drop their past."""
         self.table.freeze(poses)
         first, last_ns = self.n_frozen, self.last_frozen_ns
         for source, stream in self.streams.items():
@@ -407,10 +408,9 @@ class HiddenNodes:
 
     def newest(self) -> tuple[FloatArray, FloatArray, FloatArray]:
         """
-        Return the motion from the newest node to the newest sample, and its covariance.
+        Return the motion from the newest node to the newest sample, and its covariance at its end.
 
-        The motion has the shape (3,) [m, m, rad], its covariance is in the frame at its end, and
-        third comes the newest pose of the primary source as received, shape (3,) [m, m, rad].
+        Third comes the newest pose of the primary source as received, shape (3,) [m, m, rad].
         """
         stream = self.streams[self.primary]
         motion, raw = stream.newest(self._base_ns)
@@ -430,7 +430,7 @@ class HiddenNodes:
             {name: stream.saved(needed_ns, self._secondary.progress[name])
              for name, stream in self.streams.items()},
             self.table.frozen.copy(), float(self.table.travelled[0]), self.table.thinned.saved(),
-            np.array(self.errors))
+            np.array(self.errors), np.array(sorted(self.relocated), dtype=np.int64))
 
     def restore(self, saved: SavedNodes) -> None:
         """Set the state of this empty object to a saved one."""
@@ -442,6 +442,7 @@ class HiddenNodes:
         for name, stream in saved.streams.items():
             self._make_stream(name).restore(stream)
             self._secondary.progress[name] = stream.tied, stream.next_to_tie
+        self.relocated = {*saved.relocated.tolist()}
         if len(saved.errors) > 0:
             self.errors = OdometryErrors(*saved.errors.tolist())
         if len(self.table.thinned) > 0:

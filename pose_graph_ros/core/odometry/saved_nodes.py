@@ -61,6 +61,9 @@ class SavedNodes:
     the edges stand for them.
     """
 
+    relocated: Integers = field(default_factory=lambda: np.empty(0, dtype=np.int64))
+    """Numbers of the nodes at which the robot was put by hand; empty in older files."""
+
     def poses(self, node_ids: IntArray, poses: FloatArray) -> FloatArray:
         """
         Return the poses of all nodes, shape (H, 3) [m, m, rad].

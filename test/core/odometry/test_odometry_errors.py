@@ -128,7 +128,7 @@ def test_a_chain_follows_the_edges(
             ends, ends + 1, *known, [EdgeKind.ODOMETRY] * len(means))))
         chains.append(OdometryChain())
         chains[-1].extend(graph)
-    chains[0].correct(before, after, stamps_ns)
+    chains[0].correct(before, after, stamps_ns, np.ones(len(means), dtype=bool))
     np.testing.assert_allclose(chains[0].poses, chains[1].poses, atol=1e-9)
     np.testing.assert_allclose(chains[0].sums, chains[1].sums, rtol=1e-5, atol=1e-6)
     np.testing.assert_allclose(chains[0].travel(chains[0].nodes), chains[1].travel(
